@@ -1,0 +1,59 @@
+# Every target does its own set-up; all that it needs is Python >= 3.11 and make.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test test-all fmt lint types contracts proto proto-check check serve clean
+
+help: ## list the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/:/' | column -t -s:
+
+install: $(INSTALLED) ## make .venv with every extra
+
+$(INSTALLED): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "visloc needs Python 3.11 or newer")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
+		--editable '.[mapping,service,clients,dev]'
+	touch $(INSTALLED)
+
+demo: install ## the main job on a synthetic sample: build, serve, localize, picture
+	$(BIN)/python -m benchmarks.demo
+
+test: install ## the tests, in under ten minutes on two cores
+	$(BIN)/pytest -m 'not slow'
+
+test-all: install ## the slow tests too
+	$(BIN)/pytest
+
+fmt: install ## format the code
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+lint: install ## ruff
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: install ## mypy, strict
+	$(BIN)/mypy
+
+contracts: install ## who may import whom
+	$(BIN)/lint-imports
+
+proto: install ## generate visloc_api from proto/
+	$(BIN)/python -m grpc_tools.protoc --proto_path=proto --python_out=. --grpc_python_out=. \
+		--mypy_out=. --mypy_grpc_out=. proto/visloc_api/v1/localization.proto
+
+proto-check: proto ## the committed stubs are those of the proto
+	git diff --exit-code -- visloc_api
+	@test -z "$$(git status --porcelain -- visloc_api)" || (git status --short -- visloc_api; exit 1)
+
+check: lint types contracts proto-check ## what must be green before review
+
+serve: install ## serve the maps in maps/ on 127.0.0.1:8000 (HTTP) and :50051 (gRPC)
+	$(BIN)/python -m service --maps-dir maps
+
+clean: ## remove what make made
+	rm -rf $(VENV) .demo

@@ -1,0 +1,94 @@
+"""What a local feature and a global descriptor must offer, and how each is identified."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.types import LocalFeatures
+
+
+@dataclass(frozen=True, slots=True)
+class Fingerprint:
+    """Identifies what was computed: equal fingerprints mean comparable features.
+
+    Attributes:
+        name: the registry's name.
+        revision: raised whenever the code changes what comes out.
+        parameters: everything that shapes the result.
+        weights_sha256: of the weights file as published; None without weights.
+    """
+
+    name: str
+    revision: int
+    parameters: Mapping[str, int | float | str]
+    weights_sha256: str | None = None
+
+
+class LocalFeatureExtractor(Protocol):
+    """Finds keypoints in one image and describes them. Safe to call from several threads."""
+
+    @property
+    def fingerprint(self) -> Fingerprint:
+        """Name, parameters and weights; kept in the manifest of every map."""
+
+    @property
+    def descriptor_dim(self) -> int:
+        """Length D of one descriptor."""
+
+    def extract(self, rgb: NDArray[np.uint8], *, max_keypoints: int) -> LocalFeatures:
+        """Return at most ``max_keypoints`` features, strongest first.
+
+        rgb: (H, W, 3). Keypoints are in its pixels, whatever size the network worked at.
+        A blank image gives none. It is not an error; nor is an image of one pixel.
+        """
+
+
+class GlobalDescriptor(Protocol):
+    """Turns one photo into one vector, with a model learned on the map's own photos.
+
+    The model is a mapping of plain arrays: what ``learn_vocabulary`` and ``learn_projection``
+    returned, together. Safe to call from several threads.
+    """
+
+    @property
+    def fingerprint(self) -> Fingerprint:
+        """Name and parameters; kept in the manifest of every map."""
+
+    def training_words(
+        self, rgb: NDArray[np.uint8], local: LocalFeatures, seed: int
+    ) -> NDArray[np.float32]:
+        """Return a seeded sample (n, d) of what the vocabulary is learned from."""
+
+    def learn_vocabulary(
+        self, words: NDArray[np.float32], seed: int
+    ) -> dict[str, NDArray[np.float32]]:
+        """Learn from the training words (n, d) of many photos."""
+
+    def pool(
+        self,
+        rgb: NDArray[np.uint8],
+        local: LocalFeatures,
+        vocabulary: Mapping[str, NDArray[np.float32]],
+    ) -> NDArray[np.float32]:
+        """Aggregate one photo to a raw vector (R,)."""
+
+    def learn_projection(self, pooled: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+        """Learn whitening from the raw vectors (n, R) of the map's photos, n >= 1."""
+
+    def project(
+        self, pooled: NDArray[np.float32], model: Mapping[str, NDArray[np.float32]]
+    ) -> NDArray[np.float32]:
+        """Whiten raw vectors (..., R) to rows (..., D) of unit length; zero rows stay zero."""
+
+    def describe(
+        self,
+        rgb: NDArray[np.uint8],
+        local: LocalFeatures,
+        model: Mapping[str, NDArray[np.float32]],
+    ) -> NDArray[np.float32]:
+        """Return ``project(pool(...))``: (D,), unit length, or zero for a blank photo."""

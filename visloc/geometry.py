@@ -1,0 +1,269 @@
+"""Poses, cameras and their conventions (docs/conventions.md).
+
+``a_from_b`` maps coordinates of frame b to frame a, so that
+``cam_from_world = cam_from_rig @ rig_from_world`` reads right by eye.
+Pixels as in COLMAP: the centre of the top-left pixel is (0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from visloc.errors import InvalidInput
+
+# COLMAP's camera models that kapture knows, with their parameters in COLMAP's order.
+CAMERA_MODELS: Mapping[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "FULL_OPENCV": (
+        *("fx", "fy", "cx", "cy"),
+        *("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    ),
+    "FOV": ("fx", "fy", "cx", "cy", "omega"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+    "THIN_PRISM_FISHEYE": (
+        *("fx", "fy", "cx", "cy"),
+        *("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
+    ),
+}
+
+MAX_IMAGE_SIDE = 1_000_000
+# Parameters that scale with the width (first set) and with the height (second) of the image.
+_SCALES_WITH_WIDTH = {"f", "fx", "cx"}
+_SCALES_WITH_HEIGHT = {"fy", "cy"}
+# 0.5 % lets a thumbnail whose sides were rounded to whole pixels pass as the same aspect.
+_ASPECT_TOLERANCE = 0.005
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """A rigid transform, named at the variable: ``a_from_b`` gives ``x_a = R @ x_b + t``.
+
+    Attributes:
+        rotation: (3, 3) float64, orthonormal, determinant +1.
+        translation: (3,) float64, in frame a, in the unit of the world (metres when metric).
+    """
+
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+
+    @staticmethod
+    def identity() -> Pose:
+        """Return the transform that changes nothing."""
+        return Pose(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_quaternion(rotation_wxyz: ArrayLike, translation: ArrayLike) -> Pose:
+        """Make a pose from a quaternion (w, x, y, z), normalized here, and a translation (3,).
+
+        Raises:
+            InvalidInput: ``pose.rotation`` or ``pose.translation`` for a wrong shape, numbers
+                that are not finite, or a quaternion shorter than 1e-6.
+        """
+        q = np.asarray(rotation_wxyz, dtype=np.float64)
+        t = np.asarray(translation, dtype=np.float64)
+        norm = float(np.linalg.norm(q)) if q.shape == (4,) else math.nan
+        if not (math.isfinite(norm) and norm >= 1e-6):
+            raise InvalidInput(
+                "pose.rotation",
+                "not a rotation",
+                field="rotation",
+                expected="a quaternion w, x, y, z of four finite numbers, not all zero",
+                got=rotation_wxyz,
+            )
+        if t.shape != (3,) or not np.isfinite(t).all():
+            raise InvalidInput(
+                "pose.translation",
+                "not a translation",
+                field="translation",
+                expected="three finite numbers",
+                got=translation,
+            )
+        return Pose(_matrix_from_quaternion(q / norm), t)
+
+    @property
+    def rotation_wxyz(self) -> NDArray[np.float64]:
+        """The rotation as a unit quaternion (w, x, y, z) with w >= 0, shape (4,)."""
+        return _quaternion_from_matrix(self.rotation)
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """The origin of frame a in frame b, (3,): of ``cam_from_world``, the camera's position."""
+        return -self.rotation.T @ self.translation
+
+    def __matmul__(self, other: Pose) -> Pose:
+        """Chain: ``a_from_b @ b_from_c = a_from_c``."""
+        return Pose(self.rotation @ other.rotation, self.apply(other.translation))
+
+    def apply(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Move points (..., 3) in frame b to frame a."""
+        return points @ self.rotation.T + self.translation
+
+    def inverse(self) -> Pose:
+        """Turn a_from_b into b_from_a."""
+        return Pose(self.rotation.T, -self.rotation.T @ self.translation)
+
+
+def rotation_angle(rotation: NDArray[np.float64]) -> float:
+    """Return the angle of a rotation matrix (3, 3) in radians, 0 to pi.
+
+    atan2 instead of the usual arc cosine of the trace, because acos loses half of the digits
+    near zero, which is where a good localizer lives.
+    """
+    r = rotation
+    two_sin = np.linalg.norm([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    return float(np.arctan2(two_sin, np.trace(r) - 1.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Intrinsics of one camera, checked when made.
+
+    Attributes:
+        model: a key of ``CAMERA_MODELS``.
+        width: image width in pixels.
+        height: image height in pixels.
+        params: parameters in COLMAP's order, pixels where they are lengths.
+
+    Raises:
+        InvalidInput: ``camera.model``, ``camera.size``, ``camera.param_count`` or
+            ``camera.param_value``, with the field that is wrong.
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        names = CAMERA_MODELS.get(self.model)
+        if names is None:
+            raise InvalidInput(
+                "camera.model",
+                "unknown camera model",
+                field="camera.model",
+                expected=f"one of {', '.join(CAMERA_MODELS)}",
+                got=self.model,
+            )
+        if not (0 < self.width <= MAX_IMAGE_SIDE and 0 < self.height <= MAX_IMAGE_SIDE):
+            raise InvalidInput(
+                "camera.size",
+                "the image size of the camera is not usable",
+                field="camera.width" if not 0 < self.width <= MAX_IMAGE_SIDE else "camera.height",
+                expected=f"1 to {MAX_IMAGE_SIDE} pixels",
+                got=f"{self.width} x {self.height}",
+            )
+        if len(self.params) != len(names):
+            raise InvalidInput(
+                "camera.param_count",
+                f"wrong number of parameters for {self.model}",
+                field="camera.params",
+                expected=f"{len(names)}: {', '.join(names)}",
+                got=len(self.params),
+            )
+        for name, value in zip(names, self.params, strict=True):
+            positive = name in ("f", "fx", "fy")
+            if not math.isfinite(value) or (positive and value <= 0):
+                raise InvalidInput(
+                    "camera.param_value",
+                    f"{name} is not usable",
+                    field="camera.params",
+                    expected=f"{name} to be a {'positive ' if positive else ''}finite number",
+                    got=value,
+                )
+
+    @staticmethod
+    def from_text(text: str) -> Camera:
+        """Parse ``MODEL,width,height,params...``, separated by commas or blanks.
+
+        Raises:
+            InvalidInput: as the constructor, and ``camera.syntax``.
+        """
+        model, *rest = text.replace(",", " ").split() or [""]
+        try:
+            width, height = (_whole(field) for field in rest[:2])
+            params = tuple(float(field) for field in rest[2:])
+        except ValueError:
+            raise InvalidInput(
+                "camera.syntax",
+                "not a camera",
+                field="camera",
+                expected="MODEL,width,height,params... such as PINHOLE,640,480,525,525,320,240",
+                got=text,
+            ) from None
+        return Camera(model, width, height, params)
+
+    @property
+    def focal_length(self) -> float:
+        """Focal length in pixels; the mean of both where the model has two."""
+        names = CAMERA_MODELS[self.model]
+        focal = [v for n, v in zip(names, self.params, strict=True) if n in ("f", "fx", "fy")]
+        return sum(focal) / len(focal)
+
+    def has_aspect_of(self, width: int, height: int) -> bool:
+        """Tell whether width x height could be this camera's image, resized."""
+        ratio = (width * self.height) / (height * self.width)
+        # Rounding to whole pixels moves the ratio by up to half a pixel on each side.
+        tolerance = max(_ASPECT_TOLERANCE, 0.5 / min(width, height, self.width, self.height))
+        return abs(ratio - 1.0) <= tolerance
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """Return this camera for its image resized to width x height.
+
+        (u, v) goes to (u * width / self.width, v * height / self.height), which is exact
+        because pixel coordinates start at the corner of the image, not at a pixel centre.
+        """
+        sx, sy = width / self.width, height / self.height
+        factors = {name: sx for name in _SCALES_WITH_WIDTH} | {n: sy for n in _SCALES_WITH_HEIGHT}
+        params = tuple(
+            value * factors.get(name, 1.0)
+            for name, value in zip(CAMERA_MODELS[self.model], self.params, strict=True)
+        )
+        return Camera(self.model, width, height, params)
+
+
+def _whole(field: str) -> int:
+    value = float(field)
+    if not value.is_integer():  # also false for NaN and infinity
+        raise ValueError(field)
+    return int(value)
+
+
+def _matrix_from_quaternion(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    w, x, y, z = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _quaternion_from_matrix(r: NDArray[np.float64]) -> NDArray[np.float64]:
+    # Shepperd's method: divide by the largest component, so that no rotation is badly scaled.
+    trace = np.trace(r)
+    squares = np.array([trace, r[0, 0], r[1, 1], r[2, 2]])
+    largest = int(np.argmax(squares))
+    if largest == 0:
+        q = np.array([1 + trace, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    else:
+        i = largest - 1
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q = np.empty(4)
+        q[0] = r[k, j] - r[j, k]
+        q[1 + i] = 1 + r[i, i] - r[j, j] - r[k, k]
+        q[1 + j] = r[j, i] + r[i, j]
+        q[1 + k] = r[k, i] + r[i, k]
+    q /= np.linalg.norm(q)
+    return -q if q[0] < 0 else q

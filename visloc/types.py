@@ -1,0 +1,240 @@
+"""The values that travel between the stages. Arrays come with shape, dtype and unit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.errors import InvalidInput
+from visloc.geometry import Camera, Pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalFeatures:
+    """Keypoints of one photo, strongest first.
+
+    Attributes:
+        keypoints: (N, 2) float32, (x, y) in pixels of the photo as stored; the centre of the
+            top-left pixel is (0.5, 0.5).
+        descriptors: (N, D) float32, rows of unit length.
+        scores: (N,) float32, higher is better, comparable within one photo only.
+        scales: (N,) float32, diameter in pixels of the patch that was described.
+    """
+
+    keypoints: NDArray[np.float32]
+    descriptors: NDArray[np.float32]
+    scores: NDArray[np.float32]
+    scales: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+
+class CameraSource(StrEnum):
+    """Where the intrinsics of a query came from."""
+
+    GIVEN = "given"
+    GIVEN_SCALED = "given_scaled"  # given for another size of the same aspect
+    EXIF = "exif"  # focal length from the photo's EXIF
+    GUESS = "guess"  # nothing known: 1.2 times the longer side
+
+
+class ReadAs(StrEnum):
+    """The orientation in which the features of a photo were found."""
+
+    STORED = "stored"
+    UPRIGHT = "upright"  # turned by the photo's EXIF orientation
+
+
+class Reason(StrEnum):
+    """Why a photo was not localized."""
+
+    NO_KEYPOINTS = "no_keypoints"
+    NO_CANDIDATES = "no_candidates"
+    TOO_FEW_MATCHES = "too_few_matches"
+    NO_POSE = "no_pose"
+    TOO_FEW_INLIERS = "too_few_inliers"
+    LOW_INLIER_RATIO = "low_inlier_ratio"
+    UNCERTAIN_POSE = "uncertain_pose"
+
+
+@dataclass(frozen=True, slots=True)
+class RegistrationPreset:
+    """Thresholds under which a pose is accepted.
+
+    Attributes:
+        max_error_px: largest reprojection error of an inlier, pixels.
+        min_inliers: fewest inliers of an accepted pose.
+        min_inlier_ratio: smallest share of inliers among the correspondences.
+    """
+
+    max_error_px: float
+    min_inliers: int
+    min_inlier_ratio: float
+
+
+# config1 and config2: table 2 of Humenberger et al. 2020 (abs_pose_max_error,
+# abs_pose_min_num_inliers, abs_pose_min_inlier_ratio). config2 was made to give an answer
+# whenever it can; it is for comparisons with the paper, not for robots.
+PRESETS: Mapping[str, RegistrationPreset] = {
+    "default": RegistrationPreset(max_error_px=12.0, min_inliers=30, min_inlier_ratio=0.05),
+    "config1": RegistrationPreset(max_error_px=12.0, min_inliers=30, min_inlier_ratio=0.25),
+    "config2": RegistrationPreset(max_error_px=20.0, min_inliers=4, min_inlier_ratio=0.05),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizeOptions:
+    """What a caller may choose per query; None takes the preset's value.
+
+    Attributes:
+        preset: a key of ``PRESETS``.
+        top_k: how many mapping photos to match against.
+        max_error_px: largest reprojection error of an inlier, pixels.
+        min_inliers: fewest inliers of an accepted pose.
+        min_inlier_ratio: smallest share of inliers among the correspondences, 0 to 1.
+        read_as: whether to turn the photo upright by its EXIF orientation before finding
+            features. Camera, pose and 2D points refer to the pixels as stored either way.
+        seed: of RANSAC; equal seeds give equal answers.
+    """
+
+    preset: str = "default"
+    top_k: int = 20
+    max_error_px: float | None = None
+    min_inliers: int | None = None
+    min_inlier_ratio: float | None = None
+    read_as: ReadAs = ReadAs.STORED
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.preset not in PRESETS:
+            raise InvalidInput(
+                "options.preset",
+                "unknown preset",
+                field="options.preset",
+                expected=f"one of {', '.join(PRESETS)}",
+                got=self.preset,
+            )
+        for name, low, high in (
+            ("top_k", 1, 1000),
+            ("max_error_px", 0.1, 1000.0),
+            ("min_inliers", 4, 1_000_000),
+            ("min_inlier_ratio", 0.0, 1.0),
+            ("seed", 0, 2**31 - 1),
+        ):
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:  # NaN fails too
+                raise InvalidInput(
+                    f"options.{name}",
+                    "out of range",
+                    field=f"options.{name}",
+                    expected=f"{low} to {high}",
+                    got=value,
+                )
+
+    @property
+    def registration(self) -> RegistrationPreset:
+        """The preset's thresholds, with those replaced that the caller named."""
+        preset = PRESETS[self.preset]
+        return RegistrationPreset(
+            preset.max_error_px if self.max_error_px is None else self.max_error_px,
+            preset.min_inliers if self.min_inliers is None else self.min_inliers,
+            preset.min_inlier_ratio if self.min_inlier_ratio is None else self.min_inlier_ratio,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class RetrievedImage:
+    """A mapping photo that the query was matched against.
+
+    Attributes:
+        name: its name in the map.
+        score: fused similarity, comparable within one query only.
+        similarities: cosine similarity by global descriptor.
+    """
+
+    name: str
+    score: float
+    similarities: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """What was seen on the way to an answer, localized or not.
+
+    Attributes:
+        camera: the intrinsics used, for the pixels as stored.
+        camera_source: where they came from.
+        exif_orientation: the photo's EXIF orientation, 1 to 8; 1 when it has none.
+        read_as: the orientation in which features were found.
+        num_keypoints: keypoints found in the photo.
+        num_correspondences: 2D-3D correspondences given to the solver.
+        num_inliers: those that agree with the pose (of the best pose, when it was refused).
+        retrieved: the mapping photos matched against, best first.
+        seconds: wall time by stage.
+    """
+
+    camera: Camera
+    camera_source: CameraSource
+    exif_orientation: int
+    read_as: ReadAs
+    num_keypoints: int = 0
+    num_correspondences: int = 0
+    num_inliers: int = 0
+    retrieved: tuple[RetrievedImage, ...] = ()
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def inlier_ratio(self) -> float:
+        """Share of inliers among the correspondences, 0 when there are none."""
+        return self.num_inliers / self.num_correspondences if self.num_correspondences else 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Localized:
+    """A pose that passed the gate.
+
+    Attributes:
+        evidence: what led to it.
+        cam_from_world: the pose.
+        covariance: (6, 6) float64 of rotation (rad) then translation, for R <- Exp(w) R and
+            t <- t + dt of ``cam_from_world``. It tells what the scatter of the image
+            measurements leaves open, not errors that the whole map shares.
+        position_std: (3,) standard deviations of the camera centre along the world's axes.
+        orientation_std: (3,) standard deviations of w (rad), about the camera's x, y, z.
+        inlier_keypoints: (N, 2) float32 pixels of the photo as stored.
+        inlier_points: (N, 3) float64 in the world.
+    """
+
+    evidence: Evidence
+    cam_from_world: Pose
+    covariance: NDArray[np.float64]
+    position_std: NDArray[np.float64]
+    orientation_std: NDArray[np.float64]
+    inlier_keypoints: NDArray[np.float32]
+    inlier_points: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NotLocalized:
+    """The map was searched and gave no pose that can be trusted.
+
+    Attributes:
+        evidence: how far it came.
+        stage: the stage that gave up.
+        reason: why, as a stable word.
+        message: why, for a person.
+    """
+
+    evidence: Evidence
+    stage: Literal["features", "retrieval", "matching", "pose", "gate"]
+    reason: Reason
+    message: str
+
+
+Answer = Localized | NotLocalized

@@ -1,0 +1,1 @@
+"""The wire: protobuf messages and gRPC stubs generated from ``proto/`` (``make proto``)."""
