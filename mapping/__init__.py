@@ -1,1 +1,1 @@
-"""placeholder"""
+"""The offline job: ``mapping build | inspect | verify | export-features | sample``."""

@@ -224,7 +224,7 @@ class Camera:
         because pixel coordinates start at the corner of the image, not at a pixel centre.
         """
         sx, sy = width / self.width, height / self.height
-        factors = {name: sx for name in _SCALES_WITH_WIDTH} | {n: sy for n in _SCALES_WITH_HEIGHT}
+        factors = dict.fromkeys(_SCALES_WITH_WIDTH, sx) | dict.fromkeys(_SCALES_WITH_HEIGHT, sy)
         params = tuple(
             value * factors.get(name, 1.0)
             for name, value in zip(CAMERA_MODELS[self.model], self.params, strict=True)

@@ -35,6 +35,23 @@ class LocalFeatures:
         return len(self.keypoints)
 
 
+@dataclass(frozen=True, slots=True)
+class Fingerprint:
+    """Identifies what was computed: equal fingerprints mean comparable features.
+
+    Attributes:
+        name: the registry's name.
+        revision: raised whenever the code changes what comes out.
+        parameters: everything that shapes the result.
+        weights_sha256: of the weights file as published; None without weights.
+    """
+
+    name: str
+    revision: int
+    parameters: Mapping[str, int | float | str]
+    weights_sha256: str | None = None
+
+
 class CameraSource(StrEnum):
     """Where the intrinsics of a query came from."""
 

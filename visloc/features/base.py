@@ -3,30 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.types import LocalFeatures
+from visloc.types import Fingerprint, LocalFeatures
 
-
-@dataclass(frozen=True, slots=True)
-class Fingerprint:
-    """Identifies what was computed: equal fingerprints mean comparable features.
-
-    Attributes:
-        name: the registry's name.
-        revision: raised whenever the code changes what comes out.
-        parameters: everything that shapes the result.
-        weights_sha256: of the weights file as published; None without weights.
-    """
-
-    name: str
-    revision: int
-    parameters: Mapping[str, int | float | str]
-    weights_sha256: str | None = None
+__all__ = ["Fingerprint", "GlobalDescriptor", "LocalFeatureExtractor"]
 
 
 class LocalFeatureExtractor(Protocol):

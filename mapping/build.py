@@ -1,0 +1,359 @@
+"""``mapping build``: from a kapture dataset to a published map, stage by stage."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.photos import MappingPhoto, collect_photos
+from mapping.rgbd import LiftedKeypoints, lift_keypoints, merge_landmarks
+from mapping.stages import WorkFolder, exclusive, key_of
+from visloc.archive import (
+    FingerprintRecord,
+    GlobalFeatures,
+    ImageRecord,
+    Landmarks,
+    MapContent,
+    MapStore,
+    write_map,
+)
+from visloc.errors import Conflict, Unavailable
+from visloc.features import (
+    DEFAULT_GLOBAL_FEATURES,
+    DEFAULT_LOCAL_FEATURES,
+    GlobalDescriptor,
+    LocalFeatureExtractor,
+    make_global_descriptor,
+    make_local_features,
+)
+from visloc.geometry import Pose
+from visloc.images import read_photo_file
+from visloc.kapture import Dataset, read_dataset
+from visloc.types import Fingerprint, LocalFeatures
+
+Progress = Callable[[str, int, int], None]
+"""Told the stage, how much of it is done, and how much there is."""
+
+METHODS = ("rgbd",)
+# The vocabulary of a global descriptor is learned from at most this many photos, evenly chosen.
+_VOCABULARY_PHOTOS = 200
+# Raised when the code of a stage changes what comes out.
+_REVISION = {"words": 1, "vocabulary": 1, "pooled": 1, "projection": 1, "lifted": 1}
+
+
+@dataclass(frozen=True, slots=True)
+class BuildSettings:
+    """What a build is made of.
+
+    Attributes:
+        dataset: kapture folder.
+        map_id: id of the map.
+        maps_dir: folder of maps.
+        method: a name of ``METHODS``.
+        local_features: a name of ``visloc.features.LOCAL_FEATURES``.
+        global_features: names of ``visloc.features.GLOBAL_FEATURES``.
+        weights_dir: folder with network weights.
+        max_keypoints: strongest keypoints kept per photo, in the map and in queries.
+        voxel_size: edge in which lifted keypoints become one landmark, in metres.
+        depth_sensor: the depth sensor to use, when several go with a photo.
+        depth_scale: metres per unit of 16-bit PNG depth.
+        force: publish a new version of a map that exists.
+    """
+
+    dataset: Path
+    map_id: str
+    maps_dir: Path
+    method: str = "rgbd"
+    local_features: str = DEFAULT_LOCAL_FEATURES
+    global_features: tuple[str, ...] = DEFAULT_GLOBAL_FEATURES
+    weights_dir: Path | None = None
+    max_keypoints: int = 5000
+    voxel_size: float = 0.01
+    depth_sensor: str | None = None
+    depth_scale: float = 0.001
+    force: bool = False
+
+
+def build_map(settings: BuildSettings, progress: Progress) -> Path:
+    """Build a map and publish it as the current version.
+
+    Killed at any moment, the same call finds its finished work again; the map that was current
+    before stays so until the new one is complete and verified.
+
+    Returns:
+        The folder of the new version.
+
+    Raises:
+        Conflict: ``map.exists`` without ``force``; ``build.running``.
+        DatasetError, WeightsError, InvalidInput: with the file or the setting that is wrong.
+        Unavailable: ``storage.write`` when the disk is full.
+    """
+    store = MapStore(settings.maps_dir)
+    versions = store.versions(settings.map_id)
+    if versions and not settings.force:
+        raise Conflict(
+            "map.exists",
+            f"map {settings.map_id!r} exists (version {versions[-1]}); "
+            "--force publishes a new version and keeps the old one",
+            field="--map",
+        )
+    extractor = make_local_features(settings.local_features, settings.weights_dir)
+    descriptors = [make_global_descriptor(name) for name in settings.global_features]
+    dataset = read_dataset(settings.dataset)
+    work_root = settings.maps_dir / ".work" / settings.map_id
+    try:
+        with exclusive(work_root):
+            folder = _build(settings, dataset, extractor, descriptors, store, work_root, progress)
+            shutil.rmtree(work_root)
+    except OSError as error:
+        raise Unavailable(
+            "storage.write",
+            f"writing failed: {error.strerror}; finished work is kept, the same command resumes",
+            field=str(error.filename or work_root),
+        ) from error
+    return folder
+
+
+def _build(
+    settings: BuildSettings,
+    dataset: Dataset,
+    extractor: LocalFeatureExtractor,
+    descriptors: Sequence[GlobalDescriptor],
+    store: MapStore,
+    work_root: Path,
+    progress: Progress,
+) -> Path:
+    work = WorkFolder(work_root)
+    photos, notes = collect_photos(
+        dataset,
+        with_depth=True,
+        depth_sensor=settings.depth_sensor,
+        progress=lambda done, total: progress("photos", done, total),
+    )
+    features = _LocalFeaturesStage(work, extractor, settings.max_keypoints)
+    for done, photo in enumerate(photos, 1):
+        features.compute(photo)
+        progress("local features", done, len(photos))
+    global_features = tuple(
+        _global_features(work, photos, features, descriptor, progress) for descriptor in descriptors
+    )
+    landmarks, rows = _landmarks_from_depth(work, dataset, photos, features, settings, progress)
+
+    def observed_descriptors() -> Iterator[NDArray[np.float32]]:
+        for photo, kept in zip(photos, rows, strict=True):
+            yield features.read(photo).descriptors[kept]
+
+    progress("archive", 0, 1)
+    now = datetime.now(UTC)
+    content = MapContent(
+        metric=True,
+        method=settings.method,
+        settings={"voxel_size": settings.voxel_size, "depth_scale": settings.depth_scale},
+        notes=(*dataset.notes, *notes),
+        cameras={photo.record.sensor_id: photo.camera for photo in photos},
+        rigs=_known_rigs(dataset, {photo.record.sensor_id for photo in photos}),
+        images=tuple(
+            ImageRecord(
+                name=photo.name, camera=photo.record.sensor_id, timestamp=photo.record.timestamp
+            )
+            for photo in photos
+        ),
+        image_poses=tuple(photo.cam_from_world for photo in photos),
+        landmarks=landmarks,
+        local_fingerprint=FingerprintRecord.of(extractor.fingerprint),
+        max_keypoints=settings.max_keypoints,
+        descriptor_dim=extractor.descriptor_dim,
+        descriptors=_Rereadable(observed_descriptors),
+        global_features=global_features,
+    )
+    incoming = Path(tempfile.mkdtemp(prefix="incoming-", dir=work_root))
+    try:
+        version = write_map(
+            incoming,
+            content,
+            map_id=settings.map_id,
+            version=now.strftime("%Y%m%dT%H%M%SZ-"),
+            created=now.isoformat(timespec="seconds"),
+        )
+        folder = store.publish(incoming, settings.map_id, version)
+    finally:
+        shutil.rmtree(incoming, ignore_errors=True)
+    progress("archive", 1, 1)
+    return folder
+
+
+@dataclass(frozen=True, slots=True)
+class _Rereadable:
+    """An iterable that starts anew each time, for data that does not fit in memory."""
+
+    start: Callable[[], Iterator[NDArray[np.float32]]]
+
+    def __iter__(self) -> Iterator[NDArray[np.float32]]:
+        return self.start()
+
+
+@dataclass(frozen=True, slots=True)
+class _LocalFeaturesStage:
+    work: WorkFolder
+    extractor: LocalFeatureExtractor
+    max_keypoints: int
+
+    def key(self, photo: MappingPhoto) -> str:
+        return key_of(
+            "local_features",
+            1,
+            photo=photo.sha256,
+            fingerprint=_json(self.extractor.fingerprint),
+            max_keypoints=self.max_keypoints,
+        )
+
+    def compute(self, photo: MappingPhoto) -> None:
+        if not self.work.has(self.key(photo)):
+            self.read(photo)
+
+    def read(self, photo: MappingPhoto) -> LocalFeatures:
+        def extract() -> Mapping[str, NDArray[np.float32]]:
+            local = self.extractor.extract(
+                read_photo_file(photo.path).rgb, max_keypoints=self.max_keypoints
+            )
+            return {
+                "keypoints": local.keypoints,
+                "descriptors": local.descriptors,
+                "scores": local.scores,
+                "scales": local.scales,
+            }
+
+        return LocalFeatures(**self.work.get(self.key(photo), extract))
+
+
+def _global_features(
+    work: WorkFolder,
+    photos: Sequence[MappingPhoto],
+    features: _LocalFeaturesStage,
+    descriptor: GlobalDescriptor,
+    progress: Progress,
+) -> GlobalFeatures:
+    fingerprint = _json(descriptor.fingerprint)
+    stage = f"{descriptor.fingerprint.name}"
+
+    chosen = np.unique(np.linspace(0, len(photos) - 1, _VOCABULARY_PHOTOS).astype(int)).tolist()
+    word_keys = []
+    for done, row in enumerate(chosen, 1):
+        photo = photos[row]
+        key = key_of(
+            "words", _REVISION["words"], fingerprint=fingerprint, local=features.key(photo)
+        )
+        work.get(
+            key,
+            lambda photo=photo: {  # type: ignore[misc]  # mypy infers no type with a default
+                "words": descriptor.training_words(
+                    read_photo_file(photo.path).rgb, features.read(photo), seed=0
+                )
+            },
+        )
+        word_keys.append(key)
+        progress(f"{stage} words", done, len(chosen))
+
+    vocabulary_key = key_of(
+        "vocabulary", _REVISION["vocabulary"], fingerprint=fingerprint, words=word_keys
+    )
+    vocabulary = work.get(
+        vocabulary_key,
+        lambda: descriptor.learn_vocabulary(
+            np.concatenate([work.read(key)["words"] for key in word_keys]), seed=0
+        ),
+    )
+    pooled_keys = []
+    for done, photo in enumerate(photos, 1):
+        key = key_of(
+            "pooled", _REVISION["pooled"], vocabulary=vocabulary_key, local=features.key(photo)
+        )
+        work.get(
+            key,
+            lambda photo=photo: {  # type: ignore[misc]
+                "pooled": descriptor.pool(
+                    read_photo_file(photo.path).rgb, features.read(photo), vocabulary
+                )
+            },
+        )
+        pooled_keys.append(key)
+        progress(stage, done, len(photos))
+
+    def read_pooled() -> NDArray[np.float32]:
+        return np.stack([work.read(key)["pooled"] for key in pooled_keys])
+
+    projection = work.get(
+        key_of("projection", _REVISION["projection"], pooled=pooled_keys),
+        lambda: descriptor.learn_projection(read_pooled()),
+    )
+    model = {**vocabulary, **projection}
+    return GlobalFeatures(
+        FingerprintRecord.of(descriptor.fingerprint),
+        descriptor.project(read_pooled(), model),
+        model,
+    )
+
+
+def _landmarks_from_depth(
+    work: WorkFolder,
+    dataset: Dataset,
+    photos: Sequence[MappingPhoto],
+    features: _LocalFeaturesStage,
+    settings: BuildSettings,
+    progress: Progress,
+) -> tuple[Landmarks, list[NDArray[np.int64]]]:
+    """Landmarks, and of each photo the rows of its features that became observations."""
+    lifted, keypoints = [], []
+    for done, photo in enumerate(photos, 1):
+        local = features.read(photo)
+        item = work.get(
+            key_of(
+                "lifted",
+                _REVISION["lifted"],
+                local=features.key(photo),
+                camera=[photo.camera.model, *photo.camera.params],
+                pose=_numbers(photo.cam_from_world),
+                depth=photo.depth
+                and [
+                    photo.depth_sha256,
+                    photo.depth.camera.model,
+                    *photo.depth.camera.params,
+                    *_numbers(photo.depth.cam_from_depth),
+                ],
+                depth_scale=settings.depth_scale,
+            ),
+            lambda photo=photo, local=local: asdict(  # type: ignore[misc]
+                lift_keypoints(dataset, photo, local.keypoints, settings.depth_scale)
+            ),
+        )
+        lifted.append(LiftedKeypoints(**item))
+        keypoints.append(local.keypoints[item["rows"]])
+        progress("depth", done, len(photos))
+    progress("landmarks", 0, 1)
+    landmarks = merge_landmarks(photos, keypoints, lifted, settings.voxel_size)
+    progress("landmarks", 1, 1)
+    return landmarks, [one.rows for one in lifted]
+
+
+def _known_rigs(dataset: Dataset, cameras: set[str]) -> dict[str, dict[str, Pose]]:
+    """cam_from_rig of the map's cameras, where the dataset knows it."""
+    rigs = {
+        rig: {sensor: pose for sensor, pose in members.items() if sensor in cameras and pose}
+        for rig, members in dataset.rigs.items()
+    }
+    return {rig: members for rig, members in rigs.items() if members}
+
+
+def _numbers(pose: Pose) -> list[float]:
+    return [*pose.rotation.ravel().tolist(), *pose.translation.tolist()]
+
+
+def _json(fingerprint: Fingerprint) -> dict[str, object]:
+    return FingerprintRecord.of(fingerprint).model_dump()

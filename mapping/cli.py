@@ -1,0 +1,264 @@
+"""The ``mapping`` command."""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from mapping.build import METHODS, BuildSettings, build_map
+from mapping.export_features import export_features
+from mapping.progress import StageProgress
+from mapping.sample import write_sample
+from visloc.archive import Map, MapStore, open_map, verify_map
+from visloc.errors import InvalidInput, VislocError
+from visloc.features import (
+    DEFAULT_GLOBAL_FEATURES,
+    DEFAULT_LOCAL_FEATURES,
+    GLOBAL_FEATURES,
+    LOCAL_FEATURES,
+)
+
+app = typer.Typer(
+    name="mapping",
+    help="Build, inspect and check maps for the localization service.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+_out = Console()
+_err = Console(stderr=True)
+
+MapsDirOption = Annotated[
+    Path, typer.Option("--maps-dir", envvar="VISLOC_MAPS_DIR", help="Folder of maps.")
+]
+WeightsDirOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--weights-dir",
+        envvar="VISLOC_WEIGHTS_DIR",
+        help="Folder with network weights; r2d2 and faster2d2 need it.",
+    ),
+]
+LocalFeaturesOption = Annotated[
+    str, typer.Option(help=f"One of {', '.join(sorted(LOCAL_FEATURES))}.")
+]
+MaxKeypointsOption = Annotated[
+    int, typer.Option(min=100, max=100_000, help="Strongest keypoints kept per photo.")
+]
+MapArgument = Annotated[str, typer.Argument(metavar="MAP", help="id, id@version, or a folder.")]
+DatasetArgument = Annotated[Path, typer.Argument(help="kapture folder (holds sensors/).")]
+
+
+@app.command()
+def build(
+    dataset: DatasetArgument,
+    map_id: Annotated[str, typer.Option("--map", help="Id of the map.")],
+    maps_dir: MapsDirOption = Path("maps"),
+    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = METHODS[0],
+    local_features: LocalFeaturesOption = DEFAULT_LOCAL_FEATURES,
+    global_features: Annotated[
+        str, typer.Option(help=f"Comma-separated, of {', '.join(sorted(GLOBAL_FEATURES))}.")
+    ] = ",".join(DEFAULT_GLOBAL_FEATURES),
+    weights_dir: WeightsDirOption = None,
+    max_keypoints: MaxKeypointsOption = 5000,
+    voxel_size: Annotated[
+        float, typer.Option(help="Points of one such cell become one landmark, metres.")
+    ] = 0.01,
+    depth_sensor: Annotated[
+        str | None, typer.Option(help="Depth sensor to use, when several go with a photo.")
+    ] = None,
+    depth_scale: Annotated[
+        float, typer.Option(help="Metres per unit of 16-bit PNG depth.")
+    ] = 0.001,
+    force: Annotated[
+        bool, typer.Option("--force", help="Publish a new version of a map that exists.")
+    ] = False,
+) -> None:
+    """Turn a posed dataset into a map.
+
+    Killed at any moment, the same command resumes; the map in use stays until the new one is
+    complete.
+    """
+    names = tuple(name.strip() for name in global_features.split(","))
+    settings = BuildSettings(
+        dataset=dataset,
+        map_id=map_id,
+        maps_dir=maps_dir,
+        method=method,
+        local_features=local_features,
+        global_features=names,
+        weights_dir=weights_dir,
+        max_keypoints=max_keypoints,
+        voxel_size=voxel_size,
+        depth_sensor=depth_sensor,
+        depth_scale=depth_scale,
+        force=force,
+    )
+    with StageProgress(_err) as progress:
+        folder = build_map(settings, progress)
+    opened = open_map(folder)
+    _print_map(opened)
+    _out.print(f"peak memory {_peak_memory_bytes() / 2**30:.2f} GiB")
+
+
+@app.command()
+def inspect(
+    map_ref: MapArgument,
+    maps_dir: MapsDirOption = Path("maps"),
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+) -> None:
+    """Show what a map holds."""
+    opened = open_map(_folder(map_ref, maps_dir))
+    if as_json:
+        sys.stdout.write(json.dumps(_summary(opened), indent=2) + "\n")
+    else:
+        _print_map(opened)
+
+
+@app.command()
+def verify(map_ref: MapArgument, maps_dir: MapsDirOption = Path("maps")) -> None:
+    """Read every byte of a map: checksums, ranges, features that exist here."""
+    opened = verify_map(_folder(map_ref, maps_dir))
+    manifest = opened.manifest
+    for fingerprint, known in (
+        (manifest.local_features.fingerprint, LOCAL_FEATURES),
+        *((g.fingerprint, GLOBAL_FEATURES) for g in manifest.global_features),
+    ):
+        if fingerprint.name not in known:
+            raise InvalidInput(
+                "features.unknown",
+                "the map needs a feature that is not installed",
+                field=str(opened.path),
+                expected=f"one of {', '.join(sorted(known))}",
+                got=fingerprint.name,
+            )
+    _out.print(f"{opened.ref}: {len(opened.manifest.files)} files, every byte as published")
+
+
+@app.command("export-features")
+def export_features_command(
+    dataset: DatasetArgument,
+    output: Annotated[Path, typer.Option("--output", help="Folder of the new kapture.")],
+    local_features: LocalFeaturesOption = DEFAULT_LOCAL_FEATURES,
+    weights_dir: WeightsDirOption = None,
+    max_keypoints: MaxKeypointsOption = 5000,
+    map_ref: Annotated[
+        str | None,
+        typer.Option("--map", help="Export this map's global descriptors of the photos too."),
+    ] = None,
+    maps_dir: MapsDirOption = Path("maps"),
+) -> None:
+    """Write our features of a dataset in kapture's layout, for other tools."""
+    opened = None if map_ref is None else open_map(_folder(map_ref, maps_dir))
+    with StageProgress(_err) as progress:
+        export_features(
+            dataset,
+            output,
+            local_features=local_features,
+            weights_dir=weights_dir,
+            max_keypoints=max_keypoints,
+            global_from=opened,
+            progress=progress,
+        )
+    _out.print(f"kapture with features: {output}", soft_wrap=True)
+
+
+@app.command()
+def sample(
+    output: Annotated[Path, typer.Argument(help="Folder to make; holds mapping/ and query/.")],
+    images: Annotated[int, typer.Option(help="Mapping photos.")] = 60,
+    seed: Annotated[int, typer.Option(help="Another seed, another room.")] = 0,
+    size: Annotated[str, typer.Option(help="Size of a photo, WxH.")] = "640x480",
+) -> None:
+    """Make a small synthetic dataset with exact poses."""
+    with StageProgress(_err) as progress:
+        write_sample(
+            output,
+            images=images,
+            seed=seed,
+            size=_parse_size(size),
+            progress=lambda done, total: progress("photos", done, total),
+        )
+    _out.print(f"sample dataset: {output}/mapping and {output}/query", soft_wrap=True)
+
+
+def main() -> None:
+    """Run the command; an error is one line, not a traceback."""
+    try:
+        app()
+    except VislocError as error:
+        _err.print(f"error [{error.code}] {error}", markup=False, highlight=False, soft_wrap=True)
+        sys.exit(1)
+
+
+def _parse_size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise InvalidInput(
+            "sample.size", "not a size", field="--size", expected="WxH such as 640x480", got=text
+        )
+    return int(width), int(height)
+
+
+def _folder(ref: str, maps_dir: Path) -> Path:
+    path = Path(ref)
+    return path if (path / "manifest.json").is_file() else MapStore(maps_dir).folder(ref)
+
+
+def _summary(opened: Map) -> dict[str, Any]:
+    manifest = opened.manifest.model_dump(exclude={"files"}, mode="json")
+    counts = manifest["counts"]
+    return {
+        **manifest,
+        "size_bytes": opened.size_bytes,
+        "bytes_per_observation": opened.size_bytes / counts["observations"],
+        "mean_track_length": float(opened.track_lengths.mean()),
+        "cameras": len(opened.cameras),
+        "path": str(opened.path),
+    }
+
+
+def _print_map(opened: Map) -> None:
+    summary = _summary(opened)
+    counts, local = summary["counts"], summary["local_features"]
+    extent = summary["world"]["extent"]
+    sides = [high - low for low, high in zip(extent["min"], extent["max"], strict=True)]
+    table = Table(show_header=False, box=None, title=f"map {opened.ref}", title_justify="left")
+    rows = {
+        "photos": f"{counts['images']} by {summary['cameras']} cameras",
+        "landmarks": f"{counts['landmarks']}, seen by {summary['mean_track_length']:.1f} photos "
+        "in the mean",
+        "observations": f"{counts['observations']}",
+        "local features": f"{local['fingerprint']['name']}, {local['descriptor_dim']} dimensions, "
+        f"at most {local['max_keypoints']} per photo",
+        "global features": ", ".join(
+            f"{g['fingerprint']['name']} ({g['dim']})" for g in summary["global_features"]
+        ),
+        "extent": " x ".join(f"{side:.2f}" for side in sides)
+        + (" m" if summary["world"]["metric"] else " (not metric)"),
+        "method": summary["method"]["name"],
+        "size": f"{summary['size_bytes'] / 2**20:.1f} MiB, "
+        f"{summary['bytes_per_observation']:.0f} bytes per observation",
+        "created": summary["created"],
+        "folder": summary["path"],
+    }
+    for name, value in rows.items():
+        table.add_row(name, value)
+    _out.print(table)
+    for note in summary["notes"]:
+        _out.print(f"note: {note}", markup=False, soft_wrap=True)
+
+
+def _peak_memory_bytes() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+if __name__ == "__main__":
+    main()

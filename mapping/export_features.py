@@ -1,0 +1,88 @@
+"""Our features of a dataset in kapture's layout, so that other tools can run on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from visloc.archive import FingerprintRecord, Map
+from visloc.errors import Conflict
+from visloc.features import make_global_descriptor, make_local_features
+from visloc.images import read_photo_file
+from visloc.kapture import (
+    read_dataset,
+    write_dataset,
+    write_global_features,
+    write_local_features,
+)
+
+
+def export_features(
+    dataset_root: Path,
+    output: Path,
+    *,
+    local_features: str,
+    weights_dir: Path | None,
+    max_keypoints: int,
+    global_from: Map | None,
+    progress: Callable[[str, int, int], None],
+) -> None:
+    """Write a kapture of the same photos with keypoints, descriptors and global descriptors.
+
+    ``output`` gets the dataset's text files, a link to its photos, and
+    ``reconstruction/<kind>/<name>/``. Keypoints are x, y, scale in our pixel convention (the
+    centre of the first pixel is 0.5, as COLMAP has it). Finished photos are not done again.
+
+    Args:
+        dataset_root: kapture folder.
+        output: folder to make, or one that an earlier run with the same settings left.
+        local_features: a name of ``visloc.features.LOCAL_FEATURES``.
+        weights_dir: folder with network weights.
+        max_keypoints: strongest keypoints kept per photo.
+        global_from: a map whose global descriptors are computed for the photos; its local
+            features must be the same, since ``localvlad`` is made of them.
+        progress: told the stage, how much is done, and how much there is.
+
+    Raises:
+        Conflict: ``map.features`` when the map has other local features.
+    """
+    dataset = read_dataset(dataset_root)
+    extractor = make_local_features(local_features, weights_dir)
+    descriptors = {}
+    if global_from is not None:
+        built_with = global_from.manifest.local_features.fingerprint
+        if built_with != FingerprintRecord.of(extractor.fingerprint):
+            raise Conflict(
+                "map.features",
+                "the map was built with other local features",
+                field="--map",
+                expected=local_features,
+                got=built_with.name,
+            )
+        for features in global_from.manifest.global_features:
+            name = features.fingerprint.name
+            descriptors[name] = (make_global_descriptor(name), global_from.global_models[name])
+    write_dataset(replace(dataset, root=output))
+    link = output / "sensors" / "records_data"
+    if not link.exists():
+        link.symlink_to((dataset.root / "sensors" / "records_data").resolve())
+    for done, record in enumerate(dataset.images, 1):
+        finished = output / "reconstruction" / "descriptors" / local_features
+        if not (finished / f"{record.path}.desc").is_file() or descriptors:
+            rgb = read_photo_file(dataset.path_of(record)).rgb
+            local = extractor.extract(rgb, max_keypoints=max_keypoints)
+            for name, (descriptor, model) in descriptors.items():
+                vector = descriptor.describe(rgb, local, model)
+                write_global_features(output, name, record.path, vector, name=name)
+            write_local_features(
+                output,
+                local_features,
+                record.path,
+                np.column_stack([local.keypoints, local.scales]),
+                local.descriptors,
+                name=local_features,
+            )
+        progress("features", done, len(dataset.images))

@@ -1,0 +1,90 @@
+"""Resumable work: every result is a file named by the hash of all that it depends on.
+
+A stage asks for an item by its key. If the file is there it is read, otherwise the work is done
+and the file appears by one atomic rename. A build that was killed finds its finished items again;
+a build whose photos, settings, weights or code changed finds none of those that depend on them.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.errors import Conflict
+
+Item = Mapping[str, NDArray[Any]]
+
+
+def key_of(stage: str, revision: int, **inputs: object) -> str:
+    """Name of a result: the stage, the revision of its code, and all that goes in.
+
+    Args:
+        stage: name of the stage; the folder of its items.
+        revision: raised whenever the code changes what comes out.
+        inputs: JSON values: settings, and the keys of the items that it reads.
+    """
+    text = json.dumps([stage, revision, inputs], sort_keys=True)
+    return f"{stage}/{hashlib.sha256(text.encode()).hexdigest()[:32]}"
+
+
+class WorkFolder:
+    """Finished items of a build, found again after an interruption."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def has(self, key: str) -> bool:
+        """Tell whether an item is finished."""
+        return self._path(key).is_file()
+
+    def read(self, key: str) -> Item:
+        """Read a finished item."""
+        with np.load(self._path(key), allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+
+    def get(self, key: str, compute: Callable[[], Item]) -> Item:
+        """Read an item, or compute and keep it."""
+        try:
+            return self.read(key)
+        except (FileNotFoundError, zipfile.BadZipFile, EOFError, ValueError):
+            item = compute()
+        path = self._path(key)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = path.with_suffix(f".{os.getpid()}.tmp")
+        with unfinished.open("wb") as file:
+            np.savez(file, **item)  # type: ignore[arg-type]  # the stub knows no **arrays
+            file.flush()
+            os.fsync(file.fileno())
+        unfinished.replace(path)
+        return item
+
+    def _path(self, key: str) -> Path:
+        return self.root / f"{key}.npz"
+
+
+@contextmanager
+def exclusive(folder: Path) -> Iterator[None]:
+    """Hold a folder against a second build; released when the process ends, however it ends.
+
+    Raises:
+        Conflict: ``build.running``.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise Conflict(
+                "build.running", "another build of this map is running", field=str(folder)
+            ) from None
+        yield

@@ -1,0 +1,276 @@
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from visloc.archive import (
+    FingerprintRecord,
+    GlobalFeatures,
+    ImageRecord,
+    Landmarks,
+    MapContent,
+    MapStore,
+    open_map,
+    verify_map,
+    write_map,
+)
+from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound
+from visloc.geometry import Camera, Pose
+
+CREATED = "2026-01-02T03:04:05+00:00"
+
+
+def make_content(seed: int = 0) -> MapContent:
+    """Three photos that see five landmarks seven times."""
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(7, 8)).astype(np.float32)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    return MapContent(
+        metric=True,
+        method="rgbd",
+        settings={"voxel_size": 0.01},
+        notes=("one photo has no depth",),
+        cameras={"cam": Camera("PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))},
+        rigs={"rig": {"cam": Pose.from_quaternion([0.6, 0.8, 0.0, 0.0], [1.0, 2.0, 3.0])}},
+        images=tuple(ImageRecord(name=f"{i}.jpg", camera="cam", timestamp=i) for i in range(3)),
+        image_poses=tuple(
+            Pose.from_quaternion(rng.normal(size=4), rng.normal(size=3)) for _ in range(3)
+        ),
+        landmarks=Landmarks(
+            origin=np.array([500_000.0, 0.0, 10.0]),
+            points=rng.normal(size=(5, 3)).astype(np.float32),
+            track_lengths=np.array([2, 1, 1, 2, 1], dtype=np.uint16),
+            errors_px=np.ones(5, dtype=np.float32),
+            angles_deg=np.full(5, np.nan, dtype=np.float32),
+            offsets=np.array([0, 3, 3, 7]),
+            observed=np.array([0, 1, 3, 0, 2, 3, 4], dtype=np.uint32),
+            keypoints=rng.uniform(0, 48, (7, 2)).astype(np.float32),
+        ),
+        local_fingerprint=FingerprintRecord(name="sift", revision=1, parameters={"max_size": 1600}),
+        max_keypoints=100,
+        descriptor_dim=8,
+        descriptors=[rows[:3], rows[3:3], rows[3:]],
+        global_features=(
+            GlobalFeatures(
+                FingerprintRecord(name="densevlad", revision=1, parameters={}),
+                np.eye(3, 4, dtype=np.float32),
+                {"vocabulary": rng.normal(size=(2, 4)).astype(np.float32)},
+            ),
+        ),
+    )
+
+
+def write(folder: Path, version: str = "v1", seed: int = 0) -> Path:
+    folder.mkdir(parents=True)
+    write_map(folder, make_content(seed), map_id="room", version=version, created=CREATED)
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write(tmp_path / "map")
+
+
+def test_a_written_map_reads_back_as_it_was(folder: Path) -> None:
+    content, opened = make_content(), verify_map(folder)
+    assert opened.ref == "room@v1"
+    assert opened.images == content.images
+    assert opened.cameras == content.cameras
+    assert np.array_equal(opened.landmarks, content.landmarks.points)
+    assert opened.manifest.world.origin == (500_000.0, 0.0, 10.0)
+    low = content.landmarks.points.min(axis=0) + content.landmarks.origin
+    assert opened.manifest.world.extent.min == pytest.approx(low)
+    pose = Pose.from_quaternion(opened.image_poses[1, :4], opened.image_poses[1, 4:])
+    assert pose.rotation == pytest.approx(content.image_poses[1].rotation)
+    assert opened.rigs["rig"]["cam"].translation.tolist() == [1.0, 2.0, 3.0]
+    landmarks, descriptors = opened.observations(2)
+    assert landmarks.tolist() == [0, 2, 3, 4]
+    # eight bits: half a step of the largest value
+    assert descriptors == pytest.approx(
+        np.concatenate(list(content.descriptors))[3:], abs=0.5 / 127
+    )
+    assert len(opened.observations(1)[0]) == 0
+
+
+def test_equal_contents_have_equal_hashes_whatever_their_id_version_and_time(
+    tmp_path: Path,
+) -> None:
+    hashes = []
+    for map_id, created, seed in (
+        ("a", CREATED, 0),
+        ("b", "2027-01-01T00:00:00+00:00", 0),
+        ("a", CREATED, 1),
+    ):
+        target = tmp_path / str(len(hashes))
+        target.mkdir()
+        version = write_map(
+            target, make_content(seed), map_id=map_id, version="t-", created=created
+        )
+        digest = open_map(target).manifest.content_hash
+        assert version == f"t-{digest[:8]}"
+        hashes.append(digest)
+    assert hashes[0] == hashes[1] != hashes[2]
+
+
+def test_any_flipped_byte_is_found_by_verify_and_refused_when_published(tmp_path: Path) -> None:
+    names = [p.relative_to(tmp_path / "0") for p in write(tmp_path / "0").rglob("*") if p.is_file()]
+    for number, name in enumerate(names, 1):
+        damaged = tmp_path / "incoming" / str(number)
+        shutil.copytree(tmp_path / "0", damaged)
+        data = bytearray((damaged / name).read_bytes())
+        data[len(data) // 2] ^= 0x04
+        (damaged / name).write_bytes(data)
+        with pytest.raises(MapCorrupt) as caught:
+            verify_map(damaged)
+        assert caught.value.field
+        with pytest.raises(MapCorrupt):
+            MapStore(tmp_path / "maps").publish(damaged, "room", "v2")
+    assert MapStore(tmp_path / "maps").ids() == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("2026-01-02", "2026-01-03"), ('"room"', '"moor"'), ("\n ", "\n\t")]
+)
+def test_any_change_of_the_manifest_is_found_by_verify(folder: Path, old: str, new: str) -> None:
+    path = folder / "manifest.json"
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(MapCorrupt) as caught:
+        verify_map(folder)
+    assert caught.value.code == "map.manifest_hash"
+
+
+def drop_file(folder: Path) -> None:
+    (folder / "landmarks.npy").unlink()
+
+
+def truncate(folder: Path) -> None:
+    data = (folder / "landmarks.npy").read_bytes()
+    (folder / "landmarks.npy").write_bytes(data[:-1])
+
+
+def link_out(folder: Path) -> None:
+    (folder / "landmarks.npy").rename(folder / "elsewhere.npy")
+    (folder / "landmarks.npy").symlink_to("elsewhere.npy")
+
+
+def edit_manifest(**changes: object) -> Callable[[Path], None]:
+    def edit(folder: Path) -> None:
+        manifest = json.loads((folder / "manifest.json").read_text())
+        for key, value in changes.items():
+            manifest[key] = value
+        (folder / "manifest.json").write_text(json.dumps(manifest))
+
+    return edit
+
+
+def escape(folder: Path) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["files"]["../../etc/passwd"] = manifest["files"]["landmarks.npy"]
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
+def replace_array(name: str, array: np.ndarray) -> Callable[[Path], None]:
+    """Swap a file for another of the same size, as an attacker would, manifest included."""
+
+    def swap(folder: Path) -> None:
+        np.save(folder / name, array)
+        manifest = json.loads((folder / "manifest.json").read_text())
+        manifest["files"][name]["size"] = (folder / name).stat().st_size
+        (folder / "manifest.json").write_text(json.dumps(manifest))
+
+    return swap
+
+
+@pytest.mark.parametrize(
+    ("damage", "code"),
+    [
+        (drop_file, "map.file_missing"),
+        (truncate, "map.file_size"),
+        (link_out, "map.file_missing"),
+        (escape, "map.file_name"),
+        (lambda f: (f / "manifest.json").unlink(), "map.manifest"),
+        (lambda f: (f / "manifest.json").write_text("{"), "map.manifest"),
+        (lambda f: (f / "manifest.json").write_text("[]"), "map.manifest"),
+        (lambda f: (f / "manifest.json").write_bytes(b"\xff\xfe"), "map.manifest"),
+        (edit_manifest(format_version="2.0"), "map.format_version"),
+        (edit_manifest(format="zip"), "map.manifest"),
+        (edit_manifest(files={}), "map.file_missing"),
+        (edit_manifest(counts={"images": 3, "landmarks": 6, "observations": 7}), "map.array"),
+        (edit_manifest(counts={"images": 2, "landmarks": 5, "observations": 7}), "map.images"),
+        (replace_array("landmarks.npy", np.zeros((5, 3))), "map.array"),
+        (replace_array("landmarks.npy", np.zeros((1, 3), np.float32)), "map.array"),
+    ],
+)
+def test_a_damaged_map_is_refused_at_opening_with_the_reason(
+    folder: Path, damage: Callable[[Path], None], code: str
+) -> None:
+    damage(folder)
+    with pytest.raises(MapCorrupt) as caught:
+        open_map(folder)
+    assert caught.value.code == code
+    assert caught.value.field
+
+
+def test_a_newer_minor_format_with_unknown_fields_opens(folder: Path) -> None:
+    edit_manifest(format_version="1.9", colours="yes")(folder)
+    assert open_map(folder).manifest.format_version == "1.9"
+
+
+def test_numbers_that_lie_are_found_even_when_checksums_agree(tmp_path: Path) -> None:
+    content = make_content()
+    content.landmarks.observed[2] = 99
+    target = tmp_path / "lying"
+    target.mkdir()
+    write_map(target, content, map_id="room", version="v1", created=CREATED)
+    with pytest.raises(MapCorrupt, match="observation_landmarks"):
+        verify_map(target)
+
+
+def test_publishing_switches_current_and_keeps_the_older_version(tmp_path: Path) -> None:
+    store = MapStore(tmp_path / "maps")
+    for number, version in enumerate(["v1", "v2"]):
+        store.publish(write(tmp_path / version, version, seed=number), "room", version)
+    assert store.ids() == ["room"]
+    assert store.versions("room") == ["v1", "v2"]
+    assert store.open("room").ref == "room@v2"
+    assert store.open("room@v1").ref == "room@v1"
+    with pytest.raises(Conflict):
+        store.publish(write(tmp_path / "again", "v2"), "room", "v2")
+    assert store.open("room").ref == "room@v2"
+
+
+@pytest.mark.parametrize(
+    "ref", ["../room", "room/..", "", "room@../v1", ".hidden", "a" * 65, "ro\0om"]
+)
+def test_a_reference_that_is_a_path_is_refused(tmp_path: Path, ref: str) -> None:
+    store = MapStore(tmp_path / "maps")
+    store.publish(write(tmp_path / "one"), "room", "v1")
+    with pytest.raises(InvalidInput) as caught:
+        store.folder(ref)
+    assert caught.value.code == "map.id"
+
+
+def test_an_unknown_map_or_version_is_answered_with_the_known_ones(tmp_path: Path) -> None:
+    store = MapStore(tmp_path / "maps")
+    with pytest.raises(NotFound, match="none"):
+        store.folder("room")
+    store.publish(write(tmp_path / "one"), "room", "v1")
+    with pytest.raises(NotFound, match="room"):
+        store.folder("kitchen")
+    with pytest.raises(NotFound, match="v1"):
+        store.folder("room@v9")
+    with pytest.raises(NotFound):
+        store.folder("kitchen@v1")
+
+
+def test_a_damaged_current_file_is_named(tmp_path: Path) -> None:
+    store = MapStore(tmp_path / "maps")
+    store.publish(write(tmp_path / "one"), "room", "v1")
+    (tmp_path / "maps" / "room" / "current").write_text("../../etc\n")
+    with pytest.raises(MapCorrupt, match="current"):
+        store.open("room")

@@ -1,0 +1,22 @@
+"""The map on disk: schema, writer, reader, checks and the store (docs/map-format.md)."""
+
+from __future__ import annotations
+
+from visloc.archive.reader import Map, open_map, verify_map
+from visloc.archive.schema import FingerprintRecord, ImageRecord, Manifest
+from visloc.archive.store import MapStore
+from visloc.archive.writer import GlobalFeatures, Landmarks, MapContent, write_map
+
+__all__ = [
+    "FingerprintRecord",
+    "GlobalFeatures",
+    "ImageRecord",
+    "Landmarks",
+    "Manifest",
+    "Map",
+    "MapContent",
+    "MapStore",
+    "open_map",
+    "verify_map",
+    "write_map",
+]

@@ -1,0 +1,235 @@
+"""Reading a map's files without trusting them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ValidationError
+
+from visloc.archive.schema import FORMAT_MAJOR, FORMAT_MINOR, Manifest
+from visloc.errors import MapCorrupt
+
+RecordType = TypeVar("RecordType", bound=BaseModel)
+
+_MAX_JSON_BYTES = 2**30
+_MAX_MANIFEST_BYTES = 16 * 2**20
+
+
+def sha256_of(path: Path) -> str:
+    """Checksum of a file as lower-case hex."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def content_hash(manifest: Mapping[str, Any]) -> str:
+    """Hash of everything in a map but its id, version and creation time.
+
+    Args:
+        manifest: the manifest as JSON values; its ``files`` carry the other files' checksums.
+    """
+    return _hash_without(manifest, "id", "version", "created", "content_hash", "manifest_hash")
+
+
+def manifest_hash(manifest: Mapping[str, Any]) -> str:
+    """Hash of the whole manifest but itself."""
+    return _hash_without(manifest, "manifest_hash")
+
+
+def json_text(value: object) -> str:
+    """The one spelling of a map's JSON files."""
+    return json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n"
+
+
+def _hash_without(manifest: Mapping[str, Any], *left_out: str) -> str:
+    fields = {key: value for key, value in manifest.items() if key not in left_out}
+    return hashlib.sha256(json_text(fields).encode()).hexdigest()
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Read ``manifest.json`` of a map folder.
+
+    Raises:
+        MapCorrupt: ``map.manifest`` when it is missing or not a manifest, ``map.format_version``
+            when it is of a newer major format.
+    """
+    path = folder / "manifest.json"
+    text = _read_text(path, _MAX_MANIFEST_BYTES, "map.manifest")
+    try:
+        version = str(json.loads(text).get("format_version", ""))
+    except (ValueError, AttributeError, RecursionError):
+        version = ""
+    major = version.partition(".")[0]
+    if major.isascii() and major.isdigit() and len(major) < 9 and int(major) > FORMAT_MAJOR:
+        raise MapCorrupt(
+            "map.format_version",
+            "the map was written by a newer visloc; upgrade visloc or rebuild the map",
+            field=str(path),
+            expected=f"format {FORMAT_MAJOR}.x (this program writes {FORMAT_MAJOR}.{FORMAT_MINOR})",
+            got=version,
+        )
+    return _parse(Manifest, text, path, "map.manifest")
+
+
+def check_files(folder: Path, manifest: Manifest) -> None:
+    """Check that every file of the manifest is there with its size.
+
+    Raises:
+        MapCorrupt: ``map.file_missing``, ``map.file_size`` or ``map.file_name``.
+    """
+    for name, entry in manifest.files.items():
+        parts = PurePosixPath(name).parts
+        if not parts or ".." in parts or name.startswith("/") or "\\" in name or "\0" in name:
+            raise MapCorrupt(
+                "map.file_name",
+                "a file name leads out of the map",
+                field=str(folder / "manifest.json"),
+                got=name,
+            )
+        path = folder / name
+        if path.is_symlink() or not path.is_file():
+            raise MapCorrupt("map.file_missing", "a file of the map is missing", field=str(path))
+        size = path.stat().st_size
+        if size != entry.size:
+            raise MapCorrupt(
+                "map.file_size",
+                "a file of the map has another size than when it was published",
+                field=str(path),
+                expected=f"{entry.size} bytes",
+                got=f"{size} bytes",
+            )
+
+
+def check_checksums(folder: Path, manifest: Manifest) -> None:
+    """Read every byte of a map and compare it with the manifest.
+
+    Raises:
+        MapCorrupt: ``map.checksum`` or ``map.manifest_hash``.
+    """
+    for name, entry in manifest.files.items():
+        digest = sha256_of(folder / name)
+        if digest != entry.sha256:
+            raise MapCorrupt(
+                "map.checksum",
+                "a file of the map was altered after it was published; restore or rebuild it",
+                field=str(folder / name),
+                expected=f"sha256 {entry.sha256}",
+                got=digest,
+            )
+    path = folder / "manifest.json"
+    text = path.read_text(encoding="utf-8")
+    fields = json.loads(text)
+    if (
+        text != json_text(fields)
+        or manifest_hash(fields) != manifest.manifest_hash
+        or content_hash(fields) != manifest.content_hash
+    ):
+        raise MapCorrupt(
+            "map.manifest_hash",
+            "the manifest was altered after it was published; restore or rebuild the map",
+            field=str(path),
+        )
+
+
+def read_record(folder: Path, name: str, record: type[RecordType]) -> RecordType:
+    """Read one of a map's JSON files."""
+    path = folder / name
+    return _parse(record, _read_text(path, _MAX_JSON_BYTES, "map.json"), path, "map.json")
+
+
+def map_array(
+    folder: Path, name: str, dtype: str, shape: tuple[int, ...], *, load: bool = False
+) -> NDArray[Any]:
+    """Open one ``.npy`` of a map, memory-mapped and read-only unless ``load``.
+
+    Raises:
+        MapCorrupt: ``map.array`` when it is not exactly such an array.
+    """
+    path = folder / name
+    try:
+        array = np.load(path, mmap_mode=None if load else "r", allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise MapCorrupt("map.array", "not a NumPy array file", field=str(path)) from error
+    # NumPy accepts trailing bytes in silence.
+    offset = getattr(array, "offset", path.stat().st_size - array.nbytes)
+    whole = path.stat().st_size == offset + array.nbytes
+    if array.dtype != np.dtype(dtype) or array.shape != shape or not whole:
+        raise MapCorrupt(
+            "map.array",
+            "an array of the map is not what the manifest says",
+            field=str(path),
+            expected=f"{np.dtype(dtype)} of shape {shape}",
+            got=f"{array.dtype} of shape {array.shape}" + ("" if whole else " and further bytes"),
+        )
+    return np.asarray(array) if load else array
+
+
+def read_model(folder: Path, name: str) -> dict[str, NDArray[np.float32]]:
+    """Read the arrays of a global descriptor's model (``.npz`` without compression).
+
+    Raises:
+        MapCorrupt: ``map.array``.
+    """
+    path = folder / name
+    try:
+        with zipfile.ZipFile(path) as archive:
+            stored = all(
+                info.compress_type == zipfile.ZIP_STORED and info.filename.endswith(".npy")
+                for info in archive.infolist()
+            )
+        if not stored:  # a compressed entry could unpack to any size
+            raise MapCorrupt(
+                "map.array", "a model must be an .npz without compression", field=str(path)
+            )
+        with np.load(path, allow_pickle=False) as arrays:
+            model = {key: arrays[key] for key in arrays.files}
+    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        raise MapCorrupt("map.array", "not a model file", field=str(path)) from error
+    for key, array in model.items():
+        if array.dtype != np.float32 or not np.isfinite(array).all():
+            raise MapCorrupt(
+                "map.array",
+                f"array {key!r} of a model is not usable",
+                field=str(path),
+                expected="finite float32",
+                got=str(array.dtype),
+            )
+    return model
+
+
+def _read_text(path: Path, limit: int, code: str) -> str:
+    try:
+        if path.stat().st_size > limit:
+            raise MapCorrupt(
+                code, "the file is too large", field=str(path), expected=f"at most {limit} bytes"
+            )
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise MapCorrupt(code, "the file is missing", field=str(path)) from None
+    except UnicodeDecodeError as error:
+        raise MapCorrupt(code, "the file is not UTF-8 text", field=str(path)) from error
+
+
+def _parse(record: type[RecordType], text: str, path: Path, code: str) -> RecordType:
+    try:
+        return record.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise MapCorrupt(
+            code, f"{where or 'the file'}: {first['msg']}", field=str(path), got=first["input"]
+        ) from error
+
+
+def is_finite(array: NDArray[Any], block: int = 1_000_000) -> bool:
+    """Tell whether all numbers are finite, reading block by block."""
+    return all(
+        bool(np.isfinite(array[start : start + block]).all())
+        for start in range(0, max(len(array), 1), block)
+    )

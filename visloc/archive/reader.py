@@ -1,0 +1,197 @@
+"""A map in memory: small things read, large arrays mapped from disk."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.archive.checks import (
+    check_checksums,
+    check_files,
+    is_finite,
+    map_array,
+    read_manifest,
+    read_model,
+    read_record,
+)
+from visloc.archive.schema import CamerasFile, ImageRecord, ImagesFile, Manifest
+from visloc.errors import InvalidInput, MapCorrupt
+from visloc.geometry import Camera, Pose
+
+Model = Mapping[str, NDArray[np.float32]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Map:
+    """One version of a map, open for reading. Files stay mapped while it lives.
+
+    Attributes:
+        path: its folder.
+        manifest: what it says about itself.
+        cameras: intrinsics by camera id.
+        rigs: of each rig, cam_from_rig by camera id.
+        images: the mapping photos.
+        image_poses: (n, 7) float64, cam_from_world as qw qx qy qz tx ty tz.
+        landmarks: (P, 3) float32, relative to the manifest's origin.
+        track_lengths: (P,) uint16, mapping photos that see each landmark.
+        errors_px: (P,) float32, mean reprojection error; NaN where it does not apply.
+        angles_deg: (P,) float32, largest angle between viewing rays; NaN where not computed.
+        observation_offsets: (n + 1,) int64; rows offsets[i]:offsets[i + 1] belong to photo i.
+        observation_landmarks: (M,) uint32 rows of ``landmarks``.
+        observation_descriptors: (M, D) int8; times the manifest's ``descriptor_scale``.
+        observation_keypoints: (M, 2) float32 pixels.
+        global_descriptors: (n, D) float32 unit rows by name.
+        global_models: the arrays of each global descriptor's model.
+    """
+
+    path: Path
+    manifest: Manifest
+    cameras: Mapping[str, Camera]
+    rigs: Mapping[str, Mapping[str, Pose]]
+    images: tuple[ImageRecord, ...]
+    image_poses: NDArray[np.float64]
+    landmarks: NDArray[np.float32]
+    track_lengths: NDArray[np.uint16]
+    errors_px: NDArray[np.float32]
+    angles_deg: NDArray[np.float32]
+    observation_offsets: NDArray[np.int64]
+    observation_landmarks: NDArray[np.uint32]
+    observation_descriptors: NDArray[np.int8]
+    observation_keypoints: NDArray[np.float32]
+    global_descriptors: Mapping[str, NDArray[np.float32]]
+    global_models: Mapping[str, Model]
+
+    @property
+    def ref(self) -> str:
+        """``id@version``."""
+        return f"{self.manifest.id}@{self.manifest.version}"
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of all files but the manifest."""
+        return sum(entry.size for entry in self.manifest.files.values())
+
+    def observations(self, image: int) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
+        """Landmarks (m,) that one photo observes and their unit descriptors (m, D)."""
+        start, stop = self.observation_offsets[image], self.observation_offsets[image + 1]
+        scale = np.float32(self.manifest.local_features.descriptor_scale)
+        descriptors = self.observation_descriptors[start:stop].astype(np.float32)
+        descriptors *= scale
+        return self.observation_landmarks[start:stop], descriptors
+
+
+def open_map(folder: Path) -> Map:
+    """Open a map after checking its manifest and the presence and size of its files.
+
+    Contents are checked when a map is published and by ``verify_map``, not here: opening a map
+    of many gigabytes takes milliseconds.
+
+    Raises:
+        MapCorrupt: with the file that is wrong.
+    """
+    manifest = read_manifest(folder)
+    check_files(folder, manifest)
+    counts, local = manifest.counts, manifest.local_features
+    n, num_landmarks, m = counts.images, counts.landmarks, counts.observations
+    names = [record.fingerprint.name for record in manifest.global_features]
+    for name in (*_ARRAYS, *(f"global/{g}{end}" for g in names for end in (".npy", ".model.npz"))):
+        if name not in manifest.files:
+            raise MapCorrupt(
+                "map.file_missing", "a file that every such map has is not listed", field=name
+            )
+    images = read_record(folder, "images.json", ImagesFile).images
+    cameras = read_record(folder, "cameras.json", CamerasFile)
+    if len(images) != n or any(image.camera not in cameras.cameras for image in images):
+        raise MapCorrupt(
+            "map.images",
+            "the photos do not fit the manifest or the cameras",
+            field=str(folder / "images.json"),
+        )
+    try:
+        camera_by_id = {
+            key: Camera(c.model, c.width, c.height, c.params) for key, c in cameras.cameras.items()
+        }
+        rigs = {
+            rig: {key: Pose.from_quaternion(p[:4], p[4:]) for key, p in members.items()}
+            for rig, members in cameras.rigs.items()
+        }
+    except InvalidInput as error:
+        raise MapCorrupt("map.cameras", str(error), field=str(folder / "cameras.json")) from error
+    return Map(
+        path=folder,
+        manifest=manifest,
+        cameras=camera_by_id,
+        rigs=rigs,
+        images=images,
+        image_poses=map_array(folder, "image_poses.npy", "<f8", (n, 7), load=True),
+        landmarks=map_array(folder, "landmarks.npy", "<f4", (num_landmarks, 3)),
+        track_lengths=map_array(folder, "landmark_track_length.npy", "<u2", (num_landmarks,)),
+        errors_px=map_array(folder, "landmark_error_px.npy", "<f4", (num_landmarks,)),
+        angles_deg=map_array(folder, "landmark_angle_deg.npy", "<f4", (num_landmarks,)),
+        observation_offsets=map_array(
+            folder, "observation_offsets.npy", "<i8", (n + 1,), load=True
+        ),
+        observation_landmarks=map_array(folder, "observation_landmarks.npy", "<u4", (m,)),
+        observation_descriptors=map_array(
+            folder, "observation_descriptors.npy", "|i1", (m, local.descriptor_dim)
+        ),
+        observation_keypoints=map_array(folder, "observation_keypoints.npy", "<f4", (m, 2)),
+        global_descriptors={
+            record.fingerprint.name: map_array(
+                folder, f"global/{record.fingerprint.name}.npy", "<f4", (n, record.dim)
+            )
+            for record in manifest.global_features
+        },
+        global_models={name: read_model(folder, f"global/{name}.model.npz") for name in names},
+    )
+
+
+def verify_map(folder: Path) -> Map:
+    """Open a map and read every byte of it: checksums, then ranges.
+
+    Raises:
+        MapCorrupt: with the file and what is wrong.
+    """
+    opened = open_map(folder)
+    check_checksums(folder, opened.manifest)
+    counts = opened.manifest.counts
+    offsets = opened.observation_offsets
+    fine = {
+        "image_poses.npy": is_finite(opened.image_poses)
+        and bool((np.abs(np.linalg.norm(opened.image_poses[:, :4], axis=1) - 1) < 1e-6).all()),
+        "landmarks.npy": is_finite(opened.landmarks),
+        "observation_offsets.npy": offsets[0] == 0
+        and offsets[-1] == counts.observations
+        and bool((np.diff(offsets) >= 0).all()),
+        "observation_landmarks.npy": int(opened.observation_landmarks.max()) < counts.landmarks,
+        "observation_keypoints.npy": is_finite(opened.observation_keypoints),
+        **{
+            f"global/{name}.npy": is_finite(rows)
+            for name, rows in opened.global_descriptors.items()
+        },
+    }
+    for name, good in fine.items():
+        if not good:
+            raise MapCorrupt(
+                "map.range", "numbers are out of their range", field=str(folder / name)
+            )
+    return opened
+
+
+_ARRAYS = (
+    "cameras.json",
+    "images.json",
+    "image_poses.npy",
+    "landmarks.npy",
+    "landmark_track_length.npy",
+    "landmark_error_px.npy",
+    "landmark_angle_deg.npy",
+    "observation_offsets.npy",
+    "observation_landmarks.npy",
+    "observation_descriptors.npy",
+    "observation_keypoints.npy",
+)

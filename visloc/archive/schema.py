@@ -1,0 +1,146 @@
+"""The words of a map's manifest and its JSON files (docs/map-format.md)."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
+
+from visloc.types import Fingerprint
+
+FORMAT = "visloc-map"
+FORMAT_MAJOR, FORMAT_MINOR = 1, 0
+
+ID_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+Vector = tuple[float, float, float]
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class _Record(BaseModel):
+    # Unknown fields pass: a reader must open maps of a newer minor format.
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+
+class FileEntry(_Record):
+    """Size and checksum of one file of the map."""
+
+    size: Annotated[int, Field(ge=0)]
+    sha256: Sha256
+
+
+class FingerprintRecord(_Record):
+    """``visloc.types.Fingerprint`` as JSON."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_.-]*$")]
+    revision: int
+    parameters: dict[str, int | float | str]
+    weights_sha256: Sha256 | None = None
+
+    @staticmethod
+    def of(fingerprint: Fingerprint) -> FingerprintRecord:
+        """Return the same as a record."""
+        return FingerprintRecord(
+            name=fingerprint.name,
+            revision=fingerprint.revision,
+            parameters=dict(fingerprint.parameters),
+            weights_sha256=fingerprint.weights_sha256,
+        )
+
+
+class LocalFeaturesRecord(_Record):
+    """The local feature that a map was built with, and how its descriptors are stored."""
+
+    fingerprint: FingerprintRecord
+    max_keypoints: Annotated[int, Field(ge=1)]
+    descriptor_dim: Annotated[int, Field(ge=1)]
+    # value = stored int8 x scale
+    descriptor_scale: Annotated[float, Field(gt=0)]
+
+
+class GlobalFeaturesRecord(_Record):
+    """One global descriptor of a map."""
+
+    fingerprint: FingerprintRecord
+    dim: Annotated[int, Field(ge=1)]
+
+
+class Extent(_Record):
+    """Smallest box along the world's axes that holds all landmarks."""
+
+    min: Vector
+    max: Vector
+
+
+class World(_Record):
+    """The frame of the map."""
+
+    metric: bool
+    origin: Vector
+    extent: Extent
+
+
+class Counts(_Record):
+    """How much of everything."""
+
+    images: Annotated[int, Field(ge=1)]
+    landmarks: Annotated[int, Field(ge=1)]
+    observations: Annotated[int, Field(ge=1)]
+
+
+class Method(_Record):
+    """How the landmarks were made."""
+
+    name: str
+    settings: dict[str, JsonValue]
+
+
+class Manifest(_Record):
+    """``manifest.json``."""
+
+    format: Literal["visloc-map"]
+    format_version: Annotated[str, Field(pattern=r"^\d+\.\d+$")]
+    id: Annotated[str, Field(pattern=rf"^{ID_PATTERN.pattern}$")]
+    version: Annotated[str, Field(pattern=rf"^{ID_PATTERN.pattern}$")]
+    created: str
+    world: World
+    method: Method
+    local_features: LocalFeaturesRecord
+    global_features: tuple[GlobalFeaturesRecord, ...]
+    counts: Counts
+    notes: tuple[str, ...] = ()
+    content_hash: Sha256
+    manifest_hash: Sha256
+    files: dict[str, FileEntry]
+
+
+class CameraRecord(_Record):
+    """``visloc.geometry.Camera`` as JSON."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+class CamerasFile(_Record):
+    """``cameras.json``: cameras by sensor id; of each rig, cam_from_rig by sensor id."""
+
+    cameras: dict[str, CameraRecord]
+    # qw qx qy qz tx ty tz
+    rigs: dict[str, dict[str, tuple[float, float, float, float, float, float, float]]] = {}
+
+
+class ImageRecord(_Record):
+    """One mapping photo; its pose is the same row of ``image_poses.npy``."""
+
+    name: str
+    camera: str
+    timestamp: int
+
+
+class ImagesFile(_Record):
+    """``images.json``."""
+
+    images: tuple[ImageRecord, ...]

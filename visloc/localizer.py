@@ -1,0 +1,240 @@
+"""One query from pixels to answer: the whole pipeline on one screen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+
+from visloc.archive import FingerprintRecord, Map
+from visloc.errors import Conflict, InvalidInput
+from visloc.features import LocalFeatureExtractor, make_global_descriptor
+from visloc.geometry import Camera
+from visloc.images import Photo, stored_from_upright, upright
+from visloc.matching.correspondences import match_landmarks
+from visloc.pose.absolute import estimate_absolute_pose
+from visloc.pose.covariance import position_covariance, with_origin
+from visloc.retrieval.index import Retrieved, retrieve
+from visloc.types import (
+    Answer,
+    CameraSource,
+    Evidence,
+    Fingerprint,
+    LocalFeatures,
+    Localized,
+    LocalizeOptions,
+    NotLocalized,
+    ReadAs,
+    Reason,
+    RetrievedImage,
+)
+
+# Focal length in units of the longer side when nothing is known: 45 degrees across, between a
+# phone's main camera (0.7 to 0.8) and a long lens. It is COLMAP's guess too.
+GUESSED_FOCAL = 1.2
+
+
+class Localizer:
+    """Localizes photos in one map. Safe to use from several threads.
+
+    Raises:
+        Conflict: ``map.features`` when the map was built with other features than those at hand.
+    """
+
+    def __init__(self, opened: Map, extractor: LocalFeatureExtractor) -> None:
+        self.map = opened
+        self._extractor = extractor
+        manifest = opened.manifest
+        _check_fingerprint(manifest.local_features.fingerprint, extractor.fingerprint, opened.ref)
+        self._descriptors = {}
+        for record in manifest.global_features:
+            descriptor = make_global_descriptor(record.fingerprint.name)
+            _check_fingerprint(record.fingerprint, descriptor.fingerprint, opened.ref)
+            self._descriptors[record.fingerprint.name] = descriptor
+        self._origin = np.array(manifest.world.origin)
+
+    def warm_up(self) -> None:
+        """Run once on noise, so that the first photo does not pay for the first use."""
+        noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+        self.localize(
+            Photo(noise, exif_orientation=1, focal_length_px=None), None, LocalizeOptions()
+        )
+
+    def localize(self, photo: Photo, camera: Camera | None, options: LocalizeOptions) -> Answer:
+        """Estimate the pose of one photo.
+
+        Args:
+            photo: pixels as stored.
+            camera: its intrinsics, for the pixels as stored; None when unknown.
+            options: thresholds and the like.
+
+        Raises:
+            InvalidInput: ``camera.size_mismatch``.
+        """
+        used, source = resolve_camera(photo, camera)
+        seconds: dict[str, float] = {}
+        evidence = Evidence(used, source, photo.exif_orientation, options.read_as, seconds=seconds)
+        registration = options.registration
+
+        with _timed(seconds, "local_features"):
+            local, rgb = self._find_features(photo, options.read_as)
+        evidence = replace(evidence, num_keypoints=len(local))
+        if len(local) == 0:
+            return NotLocalized(
+                evidence,
+                "features",
+                Reason.NO_KEYPOINTS,
+                "the photo shows nothing to hold on to: it is blank, dark, blurred or too small",
+            )
+
+        with _timed(seconds, "global_features"):
+            query = {
+                name: descriptor.describe(rgb, local, self.map.global_models[name])
+                for name, descriptor in self._descriptors.items()
+            }
+        with _timed(seconds, "retrieval"):
+            retrieved = retrieve(query, self.map.global_descriptors, options.top_k)
+        evidence = replace(evidence, retrieved=tuple(self._describe_retrieved(retrieved)))
+
+        with _timed(seconds, "matching"):
+            pairs = match_landmarks(
+                local.descriptors, (self.map.observations(int(i)) for i in retrieved.images)
+            )
+        evidence = replace(evidence, num_correspondences=len(pairs))
+        if len(pairs) < registration.min_inliers:
+            return NotLocalized(
+                evidence,
+                "matching",
+                Reason.TOO_FEW_MATCHES,
+                f"only {len(pairs)} keypoints match the map, {registration.min_inliers} are needed",
+            )
+
+        with _timed(seconds, "pose"):
+            pixels = local.keypoints[pairs.keypoints].astype(np.float64)
+            points = self.map.landmarks[pairs.landmarks].astype(np.float64)
+            found = estimate_absolute_pose(
+                pixels, points, used, max_error_px=registration.max_error_px, seed=options.seed
+            )
+        if found is None:
+            return NotLocalized(
+                evidence, "pose", Reason.NO_POSE, "no camera pose explains the matches"
+            )
+
+        evidence = replace(evidence, num_inliers=int(found.inliers.sum()))
+        if evidence.num_inliers < registration.min_inliers:
+            return NotLocalized(
+                evidence,
+                "gate",
+                Reason.TOO_FEW_INLIERS,
+                f"the best pose explains {evidence.num_inliers} matches, "
+                f"{registration.min_inliers} are needed; is this photo of the mapped place?",
+            )
+        if evidence.inlier_ratio < registration.min_inlier_ratio:
+            return NotLocalized(
+                evidence,
+                "gate",
+                Reason.LOW_INLIER_RATIO,
+                f"the best pose explains {evidence.inlier_ratio:.1%} of the matches, "
+                f"{registration.min_inlier_ratio:.1%} are needed",
+            )
+        if found.covariance is None:
+            return NotLocalized(
+                evidence,
+                "gate",
+                Reason.UNCERTAIN_POSE,
+                "the matched landmarks leave the pose undetermined: they lie in a line or a spot",
+            )
+        position_variance = np.diag(position_covariance(found.cam_from_world, found.covariance))
+        cam_from_world, covariance = with_origin(
+            found.cam_from_world, found.covariance, self._origin
+        )
+        return Localized(
+            evidence=evidence,
+            cam_from_world=cam_from_world,
+            covariance=covariance,
+            position_std=np.sqrt(position_variance),
+            orientation_std=np.sqrt(np.diag(covariance)[:3]),
+            inlier_keypoints=local.keypoints[pairs.keypoints[found.inliers]],
+            inlier_points=points[found.inliers] + self._origin,
+        )
+
+    def _find_features(
+        self, photo: Photo, read_as: ReadAs
+    ) -> tuple[LocalFeatures, np.ndarray[tuple[int, ...], np.dtype[np.uint8]]]:
+        """Features with keypoints in the stored pixels, and the image they were found in."""
+        max_keypoints = self.map.manifest.local_features.max_keypoints
+        if read_as is ReadAs.STORED or photo.exif_orientation == 1:
+            return self._extractor.extract(photo.rgb, max_keypoints=max_keypoints), photo.rgb
+        rgb = upright(photo.rgb, photo.exif_orientation)
+        local = self._extractor.extract(rgb, max_keypoints=max_keypoints)
+        keypoints = stored_from_upright(
+            local.keypoints, photo.exif_orientation, photo.width, photo.height
+        )
+        return replace(local, keypoints=keypoints), rgb
+
+    def _describe_retrieved(self, retrieved: Retrieved) -> Iterator[RetrievedImage]:
+        for rank, image in enumerate(retrieved.images):
+            yield RetrievedImage(
+                name=self.map.images[image].name,
+                score=float(retrieved.scores[rank]),
+                similarities={
+                    name: float(values[rank]) for name, values in retrieved.similarities.items()
+                },
+            )
+
+
+def resolve_camera(photo: Photo, given: Camera | None) -> tuple[Camera, CameraSource]:
+    """Choose the intrinsics of a photo: given, else EXIF's focal length, else a guess.
+
+    A camera given for another size of the same aspect is scaled to the photo.
+
+    Raises:
+        InvalidInput: ``camera.size_mismatch``.
+    """
+    width, height = photo.width, photo.height
+    if given is None:
+        known = photo.focal_length_px is not None
+        focal = photo.focal_length_px or GUESSED_FOCAL * max(width, height)
+        camera = Camera("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
+        return camera, CameraSource.EXIF if known else CameraSource.GUESS
+    if (given.width, given.height) == (width, height):
+        return given, CameraSource.GIVEN
+    if given.has_aspect_of(width, height):
+        return given.scaled(width, height), CameraSource.GIVEN_SCALED
+    turned = photo.exif_orientation >= 5 and given.has_aspect_of(height, width)
+    raise InvalidInput(
+        "camera.size_mismatch",
+        "the camera is not for this photo"
+        + (
+            "; the photo is stored turned (EXIF orientation "
+            f"{photo.exif_orientation}) and the camera must be that of the stored pixels"
+            if turned
+            else ""
+        ),
+        field="camera",
+        expected=f"{width} x {height} or another size of the same aspect",
+        got=f"{given.width} x {given.height}",
+    )
+
+
+def _check_fingerprint(built_with: FingerprintRecord, at_hand: Fingerprint, ref: str) -> None:
+    if built_with == FingerprintRecord.of(at_hand):
+        return
+    raise Conflict(
+        "map.features",
+        f"map {ref} was built with another {built_with.name}; use the weights and the version of "
+        "visloc that built it, or build it again",
+        field="weights_dir" if built_with.weights_sha256 != at_hand.weights_sha256 else "map",
+        expected=str(built_with.model_dump()),
+        got=str(FingerprintRecord.of(at_hand).model_dump()),
+    )
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    start = perf_counter()
+    yield
+    seconds[stage] = perf_counter() - start

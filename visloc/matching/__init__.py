@@ -1,0 +1,1 @@
+"""From descriptors to 2D-3D correspondences."""

@@ -1,0 +1,109 @@
+"""Matching a query's keypoints against the landmarks that mapping photos see."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correspondences:
+    """2D-3D correspondences, each keypoint and each landmark at most once, best first.
+
+    Attributes:
+        keypoints: (n,) int64 rows of the query's features.
+        landmarks: (n,) int64 rows of the map's landmarks.
+        votes: (n,) int64, how many mapping photos proposed the pair.
+        similarities: (n,) float32, the best cosine similarity among them.
+    """
+
+    keypoints: NDArray[np.int64]
+    landmarks: NDArray[np.int64]
+    votes: NDArray[np.int64]
+    similarities: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+
+def mutual_nearest_neighbours(
+    a: NDArray[np.float32], b: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
+    """Pair the rows of a (n, D) and b (m, D) that are each other's most similar.
+
+    Returns:
+        Rows of a, rows of b and their dot products. Ties go to the lower row of b, and of a.
+    """
+    if len(a) == 0 or len(b) == 0:
+        none = np.empty(0, dtype=np.int64)
+        return none, none, np.empty(0, dtype=np.float32)
+    similarity = a @ b.T
+    best_b = np.argmax(similarity, axis=1)
+    rows = np.arange(len(a))
+    best = similarity[rows, best_b]
+    # Equality with the column's maximum replaces a second, slower arg-max over the columns.
+    mutual = np.flatnonzero(best == similarity.max(axis=0)[best_b])
+    # Rows with equal similarity to one column (duplicate descriptors): the first one keeps it.
+    _, first = np.unique(best_b[mutual], return_index=True)
+    mutual = mutual[np.sort(first)]
+    return mutual, best_b[mutual], best[mutual]
+
+
+def match_landmarks(
+    query: NDArray[np.float32],
+    images: Iterable[tuple[NDArray[np.integer], NDArray[np.float32]]],
+) -> Correspondences:
+    """Match a query against several mapping photos and settle conflicts by vote.
+
+    Every photo proposes pairs of keypoint and landmark by mutual nearest neighbours. A pair that
+    more photos propose wins over one that fewer propose, then the more similar one; each
+    keypoint and each landmark is used once.
+
+    Args:
+        query: (n, D) unit descriptors of the query.
+        images: of each mapping photo, the landmarks (m,) that it observes and their unit
+            descriptors (m, D).
+    """
+    keypoints, landmarks, similarities = [], [], []
+    for seen, descriptors in images:
+        i, j, similarity = mutual_nearest_neighbours(query, descriptors)
+        keypoints.append(i)
+        landmarks.append(seen[j].astype(np.int64))
+        similarities.append(similarity)
+    if not keypoints:
+        none = np.empty(0, dtype=np.int64)
+        return Correspondences(none, none, none, np.empty(0, dtype=np.float32))
+    return _settle(np.concatenate(keypoints), np.concatenate(landmarks), similarities)
+
+
+def _settle(
+    keypoints: NDArray[np.int64],
+    landmarks: NDArray[np.int64],
+    similarities: list[NDArray[np.float32]],
+) -> Correspondences:
+    similarity = np.concatenate(similarities)
+    # One row per distinct pair, with its votes and its best similarity.
+    order = np.lexsort((-similarity, landmarks, keypoints))
+    keypoints, landmarks, similarity = keypoints[order], landmarks[order], similarity[order]
+    starts = np.ones(len(keypoints), dtype=bool)
+    starts[1:] = (np.diff(keypoints) != 0) | (np.diff(landmarks) != 0)
+    first = np.flatnonzero(starts)
+    votes = np.diff(np.append(first, len(keypoints)))
+    keypoints, landmarks, similarity = keypoints[first], landmarks[first], similarity[first]
+
+    order = np.lexsort((landmarks, keypoints, -similarity, -votes))
+    taken_keypoints: set[int] = set()
+    taken_landmarks: set[int] = set()
+    kept = []
+    for row, keypoint, landmark in zip(
+        order.tolist(), keypoints[order].tolist(), landmarks[order].tolist(), strict=True
+    ):
+        if keypoint not in taken_keypoints and landmark not in taken_landmarks:
+            taken_keypoints.add(keypoint)
+            taken_landmarks.add(landmark)
+            kept.append(row)
+    chosen = np.array(kept, dtype=np.int64)
+    return Correspondences(keypoints[chosen], landmarks[chosen], votes[chosen], similarity[chosen])

@@ -1,0 +1,46 @@
+"""Our values as pycolmap's and back. The only place that knows pycolmap's conventions."""
+
+from __future__ import annotations
+
+import numpy as np
+import PIL.Image  # noqa: F401  Pillow saves PNGs only when it was imported before pycolmap
+import pycolmap
+from numpy.typing import NDArray
+
+from visloc.geometry import Camera, Pose
+
+
+def colmap_camera(camera: Camera) -> pycolmap.Camera:
+    """Return the same camera for pycolmap. Pixel conventions are the same."""
+    return pycolmap.Camera(
+        model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
+    )
+
+
+def colmap_pose(pose: Pose) -> pycolmap.Rigid3d:
+    """Return the same transform for pycolmap."""
+    return pycolmap.Rigid3d(np.column_stack([pose.rotation, pose.translation]))
+
+
+def pose_from_colmap(rigid: pycolmap.Rigid3d) -> Pose:
+    """Return pycolmap's transform as ours, with a rotation that is a copy, not a view."""
+    matrix = np.array(rigid.matrix(), dtype=np.float64)
+    return Pose(matrix[:, :3], matrix[:, 3])
+
+
+def normalized_rays(camera: Camera, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the points (N, 3) at depth 1 that pixels (N, 2) see, in the camera's frame.
+
+    A pixel whose undistortion does not converge gives NaN.
+    """
+    if len(pixels) == 0:
+        return np.empty((0, 3))
+    plane = np.asarray(colmap_camera(camera).cam_from_img(np.asarray(pixels, dtype=np.float64)))
+    return np.column_stack([plane, np.ones(len(plane))])
+
+
+def project(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Project points (N, 3) in the camera's frame to pixels (N, 2); NaN behind the camera."""
+    if len(points) == 0:
+        return np.empty((0, 2))
+    return np.asarray(colmap_camera(camera).img_from_cam(points))

@@ -1,0 +1,1 @@
+"""Image retrieval with several fused global descriptors."""
