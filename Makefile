@@ -20,7 +20,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	touch $(INSTALLED)
 
 demo: install ## the main job on a synthetic sample: build, serve, localize, picture
-	$(BIN)/python -m benchmarks.demo
+	$(BIN)/python examples/demo.py
 
 test: install ## the tests, in under ten minutes on two cores
 	$(BIN)/pytest -m 'not slow'

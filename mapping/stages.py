@@ -49,7 +49,7 @@ class WorkFolder:
 
     def read(self, key: str) -> Item:
         """Read a finished item."""
-        with np.load(self._path(key), allow_pickle=False) as arrays:
+        with self._path(key).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
 
     def get(self, key: str, compute: Callable[[], Item]) -> Item:

@@ -72,7 +72,7 @@ class Pose:
         """
         q = np.asarray(rotation_wxyz, dtype=np.float64)
         t = np.asarray(translation, dtype=np.float64)
-        norm = float(np.linalg.norm(q)) if q.shape == (4,) else math.nan
+        norm = math.hypot(*q) if q.shape == (4,) else math.nan  # no overflow on the way
         if not (math.isfinite(norm) and norm >= 1e-6):
             raise InvalidInput(
                 "pose.rotation",

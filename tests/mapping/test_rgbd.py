@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mapping.depth import DepthMatch
+from mapping.photos import MappingPhoto
+from mapping.rgbd import LiftedKeypoints, lift_keypoints, merge_landmarks
+from visloc.errors import InvalidInput
+from visloc.geometry import Camera, Pose
+from visloc.kapture import Dataset, FileRecord
+
+CAMERA = Camera("PINHOLE", 64, 48, (60.0, 62.0, 31.0, 25.0))
+POSE = Pose.from_quaternion([0.9, 0.1, -0.3, 0.2], [0.3, -0.2, 0.5])
+
+
+def make_photo(name: str = "a.jpg", pose: Pose = POSE, depth: bool = True) -> MappingPhoto:
+    record = FileRecord(timestamp=0, sensor_id="cam", path=name)
+    match = DepthMatch(FileRecord(0, "depth", "a.depth"), CAMERA, Pose.identity())
+    return MappingPhoto(record, Path(name), "", CAMERA, pose, match if depth else None, None)
+
+
+def dataset_with_depth(root: Path, depth: NDArray[np.float32]) -> Dataset:
+    folder = root / "sensors" / "records_data"
+    folder.mkdir(parents=True)
+    depth.astype("<f4").tofile(folder / "a.depth")
+    return Dataset(root, {}, {}, {}, (), (), (), ())
+
+
+def test_keypoints_are_lifted_to_where_the_plane_is(tmp_path: Path) -> None:
+    # The plane z = 2 + 0.2 x in the camera's frame, seen at every pixel centre.
+    u, _ = np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5)
+    slope = (u - 31.0) / 60.0
+    depth = (2.0 / (1.0 - 0.2 * slope)).astype(np.float32)
+    keypoints = np.array([[10.3, 7.9], [40.75, 30.25], [63.9, 10.0]], dtype=np.float32)
+
+    lifted = lift_keypoints(dataset_with_depth(tmp_path, depth), make_photo(), keypoints, 0.001)
+
+    assert lifted.rows.tolist() == [0, 1]  # the third has no neighbour on its right
+    in_camera = POSE.apply(lifted.points)
+    assert in_camera[:, 2] == pytest.approx(2.0 + 0.2 * in_camera[:, 0], abs=1e-5)
+    u = 60.0 * in_camera[:, 0] / in_camera[:, 2] + 31.0
+    assert u == pytest.approx(keypoints[:2, 0], abs=1e-4)
+
+
+def test_a_photo_without_depth_gives_nothing(tmp_path: Path) -> None:
+    dataset = dataset_with_depth(tmp_path, np.ones((48, 64), np.float32))
+    lifted = lift_keypoints(dataset, make_photo(depth=False), np.ones((3, 2), np.float32), 0.001)
+    assert len(lifted.rows) == 0
+    assert lifted.points.shape == (0, 3)
+
+
+def lifted_at(*points: tuple[float, float, float]) -> LiftedKeypoints:
+    return LiftedKeypoints(np.arange(len(points)), np.array(points).reshape(-1, 3))
+
+
+def pixels_of(photo: MappingPhoto, lifted: LiftedKeypoints) -> NDArray[np.float32]:
+    seen = photo.cam_from_world.apply(lifted.points)
+    u = 60.0 * seen[:, 0] / seen[:, 2] + 31.0
+    v = 62.0 * seen[:, 1] / seen[:, 2] + 25.0
+    return np.column_stack([u, v]).astype(np.float32)
+
+
+def test_points_of_one_voxel_become_one_landmark_with_their_observations() -> None:
+    photos = [make_photo("a.jpg", Pose.identity()), make_photo("b.jpg", Pose.identity())]
+    lifted = [
+        lifted_at((0.011, 0.001, 2.001), (0.5, 0.5, 3.001)),
+        lifted_at((0.013, 0.003, 2.003), (0.014, 0.002, 2.002), (-0.5, 0.5, 4.001)),
+    ]
+    keypoints = [pixels_of(p, one) for p, one in zip(photos, lifted, strict=True)]
+
+    landmarks = merge_landmarks(photos, keypoints, lifted, voxel_size=0.01)
+
+    assert len(landmarks.points) == 3
+    assert landmarks.offsets.tolist() == [0, 2, 5]
+    first, second, third, fourth, fifth = landmarks.observed.tolist()
+    assert first == third == fourth
+    assert len({first, second, fifth}) == 3
+    assert landmarks.points[first] == pytest.approx([0.038 / 3, 0.002, 2.002], abs=1e-6)
+    # the second photo sees it twice, which counts once
+    assert landmarks.track_lengths[[first, second, fifth]].tolist() == [2, 1, 1]
+    assert landmarks.errors_px[second] == pytest.approx(0.0, abs=1e-4)
+    # 2 mm at 2 m with a focal length of 60 px
+    assert 0.0 < landmarks.errors_px[first] < 0.1
+    assert np.concatenate(keypoints).tolist() == landmarks.keypoints.tolist()
+
+
+def test_far_from_the_origin_millimetres_survive() -> None:
+    center = np.array([500_000.0, 4_600_000.0, 120.0])
+    pose = Pose(np.eye(3), -center)
+    photo = make_photo("a.jpg", pose)
+    lifted = LiftedKeypoints(np.arange(2), center + np.array([[0.0011, 0.0, 2.0], [0.5, 0.0, 2.0]]))
+    landmarks = merge_landmarks([photo], [pixels_of(photo, lifted)], [lifted], voxel_size=0.01)
+    positions = landmarks.points.astype(np.float64) + landmarks.origin
+    assert np.sort(positions[:, 0] - center[0]) == pytest.approx([0.0011, 0.5], abs=1e-6)
+
+
+def test_no_depth_anywhere_is_refused_with_a_hint() -> None:
+    with pytest.raises(InvalidInput, match="--depth-sensor"):
+        merge_landmarks([make_photo()], [np.empty((0, 2), np.float32)], [lifted_at()], 0.01)
+
+
+def test_a_voxel_size_that_would_overflow_is_refused() -> None:
+    lifted = lifted_at((0.0, 0.0, 1.0), (1e7, 1e7, 1e7))
+    photo = make_photo()
+    with pytest.raises(InvalidInput, match="--voxel-size"):
+        merge_landmarks([photo], [pixels_of(photo, lifted)], [lifted], voxel_size=1e-6)

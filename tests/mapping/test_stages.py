@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapping.stages import WorkFolder, exclusive, key_of
+from visloc.errors import Conflict
+
+
+def test_a_finished_item_is_not_computed_again(tmp_path: Path) -> None:
+    work = WorkFolder(tmp_path)
+    calls = []
+
+    def compute() -> Mapping[str, np.ndarray]:
+        calls.append(1)
+        return {"a": np.arange(3), "b": np.eye(2, dtype=np.float32)}
+
+    key = key_of("stage", 1, photo="x")
+    first, second = work.get(key, compute), work.get(key, compute)
+    assert calls == [1]
+    assert all(np.array_equal(first[name], second[name]) for name in ("a", "b"))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        key_of("stage", 2, photo="x"),
+        key_of("stage", 1, photo="y"),
+        key_of("stage", 1, photo="x", scale=1.0),
+        key_of("other", 1, photo="x"),
+    ],
+)
+def test_a_key_changes_with_everything_that_goes_in(other: str) -> None:
+    assert other != key_of("stage", 1, photo="x")
+
+
+@pytest.mark.parametrize("torn", [b"", b"PK\x03\x04 torn"])
+def test_a_torn_item_is_computed_again(tmp_path: Path, torn: bytes) -> None:
+    work = WorkFolder(tmp_path)
+    key = key_of("stage", 1)
+    work.get(key, lambda: {"a": np.zeros(1)})
+    next(tmp_path.rglob("*.npz")).write_bytes(torn)
+    assert work.get(key, lambda: {"a": np.ones(1)})["a"].tolist() == [1.0]
+
+
+def test_a_failing_computation_leaves_nothing(tmp_path: Path) -> None:
+    work = WorkFolder(tmp_path)
+
+    def fail() -> Mapping[str, np.ndarray]:
+        raise RuntimeError("no")
+
+    with pytest.raises(RuntimeError):
+        work.get(key_of("stage", 1), fail)
+    assert list(tmp_path.rglob("*")) == []
+
+
+def _hold(folder: Path, ready: object, leave: object) -> None:
+    with exclusive(folder):
+        ready.set()  # type: ignore[attr-defined]
+        leave.wait()  # type: ignore[attr-defined]
+
+
+def test_a_second_build_of_the_same_map_is_refused_until_the_first_ends(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("spawn")
+    ready, leave = context.Event(), context.Event()
+    holder = context.Process(target=_hold, args=(tmp_path, ready, leave))
+    holder.start()
+    assert ready.wait(60)
+    with pytest.raises(Conflict, match="another build"), exclusive(tmp_path):
+        pass
+    holder.kill()
+    holder.join()
+    with exclusive(tmp_path):
+        pass

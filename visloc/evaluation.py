@@ -1,0 +1,131 @@
+"""How good poses are: errors, recall within thresholds, medians and percentiles.
+
+Definitions as in Sattler et al., "Benchmarking 6DOF Outdoor Visual Localization in Changing
+Conditions", CVPR 2018, section 3.3, and in kapture's evaluation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from visloc.errors import InvalidInput
+from visloc.geometry import Pose, rotation_angle
+
+
+@dataclass(frozen=True, slots=True)
+class Threshold:
+    """A pose is within it when neither error is larger.
+
+    Attributes:
+        max_position_error_m: metres.
+        max_orientation_error_deg: degrees.
+    """
+
+    max_position_error_m: float
+    max_orientation_error_deg: float
+
+    def __post_init__(self) -> None:
+        # Written so that NaN fails too.
+        if not (self.max_position_error_m >= 0 and self.max_orientation_error_deg >= 0):
+            raise InvalidInput(
+                "evaluation.threshold",
+                "not a threshold",
+                field="threshold",
+                expected="metres and degrees, neither negative",
+                got=f"{self.max_position_error_m} m, {self.max_orientation_error_deg} degrees",
+            )
+
+
+# Indoors (7-Scenes), then the high, medium and low precision of Sattler et al.
+DEFAULT_THRESHOLDS = (
+    Threshold(0.05, 5.0),
+    Threshold(0.25, 2.0),
+    Threshold(0.5, 5.0),
+    Threshold(5.0, 10.0),
+)
+
+
+def pose_error(estimated: Pose, truth: Pose) -> tuple[float, float]:
+    """Compare two ``cam_from_world``.
+
+    Returns:
+        The distance between the camera centres in the unit of the world (metres), and the angle
+        of the rotation between the two orientations in degrees, 0 to 180.
+    """
+    position_error = float(np.linalg.norm(estimated.center - truth.center))
+    orientation_error = rotation_angle(estimated.rotation @ truth.rotation.T)
+    return position_error, math.degrees(orientation_error)
+
+
+def recall(
+    errors: Sequence[tuple[float, float]],
+    num_queries: int,
+    thresholds: Sequence[Threshold] = DEFAULT_THRESHOLDS,
+) -> list[float]:
+    """Return for each threshold the fraction of all queries within it, bounds included.
+
+    Args:
+        errors: (metres, degrees) of each localized query, as ``pose_error`` gives them.
+        num_queries: all queries; those without an error count as failures.
+        thresholds: what counts as success.
+
+    Raises:
+        InvalidInput: ``evaluation.num_queries`` if there are none, or fewer than errors.
+    """
+    _check_count(errors, num_queries)
+    return [
+        sum(
+            position <= threshold.max_position_error_m
+            and orientation <= threshold.max_orientation_error_deg
+            for position, orientation in errors
+        )
+        / num_queries
+        for threshold in thresholds
+    ]
+
+
+def median_errors_localized(errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Return the medians (metres, degrees) over the localized queries; NaN if there are none."""
+    if not errors:
+        return math.nan, math.nan
+    position, orientation = np.median(np.asarray(errors, dtype=np.float64), axis=0)
+    return float(position), float(orientation)
+
+
+def median_errors_all(
+    errors: Sequence[tuple[float, float]], num_queries: int
+) -> tuple[float, float]:
+    """Return the medians (metres, degrees) over all queries, infinite for those without an error.
+
+    Raises:
+        InvalidInput: as ``recall``.
+    """
+    _check_count(errors, num_queries)
+    failures = [(math.inf, math.inf)] * (num_queries - len(errors))
+    return median_errors_localized([*errors, *failures])
+
+
+def percentile(values: Sequence[float], percent: float) -> float:
+    """Return the smallest value that at least ``percent`` % of the values do not exceed.
+
+    This is the nearest-rank definition: the answer is always one of the values, as befits
+    latencies, where the slowest of few must not be interpolated away. NaN without values.
+    """
+    if not values:
+        return math.nan
+    return float(np.percentile(values, percent, method="inverted_cdf"))
+
+
+def _check_count(errors: Sequence[tuple[float, float]], num_queries: int) -> None:
+    if not 0 < num_queries >= len(errors):
+        raise InvalidInput(
+            "evaluation.num_queries",
+            "wrong number of queries",
+            field="num_queries",
+            expected=f"at least one, and not fewer than the {len(errors)} localized",
+            got=num_queries,
+        )

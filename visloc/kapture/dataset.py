@@ -1,0 +1,146 @@
+"""A kapture dataset in memory: its sensors, poses and records, not the pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from visloc.geometry import Camera, Pose
+
+UNKNOWN_CAMERA = "UNKNOWN_CAMERA"
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """One line of ``sensors.txt``.
+
+    Attributes:
+        id: names the sensor in every other file; any text, never a file name.
+        name: for people; may be empty.
+        kind: "camera", "depth", "gnss" or any other word.
+        params: the parameters as in the file; of a camera: model, width, height, ...
+        camera: intrinsics of a camera or depth sensor; None for UNKNOWN_CAMERA and other kinds.
+    """
+
+    id: str
+    name: str
+    kind: str
+    params: tuple[str, ...]
+    camera: Camera | None
+
+    @staticmethod
+    def with_camera(sensor_id: str, camera: Camera, kind: str = "camera", name: str = "") -> Sensor:
+        """Make a camera or depth sensor, with the parameters written out."""
+        values = (_shortest(value) for value in camera.params)
+        params = (camera.model, str(camera.width), str(camera.height), *values)
+        return Sensor(sensor_id, name, kind, params, camera)
+
+    @property
+    def image_size(self) -> tuple[int, int] | None:
+        """(width, height) in pixels, also of an UNKNOWN_CAMERA; None for other kinds."""
+        if self.camera is not None:
+            return self.camera.width, self.camera.height
+        if self.kind in ("camera", "depth") and self.params[:1] == (UNKNOWN_CAMERA,):
+            return int(float(self.params[1])), int(float(self.params[2]))  # 640.0 is legal
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class FileRecord:
+    """A photo or depth map.
+
+    Attributes:
+        timestamp: integer in the dataset's own unit.
+        sensor_id: the sensor that took it.
+        path: relative to ``sensors/records_data``, with forward slashes: its identity.
+    """
+
+    timestamp: int
+    sensor_id: str
+    path: str
+
+
+@dataclass(frozen=True, slots=True)
+class GnssRecord:
+    """A GNSS fix.
+
+    Attributes:
+        timestamp: integer in the dataset's own unit.
+        sensor_id: the receiver; its parameter names the coordinate system, EPSG:4326 by default.
+        x: longitude in degrees for EPSG:4326, else easting.
+        y: latitude in degrees for EPSG:4326, else northing.
+        z: altitude in metres.
+        utc: Unix time in seconds, 0 when unknown.
+        dop: dilution of precision, 0 when unknown.
+    """
+
+    timestamp: int
+    sensor_id: str
+    x: float
+    y: float
+    z: float
+    utc: float
+    dop: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Dataset:
+    """What the ``sensors`` folder of a kapture dataset says.
+
+    Attributes:
+        root: the folder that holds ``sensors``.
+        sensors: by id.
+        rigs: rig id -> sensor id -> ``sensor_from_rig``; nested rigs are unrolled; None where
+            the transform is unknown.
+        trajectories: (timestamp, sensor or rig id) -> ``device_from_world``.
+        images: sorted by (timestamp, sensor_id, path).
+        depth_maps: sorted the same way.
+        gnss: sorted by (timestamp, sensor_id).
+        notes: what was tolerated in reading, one sentence each, with file and count.
+    """
+
+    root: Path
+    sensors: Mapping[str, Sensor]
+    rigs: Mapping[str, Mapping[str, Pose | None]]
+    trajectories: Mapping[tuple[int, str], Pose]
+    images: tuple[FileRecord, ...]
+    depth_maps: tuple[FileRecord, ...]
+    gnss: tuple[GnssRecord, ...]
+    notes: tuple[str, ...] = ()
+    _rigs_of_sensor: Mapping[str, list[str]] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        rigs_of_sensor: dict[str, list[str]] = {}
+        for rig_id, members in self.rigs.items():
+            for sensor_id in members:
+                rigs_of_sensor.setdefault(sensor_id, []).append(rig_id)
+        object.__setattr__(self, "_rigs_of_sensor", rigs_of_sensor)
+
+    def pose(self, record: FileRecord) -> Pose | None:
+        """Return ``sensor_from_world`` of a record, None when it is unknown.
+
+        The sensor's own trajectory is preferred to that of a rig that carries it.
+        """
+        own = self.trajectories.get((record.timestamp, record.sensor_id))
+        if own is not None:
+            return own
+        for rig_id in self._rigs_of_sensor.get(record.sensor_id, ()):
+            sensor_from_rig = self.rigs[rig_id][record.sensor_id]
+            rig_from_world = self.trajectories.get((record.timestamp, rig_id))
+            if sensor_from_rig is not None and rig_from_world is not None:
+                return sensor_from_rig @ rig_from_world
+        return None
+
+    def rigs_of(self, sensor_id: str) -> tuple[str, ...]:
+        """Return the ids of the rigs that carry a sensor, in the dataset's order."""
+        return tuple(self._rigs_of_sensor.get(sensor_id, ()))
+
+    def path_of(self, record: FileRecord) -> Path:
+        """Return where the record's file should lie; it may be missing."""
+        return self.root / "sensors" / "records_data" / record.path
+
+
+def _shortest(value: float) -> str:
+    # kapture's own tools write whole numbers without a point; repr keeps every digit of others.
+    return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(float(value))

@@ -1,0 +1,150 @@
+"""Writing features in kapture's layout, one image at a time, so that other tools can run on them.
+
+``reconstruction/keypoints/TYPE/IMAGE.kpt`` and its siblings hold rows of numbers, little-endian
+and without a header; one line in ``keypoints.txt`` says of which type and how many per row.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.errors import Conflict, DatasetError, InvalidInput
+from visloc.kapture.text import is_field, is_folder_name, relative_path
+from visloc.kapture.writer import VERSION_LINE, write_atomically
+
+_DTYPES: dict[str, np.dtype[Any]] = {
+    "float32": np.dtype("<f4"),
+    "float64": np.dtype("<f8"),
+    "uint8": np.dtype("u1"),
+    "int32": np.dtype("<i4"),
+}
+_COLUMNS = {
+    "keypoints": "name, dtype, dsize",
+    "descriptors": "name, dtype, dsize, keypoints_type, metric_type",
+    "global_features": "name, dtype, dsize, metric_type",
+}
+
+
+def write_local_features(
+    root: Path,
+    feature_type: str,
+    image_path: str,
+    keypoints: NDArray[np.generic],
+    descriptors: NDArray[np.generic],
+    *,
+    name: str,
+) -> None:
+    """Write the keypoints and descriptors of one image.
+
+    Args:
+        root: the dataset; its ``sensors`` need not exist.
+        feature_type: folder TYPE, for keypoints and descriptors alike.
+        image_path: the image's identity, as in ``records_camera.txt``.
+        keypoints: (N, K >= 2): x, y in pixels (top-left centre at 0.5), then what the type adds,
+            such as the scale. N may be 0.
+        descriptors: (N, D), compared by their L2 distance.
+        name: of the method, for the reader of ``keypoints.txt``.
+
+    Raises:
+        Conflict: ``kapture.feature_type`` if TYPE exists with other names, numbers or sizes.
+        InvalidInput: ``kapture.features`` for a wrong shape or dtype.
+        DatasetError: ``kapture.path``, ``kapture.field``.
+    """
+    if keypoints.ndim != 2 or keypoints.shape[1] < 2 or len(keypoints) != len(descriptors):
+        raise InvalidInput(
+            "kapture.features",
+            "not the features of an image",
+            field="keypoints",
+            expected="(N, 2 or more) keypoints and as many descriptors",
+            got=f"{keypoints.shape} and {descriptors.shape}",
+        )
+    _write("keypoints", ".kpt", root, feature_type, image_path, keypoints, name, ())
+    _write(
+        "descriptors",
+        ".desc",
+        root,
+        feature_type,
+        image_path,
+        descriptors,
+        name,
+        (feature_type, "L2"),
+    )
+
+
+def write_global_features(
+    root: Path, feature_type: str, image_path: str, vector: NDArray[np.generic], *, name: str
+) -> None:
+    """Write the global descriptor (D,) of one image, compared by its L2 distance.
+
+    Raises:
+        Conflict, InvalidInput, DatasetError: as ``write_local_features``.
+    """
+    rows = vector[np.newaxis]
+    _write("global_features", ".gfeat", root, feature_type, image_path, rows, name, ("L2",))
+
+
+def _write(
+    kind: str,
+    suffix: str,
+    root: Path,
+    feature_type: str,
+    image_path: str,
+    rows: NDArray[np.generic],
+    name: str,
+    last_fields: tuple[str, ...],
+) -> None:
+    if not is_folder_name(feature_type) or not (name and is_field(name) and name[0] != "#"):
+        raise DatasetError(
+            "kapture.field",
+            "not the name of a feature type",
+            field="feature_type",
+            expected="a folder name without commas",
+            got=f"type {feature_type!r}, name {name!r}",
+        )
+    try:
+        relative = relative_path(image_path)
+    except ValueError:
+        raise DatasetError(
+            "kapture.path",
+            "features cannot be written for this image",
+            field="image_path",
+            expected="a relative path that stays inside the dataset",
+            got=image_path,
+        ) from None
+    dtype_name = rows.dtype.newbyteorder("=").name
+    if rows.ndim != 2 or rows.shape[1] == 0 or dtype_name not in _DTYPES:
+        raise InvalidInput(
+            "kapture.features",
+            "kapture cannot hold these features",
+            field=kind,
+            expected=f"(N, D) numbers of {', '.join(_DTYPES)}",
+            got=f"{rows.shape} {rows.dtype}",
+        )
+    folder = root / "reconstruction" / kind / feature_type
+    fields = (name, dtype_name, str(rows.shape[1]), *last_fields)
+    _declare(folder / f"{kind}.txt", fields)
+    path = folder / f"{relative}{suffix}"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, np.ascontiguousarray(rows, dtype=_DTYPES[dtype_name]).tobytes())
+
+
+def _declare(path: Path, fields: tuple[str, ...]) -> None:
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        text = f"{VERSION_LINE}\n# {_COLUMNS[path.stem]}\n{', '.join(fields)}\n"
+        write_atomically(path, text.encode("utf-8"))
+        return
+    lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    data = [line for line in lines if line.strip() and not line.strip().startswith("#")]
+    if [tuple(field.strip() for field in line.split(",")) for line in data] != [fields]:
+        raise Conflict(
+            "kapture.feature_type",
+            "the folder holds features of another kind",
+            field=str(path),
+            expected=", ".join(fields),
+            got="; ".join(data),
+        )

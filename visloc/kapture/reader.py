@@ -1,0 +1,258 @@
+"""Reading the ``sensors`` folder of a dataset, kapture 1.0 or 1.1.
+
+Bad data is either tolerated with a note or refused with file and line. Nothing in it is executed
+or guessed, and no path leads out of ``records_data`` except through links that lie there.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Container, Mapping
+from pathlib import Path
+
+from visloc.geometry import CAMERA_MODELS, MAX_IMAGE_SIDE, Camera, Pose
+from visloc.kapture.dataset import UNKNOWN_CAMERA, Dataset, FileRecord, GnssRecord, Sensor
+from visloc.kapture.rigs import unroll_rigs
+from visloc.kapture.table import Table
+from visloc.kapture.text import relative_path
+
+_NEWEST_VERSION = (1, 1)
+
+
+def read_dataset(root: Path) -> Dataset:
+    """Read sensors, rigs, trajectories and the camera, depth and GNSS records of a dataset.
+
+    Only ``sensors/sensors.txt`` must exist. What is tolerated is told in ``notes``.
+
+    Raises:
+        DatasetError: codes ``kapture.*``, ``camera.*`` and ``pose.*``; the field is the file,
+            relative to ``root``, with the line.
+    """
+    notes: list[str] = []
+    sensors = _read_sensors(root, notes)
+    rigs = _read_rigs(root, sensors, notes)
+    trajectories = _read_trajectories(root, sensors.keys() | rigs.keys(), notes)
+    images = _read_files(root, "records_camera.txt", "camera", sensors, notes)
+    depth_maps = _read_files(root, "records_depth.txt", "depth", sensors, notes)
+    gnss = _read_gnss(root, sensors, notes)
+    return Dataset(root, sensors, rigs, trajectories, images, depth_maps, gnss, tuple(notes))
+
+
+def _read_sensors(root: Path, notes: list[str]) -> dict[str, Sensor]:
+    table = Table(root, "sensors/sensors.txt", None)
+    if not table.exists():
+        raise table.error(
+            "kapture.no_dataset",
+            f"{root} is not a kapture dataset: the file is missing",
+            expected="a folder that holds sensors/sensors.txt",
+        )
+    _check_version(table, notes)
+    sensors: dict[str, Sensor] = {}
+    for fields in table:
+        if len(fields) < 3:
+            raise table.error(
+                "kapture.column_count",
+                "wrong number of columns",
+                expected="sensor_id, name, sensor_type, parameters",
+                got=len(fields),
+            )
+        sensor_id, name, kind, *params = fields
+        _refuse_duplicate(table, sensor_id, sensors)
+        _refuse_empty(table, sensor_id)
+        camera = _parse_camera(table, params) if kind in ("camera", "depth") else None
+        sensors[sensor_id] = Sensor(sensor_id, name, kind, tuple(params), camera)
+    return sensors
+
+
+def _check_version(table: Table, notes: list[str]) -> None:
+    version = table.version()
+    if version is None or not (1, 0) <= version <= _NEWEST_VERSION:
+        raise table.error(
+            "kapture.version",
+            "the first line does not declare a version"
+            if version is None
+            else "this version of kapture is not known",
+            expected="'# kapture format: 1.1' or 1.0 in the first line",
+            got=None if version is None else f"{version[0]}.{version[1]}",
+        )
+    if version == (1, 0):
+        notes.append(f"{table.relative}: version 1.0, whose reconstruction folder is not read")
+
+
+def _parse_camera(table: Table, params: list[str]) -> Camera | None:
+    model, *values = params or [""]
+    names = () if model == UNKNOWN_CAMERA else CAMERA_MODELS.get(model)
+    if names is None:
+        raise table.error(
+            "camera.model",
+            "unknown camera model",
+            expected=f"one of {', '.join((UNKNOWN_CAMERA, *CAMERA_MODELS))}",
+            got=model,
+        )
+    if len(values) != 2 + len(names):
+        raise table.error(
+            "camera.param_count",
+            f"wrong number of parameters for {model}",
+            expected=f"{2 + len(names)}: {', '.join(('width', 'height', *names))}",
+            got=len(values),
+        )
+    width, height, *numbers = table.numbers(values)
+    if not all(0 < side <= MAX_IMAGE_SIDE and side.is_integer() for side in (width, height)):
+        raise table.error(
+            "camera.size",
+            "the image size of the camera is not usable",
+            expected=f"1 to {MAX_IMAGE_SIDE} whole pixels",
+            got=f"{values[0]} x {values[1]}",
+        )
+    if model == UNKNOWN_CAMERA:
+        return None
+    with table.errors_at_row():
+        return Camera(model, int(width), int(height), tuple(numbers))
+
+
+def _read_rigs(
+    root: Path, sensors: Mapping[str, Sensor], notes: list[str]
+) -> dict[str, dict[str, Pose | None]]:
+    table = Table(root, "sensors/rigs.txt", 9)
+    if not table.exists():
+        return {}
+    members: dict[str, dict[str, Pose | None]] = {}
+    lines: dict[tuple[str, str], int] = {}
+    for rig_id, member_id, *fields in table:
+        _refuse_empty(table, rig_id)
+        if rig_id in sensors:
+            raise table.error(
+                "kapture.rig_is_sensor",
+                "a rig cannot have the id of a sensor",
+                expected="an id that sensors.txt does not have",
+                got=rig_id,
+            )
+        rig = members.setdefault(rig_id, {})
+        _refuse_duplicate(table, member_id, rig)
+        rig[member_id] = _parse_pose(table, fields)
+        if rig[member_id] is None:
+            table.tolerate("transforms are unknown or incomplete", f"{rig_id}, {member_id}")
+        lines[rig_id, member_id] = table.line
+    # Only now is it known which ids are rigs.
+    for (rig_id, member_id), line in lines.items():
+        if member_id not in sensors and member_id not in members:
+            table.line = line
+            table.tolerate("members that sensors.txt does not have were left out", member_id)
+            del members[rig_id][member_id]
+    notes += table.notes()
+    table.line = 0
+    return unroll_rigs(members, table)
+
+
+def _read_trajectories(
+    root: Path, devices: Container[str], notes: list[str]
+) -> dict[tuple[int, str], Pose]:
+    table = Table(root, "sensors/trajectories.txt", 9)
+    if not table.exists():
+        return {}
+    poses: dict[tuple[int, str], Pose | None] = {}
+    for timestamp, device_id, *fields in table:
+        key = (table.timestamp(timestamp), device_id)
+        _refuse_duplicate(table, key, poses)
+        pose = _parse_pose(table, fields)
+        if device_id not in devices:
+            table.tolerate("poses of unknown devices were left out", device_id)
+            pose = None
+        elif pose is None:
+            table.tolerate("poses without rotation or translation were left out", device_id)
+        poses[key] = pose
+    notes += table.notes()
+    return {key: pose for key, pose in poses.items() if pose is not None}
+
+
+def _parse_pose(table: Table, fields: list[str]) -> Pose | None:
+    rotation, translation = (
+        table.numbers([field for field in part if field]) for part in (fields[:4], fields[4:])
+    )
+    if len(rotation) < 4 or len(translation) < 3:
+        return None
+    with table.errors_at_row():
+        return Pose.from_quaternion(rotation, translation)
+
+
+def _read_files(
+    root: Path, name: str, kind: str, sensors: Mapping[str, Sensor], notes: list[str]
+) -> tuple[FileRecord, ...]:
+    table = Table(root, f"sensors/{name}", 3)
+    if not table.exists():
+        return ()
+    records: dict[tuple[int, str], FileRecord | None] = {}
+    paths: set[str] = set()
+    data = root / "sensors" / "records_data"
+    for timestamp, sensor_id, path_text in table:
+        key = (table.timestamp(timestamp), sensor_id)
+        _refuse_duplicate(table, key, records)
+        try:
+            path = relative_path(path_text)
+        except ValueError:
+            raise table.error(
+                "kapture.path",
+                "the path cannot be used",
+                expected="a relative path that stays inside sensors/records_data",
+                got=path_text,
+            ) from None
+        if not _is_known(table, sensors, sensor_id, kind):
+            records[key] = None
+            continue
+        if path in paths:
+            raise table.error(
+                "kapture.duplicate",
+                "the path is listed twice; it must name one record",
+                expected="every path once",
+                got=path,
+            )
+        paths.add(path)
+        records[key] = FileRecord(*key, path)
+        # Path.is_file would raise for a name that is too long.
+        if not os.path.isfile(data / path):  # noqa: PTH113
+            table.tolerate("files do not exist", path)
+    notes += table.notes()
+    return tuple(record for key in sorted(records) if (record := records[key]) is not None)
+
+
+def _read_gnss(
+    root: Path, sensors: Mapping[str, Sensor], notes: list[str]
+) -> tuple[GnssRecord, ...]:
+    table = Table(root, "sensors/records_gnss.txt", 7)
+    if not table.exists():
+        return ()
+    records: dict[tuple[int, str], GnssRecord | None] = {}
+    for timestamp, sensor_id, *fields in table:
+        key = (table.timestamp(timestamp), sensor_id)
+        _refuse_duplicate(table, key, records)
+        fix = GnssRecord(*key, *table.numbers(fields))
+        records[key] = fix if _is_known(table, sensors, sensor_id, "gnss") else None
+    notes += table.notes()
+    return tuple(record for key in sorted(records) if (record := records[key]) is not None)
+
+
+def _is_known(table: Table, sensors: Mapping[str, Sensor], sensor_id: str, kind: str) -> bool:
+    sensor = sensors.get(sensor_id)
+    if sensor is None:
+        table.tolerate("records of unknown sensors were left out", sensor_id)
+    elif sensor.kind != kind:
+        table.tolerate(
+            f"records of sensors that are not of type {kind} were left out",
+            f"{sensor_id} is of type {sensor.kind!r}",
+        )
+    return sensor is not None and sensor.kind == kind
+
+
+def _refuse_duplicate(table: Table, key: object, known: Container[object]) -> None:
+    if key in known:
+        raise table.error(
+            "kapture.duplicate",
+            "listed before in this file",
+            expected="every key once",
+            got=", ".join(map(str, key)) if isinstance(key, tuple) else key,
+        )
+
+
+def _refuse_empty(table: Table, device_id: str) -> None:
+    if not device_id:
+        raise table.error("kapture.field", "the id is empty", expected="an id in the first column")

@@ -1,0 +1,141 @@
+"""Rows of one kapture text file, with errors that name file and line."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from visloc.errors import DatasetError, InvalidInput
+
+_VERSION = re.compile(r"#\s*kapture format:\s*(\d{1,4})\.(\d{1,4})", re.ASCII)
+_INTEGER = re.compile(r"[+-]?\d{1,19}", re.ASCII)
+_INT64_LIMIT = 2**63
+
+
+class Table:
+    """One text file of a dataset: iterates over its rows and collects what was tolerated.
+
+    Args:
+        root: folder of the dataset.
+        relative: path of the file in it, with forward slashes.
+        num_columns: fields of every row; None where they differ.
+    """
+
+    def __init__(self, root: Path, relative: str, num_columns: int | None) -> None:
+        self.relative = relative
+        self.line = 0  # of the row at hand, from 1
+        self._path = root / relative
+        self._num_columns = num_columns
+        self._tolerated: Counter[str] = Counter()
+        self._examples: dict[str, str] = {}
+
+    def exists(self) -> bool:
+        """Tell whether the file is there."""
+        try:
+            self._path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        except OSError as error:
+            raise self._unreadable(error) from error
+        return True
+
+    def version(self) -> tuple[int, int] | None:
+        """Return the version that the first line declares, None when it declares none."""
+        for line in self._lines():
+            match = _VERSION.match(line.strip())
+            return None if match is None else (int(match[1]), int(match[2]))
+        return None
+
+    def __iter__(self) -> Iterator[list[str]]:
+        for line in self._lines():
+            text = line.strip()
+            if not text or text[0] == "#":
+                continue
+            fields = [field.strip() for field in text.split(",")]
+            if self._num_columns is not None and len(fields) != self._num_columns:
+                raise self.error(
+                    "kapture.column_count",
+                    "wrong number of columns (fields cannot contain commas)",
+                    expected=str(self._num_columns),
+                    got=len(fields),
+                )
+            yield fields
+
+    def error(
+        self, code: str, message: str, *, expected: str | None = None, got: object = None
+    ) -> DatasetError:
+        """Make an error about the row at hand."""
+        where = f"{self.relative}:{self.line}" if self.line else self.relative
+        return DatasetError(code, message, field=where, expected=expected, got=got)
+
+    @contextmanager
+    def errors_at_row(self) -> Iterator[None]:
+        """Turn what a value says of itself into an error about the row at hand."""
+        try:
+            yield
+        except InvalidInput as error:
+            raise self.error(
+                error.code, error.message, expected=error.expected, got=error.got
+            ) from None
+
+    def tolerate(self, what: str, example: str) -> None:
+        """Count one row, or one thing said in it, that is left out."""
+        self._tolerated[what] += 1
+        self._examples.setdefault(what, f"line {self.line}: {example}")
+
+    def notes(self) -> list[str]:
+        """Return one sentence for each kind of thing tolerated, with its count."""
+        return [
+            f"{self.relative}: {count} {what} (first in {self._examples[what]})"
+            for what, count in self._tolerated.items()
+        ]
+
+    def timestamp(self, text: str) -> int:
+        """Parse an int64."""
+        if _INTEGER.fullmatch(text):
+            value = int(text)
+            if -_INT64_LIMIT <= value < _INT64_LIMIT:
+                return value
+        raise self.error(
+            "kapture.timestamp", "not a timestamp", expected="a 64-bit integer", got=text
+        )
+
+    def numbers(self, texts: list[str]) -> list[float]:
+        """Parse finite numbers."""
+        numbers = []
+        for text in texts:
+            try:
+                value = math.nan if "_" in text else float(text)  # Python reads 1_000 as a number
+            except ValueError:
+                value = math.nan
+            if not math.isfinite(value):
+                raise self.error(
+                    "kapture.number", "not a number", expected="a finite number", got=text
+                )
+            numbers.append(value)
+        return numbers
+
+    def _lines(self) -> Iterator[str]:
+        self.line = 0
+        try:
+            with self._path.open(encoding="utf-8-sig") as file:
+                for line in file:
+                    self.line += 1
+                    yield line
+        except UnicodeDecodeError as error:
+            self.line = 0  # text is decoded in blocks, so the line would be wrong
+            raise self.error(
+                "kapture.encoding", "not a text file in UTF-8", expected="UTF-8", got=str(error)
+            ) from error
+        except OSError as error:
+            raise self._unreadable(error) from error
+
+    def _unreadable(self, error: OSError) -> DatasetError:
+        self.line = 0
+        return self.error(
+            "kapture.unreadable", "the file cannot be read", got=error.strerror or str(error)
+        )
