@@ -1,0 +1,82 @@
+"""Failures on the wire as the exceptions of ``visloc.errors``, the same over HTTP and gRPC."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from visloc import errors
+from visloc.errors import Unavailable, VislocError
+
+# By the name that the server sends.
+_KINDS = {
+    name: value
+    for name, value in vars(errors).items()
+    if isinstance(value, type) and issubclass(value, VislocError)
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Fallback:
+    """What to raise when an answer has a status but not our words, as proxies send."""
+
+    kind: type[VislocError]
+    code: str
+
+
+INVALID = Fallback(errors.InvalidInput, "request.invalid")
+NOT_FOUND = Fallback(errors.NotFound, "request.not_found")
+CONFLICT = Fallback(errors.Conflict, "request.conflict")
+TOO_LARGE = Fallback(errors.TooLarge, "request.too_large")
+OVERLOADED = Fallback(errors.Overloaded, "server.overloaded")
+UNAVAILABLE = Fallback(errors.Unavailable, "server.unavailable")
+INTERNAL = Fallback(errors.Unavailable, "server.internal")
+
+
+def received(parts: Mapping[str, object], fallback: Fallback, message: str) -> VislocError:
+    """Make the exception that the server describes.
+
+    Args:
+        parts: ``kind``, ``code``, ``message``, ``field``, ``expected``, ``got``; any may lack.
+        fallback: kind and code where the server names none that is known.
+        message: stands in for a missing one.
+    """
+    text = {name: str(value) for name, value in parts.items() if value is not None}
+    kind = _KINDS.get(text.get("kind", ""), fallback.kind)
+    return kind(
+        text.get("code") or fallback.code,
+        text.get("message") or message,
+        field=text.get("field"),
+        expected=text.get("expected"),
+        got=text.get("got"),
+    )
+
+
+def unreachable(server: str, why: str) -> Unavailable:
+    """Make the exception for a server that does not take or keep the connection."""
+    return Unavailable(
+        "server.unreachable",
+        "the server cannot be reached; check that it runs, and its address and port",
+        field=server,
+        got=why or None,
+    )
+
+
+def timed_out(server: str, timeout_s: float) -> Unavailable:
+    """Make the exception for an answer that did not come in time."""
+    return Unavailable(
+        "server.timeout",
+        "no answer in time; the server may be busy, or allow it more time",
+        field=server,
+        expected=f"an answer within {timeout_s:g} s",
+    )
+
+
+def not_understood(server: str, got: object) -> Unavailable:
+    """Make the exception for an answer that no localization service gives."""
+    return Unavailable(
+        "server.answer",
+        "this is not the answer of a localization service of this version; check the address",
+        field=server,
+        got=got,
+    )

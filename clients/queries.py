@@ -1,0 +1,136 @@
+"""The photos to localize: a kapture dataset, or a list of image paths with cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from visloc.errors import DatasetError, InvalidInput
+from visloc.geometry import Camera, Pose
+from visloc.kapture import read_dataset
+from visloc.kapture.text import relative_path
+
+_UNKNOWN_CAMERA = "UNKNOWN_CAMERA"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Query:
+    """One photo to localize.
+
+    Attributes:
+        name: as the dataset or list has it; unique.
+        path: the file, which may be missing.
+        camera: intrinsics; None when unknown.
+        truth: the true ``cam_from_world``, when known.
+    """
+
+    name: str
+    path: Path
+    camera: Camera | None
+    truth: Pose | None
+
+
+def read_queries(source: Path) -> list[Query]:
+    """Read a kapture folder or a text file that lists photos, in their order.
+
+    Each line of a list is ``image_name`` or ``image_name MODEL width height params...``,
+    separated by blanks, with names relative to the folder of the list. Empty lines and those
+    that begin with ``#`` are skipped. UNKNOWN_CAMERA, here or in kapture, sends no camera.
+
+    Raises:
+        DatasetError: codes ``kapture.*``, ``list.*``, ``camera.*``; ``queries.missing`` when
+            there is nothing at ``source``, ``queries.empty`` when it holds no photo.
+    """
+    if source.is_dir():
+        queries = _read_kapture(source)
+    elif source.is_file():
+        queries = _read_list(source)
+    else:
+        raise DatasetError(
+            "queries.missing",
+            "no such file or folder",
+            field=str(source),
+            expected="a kapture folder, or a text file that lists photos",
+        )
+    if not queries:
+        raise DatasetError(
+            "queries.empty",
+            "there is no photo in it",
+            field=str(source),
+            expected="photos in sensors/records_camera.txt" if source.is_dir() else "a line each",
+        )
+    return queries
+
+
+def _read_kapture(root: Path) -> list[Query]:
+    dataset = read_dataset(root)
+    return [
+        Query(
+            record.path,
+            dataset.path_of(record),
+            dataset.sensors[record.sensor_id].camera,
+            dataset.pose(record),
+        )
+        for record in dataset.images
+    ]
+
+
+def _read_list(path: Path) -> list[Query]:
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(
+            "list.unreadable",
+            "the list cannot be read",
+            field=str(path),
+            expected="a text file in UTF-8 with one photo per line",
+            got=str(error),
+        ) from error
+    queries: dict[str, Query] = {}
+    for number, line in enumerate(lines, start=1):
+        fields = line.split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        where = f"{path}:{number}"
+        name = _parse_name(where, fields[0])
+        if name in queries:
+            raise DatasetError(
+                "list.duplicate", "listed twice", field=where, expected="every name once", got=name
+            )
+        queries[name] = Query(name, path.parent / name, _parse_camera(where, fields[1:]), None)
+    return list(queries.values())
+
+
+def _parse_name(where: str, text: str) -> str:
+    try:
+        return relative_path(text)
+    except ValueError:
+        raise DatasetError(
+            "list.path",
+            "the path cannot be used",
+            field=where,
+            expected="a path relative to the folder of the list, that stays inside it",
+            got=text,
+        ) from None
+
+
+def _parse_camera(where: str, fields: Sequence[str]) -> Camera | None:
+    if not fields:
+        return None
+    if fields[0] == _UNKNOWN_CAMERA:
+        if len(fields) == 3 and all(field.isdecimal() for field in fields[1:]):
+            return None
+        raise DatasetError(
+            "camera.param_count",
+            f"wrong parameters for {_UNKNOWN_CAMERA}",
+            field=where,
+            expected="2: width, height",
+            got=" ".join(fields[1:]),
+        )
+    try:
+        return Camera.from_text(" ".join(fields))
+    except InvalidInput as error:
+        raise DatasetError(
+            error.code, error.message, field=where, expected=error.expected, got=error.got
+        ) from None

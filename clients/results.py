@@ -1,0 +1,162 @@
+"""Results on disk: ``results.jsonl``, ``poses.txt``, and files that are written whole or not."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from clients.answers import parse_pose
+from clients.running import Outcome
+from clients.types import PoseEstimate
+from visloc.errors import DatasetError, InvalidInput
+
+_ERROR = "error"
+_STATUSES = ("localized", "not_localized", _ERROR)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredResult:
+    """One line of ``results.jsonl``.
+
+    Attributes:
+        name: of the photo.
+        status: localized, not_localized or error.
+        pose: when localized.
+        offset: where the line begins in the file, bytes.
+        length: of the line with its end, bytes.
+    """
+
+    name: str
+    status: str
+    pose: PoseEstimate | None
+    offset: int
+    length: int
+
+
+def result_line(outcome: Outcome) -> str:
+    """Write an outcome as one line of JSON: the name, then the answer as received.
+
+    A photo without an answer has ``"status": "error"`` and an object ``error`` with kind, code,
+    message, field, expected and got.
+    """
+    entry: dict[str, Any] = {"name": outcome.query.name}
+    if outcome.result is not None:
+        entry |= outcome.result.raw
+    else:
+        error = outcome.error
+        assert error is not None
+        details = {
+            name: getattr(error, name) for name in ("code", "message", "field", "expected", "got")
+        }
+        entry |= {"status": _ERROR, "error": {"kind": type(error).__name__} | details}
+    return json.dumps(entry) + "\n"
+
+
+def drop_torn_line(path: Path) -> None:
+    """Cut off what a killed run left of its last line; a missing file stays missing."""
+    if not path.exists():
+        return
+    with path.open("r+b") as file:
+        size = file.seek(0, os.SEEK_END)
+        end = size
+        while end > 0:
+            start = max(0, end - 65536)
+            file.seek(start)
+            newline = file.read(end - start).rfind(b"\n")
+            if newline >= 0:
+                end = start + newline + 1
+                break
+            end = start
+        if end < size:
+            file.truncate(end)
+
+
+def read_results(path: Path) -> Iterator[StoredResult]:
+    """Read ``results.jsonl``; a missing file has no lines.
+
+    Raises:
+        DatasetError: ``results.line``, with file and line.
+    """
+    if not path.exists():
+        return
+    offset = 0
+    with path.open("rb") as file:
+        for number, line in enumerate(file, start=1):
+            try:
+                name, status, pose = _parse_line(line)
+            except (KeyError, TypeError, ValueError, InvalidInput) as error:
+                raise DatasetError(
+                    "results.line",
+                    "not a result; begin again with --restart, or remove the line",
+                    field=f"{path}:{number}",
+                    got=str(error),
+                ) from error
+            yield StoredResult(name, status, pose, offset, len(line))
+            offset += len(line)
+
+
+def copy_lines(source: Path, results: Iterable[StoredResult], target: Path) -> None:
+    """Copy lines of ``source`` to ``target``, in the order given; they may be the same file."""
+    with source.open("rb") as file:
+
+        def lines() -> Iterator[bytes]:
+            for result in results:
+                file.seek(result.offset)
+                yield file.read(result.length)
+
+        write_whole(target, lines())
+
+
+def write_poses(path: Path, poses: Iterable[tuple[str, PoseEstimate]]) -> None:
+    """Write ``name qw qx qy qz tx ty tz`` lines of ``cam_from_world``, every digit as received.
+
+    Names may contain blanks; the last seven fields are always the numbers.
+    """
+    write_whole(path, (_pose_line(name, pose).encode() for name, pose in poses))
+
+
+def write_whole(path: Path, parts: Iterable[bytes]) -> None:
+    """Write a file so that a reader sees the old one or the new one, never a half."""
+    unfinished = path.with_name(f".{path.name}.new")
+    with unfinished.open("wb") as file:
+        _write_and_sync(file, parts)
+    unfinished.replace(path)
+
+
+def check_can_be_written(paths: Sequence[Path]) -> None:
+    """Find out before a long run, not after it.
+
+    Raises:
+        InvalidInput: ``output.folder``.
+    """
+    for path in paths:
+        if path.is_dir() or not os.access(path.parent, os.W_OK):
+            raise InvalidInput(
+                "output.folder",
+                "cannot be written",
+                field=str(path),
+                expected="a file in an existing folder that is not write-protected",
+            )
+
+
+def _parse_line(line: bytes) -> tuple[str, str, PoseEstimate | None]:
+    entry = json.loads(line)
+    name, status = entry["name"], entry["status"]
+    if not isinstance(name, str) or status not in _STATUSES:
+        raise ValueError(f"name {name!r}, status {status!r}")
+    return name, status, parse_pose(entry["pose"]) if status == "localized" else None
+
+
+def _pose_line(name: str, pose: PoseEstimate) -> str:
+    numbers = (repr(value) for value in (*pose.rotation_wxyz, *pose.translation))
+    return f"{name} {' '.join(numbers)}\n"
+
+
+def _write_and_sync(file: BinaryIO, parts: Iterable[bytes]) -> None:
+    file.writelines(parts)
+    file.flush()
+    os.fsync(file.fileno())

@@ -1,0 +1,312 @@
+"""What a caller of the clients sends and receives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.errors import InvalidInput
+from visloc.geometry import Camera, Pose
+
+OptionValue = int | float | str
+
+# On the wire whole numbers are uint32. Narrower ranges are the server's to tell.
+_MAX_WHOLE = 2**32 - 1
+_OPTION_KINDS: Mapping[str, type[int] | type[float] | type[str]] = {
+    "preset": str,
+    "top_k": int,
+    "max_error_px": float,
+    "min_inliers": int,
+    "min_inlier_ratio": float,
+    "read_as": str,
+    "seed": int,
+}
+_EXPECTED = {int: f"a whole number from 0 to {_MAX_WHOLE}", float: "a finite number", str: "a text"}
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizeOptions:
+    """What may be chosen per photo; None leaves the choice to the server.
+
+    Attributes:
+        preset: thresholds to start from: default, config1 or config2.
+        top_k: how many mapping photos to match against.
+        max_error_px: largest reprojection error of an inlier, pixels.
+        min_inliers: fewest inliers of an accepted pose.
+        min_inlier_ratio: smallest share of inliers among the correspondences, 0 to 1.
+        read_as: ``stored``, or ``upright`` to turn the photo by its EXIF orientation before
+            features are found; the pose refers to the pixels as stored either way.
+        seed: of RANSAC; equal seeds give equal answers.
+
+    Raises:
+        InvalidInput: ``options.NAME`` for a value that cannot be sent.
+    """
+
+    preset: str | None = None
+    top_k: int | None = None
+    max_error_px: float | None = None
+    min_inliers: int | None = None
+    min_inlier_ratio: float | None = None
+    read_as: str | None = None
+    seed: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in self.given().items():
+            if not _can_be_sent(value, _OPTION_KINDS[name]):
+                raise _not_usable(name, value)
+
+    @staticmethod
+    def from_mapping(values: Mapping[str, Any]) -> LocalizeOptions:
+        """Make options from names and values.
+
+        Raises:
+            InvalidInput: ``request.unknown_field`` for a name that is none of the attributes.
+        """
+        for name in values:
+            _check_option_name(name)
+        return LocalizeOptions(**values)
+
+    @staticmethod
+    def from_texts(texts: Iterable[str]) -> LocalizeOptions:
+        """Parse ``NAME=VALUE``, as the command line has them.
+
+        Raises:
+            InvalidInput: ``options.syntax``, ``request.unknown_field`` or ``options.NAME``.
+        """
+        values: dict[str, OptionValue] = {}
+        for text in texts:
+            name, equals, value = text.partition("=")
+            if not equals:
+                raise InvalidInput(
+                    "options.syntax",
+                    "not an option",
+                    field="option",
+                    expected="NAME=VALUE such as top_k=10",
+                    got=text,
+                )
+            _check_option_name(name)
+            try:
+                values[name] = _OPTION_KINDS[name](value)
+            except ValueError:
+                raise _not_usable(name, value) from None
+        return LocalizeOptions.from_mapping(values)
+
+    def given(self) -> dict[str, OptionValue]:
+        """The options that are not left to the server, by name."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseEstimate:
+    """A pose and how sure it is.
+
+    Attributes:
+        cam_from_world: the pose.
+        rotation_wxyz: its rotation as a unit quaternion (w, x, y, z), every digit as sent.
+        translation: its translation, every digit as sent.
+        position: (3,) camera centre in the world, metres when the map is metric.
+        orientation: (4,) rotation of ``world_from_cam`` as a quaternion (w, x, y, z).
+        covariance: (6, 6) of rotation (rad), then translation, for R <- Exp(w) R and
+            t <- t + dt of ``cam_from_world``.
+        position_std: (3,) standard deviations of ``position`` along the world's axes.
+        orientation_std_deg: (3,) standard deviations about the camera's x, y, z, degrees.
+    """
+
+    cam_from_world: Pose
+    rotation_wxyz: tuple[float, float, float, float]
+    translation: tuple[float, float, float]
+    position: NDArray[np.float64]
+    orientation: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    position_std: NDArray[np.float64]
+    orientation_std_deg: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why there is no pose.
+
+    Attributes:
+        stage: the stage that gave up: features, retrieval, matching, pose or gate.
+        reason: a stable word.
+        message: the reason for a person.
+    """
+
+    stage: str
+    reason: str
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class RetrievedImage:
+    """A mapping photo that the query was matched against.
+
+    Attributes:
+        image: its name in the map.
+        score: fused similarity, comparable within one answer only.
+        similarities: cosine similarity by global descriptor.
+    """
+
+    image: str
+    score: float
+    similarities: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraUsed:
+    """The intrinsics that the pose was computed with.
+
+    Attributes:
+        camera: for the pixels as stored.
+        source: given, given_scaled (from another size), exif, or guess.
+    """
+
+    camera: Camera
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class Orientation:
+    """How the pixels were read.
+
+    Attributes:
+        exif: the photo's EXIF orientation, 1 to 8; 1 when it has none.
+        read_as: stored or upright.
+    """
+
+    exif: int
+    read_as: str
+
+
+@dataclass(frozen=True, slots=True)
+class MapVersion:
+    """The map that answered."""
+
+    id: str
+    version: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalizeResult:
+    """The answer to one photo.
+
+    Attributes:
+        request_id: names the request in the server's logs.
+        pose: None when the photo was not localized; then ``refusal`` says why.
+        refusal: None when the photo was localized.
+        keypoints: found in the photo.
+        correspondences: 2D-3D, given to the solver.
+        inliers: correspondences that agree with the pose.
+        inlier_ratio: inliers / correspondences.
+        retrieved: mapping photos matched against, best first.
+        camera: intrinsics used and where they came from.
+        orientation: how the pixels were read.
+        map: the map that answered.
+        seconds: wall time on the server by stage.
+        raw: the answer as received; the same over HTTP and gRPC.
+    """
+
+    request_id: str
+    pose: PoseEstimate | None
+    refusal: Refusal | None
+    keypoints: int
+    correspondences: int
+    inliers: int
+    inlier_ratio: float
+    retrieved: tuple[RetrievedImage, ...]
+    camera: CameraUsed
+    orientation: Orientation
+    map: MapVersion
+    seconds: Mapping[str, float]
+    raw: Mapping[str, Any]
+
+    @property
+    def localized(self) -> bool:
+        """Whether there is a pose."""
+        return self.pose is not None
+
+
+@dataclass(frozen=True, slots=True)
+class MapInfo:
+    """A map that the server has.
+
+    Attributes:
+        id: its name.
+        version: of the map that ``id`` alone stands for, or the one asked for.
+        created: ISO 8601, UTC.
+        metric: whether one unit of the world is a metre.
+        method: how its landmarks were made.
+        local_features: registry name.
+        global_features: registry names.
+        images: mapping photos.
+        landmarks: 3D points.
+        observations: sightings of landmarks in mapping photos.
+        extent: least and greatest x, y, z of the landmarks, in the world.
+        size_bytes: on the server's disk.
+    """
+
+    id: str
+    version: str
+    created: str
+    metric: bool
+    method: str
+    local_features: str
+    global_features: tuple[str, ...]
+    images: int
+    landmarks: int
+    observations: int
+    extent: tuple[tuple[float, ...], tuple[float, ...]]
+    size_bytes: int
+
+    @property
+    def ref(self) -> str:
+        """``id@version``: this version, even after the server has switched to a newer one."""
+        return f"{self.id}@{self.version}"
+
+
+@dataclass(frozen=True, slots=True)
+class ServerInfo:
+    """The server itself.
+
+    Attributes:
+        version: of the service; None when a gRPC server does not say.
+    """
+
+    version: str | None
+
+
+def _check_option_name(name: str) -> None:
+    if name not in _OPTION_KINDS:
+        raise InvalidInput(
+            "request.unknown_field",  # as the server says it
+            "unknown field",
+            field=f"options.{name}",
+            expected=f"one of {', '.join(_OPTION_KINDS)}",
+            got=name,
+        )
+
+
+def _can_be_sent(value: object, kind: type) -> bool:
+    if isinstance(value, bool):
+        return False
+    if kind is int:
+        return isinstance(value, int) and 0 <= value <= _MAX_WHOLE
+    if kind is float:
+        return isinstance(value, int | float) and math.isfinite(value)
+    return isinstance(value, str) and value.isprintable()
+
+
+def _not_usable(name: str, value: object) -> InvalidInput:
+    return InvalidInput(
+        f"options.{name}",
+        "not usable",
+        field=f"options.{name}",
+        expected=_EXPECTED[_OPTION_KINDS[name]],
+        got=value,
+    )

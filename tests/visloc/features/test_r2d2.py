@@ -1,0 +1,278 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from visloc.errors import WeightsError
+from visloc.features.checkpoint import read_checkpoint
+from visloc.features.r2d2 import (
+    FAST_R2D2,
+    R2D2,
+    R2D2Extractor,
+    R2D2Network,
+    load_faster2d2,
+    load_r2d2,
+    pyramid_sizes,
+)
+
+# The published networks, written down a second time: number of the convolution in the state
+# dict, kernel, dilation, outputs as a multiple of the first layer's, batch norm, ReLU.
+TABLES = {
+    "r2d2": (
+        (0, 3, 1, 1, True, True),
+        (3, 3, 1, 1, True, True),
+        (6, 3, 1, 2, True, True),
+        (9, 3, 2, 2, True, True),
+        (12, 3, 2, 4, True, True),
+        (15, 3, 4, 4, True, True),
+        (18, 2, 4, 4, True, False),
+        (20, 2, 8, 4, True, False),
+        (22, 2, 16, None, False, False),
+    ),
+    "faster2d2": (
+        (0, 3, 1, 1, True, True),
+        (3, 3, 1, 1, True, True),
+        (6, 3, 1, 2, True, True),
+        (10, 3, 1, 2, True, True),
+        (13, 3, 1, 4, True, True),
+        (16, 3, 2, 4, True, True),
+        (19, 2, 2, 4, True, False),
+        (21, 2, 4, 4, True, False),
+        (23, 2, 8, None, False, False),
+    ),
+}
+ARCHITECTURES = {"r2d2": R2D2, "faster2d2": FAST_R2D2}
+LOADERS = {"r2d2": load_r2d2, "faster2d2": load_faster2d2}
+FILE_NAMES = {"r2d2": "r2d2_WASF_N16.pt", "faster2d2": "faster2d2_WASF_N16.pt"}
+BOTH = pytest.mark.parametrize("name", ["r2d2", "faster2d2"])
+
+
+def _random_state(name: str, *, base_width: int = 8, prefix: str = "") -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    state: dict[str, Tensor] = {}
+    inputs = 3
+    for number, kernel, _, width, normalized, _ in TABLES[name]:
+        outputs = width * base_width if width else 128
+        shape = (outputs, inputs, kernel, kernel)
+        spread = (2 / (inputs * kernel**2)) ** 0.5
+        state[f"ops.{number}.weight"] = torch.randn(shape, generator=generator) * spread
+        state[f"ops.{number}.bias"] = torch.randn(outputs, generator=generator)
+        if normalized:
+            norm = f"ops.{number + 1}"
+            state[f"{norm}.running_mean"] = torch.randn(outputs, generator=generator)
+            state[f"{norm}.running_var"] = torch.rand(outputs, generator=generator) + 0.5
+            state[f"{norm}.num_batches_tracked"] = torch.tensor(7)
+        inputs = outputs
+    for head, num_logits in (("clf", 2), ("sal", 1)):
+        state[f"{head}.weight"] = torch.randn((num_logits, 128, 1, 1), generator=generator) / 100
+        state[f"{head}.bias"] = torch.randn(num_logits, generator=generator)
+    return {prefix + key: value for key, value in state.items()}
+
+
+def _save(folder: Path, name: str, state: dict[str, Tensor]) -> Path:
+    path = folder / FILE_NAMES[name]
+    torch.save({"net": "untold", "state_dict": state}, path)
+    return path
+
+
+def _reference(name: str, state: dict[str, Tensor], image: Tensor) -> tuple[Tensor, ...]:
+    """Evaluate the network layer by layer, nothing folded: x, clf and sal logits, descriptors."""
+    x = image
+    for number, kernel, dilation, _, normalized, relu in TABLES[name]:
+        x = F.conv2d(
+            x,
+            state[f"ops.{number}.weight"],
+            state[f"ops.{number}.bias"],
+            dilation=dilation,
+            padding=dilation if kernel == 3 else dilation // 2,
+        )
+        if normalized:
+            norm = f"ops.{number + 1}"
+            x = F.batch_norm(x, state[f"{norm}.running_mean"], state[f"{norm}.running_var"])
+        if relu:
+            x = x.relu()
+        if name == "faster2d2" and number == 6:
+            x = F.max_pool2d(x, 2, 2)
+    if name == "faster2d2":
+        x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
+    clf = F.conv2d(x**2, state["clf.weight"], state["clf.bias"])
+    sal = F.conv2d(x**2, state["sal.weight"], state["sal.bias"])
+    return x, clf, sal, F.normalize(x, dim=1)
+
+
+@BOTH
+def test_folded_strip_wise_network_equals_the_plain_one(name: str, tmp_path: Path) -> None:
+    state = _random_state(name)
+    network = R2D2Network(ARCHITECTURES[name], read_checkpoint(_save(tmp_path, name, state))).eval()
+    image = torch.randn((1, 3, 151, 90), generator=torch.Generator().manual_seed(0))
+    with torch.inference_mode():
+        _, clf, sal, descriptors = _reference(name, state, image)
+        features = network(image)
+        logits = network.logits(features)
+        height, width = (151, 90) if name == "r2d2" else (150, 90)
+        assert logits.shape == (2, height, width)
+        torch.testing.assert_close(logits[0], clf[0, 1] - clf[0, 0], rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(logits[1], sal[0, 0], rtol=1e-4, atol=1e-4)
+        reliability = torch.sigmoid(logits[0])
+        torch.testing.assert_close(reliability, clf[0].softmax(dim=0)[1], rtol=1e-4, atol=1e-4)
+        y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        rows = network.descriptors(features, x.flatten(), y.flatten())
+        expected = descriptors[0].flatten(1).T
+        torch.testing.assert_close(rows, expected, rtol=1e-4, atol=1e-4)
+
+
+@BOTH
+@pytest.mark.parametrize("base_width", [8, 48])
+@pytest.mark.parametrize("prefix", ["", "module."])
+def test_own_trained_weights_of_another_width_load(
+    name: str, base_width: int, prefix: str, tmp_path: Path
+) -> None:
+    path = _save(tmp_path, name, _random_state(name, base_width=base_width, prefix=prefix))
+    extractor = LOADERS[name](tmp_path)
+    assert extractor.fingerprint.name == name
+    assert extractor.fingerprint.weights_sha256 == read_checkpoint(path).sha256
+    assert extractor.descriptor_dim == 128
+
+
+@BOTH
+def test_weights_of_the_other_network_are_refused_by_name(name: str, tmp_path: Path) -> None:
+    other = "faster2d2" if name == "r2d2" else "r2d2"
+    _save(tmp_path, name, _random_state(other))
+    wanted, held = ("R2D2", "Fast-R2D2") if name == "r2d2" else ("Fast-R2D2", "R2D2")
+    with pytest.raises(WeightsError, match=f"not the weights of {wanted} but of {held};") as caught:
+        LOADERS[name](tmp_path)
+    assert caught.value.code == "weights.network"
+    assert FILE_NAMES[name] in str(caught.value)
+
+
+@BOTH
+def test_published_weights_of_the_other_network_are_refused_by_name(
+    name: str, shared_weights: Path, tmp_path: Path
+) -> None:
+    other = "faster2d2" if name == "r2d2" else "r2d2"
+    (tmp_path / FILE_NAMES[name]).symlink_to(shared_weights / FILE_NAMES[other])
+    with pytest.raises(WeightsError, match="not the weights of"):
+        LOADERS[name](tmp_path)
+
+
+def test_weights_of_another_kind_of_network_are_refused(
+    shared_weights: Path, tmp_path: Path
+) -> None:
+    (tmp_path / FILE_NAMES["r2d2"]).symlink_to(shared_weights / "aliked-n16.pth")
+    with pytest.raises(WeightsError, match="but of another network"):
+        load_r2d2(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda state: state.pop("ops.12.bias"),
+        lambda state: state.update({"ops.12.weight": torch.ones(32, 16, 5, 5)}),
+        lambda state: state.update({"extra": torch.ones(1)}),
+        lambda state: state.update({"ops.0.weight": torch.tensor(1.0)}),
+        lambda state: state.update({"clf.bias": torch.tensor([0.0, float("nan")])}),
+    ],
+)
+def test_weights_that_do_not_fit_exactly_are_refused(change: object, tmp_path: Path) -> None:
+    state = _random_state("r2d2")
+    assert callable(change)
+    change(state)
+    _save(tmp_path, "r2d2", state)
+    with pytest.raises(WeightsError):
+        load_r2d2(tmp_path)
+
+
+def test_missing_weights_are_asked_for(tmp_path: Path) -> None:
+    for load in LOADERS.values():
+        with pytest.raises(WeightsError, match="CC BY-NC-SA"):
+            load(tmp_path)
+
+
+def test_pyramid_of_a_vga_photo_is_the_published_one() -> None:
+    sizes = [size for _, size, is_used in pyramid_sizes(480, 640) if is_used]
+    assert sizes == [(480, 640), (404, 538), (339, 453), (285, 381), (240, 320), (202, 269)]
+
+
+def test_large_photos_are_looked_at_from_1024_px_downwards() -> None:
+    levels = list(pyramid_sizes(820, 1280))
+    assert [is_used for _, _, is_used in levels[:3]] == [False, False, True]
+    assert levels[2][1][1] == 905
+    assert levels[-1][1][1] >= 256
+
+
+@pytest.mark.parametrize("long_side", [1, 100, 255])
+def test_photos_below_256_px_are_looked_at_once_at_their_own_size(long_side: int) -> None:
+    assert list(pyramid_sizes(1, long_side)) == [(1.0, (1, long_side), True)]
+
+
+@pytest.mark.parametrize(
+    ("name", "published"),
+    [
+        ("r2d2", [1701, 1223, 888, 667, 482, 368]),
+        ("faster2d2", [1727, 1254, 883, 632, 456, 322]),
+    ],
+)
+def test_published_weights_find_the_published_number_of_keypoints(
+    name: str, published: list[int], shared_weights: Path, shared_data: Path
+) -> None:
+    path = next((shared_data / "redkitchen" / "query").rglob("frame-000110.color.jpg"))
+    rgb = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
+    assert rgb is not None
+    extractor = LOADERS[name](shared_weights)
+    features = extractor.extract(rgb.astype(np.uint8), max_keypoints=20_000)
+    patch_sizes, counts = np.unique(features.scales, return_counts=True)
+    np.testing.assert_allclose(patch_sizes, 32 * 2 ** (np.arange(6) / 4), rtol=1e-5)
+    np.testing.assert_allclose(counts, published, rtol=0.01)
+    assert len(features) == pytest.approx(sum(published), rel=0.01)
+    assert features.scores.min() >= 0.49
+    assert features.scores.max() < 1.0
+
+
+class _BrightnessNetwork(torch.nn.Module):
+    """Finds keypoints at the brightest pixels, in place of a trained network."""
+
+    def forward(self, image: Tensor) -> Tensor:
+        return image
+
+    def logits(self, features: Tensor) -> Tensor:
+        brightness = features[0].mean(dim=0)
+        return torch.stack([torch.full_like(brightness, 5.0), 2 * brightness])
+
+    def descriptors(self, _features: Tensor, x: Tensor, _y: Tensor) -> Tensor:
+        return F.normalize(torch.ones(len(x), 128), dim=1)
+
+
+def test_keypoints_of_all_scales_lie_where_the_photo_has_them(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    height, width = 479, 641
+    grid = np.stack(np.meshgrid(np.arange(30, 620, 40), np.arange(30, 460, 40)), axis=-1)
+    centers = grid.reshape(-1, 2) + generator.uniform(-4, 4, (grid.size // 2, 2))
+    rows, columns = np.mgrid[:height, :width] + 0.5  # the centre of the first pixel is (.5, .5)
+    squared = np.full((height, width), np.inf)
+    for x, y in centers:
+        squared = np.minimum(squared, (columns - x) ** 2 + (rows - y) ** 2)
+    rgb = np.repeat((255 * np.exp(-squared / 50)).astype(np.uint8)[:, :, None], 3, axis=2)
+
+    _save(tmp_path, "r2d2", _random_state("r2d2"))
+    extractor = load_r2d2(tmp_path)
+    assert isinstance(extractor, R2D2Extractor)
+    extractor.network = _BrightnessNetwork()  # type: ignore[assignment]
+    features = extractor.extract(rgb, max_keypoints=100_000)
+
+    offsets = features.keypoints[:, None] - centers[None]
+    nearest = np.linalg.norm(offsets, axis=2).argmin(axis=1)
+    errors = offsets[np.arange(len(offsets)), nearest]
+    for level in range(6):
+        patch_px = 32 * 2 ** (level / 4)
+        of_level = np.isclose(features.scales, patch_px)
+        assert len(set(nearest[of_level])) == len(centers)
+        pixel = patch_px / 32
+        assert np.abs(errors[of_level]).max() < 1.1 * pixel
+        # The reference's mapping x * W / w would be (pixel - 1) / 2 px off: 0.69 at the last.
+        assert np.abs(errors[of_level].mean(axis=0)).max() < 0.08 * pixel

@@ -1,0 +1,27 @@
+"""VLAD of the local features already extracted: a global descriptor for next to nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.features.base import Fingerprint
+from visloc.features.vlad import VLAD_PARAMETERS, VladDescriptor
+from visloc.types import LocalFeatures
+
+
+class LocalVlad(VladDescriptor):
+    """A photo's words are the descriptors of its local features, whatever their length."""
+
+    @property
+    def fingerprint(self) -> Fingerprint:
+        """Name and parameters; the local features have a fingerprint of their own."""
+        return Fingerprint("localvlad", revision=1, parameters=dict(VLAD_PARAMETERS))
+
+    def words(
+        self,
+        rgb: NDArray[np.uint8],  # noqa: ARG002 - the local features say it all
+        local: LocalFeatures,
+    ) -> NDArray[np.float32]:
+        """Return the local features' descriptors (N, D)."""
+        return local.descriptors
