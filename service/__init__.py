@@ -1,1 +1,1 @@
-"""placeholder"""
+"""The online server: ``python -m service``."""

@@ -24,7 +24,7 @@ LOADERS = {
     "xfeat": load_xfeat,
 }
 NEEDS_WEIGHTS = {"faster2d2", "r2d2"}
-HEIGHT, WIDTH = 256, 320
+HEIGHT, WIDTH = 192, 256
 
 
 @cache
@@ -93,12 +93,12 @@ def test_features_of_a_textured_image_are_valid_and_strongest_first(
     _assert_valid(features, (HEIGHT, WIDTH), extractor.descriptor_dim)
 
 
-@pytest.mark.parametrize("grey_level", [0, 117, 255])
-@pytest.mark.parametrize("shape", [(1, 1), (240, 320)])
+@pytest.mark.parametrize("color", [(0, 0, 0), (117, 117, 117), (10, 200, 90), (255, 255, 255)])
+@pytest.mark.parametrize("shape", [(1, 1), (201, 320)])
 def test_blank_image_gives_none(
-    extractor: LocalFeatureExtractor, grey_level: int, shape: tuple[int, int]
+    extractor: LocalFeatureExtractor, color: tuple[int, int, int], shape: tuple[int, int]
 ) -> None:
-    rgb = np.full((*shape, 3), grey_level, np.uint8)
+    rgb = np.full((*shape, 3), color, np.uint8)
     features = extractor.extract(rgb, max_keypoints=100)
     assert len(features) == 0
     _assert_valid(features, rgb.shape, extractor.descriptor_dim)
@@ -107,9 +107,7 @@ def test_blank_image_gives_none(
 @pytest.mark.parametrize("shape", [(1, 2), (7, 5), (16, 1), (33, 31), (40, 2000), (1500, 9)])
 def test_odd_sizes_are_handled(extractor: LocalFeatureExtractor, shape: tuple[int, int]) -> None:
     rgb = _texture(*shape)
-    _assert_valid(
-        extractor.extract(rgb, max_keypoints=500), rgb.shape, extractor.descriptor_dim
-    )
+    _assert_valid(extractor.extract(rgb, max_keypoints=500), rgb.shape, extractor.descriptor_dim)
 
 
 def test_max_keypoints_keeps_the_strongest(extractor: LocalFeatureExtractor) -> None:
@@ -169,22 +167,26 @@ def _scale_residuals(
     return residuals[np.abs(residuals).max(axis=1) < 3]
 
 
-# Networks are less precise than SIFT, and XFeat stands a change of scale worst; a half pixel
-# that is lost would be 0.13 to 0.25 px here.
-@pytest.mark.parametrize(("height", "width"), [(351, 438), (2 * HEIGHT, 2 * WIDTH)])
-def test_keypoints_follow_a_change_of_scale(
-    extractor: LocalFeatureExtractor, height: int, width: int
-) -> None:
+# px of the small image. The networks find a corner to about a pixel, and not quite the same
+# one at another scale; the tests below and the one of R2D2's scales are exact to half a pixel.
+SCALE_TOLERANCE_PX = {"faster2d2": 0.2, "r2d2": 0.2, "sift": 0.02, "xfeat": 0.25}
+
+
+def test_keypoints_follow_a_change_of_scale(extractor: LocalFeatureExtractor) -> None:
     small = np.ascontiguousarray(_texture(HEIGHT + 16, WIDTH + 16)[:HEIGHT, :WIDTH])
-    residuals = _scale_residuals(extractor, small, _resized(small, height, width))
-    print(extractor.fingerprint.name, len(residuals), np.median(residuals, axis=0), residuals.mean(axis=0))
+    residuals = _scale_residuals(extractor, small, _resized(small, 263, 351))
+    assert len(residuals) > 200
+    tolerance = SCALE_TOLERANCE_PX[extractor.fingerprint.name]
+    assert np.abs(np.median(residuals, axis=0)).max() < tolerance
 
 
 def test_keypoints_of_photos_shrunk_inside_lie_where_the_photo_has_them(
     extractor: LocalFeatureExtractor,
 ) -> None:
-    # 1280 px is the largest size that XFeat works at, SIFT's is 1600, R2D2's 1024.
-    small = _texture(128, 1280)
-    large = _resized(small, 256, 2560)
-    residuals = _scale_residuals(extractor, small, large)
-    print(extractor.fingerprint.name, len(residuals), np.median(residuals, axis=0), residuals.mean(axis=0))
+    # 1280 px is the largest size that XFeat works at, SIFT's is 1600, R2D2's 1024. A half pixel
+    # lost on the way back would be 0.25 px here.
+    small = _texture(96, 1280)
+    residuals = _scale_residuals(extractor, small, _resized(small, 192, 2560))
+    assert len(residuals) > 500
+    assert np.abs(np.median(residuals, axis=0)).max() < 0.02
+    assert np.abs(residuals.mean(axis=0)).max() < 0.05

@@ -27,13 +27,13 @@ from visloc.features.weights import (
 OLD_START = pickle.dumps(0x1950A86A20F9469CFC6C, 2) + pickle.dumps(1001, 2)
 SYSTEM_INFO = pickle.dumps({"protocol_version": 1001, "little_endian": True}, 2)
 TENSOR = (  # a tensor of two values in storage "7", as torch pickles it
-    b"ctorch._utils\n_rebuild_tensor_v2\n(((X\x07\x00\x00\x00storagectorch\nFloatStorage\n"
+    b"ctorch._utils\n_rebuild_tensor_v2\n((X\x07\x00\x00\x00storagectorch\nFloatStorage\n"
     b"X\x01\x00\x00\x007X\x03\x00\x00\x00cpuK%cNtQK%c(K%ct(K\x01t\x89ccollections\nOrderedDict\n)RtR"
 )
 
 
 def _tensor(*, length: int = 2, offset: int = 0, size: int = 2) -> bytes:
-    return TENSOR.replace(b"((X", b"(X") % (length, offset, size)
+    return TENSOR % (length, offset, size)
 
 
 def _dict_of(value: bytes, name: bytes = b"weight") -> bytes:
@@ -184,6 +184,21 @@ def test_malformed_content_is_refused_with_the_reason(
         read_checkpoint(write(tmp_path / "w.pt", content))
     assert caught.value.code == "weights.format"
     assert str(tmp_path / "w.pt") in str(caught.value)
+
+
+@WRITERS
+def test_check_of_tensors_cannot_be_switched_off_by_the_file(write: Writer, tmp_path: Path) -> None:
+    far_away = struct.pack("<i", -(10**9))  # a stride that would read outside of the storage
+    tensor = TENSOR[TENSOR.index(b"(X") :]
+    storage = b"(X" + tensor[2 : tensor.index(b"Q") + 1] % 2
+    ordered_dict = b"ccollections\nOrderedDict\n"
+    content = (
+        *(b"\x80\x02", ordered_dict, b")R", b"X\x06\x00\x00\x00weight"),
+        *(b"](", storage, b"K\x00", b"K\x02\x85", b"J", far_away, b"\x85", b"es"),
+        *(b"}X\x05\x00\x00\x00items", ordered_dict, b"sb."),
+    )
+    with pytest.raises(WeightsError, match="holds list"):
+        read_checkpoint(write(tmp_path / "w.pt", b"".join(content)))
 
 
 def test_storage_shorter_than_it_says_is_refused(tmp_path: Path) -> None:

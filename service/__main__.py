@@ -1,0 +1,67 @@
+"""``python -m service``: settings, logging, signals."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+import sys
+
+from service.settings import ServiceSettings, SettingsError, read_settings
+
+logger = logging.getLogger("service")
+
+# How long running requests may take after SIGTERM.
+GRACE_S = 30.0
+
+
+def main() -> None:
+    """Serve until SIGTERM or SIGINT."""
+    try:
+        settings = read_settings(sys.argv[1:], os.environ)
+    except SettingsError as error:
+        sys.exit(f"visloc-service: {error}")
+    logging.basicConfig(
+        level=settings.log_level.upper(),
+        format="%(asctime)s %(levelname)s %(name)s: %(message)s",
+    )
+    logging.getLogger("python_multipart").setLevel("ERROR")  # malformed forms are answered
+    # What libraries read once, when they are loaded: hence the late import below.
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(variable, str(settings.threads_per_worker))
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(settings.max_image_pixels))
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # damaged photos are answered, not logged
+    try:
+        asyncio.run(_serve(settings))
+    except OSError as error:
+        sys.exit(f"visloc-service: {error}")
+
+
+async def _serve(settings: ServiceSettings) -> None:
+    from service.server import Server
+
+    server = Server(settings)
+    stop = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    stopping = asyncio.create_task(stop.wait())
+
+    # The doors open first, so that /readyz can be asked while the maps are loaded.
+    await server.open()
+    loading = asyncio.create_task(server.load())
+    await asyncio.wait({loading, stopping}, return_when=asyncio.FIRST_COMPLETED)
+    if loading.done():
+        loading.result()
+        logger.info(
+            "ready: http://%s:%d grpc://%s:%d, maps: %s",
+            *(settings.host, server.http_port, settings.host, server.grpc_port),
+            ", ".join(server.engine.status.maps) or f"none in {settings.maps_dir}",
+        )
+        await stopping
+    logger.info("stopping")
+    await server.close(GRACE_S)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""What FastAPI cannot derive for /openapi.json: two kinds of bodies, examples, problems."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import FastAPI
+from pydantic.json_schema import models_json_schema
+
+from service.schemas import Camera, LocalizeRequest, Problem
+
+# A grey photo of 64 x 48 pixels: small enough to read, real enough to be posted as it is.
+EXAMPLE_IMAGE = (
+    "iVBORw0KGgoAAAANSUhEUgAAAEAAAAAwCAAAAACEICPDAAAAJ0lEQVR42u3MMREAAAgEoNfkRjeEmwcB"
+    "qMlNRyAQCAQCgUAgEDwNFm0oAOBnO1pYAAAAAElFTkSuQmCC"
+)
+EXAMPLE_REQUEST = {
+    "map": "office",
+    "image": EXAMPLE_IMAGE,
+    "camera": {"model": "PINHOLE", "width": 64, "height": 48, "params": [52.5, 52.5, 32, 24]},
+    "options": {"top_k": 10, "seed": 1},
+}
+_REF = "#/components/schemas/{model}"
+
+LOCALIZE_BODY: dict[str, Any] = {
+    "required": True,
+    "content": {
+        "multipart/form-data": {
+            "schema": {
+                "type": "object",
+                "required": ["map", "image"],
+                "additionalProperties": False,
+                "properties": {
+                    "map": {"type": "string", "description": "id, or id@version"},
+                    "image": {
+                        "type": "string",
+                        "contentMediaType": "application/octet-stream",
+                        "description": "the file: JPEG, PNG, WebP, TIFF or BMP",
+                    },
+                    "camera": {
+                        "type": "string",
+                        "description": "MODEL,width,height,params... or a Camera as JSON",
+                    },
+                    "options": {"type": "string", "description": "LocalizeOptions as JSON"},
+                },
+            },
+            "example": {
+                "map": "office",
+                "image": "(the bytes of the file)",
+                "camera": "PINHOLE,640,480,525,525,320,240",
+                "options": '{"top_k": 10, "seed": 1}',
+            },
+        },
+        "application/json": {
+            "schema": {"$ref": _REF.format(model="LocalizeRequest")},
+            "example": EXAMPLE_REQUEST,
+        },
+    },
+}
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Describe the errors of a route."""
+    return {
+        status: {
+            "description": "refused",
+            "content": {
+                "application/problem+json": {"schema": {"$ref": _REF.format(model="Problem")}}
+            },
+        }
+        for status in statuses
+    }
+
+
+class App(FastAPI):
+    """FastAPI with the schemas of what it does not parse itself."""
+
+    def openapi(self) -> dict[str, Any]:
+        """Return /openapi.json."""
+        if self.openapi_schema is None:
+            schema = super().openapi()
+            _, ours = models_json_schema(
+                [
+                    (LocalizeRequest, "validation"),
+                    (Camera, "validation"),  # named by LocalizeRequest's own schema of camera
+                    (Problem, "serialization"),
+                ],
+                ref_template=_REF,
+            )
+            schema["components"]["schemas"].update(ours["$defs"])
+            schema["components"]["schemas"]["Problem"]["example"] = {
+                "type": "about:blank",
+                "title": "Unprocessable Entity",
+                "status": 422,
+                "detail": "wrong number of parameters for PINHOLE",
+                "code": "camera.param_count",
+                "field": "camera.params",
+                "expected": "4: fx, fy, cx, cy",
+                "got": "3",
+                "kind": "InvalidInput",
+                "request_id": "3f1d5c0b8a7e4e1f9d2c6b5a49382716",
+            }
+        return super().openapi()

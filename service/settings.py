@@ -1,0 +1,161 @@
+"""Every setting of the service, once: flag, environment, file and default, in that order.
+
+Plain pydantic instead of pydantic-settings, which lets a misspelt ``VISLOC_`` variable pass and
+cannot say where a refused value came from. This module imports nothing of visloc, so that
+``main`` can set the thread counts of libraries before they are loaded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+PREFIX = "VISLOC_"
+CONFIG_VARIABLE = "VISLOC_CONFIG"
+
+Port = Annotated[int, Field(ge=0, le=65535)]
+Count = Annotated[int, Field(ge=1)]
+
+# Room in a request for everything but the photo.
+REQUEST_OVERHEAD_BYTES = 64 * 1024
+
+
+class SettingsError(ValueError):
+    """A setting that cannot be used; the message names it and where it was given."""
+
+
+class ServiceSettings(BaseModel):
+    """Read once in ``main``, then passed as arguments; nothing below reads the environment."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+    maps_dir: Path = Path("maps")
+    """folder of maps, as `mapping build` writes it"""
+    weights_dir: Path | None = None
+    """folder of network weights, for maps whose features need them"""
+    host: str = "127.0.0.1"
+    """address to listen on; 0.0.0.0 serves other machines, without any access control"""
+    http_port: Port = 8000
+    """port of the HTTP API; 0 lets the system choose"""
+    grpc_port: Port = 50051
+    """port of the gRPC API; 0 lets the system choose"""
+    workers: Count = 1
+    """photos that are worked on at the same time"""
+    threads_per_worker: Count = Field(
+        default_factory=lambda data: max(1, (os.cpu_count() or 1) // data.get("workers", 1)),
+    )
+    """processor threads for one photo; default: cores / workers"""
+    max_queue: Annotated[int, Field(ge=0)] = 64
+    """photos that may wait for a worker; beyond it a request is refused at once"""
+    max_image_bytes: Count = 20 * 2**20
+    """largest encoded photo, bytes"""
+    max_image_pixels: Count = 50_000_000
+    """largest photo, width times height"""
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    """what is logged to stderr: debug, info, warning or error"""
+
+    @property
+    def max_request_bytes(self) -> int:
+        """Largest request that carries a photo as it is: multipart and gRPC."""
+        return self.max_image_bytes + REQUEST_OVERHEAD_BYTES
+
+    @property
+    def max_json_bytes(self) -> int:
+        """Largest request in JSON: base64 makes four bytes of three."""
+        return self.max_image_bytes * 4 // 3 + REQUEST_OVERHEAD_BYTES
+
+
+def read_settings(arguments: Sequence[str], environment: Mapping[str, str]) -> ServiceSettings:
+    """Merge flags, ``VISLOC_`` variables, the file that ``--config`` names, and defaults.
+
+    Raises:
+        SettingsError: for an unknown name or a value that cannot be used.
+        SystemExit: from argparse, for ``--help`` and unknown flags.
+    """
+    flags = vars(_parser().parse_args(arguments))
+    file = flags.pop("config", environment.get(CONFIG_VARIABLE) or None)
+    variables = _from_environment(environment)
+    in_file = {} if file is None else _from_file(Path(file))
+    try:
+        return ServiceSettings.model_validate({**in_file, **variables, **flags})
+    except ValidationError as refused:
+        first = refused.errors(include_url=False)[0]
+        name = str(first["loc"][0])
+        source = (
+            _flag(name) if name in flags else _variable(name) if name in variables else str(file)
+        )
+        raise SettingsError(
+            f"{source}: {name} cannot be {first['input']!r}: {first['msg']}"
+        ) from None
+
+
+def _from_environment(environment: Mapping[str, str]) -> dict[str, str]:
+    # An empty variable counts as absent, as compose files leave them behind.
+    variables = {
+        name: value for name, value in environment.items() if name.startswith(PREFIX) and value
+    }
+    variables.pop(CONFIG_VARIABLE, None)
+    known = {_variable(name): name for name in ServiceSettings.model_fields}
+    _refuse_unknown(variables, known, "environment")
+    return {known[name]: value for name, value in variables.items()}
+
+
+def _from_file(path: Path) -> dict[str, object]:
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SettingsError(f"{path}: the file of settings cannot be read: {error}") from None
+    except ValueError as error:  # of TOML and of UTF-8
+        raise SettingsError(f"{path}: not a TOML file: {error}") from None
+    _refuse_unknown(values, ServiceSettings.model_fields, str(path))
+    return values
+
+
+def _refuse_unknown(given: Iterable[str], known: Iterable[str], source: str) -> None:
+    names = sorted(known)
+    for name in given:
+        if name not in names:
+            close = get_close_matches(name, names, n=2) or names
+            raise SettingsError(f"{source}: unknown setting {name}; known: {', '.join(close)}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m service",
+        description="Serve maps: localize photos over HTTP and gRPC.",
+        epilog=f"Every flag is also an environment variable ({_variable('maps_dir')} for "
+        f"{_flag('maps_dir')}) and a key of the --config file (maps_dir). "
+        "Order: flag, environment, file, default.",
+        allow_abbrev=False,
+    )
+    parser.add_argument(
+        "--config",
+        metavar="FILE",
+        default=argparse.SUPPRESS,
+        help=f"TOML file with settings (also {CONFIG_VARIABLE})",
+    )
+    for name, field in ServiceSettings.model_fields.items():
+        default = "" if field.default_factory else f" (default: {field.default})"
+        parser.add_argument(
+            _flag(name),
+            dest=name,
+            metavar="N" if field.annotation is int else name.rsplit("_", 1)[-1].upper(),
+            default=argparse.SUPPRESS,
+            help=f"{field.description}{'' if field.default is None else default}",
+        )
+    return parser
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def _variable(name: str) -> str:
+    return PREFIX + name.upper()

@@ -1,0 +1,57 @@
+"""What both doors share: one table of statuses, and request ids."""
+
+from __future__ import annotations
+
+import re
+import uuid
+from collections.abc import Mapping
+from http import HTTPStatus
+
+import grpc
+
+from visloc.errors import (
+    Conflict,
+    DatasetError,
+    InvalidInput,
+    MapCorrupt,
+    NotFound,
+    Overloaded,
+    TooLarge,
+    Unavailable,
+    VislocError,
+    WeightsError,
+)
+
+STATUSES: Mapping[type[VislocError], tuple[HTTPStatus, grpc.StatusCode]] = {
+    VislocError: (HTTPStatus.INTERNAL_SERVER_ERROR, grpc.StatusCode.INTERNAL),
+    InvalidInput: (HTTPStatus.UNPROCESSABLE_ENTITY, grpc.StatusCode.INVALID_ARGUMENT),
+    TooLarge: (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, grpc.StatusCode.RESOURCE_EXHAUSTED),
+    DatasetError: (HTTPStatus.UNPROCESSABLE_ENTITY, grpc.StatusCode.INVALID_ARGUMENT),
+    WeightsError: (HTTPStatus.CONFLICT, grpc.StatusCode.FAILED_PRECONDITION),
+    NotFound: (HTTPStatus.NOT_FOUND, grpc.StatusCode.NOT_FOUND),
+    Conflict: (HTTPStatus.CONFLICT, grpc.StatusCode.FAILED_PRECONDITION),
+    MapCorrupt: (HTTPStatus.INTERNAL_SERVER_ERROR, grpc.StatusCode.DATA_LOSS),
+    Unavailable: (HTTPStatus.SERVICE_UNAVAILABLE, grpc.StatusCode.UNAVAILABLE),
+    Overloaded: (HTTPStatus.TOO_MANY_REQUESTS, grpc.StatusCode.RESOURCE_EXHAUSTED),
+}
+
+RETRY_AFTER_S = 1
+
+_REQUEST_ID = re.compile(r"[\x21-\x7e]{1,128}")
+
+
+def statuses_of(error: VislocError) -> tuple[HTTPStatus, grpc.StatusCode]:
+    """Return the HTTP and the gRPC status of an error, by the nearest class in the table."""
+    return next(STATUSES[kind] for kind in type(error).__mro__ if kind in STATUSES)
+
+
+def internal_error() -> VislocError:
+    """Return what a caller is told when something broke that should not have."""
+    return VislocError(
+        "server.internal", "the server made a mistake; its log has the request id and the cause"
+    )
+
+
+def request_id(given: str | None) -> str:
+    """Return the caller's id when it is short and visible ASCII, else a new one."""
+    return given if given and _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex

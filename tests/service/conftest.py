@@ -1,0 +1,131 @@
+"""A map of the sample world, and both doors on real sockets."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import threading
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import grpc
+import httpx
+import pytest
+
+from mapping.build import BuildSettings, build_map
+from mapping.sample import write_sample
+from service.server import Server
+from service.settings import ServiceSettings
+from visloc.geometry import Camera, Pose
+from visloc.kapture import read_dataset
+from visloc_api.v1.localization_pb2_grpc import LocalizationStub
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Query:
+    """A photo with its true pose."""
+
+    image: bytes
+    camera: Camera
+    cam_from_world: Pose
+
+
+@dataclass(frozen=True)
+class Doors:
+    """A running service."""
+
+    server: Server
+    http: httpx.Client
+    channel: grpc.Channel
+    stub: LocalizationStub
+
+    @property
+    def url(self) -> str:
+        return str(self.http.base_url)
+
+
+@pytest.fixture(scope="session")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Small sample dataset: ``mapping/`` and ``query/``."""
+    folder = tmp_path_factory.mktemp("sample")
+    write_sample(folder, images=8, size=(256, 192))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def built_maps(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of maps with the map ``room``; only to be read."""
+    maps = tmp_path_factory.mktemp("maps")
+    build_map(
+        BuildSettings(sample / "mapping", "room", maps, local_features="sift"), lambda *_: None
+    )
+    return maps
+
+
+@pytest.fixture
+def maps_dir(built_maps: Path, tmp_path: Path) -> Path:
+    """A copy of the maps that a test may change."""
+    return Path(shutil.copytree(built_maps, tmp_path / "maps"))
+
+
+@pytest.fixture(scope="session")
+def query(sample: Path) -> Query:
+    """The first query of the sample."""
+    dataset = read_dataset(sample / "query")
+    record = dataset.images[0]
+    camera, pose = dataset.sensors[record.sensor_id].camera, dataset.pose(record)
+    assert camera is not None
+    assert pose is not None
+    return Query(dataset.path_of(record).read_bytes(), camera, pose)
+
+
+@contextmanager
+def serving(maps_dir: Path, *, load: bool = True, **settings: object) -> Iterator[Doors]:
+    """Run both doors in a thread of their own, on free ports."""
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
+
+    def run(coroutine: Coroutine[Any, Any, T]) -> T:
+        return asyncio.run_coroutine_threadsafe(coroutine, loop).result(60)
+
+    async def make() -> Server:
+        return Server(
+            ServiceSettings(
+                maps_dir=maps_dir, http_port=0, grpc_port=0, threads_per_worker=1, **settings
+            )
+        )
+
+    try:
+        server = run(make())
+        run(server.open())
+        if load:
+            run(server.load())
+        with (
+            httpx.Client(base_url=f"http://127.0.0.1:{server.http_port}", timeout=60) as http,
+            grpc.insecure_channel(f"127.0.0.1:{server.grpc_port}") as channel,
+        ):
+            yield Doors(server, http, channel, LocalizationStub(channel))
+        run(server.close(5))
+    finally:
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
+
+
+@pytest.fixture(scope="session")
+def doors(built_maps: Path) -> Iterator[Doors]:
+    """The service with the map ``room``."""
+    with serving(built_maps, max_image_bytes=200_000, max_image_pixels=1_000_000) as doors:
+        yield doors
+
+
+@pytest.fixture
+def serve() -> Callable[..., AbstractContextManager[Doors]]:
+    """``with serve(maps_dir, **settings) as doors``: a service of the test's own."""
+    return serving

@@ -1,0 +1,238 @@
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import grpc
+import pytest
+from google.protobuf.json_format import MessageToDict
+from google.rpc.error_details_pb2 import ErrorInfo
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
+from grpc_status import rpc_status
+
+import visloc
+from service.grpc import SERVICE_NAME
+from visloc_api.v1 import localization_pb2 as pb2
+
+
+def request_for(query: Any, **fields: Any) -> pb2.LocalizeRequest:
+    camera = query.camera
+    return pb2.LocalizeRequest(
+        **{
+            "map": "room",
+            "image": query.image,
+            "camera": pb2.Camera(
+                model=camera.model,
+                width=camera.width,
+                height=camera.height,
+                params=camera.params,
+            ),
+        }
+        | fields
+    )
+
+
+def refused(
+    doors: Any, request: pb2.LocalizeRequest, status: grpc.StatusCode, code: str
+) -> ErrorInfo:
+    with pytest.raises(grpc.RpcError) as caught:
+        doors.stub.Localize(request)
+    call: Any = caught.value
+    info = ErrorInfo()
+    details = rpc_status.from_call(call)
+    assert details is not None
+    assert details.details[0].Unpack(info)
+    assert (call.code(), info.reason, info.domain) == (status, code, "visloc")
+    return info
+
+
+def bits(value: object) -> object:
+    """Floats by their bits, so that equal means equal."""
+    if isinstance(value, float):
+        return struct.pack("<d", value)
+    if isinstance(value, dict):
+        return {name: bits(inner) for name, inner in value.items()}
+    return [bits(inner) for inner in value] if isinstance(value, list) else value
+
+
+def as_json(message: Any) -> dict[str, Any]:
+    return MessageToDict(
+        message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True
+    )
+
+
+def test_both_doors_give_the_same_answer_bit_for_bit(doors: Any, query: Any) -> None:
+    options = {"top_k": 4, "seed": 5, "min_inlier_ratio": 0.0, "preset": "config2"}
+    over_grpc = as_json(
+        doors.stub.Localize(request_for(query, options=pb2.LocalizeOptions(**options)))
+    )
+    camera = query.camera
+    over_http = doors.http.post(
+        "/localize",
+        data={
+            "map": "room",
+            "camera": ",".join(
+                map(str, (camera.model, camera.width, camera.height, *camera.params))
+            ),
+            "options": str(options).replace("'", '"'),
+        },
+        files={"image": ("q.jpg", query.image)},
+    ).json()
+
+    assert over_http.pop("refusal") is None
+    assert over_http["status"] == "localized"
+    assert over_http.pop("seconds").keys() == over_grpc.pop("seconds").keys()
+    assert over_http.pop("request_id") != over_grpc.pop("request_id")
+    assert bits(over_http) == bits(over_grpc)
+
+
+def test_a_refusal_has_no_pose(doors: Any, query: Any) -> None:
+    answer = doors.stub.Localize(
+        request_for(query, options=pb2.LocalizeOptions(min_inliers=1_000_000))
+    )
+
+    assert answer.status == "not_localized"
+    assert not answer.HasField("pose")
+    assert answer.refusal.reason == "too_few_matches"
+
+
+def test_a_request_without_a_camera_is_answered_with_where_the_intrinsics_come_from(
+    doors: Any, query: Any
+) -> None:
+    answer = doors.stub.Localize(pb2.LocalizeRequest(map="room", image=query.image))
+
+    assert answer.camera.source == "guess"
+
+
+def test_a_request_id_comes_back_and_one_is_made_when_it_is_missing(doors: Any, query: Any) -> None:
+    assert doors.stub.Localize(request_for(query, request_id="job-1")).request_id == "job-1"
+    assert len(doors.stub.Localize(request_for(query)).request_id) == 32
+
+
+def test_every_answer_carries_the_servers_version(doors: Any) -> None:
+    _, call = doors.stub.ListMaps.with_call(pb2.ListMapsRequest())
+
+    assert dict(call.initial_metadata())["visloc-version"] == visloc.__version__
+
+
+@pytest.mark.parametrize(
+    ("fields", "status", "code", "field"),
+    [
+        ({"image": b"hello"}, "INVALID_ARGUMENT", "image.format", "image"),
+        ({"image": b""}, "INVALID_ARGUMENT", "image.empty", "image"),
+        ({"image": b"\xff\xd8\xff" * 100}, "INVALID_ARGUMENT", "image.undecodable", "image"),
+        ({"image": bytes(200_001)}, "RESOURCE_EXHAUSTED", "image.too_large", "image"),
+        ({"map": "hall"}, "NOT_FOUND", "map.unknown", "map"),
+        ({"map": ""}, "INVALID_ARGUMENT", "map.id", "map"),
+        ({"camera": pb2.Camera()}, "INVALID_ARGUMENT", "camera.model", "camera.model"),
+        (
+            {"camera": pb2.Camera(model="PINHOLE", width=4, height=4, params=[1, 1, 2])},
+            "INVALID_ARGUMENT",
+            "camera.param_count",
+            "camera.params",
+        ),
+        (
+            {
+                "camera": pb2.Camera(
+                    model="SIMPLE_PINHOLE", width=4, height=4, params=[float("nan"), 2, 2]
+                )
+            },
+            "INVALID_ARGUMENT",
+            "camera.param_value",
+            "camera.params",
+        ),
+        (
+            {"camera": pb2.Camera(model="SIMPLE_PINHOLE", width=4, height=9, params=[4, 2, 2])},
+            "INVALID_ARGUMENT",
+            "camera.size_mismatch",
+            "camera",
+        ),
+        (
+            {"options": pb2.LocalizeOptions(top_k=0)},
+            "INVALID_ARGUMENT",
+            "options.top_k",
+            "options.top_k",
+        ),
+        (
+            {"options": pb2.LocalizeOptions(read_as="sideways")},
+            "INVALID_ARGUMENT",
+            "options.read_as",
+            "options.read_as",
+        ),
+    ],
+)
+def test_bad_input_has_the_matching_status_code_and_field(
+    fields: dict[str, Any], status: str, code: str, field: str, doors: Any, query: Any
+) -> None:
+    info = refused(doors, request_for(query, **fields), grpc.StatusCode[status], code)
+
+    assert info.metadata["field"] == field
+    assert info.metadata["kind"] in ("InvalidInput", "TooLarge", "NotFound")
+    assert info.metadata["message"]
+    assert len(info.metadata["request_id"]) == 32
+
+
+def test_a_message_over_the_limit_is_not_taken(doors: Any, query: Any) -> None:
+    with pytest.raises(grpc.RpcError) as caught:
+        doors.stub.Localize(request_for(query, image=bytes(1_000_000)))
+    call: Any = caught.value
+    assert call.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+
+
+def test_what_breaks_inside_is_internal_without_its_insides(
+    serve: Any,
+    tmp_path: Any,
+    query: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with serve(tmp_path) as doors:
+        monkeypatch.setattr(doors.server.engine, "_localize", lambda *_: 1 / 0)
+        info = refused(doors, request_for(query), grpc.StatusCode.INTERNAL, "server.internal")
+
+    assert "division" not in str(info)
+    assert "ZeroDivisionError" in caplog.text
+
+
+def test_maps_are_listed_and_described_as_over_http(doors: Any) -> None:
+    listed = doors.stub.ListMaps(pb2.ListMapsRequest())
+    described = doors.stub.GetMap(pb2.GetMapRequest(map="room"))
+    over_http = doors.http.get("/maps/room").json()
+
+    assert list(listed.maps) == [described]
+    # protobuf writes 64-bit integers as strings.
+    assert bits(as_json(described) | {"size_bytes": described.size_bytes}) == bits(over_http)
+
+
+def test_an_unknown_map_cannot_be_described(doors: Any) -> None:
+    with pytest.raises(grpc.RpcError) as caught:
+        doors.stub.GetMap(pb2.GetMapRequest(map="hall"))
+    call: Any = caught.value
+    assert call.code() == grpc.StatusCode.NOT_FOUND
+
+
+def test_health_says_serving_only_when_the_maps_are_warm(serve: Any, built_maps: Any) -> None:
+    def health(doors: Any) -> list[int]:
+        stub = health_pb2_grpc.HealthStub(doors.channel)
+        return [
+            stub.Check(health_pb2.HealthCheckRequest(service=name)).status
+            for name in ("", SERVICE_NAME)
+        ]
+
+    serving = health_pb2.HealthCheckResponse.SERVING
+    not_serving = health_pb2.HealthCheckResponse.NOT_SERVING
+    with serve(built_maps, load=False) as doors:
+        assert health(doors) == [not_serving, not_serving]
+    with serve(built_maps) as doors:
+        assert health(doors) == [serving, serving]
+
+
+def test_reflection_lists_the_service(doors: Any) -> None:
+    stub = reflection_pb2_grpc.ServerReflectionStub(doors.channel)
+    asked = reflection_pb2.ServerReflectionRequest(list_services="")
+
+    (answer,) = stub.ServerReflectionInfo(iter([asked]))
+
+    names = {service.name for service in answer.list_services_response.service}
+    assert {"visloc.v1.Localization", "grpc.health.v1.Health"} <= names

@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import grpc
+import httpx
+import pytest
+
+from service.server import Server
+from service.settings import ServiceSettings
+from visloc_api.v1 import localization_pb2 as pb2
+from visloc_api.v1.localization_pb2_grpc import LocalizationStub
+
+READY = re.compile(r"ready: http://127\.0\.0\.1:(\d+) grpc://127\.0\.0\.1:(\d+), maps: (.*)")
+
+
+@contextmanager
+def started(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    environment = {name: value for name, value in os.environ.items() if "VISLOC" not in name}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "service", *arguments],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+    with process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def test_the_command_says_when_it_is_ready_answers_on_both_doors_and_ends_on_sigterm(
+    built_maps: Path,
+) -> None:
+    arguments = ["--maps-dir", str(built_maps), "--http-port=0", "--grpc-port=0"]
+    with started(*arguments) as process:
+        assert process.stderr is not None
+        ready = next(found for line in process.stderr if (found := READY.search(line)))
+        http_port, grpc_port, maps = ready.groups()
+        assert maps.startswith("room@")
+        assert httpx.get(f"http://127.0.0.1:{http_port}/readyz").status_code == 200
+        with grpc.insecure_channel(f"127.0.0.1:{grpc_port}") as channel:
+            listed = LocalizationStub(channel).ListMaps(pb2.ListMapsRequest())
+        assert [info.id for info in listed.maps] == ["room"]
+
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
+        assert "Traceback" not in process.stderr.read()
+
+
+def test_a_wrong_setting_ends_the_command_with_one_line() -> None:
+    with started("--http-port", "many") as process:
+        assert process.stderr is not None
+        assert process.stderr.read().startswith("visloc-service: --http-port: http_port cannot be")
+        assert process.wait(10) == 1
+
+
+@pytest.mark.parametrize("taken", ["http_port", "grpc_port"])
+def test_a_port_that_is_taken_is_an_error_that_names_it(taken: str, tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        settings = ServiceSettings(
+            **{"maps_dir": tmp_path, "http_port": 0, "grpc_port": 0} | {taken: port}
+        )
+        with pytest.raises(OSError, match=f"cannot listen on 127.0.0.1:{port}"):
+            Server(settings)

@@ -1,0 +1,208 @@
+from __future__ import annotations
+
+import base64
+import json
+from typing import Any
+
+import pytest
+from google.protobuf.descriptor import Descriptor, FieldDescriptor
+from pydantic import BaseModel
+
+from service import schemas
+from service.schemas import LocalizeOptions, LocalizeRequest
+from visloc.errors import InvalidInput
+from visloc.types import LocalizeOptions as CoreOptions
+from visloc.types import ReadAs
+from visloc_api.v1 import localization_pb2 as pb2
+
+CAMERA = {"model": "PINHOLE", "width": 640, "height": 480, "params": [525, 525.5, 320, 240]}
+
+
+def request(**fields: object) -> dict[str, Any]:
+    return {"map": "room", "image": base64.b64encode(b"photo").decode(), **fields}
+
+
+def refusal(message: object) -> InvalidInput:
+    with pytest.raises(InvalidInput) as caught:
+        LocalizeRequest.read_json(json.dumps(message)).to_job()
+    return caught.value
+
+
+def test_a_full_request_becomes_the_job_that_it_says() -> None:
+    options = {
+        "preset": "config1",
+        "top_k": 5,
+        "max_error_px": 8,
+        "min_inliers": 12,
+        "min_inlier_ratio": 0.5,
+        "read_as": "upright",
+        "seed": 9,
+    }
+
+    job = LocalizeRequest.read_json(json.dumps(request(camera=CAMERA, options=options))).to_job()
+
+    assert (job.map, job.image) == ("room", b"photo")
+    assert job.camera is not None
+    assert job.camera.params == (525.0, 525.5, 320.0, 240.0)
+    assert job.options == CoreOptions("config1", 5, 8.0, 12, 0.5, ReadAs.UPRIGHT, 9)
+
+
+def test_what_is_left_out_or_null_takes_the_default() -> None:
+    for message in (request(), request(camera=None, options={"top_k": None})):
+        job = LocalizeRequest.read_json(json.dumps(message)).to_job()
+        assert job.camera is None
+        assert job.options == CoreOptions()
+
+
+@pytest.mark.parametrize("text", ["PINHOLE,640,480,525,525.5,320,240", json.dumps(CAMERA)])
+def test_a_camera_may_be_text(text: str) -> None:
+    assert (
+        LocalizeRequest.read(request(camera=text)).to_job().camera
+        == LocalizeRequest.read(request(camera=CAMERA)).to_job().camera
+    )
+
+
+def test_options_may_be_text() -> None:
+    assert LocalizeRequest.read(request(options='{"seed": 3}')).options.seed == 3
+
+
+@pytest.mark.parametrize(
+    ("message", "code", "field", "expected"),
+    [
+        ({}, "request.missing_field", "map", None),
+        ({"map": "room"}, "request.missing_field", "image", None),
+        ([], "request.invalid", None, "an object with map, image, camera, options"),
+        (request(extra=1), "request.unknown_field", "extra", "one of map, image, camera, options"),
+        (
+            request(options={"topk": 1}),
+            "request.unknown_field",
+            "options.topk",
+            "one of preset, top_k, max_error_px, min_inliers, min_inlier_ratio, read_as, seed",
+        ),
+        (
+            request(camera=CAMERA | {"fov": 60}),
+            "request.unknown_field",
+            "camera.fov",
+            "one of model, width, height, params",
+        ),
+        (request(map=1), "request.invalid", "map", "Input should be a valid string"),
+        (request(image="?"), "image.base64", "image", "the encoded photo in standard base64"),
+        (request(image="é"), "image.base64", "image", "the encoded photo in standard base64"),
+        (request(image=5), "request.invalid", "image", "Input should be a valid bytes"),
+        (request(options=3), "request.invalid", "options", None),
+        (request(options={"top_k": "5"}), "request.invalid", "options.top_k", None),
+        (request(options={"top_k": 2.5}), "request.invalid", "options.top_k", None),
+        (request(options={"top_k": True}), "request.invalid", "options.top_k", None),
+        (request(options={"top_k": 0}), "options.top_k", "options.top_k", "1 to 1000"),
+        (request(options={"seed": 10**300}), "options.seed", "options.seed", None),
+        (request(options={"preset": "fast"}), "options.preset", "options.preset", None),
+        (
+            request(options={"max_error_px": float("nan")}),
+            "options.max_error_px",
+            "options.max_error_px",
+            "0.1 to 1000.0",
+        ),
+        (
+            request(options={"read_as": "sideways"}),
+            "options.read_as",
+            "options.read_as",
+            "one of stored, upright",
+        ),
+        (
+            request(camera=CAMERA | {"params": [525, float("nan"), 320, 240]}),
+            "camera.param_value",
+            "camera.params",
+            "fy to be a positive finite number",
+        ),
+        (
+            request(camera=CAMERA | {"params": [-525, 525, 320, 240]}),
+            "camera.param_value",
+            "camera.params",
+            "fx to be a positive finite number",
+        ),
+        (request(camera=CAMERA | {"width": 10**400}), "camera.size", "camera.width", None),
+        (request(camera=CAMERA | {"width": "640"}), "request.invalid", "camera.width", None),
+        (request(camera={"model": "PINHOLE"}), "request.missing_field", "camera.width", None),
+        (request(camera="PINHOLE"), "camera.syntax", "camera", None),
+        (request(camera="{"), "request.malformed", "camera", "JSON"),
+        (request(camera=7), "request.invalid", "camera", None),
+    ],
+)
+def test_a_wrong_request_is_refused_by_code_field_and_expectation(
+    message: object, code: str, field: str | None, expected: str | None
+) -> None:
+    error = refusal(message)
+
+    assert (error.code, error.field) == (code, field)
+    assert expected is None or error.expected == expected
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", '{"map": }', "\ufeff{}", '{"a": ' * 10_000, '{"map": "\\ud800"}', "NaN,"]
+)
+def test_malformed_json_is_refused(text: str) -> None:
+    with pytest.raises(InvalidInput) as caught:
+        LocalizeRequest.read_json(text)
+    assert caught.value.code == "request.malformed"
+
+
+def test_integers_with_thousands_of_digits_are_refused() -> None:
+    text = '{"map": "room", "image": "", "options": {"seed": ' + "9" * 20_000 + "}}"
+
+    with pytest.raises(InvalidInput):
+        LocalizeRequest.read_json(text).to_job()
+
+
+def test_a_refusal_never_echoes_a_large_value() -> None:
+    long = "x" * 1_000_000
+
+    for message in (
+        request(options={"top_k": long}),
+        request(options={"top_k": [1] * 100_000}),
+        request(**{long: 1}),
+        request(camera=long),
+        request(map=["a"] * 100_000),
+    ):
+        assert len(str(refusal(message))) < 2000
+
+
+# The proto's messages and ours are the same
+
+
+def pairs() -> list[tuple[type[BaseModel], Descriptor]]:
+    return [
+        (getattr(schemas, name), message)
+        for name, message in pb2.DESCRIPTOR.message_types_by_name.items()
+        if hasattr(schemas, name)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("model", "message"), pairs(), ids=lambda value: getattr(value, "__name__", "")
+)
+def test_json_has_the_fields_of_the_proto_in_the_same_order(
+    model: type[BaseModel], message: Descriptor
+) -> None:
+    fields = [field.name for field in message.fields]
+    if model is LocalizeRequest:
+        fields.remove("request_id")  # over HTTP it is a header
+
+    assert list(model.model_fields) == fields
+
+
+def test_all_messages_of_the_proto_have_a_model() -> None:
+    without = {"ListMapsRequest", "GetMapRequest"}
+
+    assert {message.name for _, message in pairs()} == (
+        set(pb2.DESCRIPTOR.message_types_by_name) - without
+    )
+
+
+def test_options_are_those_of_the_core() -> None:
+    assert tuple(LocalizeOptions.model_fields) == CoreOptions.__slots__
+
+
+def test_every_number_of_an_answer_is_a_double_on_the_wire() -> None:
+    for message in pb2.DESCRIPTOR.message_types_by_name.values():
+        for field in message.fields:
+            assert field.type != FieldDescriptor.TYPE_FLOAT, f"{message.name}.{field.name}"

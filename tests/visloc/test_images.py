@@ -1,0 +1,434 @@
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import ExifTags, Image, ImageOps
+
+from visloc.errors import InvalidInput, NotFound, TooLarge
+from visloc.images import (
+    ImageLimits,
+    read_photo,
+    read_photo_file,
+    stored_from_upright,
+    upright,
+)
+
+ORIENTATIONS = range(1, 9)
+LOSSLESS = {"PNG": {}, "BMP": {}, "TIFF": {}, "WEBP": {"lossless": True, "exact": True}}
+
+
+def texture(width: int = 48, height: int = 32, seed: int = 0) -> NDArray[np.uint8]:
+    noise = np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    return np.asarray(cv2.GaussianBlur(noise, (5, 5), 1.5), dtype=np.uint8)
+
+
+def encode(image: Image.Image, file_format: str, **options: object) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, file_format, **options)
+    return buffer.getvalue()
+
+
+def exif_with(orientation: int | None = None, **details: object) -> Image.Exif:
+    exif = Image.Exif()
+    if orientation is not None:
+        exif[ExifTags.Base.Orientation] = orientation
+    ifd = exif.get_ifd(ExifTags.IFD.Exif)
+    for name, value in details.items():
+        ifd[ExifTags.Base[name]] = value
+    return exif
+
+
+def png_header(width: int, height: int) -> bytes:
+    body = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunk = struct.pack(">I", 13) + body + struct.pack(">I", zlib.crc32(body))
+    return b"\x89PNG\r\n\x1a\n" + chunk + struct.pack(">I", 10) + b"IDAT" + bytes(10)
+
+
+def refusal(data: bytes, limits: ImageLimits | None = None) -> InvalidInput:
+    with pytest.raises(InvalidInput) as caught:
+        read_photo(data, limits or ImageLimits())
+    return caught.value
+
+
+# What comes out
+
+
+@pytest.mark.parametrize("file_format", LOSSLESS)
+@pytest.mark.parametrize("mode", ["RGB", "L", "P", "1"])
+def test_every_colour_kind_of_every_format_gives_its_rgb_pixels(
+    file_format: str, mode: str
+) -> None:
+    image = Image.fromarray(texture())
+    image = image.quantize(64) if mode == "P" else image.convert(mode)
+    if file_format == "WEBP":
+        image = image.convert("RGB")
+
+    photo = read_photo(encode(image, file_format, **LOSSLESS[file_format]))
+
+    assert photo.rgb.dtype == np.uint8
+    assert photo.rgb.flags.c_contiguous
+    assert (photo.width, photo.height) == (48, 32)
+    np.testing.assert_array_equal(photo.rgb, np.asarray(image.convert("RGB")))
+
+
+@pytest.mark.parametrize("file_format", ["PNG", "WEBP", "BMP"])
+def test_transparency_is_ignored_and_colours_stay(file_format: str) -> None:
+    image = Image.fromarray(texture())
+    image.putalpha(Image.fromarray(texture(seed=1)[..., 0]))
+
+    photo = read_photo(encode(image, file_format, **LOSSLESS[file_format]))
+
+    np.testing.assert_array_equal(photo.rgb, texture())
+
+
+def test_transparency_of_a_palette_or_of_grey_is_ignored() -> None:
+    palette = Image.fromarray(texture()).quantize(64)
+    some = bytes(range(0, 256, 4))
+    photo = read_photo(encode(palette, "PNG", transparency=some))
+    np.testing.assert_array_equal(photo.rgb, np.asarray(palette.convert("RGB")))
+
+    grey = Image.fromarray(texture()).convert("LA")
+    np.testing.assert_array_equal(
+        read_photo(encode(grey, "PNG")).rgb, np.asarray(grey.convert("L").convert("RGB"))
+    )
+
+
+@pytest.mark.parametrize("extension", [".png", ".tiff"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_16_bit_photos_keep_their_upper_byte(extension: str, channels: int) -> None:
+    wide = np.random.default_rng(0).integers(0, 65536, (32, 48, channels)).astype(np.uint16)
+    data = cv2.imencode(extension, wide[..., ::-1])[1].tobytes()
+
+    difference = read_photo(data).rgb.astype(int) - (wide >> 8)
+
+    assert np.abs(difference).max() <= 1  # TIFF colours are rounded, the others cut
+
+
+@pytest.mark.parametrize("mode", ["RGB", "L", "CMYK"])
+def test_jpeg_is_decoded_as_pillow_does(mode: str) -> None:
+    data = encode(Image.fromarray(texture()).convert(mode), "JPEG", quality=95)
+    expected = np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
+
+    assert np.abs(read_photo(data).rgb - expected).max() <= 2
+
+
+def test_a_photo_of_one_pixel_is_a_photo() -> None:
+    photo = read_photo(encode(Image.new("RGB", (1, 1), (1, 2, 3)), "PNG"))
+
+    assert photo.rgb.tolist() == [[[1, 2, 3]]]
+
+
+# Orientation
+
+
+@pytest.mark.parametrize("file_format", ["PNG", "TIFF", "JPEG", "WEBP"])
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_pixels_come_as_stored_whatever_the_orientation(file_format: str, orientation: int) -> None:
+    options = LOSSLESS.get(file_format, {"quality": 100, "subsampling": 0})
+    data = encode(Image.fromarray(texture()), file_format, exif=exif_with(orientation), **options)
+
+    photo = read_photo(data)
+
+    assert photo.exif_orientation == orientation
+    assert np.abs(photo.rgb.astype(int) - texture()).mean() < 3
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_upright_is_pillows_exif_transpose(orientation: int) -> None:
+    image = Image.fromarray(texture(7, 5))
+    image.getexif()[ExifTags.Base.Orientation] = orientation
+
+    turned = upright(texture(7, 5), orientation)
+
+    np.testing.assert_array_equal(turned, np.asarray(ImageOps.exif_transpose(image)))
+    assert turned.flags.c_contiguous
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_points_of_the_upright_photo_return_to_the_stored_pixel(orientation: int) -> None:
+    height, width = 5, 7
+    stored_index = np.arange(height * width * 3).astype(np.uint8).reshape(height, width, 3)
+    turned = upright(stored_index, orientation)
+    rows, columns = np.mgrid[: turned.shape[0], : turned.shape[1]]
+    centres = np.column_stack([columns.ravel(), rows.ravel()]) + 0.5
+
+    stored = stored_from_upright(centres, orientation, width, height)
+
+    column, row = np.floor(stored).astype(int).T
+    np.testing.assert_array_equal(stored - np.floor(stored), 0.5)
+    np.testing.assert_array_equal(stored_index[row, column], turned.reshape(-1, 3))
+
+
+def test_moving_points_keeps_their_type_and_takes_none() -> None:
+    points = np.array([[0.25, 1.75]], dtype=np.float32)
+
+    assert stored_from_upright(points, 6, 4, 3).dtype == np.float32
+    np.testing.assert_array_equal(stored_from_upright(points, 6, 4, 3), [[1.75, 2.75]])
+    assert stored_from_upright(np.empty((0, 2)), 8, 4, 3).shape == (0, 2)
+
+
+@pytest.mark.parametrize("orientation", [0, 9, 65535])
+def test_an_invalid_orientation_counts_as_none(orientation: int) -> None:
+    for file_format in ("JPEG", "TIFF"):
+        data = encode(Image.fromarray(texture()), file_format, exif=exif_with(orientation))
+        assert read_photo(data).exif_orientation == 1
+        assert read_photo(data).rgb.shape == (32, 48, 3)
+
+
+# Focal length
+
+
+def focal_length_of(width: int = 400, height: int = 300, **details: object) -> float | None:
+    data = encode(Image.new("RGB", (width, height)), "JPEG", exif=exif_with(None, **details))
+    return read_photo(data).focal_length_px
+
+
+def test_focal_length_from_the_35_mm_equivalent_compares_diagonals() -> None:
+    expected = 26 / math.hypot(36, 24) * 500
+
+    assert focal_length_of(FocalLengthIn35mmFilm=26) == pytest.approx(expected)
+    assert focal_length_of(300, 400, FocalLengthIn35mmFilm=26) == pytest.approx(expected)
+
+
+def test_focal_length_from_the_sensors_resolution() -> None:
+    sensor = {"FocalLength": 8.0, "FocalPlaneXResolution": 1000.0}  # 8 inch at 1000 px per inch
+
+    assert focal_length_of(
+        **sensor, FocalPlaneResolutionUnit=3, ExifImageWidth=400, ExifImageHeight=300
+    ) == pytest.approx(8.0 * 1000 / 10)
+    assert focal_length_of(**sensor) == pytest.approx(8.0 * 1000 / 25.4, rel=1e-6)
+    # Taken with 800 x 600 pixels and made smaller since.
+    assert focal_length_of(
+        **sensor, FocalPlaneResolutionUnit=3, ExifImageWidth=800, ExifImageHeight=600
+    ) == pytest.approx(400)
+
+
+@pytest.mark.parametrize(
+    "details",
+    [
+        {},
+        {"FocalLengthIn35mmFilm": 0},  # EXIF's word for unknown
+        {"FocalLengthIn35mmFilm": 1},  # implausible
+        {"FocalLength": 4.2},  # says nothing without the sensor's size
+        {"FocalLength": 0.0, "FocalPlaneXResolution": 1000.0},
+        {"FocalLength": 8.0, "FocalPlaneXResolution": 1000.0, "FocalPlaneResolutionUnit": 9},
+    ],
+)
+def test_an_absent_or_implausible_focal_length_is_none(details: dict[str, object]) -> None:
+    assert focal_length_of(**details) is None
+
+
+def test_exif_is_read_without_decoding_a_png_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = encode(Image.fromarray(texture()), "PNG")
+    monkeypatch.setattr("PIL.ImageFile.ImageFile.load", lambda _: pytest.fail("decoded"))
+
+    assert read_photo(data).exif_orientation == 1
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow's, about what it finds
+def test_broken_exif_counts_as_absent() -> None:
+    exif = exif_with(6, FocalLengthIn35mmFilm=26).tobytes()
+    random = np.random.default_rng(0)
+    image = Image.fromarray(texture())
+    for _ in range(200):
+        broken = bytearray(exif)
+        for position in random.integers(6, len(broken), 4):
+            broken[position] = random.integers(256)
+        photo = read_photo(encode(image, "JPEG", exif=bytes(broken)))
+        assert 1 <= photo.exif_orientation <= 8
+        assert photo.focal_length_px is None or photo.focal_length_px > 0
+
+
+# Refusals
+
+
+def test_no_bytes_are_refused() -> None:
+    error = refusal(b"")
+
+    assert (error.code, error.field, error.got) == ("image.empty", "image", "0 bytes")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"hello, this is no image at all",
+        b"\x00",
+        b"GIF89a" + bytes(100),
+        b"%PDF-1.7" + bytes(100),
+        b"RIFF\x00\x00\x00\x00WAVE" + bytes(100),
+        b"<svg xmlns='http://www.w3.org/2000/svg'/>",
+    ],
+)
+def test_what_is_not_an_image_is_refused_with_the_formats_that_are_read(data: bytes) -> None:
+    error = refusal(data)
+
+    assert error.code == "image.format"
+    assert error.expected == "JPEG, PNG, WebP, TIFF or BMP"
+
+
+@pytest.mark.parametrize("file_format", ["JPEG", "PNG", "WEBP", "TIFF", "BMP"])
+@pytest.mark.parametrize("kept", [0.05, 0.3, 0.6, 0.95])
+@pytest.mark.filterwarnings("ignore:Truncated File Read", "ignore:Corrupt EXIF data")
+def test_a_photo_that_is_cut_off_is_refused(file_format: str, kept: float) -> None:
+    data = encode(Image.fromarray(texture(200, 150)), file_format)
+
+    error = refusal(data[: int(len(data) * kept)])
+
+    assert error.code == "image.undecodable"
+    assert "cut off" in error.message
+
+
+def test_a_jpeg_with_a_damaged_middle_that_decodes_is_accepted() -> None:
+    data = bytearray(encode(Image.fromarray(texture(200, 150)), "JPEG"))
+    middle = len(data) // 2
+    data[middle : middle + 50] = bytes(50)
+
+    assert read_photo(bytes(data)).rgb.shape == (150, 200, 3)
+
+
+def test_too_many_bytes_are_refused_before_they_are_looked_at() -> None:
+    with pytest.raises(TooLarge) as caught:
+        read_photo(b"not an image", ImageLimits(max_bytes=11))
+
+    error = caught.value
+    assert (error.code, error.expected, error.got) == (
+        "image.too_large",
+        "at most 11 bytes",
+        "12 bytes",
+    )
+
+
+@pytest.mark.parametrize("size", [(8000, 8000), (2**31 - 1, 1), (1, 2**31 - 1), (10**6, 10**6)])
+def test_too_many_pixels_are_refused_from_the_header(
+    size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+
+    with pytest.raises(TooLarge) as caught:
+        read_photo(png_header(*size))
+
+    error = caught.value
+    assert error.code == "image.too_many_pixels"
+    assert error.expected == "at most 50000000 pixels"
+    assert error.got == f"{size[0]} x {size[1]}"
+
+
+@pytest.mark.parametrize("position", [33, -12])
+def test_a_png_chunk_that_claims_gigabytes_never_reaches_the_decoder(
+    position: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # OpenCV would allocate what the chunk claims: found by fuzzing.
+    data = encode(Image.fromarray(texture()), "PNG")
+    position %= len(data)
+    lying = data[:position] + struct.pack(">I", 2**31 - 1) + b"aBCd" + data[position:]
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+
+    assert refusal(lying).code == "image.undecodable"
+
+
+def test_a_png_with_two_headers_is_refused() -> None:
+    # Whose size was checked, and whose is decoded?
+    small = encode(Image.fromarray(texture()), "PNG")
+    two = png_header(30_000, 30_000)[:33] + small[8:]
+
+    assert refusal(two, ImageLimits(max_pixels=10**10)).code == "image.undecodable"
+    assert refusal(small[:33] + small[8:]).code == "image.undecodable"
+
+
+def test_an_animation_gives_its_first_picture() -> None:
+    first, second = (Image.fromarray(texture(seed=seed)) for seed in (0, 1))
+    for file_format in ("PNG", "TIFF", "WEBP"):
+        data = encode(
+            first, file_format, save_all=True, append_images=[second], **LOSSLESS[file_format]
+        )
+        np.testing.assert_array_equal(read_photo(data).rgb, texture())
+
+
+def test_the_limits_themselves_are_allowed() -> None:
+    data = encode(Image.fromarray(texture()), "PNG")
+
+    read_photo(data, ImageLimits(max_bytes=len(data), max_pixels=48 * 32))
+    assert refusal(data, ImageLimits(max_pixels=48 * 32 - 1)).code == "image.too_many_pixels"
+
+
+def test_a_transparent_tiff_is_refused_because_its_colours_would_be_blended() -> None:
+    image = Image.fromarray(texture())
+    image.putalpha(128)
+
+    error = refusal(encode(image, "TIFF"))
+
+    assert (error.code, error.got) == ("image.format", "transparency")
+
+
+def test_a_tiff_of_floats_is_refused() -> None:
+    data = cv2.imencode(".tiff", texture().astype(np.float32) / 255)[1].tobytes()
+
+    assert refusal(data).code in ("image.format", "image.undecodable")
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow's, about what it finds
+@pytest.mark.parametrize("file_format", ["JPEG", "PNG", "WEBP", "TIFF", "BMP"])
+def test_damaged_files_are_read_or_refused_and_nothing_else(file_format: str) -> None:
+    data = encode(
+        Image.fromarray(texture()),
+        file_format,
+        **({} if file_format == "BMP" else {"exif": exif_with(6, FocalLengthIn35mmFilm=26)}),
+    )
+    random = np.random.default_rng(1)
+    limits = ImageLimits(max_pixels=100_000)
+    for _ in range(400):
+        damaged = bytearray(data)
+        # The first bytes decide most; a few hits anywhere.
+        for position in (*random.integers(2, 200, 2), *random.integers(2, len(data), 2)):
+            damaged[min(position, len(data) - 1)] = random.integers(256)
+        if random.random() < 0.2:
+            del damaged[random.integers(len(data)) :]
+        with contextlib.suppress(InvalidInput):
+            photo = read_photo(bytes(damaged), limits)
+            assert photo.width * photo.height <= limits.max_pixels
+
+
+# Files
+
+
+def test_a_file_is_read_and_named_when_it_is_wrong(tmp_path: Path) -> None:
+    good, bad = tmp_path / "good.png", tmp_path / "bad.png"
+    good.write_bytes(encode(Image.fromarray(texture()), "PNG"))
+    bad.write_bytes(b"no image")
+
+    np.testing.assert_array_equal(read_photo_file(good).rgb, texture())
+    with pytest.raises(InvalidInput) as caught:
+        read_photo_file(bad)
+    assert (caught.value.code, caught.value.field) == ("image.format", str(bad))
+
+
+def test_a_missing_or_unreadable_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(NotFound) as missing:
+        read_photo_file(tmp_path / "absent.jpg")
+    with pytest.raises(InvalidInput) as folder:
+        read_photo_file(tmp_path)
+
+    assert (missing.value.code, missing.value.field) == (
+        "image.missing",
+        str(tmp_path / "absent.jpg"),
+    )
+    assert folder.value.code == "image.unreadable"
+
+
+def test_a_file_above_the_limit_is_refused_without_reading_it_all(tmp_path: Path) -> None:
+    huge = tmp_path / "huge.jpg"
+    with huge.open("wb") as file:
+        file.truncate(2**40)
+
+    with pytest.raises(TooLarge) as caught:
+        read_photo_file(huge)
+    assert caught.value.code == "image.too_large"

@@ -1,0 +1,119 @@
+"""Published network weights: where they come from, and whether a file holds the right ones.
+
+The weights of R2D2 are for non-commercial use and are never shipped nor fetched: whoever runs
+the software downloads them and says in which folder they lie.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from visloc.errors import WeightsError
+from visloc.features.checkpoint import Checkpoint, read_checkpoint
+
+Shapes = Mapping[str, tuple[int, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class PublishedWeights:
+    """A weights file that its authors publish.
+
+    Attributes:
+        file_name: as published, and as looked for in the weights folder.
+        network: the network it belongs to, for people.
+        source: where to download it.
+        licence: under which licence, with what it means.
+        sha256: of the file as published.
+    """
+
+    file_name: str
+    network: str
+    source: str
+    licence: str
+    sha256: str
+
+
+def _of_r2d2(file_name: str, network: str, sha256: str) -> PublishedWeights:
+    return PublishedWeights(
+        file_name=file_name,
+        network=network,
+        source="folder models of https://github.com/naver/r2d2",
+        licence="CC BY-NC-SA 3.0: non-commercial use only",
+        sha256=sha256,
+    )
+
+
+R2D2_WASF_N16 = _of_r2d2(
+    "r2d2_WASF_N16.pt",
+    "R2D2",
+    "9ae90e02a9a133d100ca7aeaa32f4d4d7736a6dd222a530a25c8f7da5e508528",
+)
+FASTER2D2_WASF_N16 = _of_r2d2(
+    "faster2d2_WASF_N16.pt",
+    "Fast-R2D2",
+    "217daa3a166bfe9bf2b68c05c1607a09dd4d552ae1bbeda885479d504eefc14b",
+)
+
+
+def read_weights(weights_dir: Path | None, published: PublishedWeights) -> Checkpoint:
+    """Read the named file from the weights folder.
+
+    A file with another sha256 than the published one is read as well, because people train
+    their own; its sha256 goes into the features' fingerprint, and ``check_shapes`` tells whether
+    the network fits.
+
+    Raises:
+        WeightsError: ``weights.missing`` with what to download, from where, under which licence,
+            and where to put it; and those of ``read_checkpoint``.
+    """
+    path = None if weights_dir is None else weights_dir / published.file_name
+    if path is None or not path.is_file():
+        raise WeightsError(
+            "weights.missing",
+            f"the weights of {published.network} are not part of this software: download "
+            f"{published.file_name} ({published.source}; licence {published.licence}), put it "
+            "into a folder and name the folder with --weights-dir or VISLOC_WEIGHTS_DIR",
+            field="weights_dir" if path is None else str(path),
+            expected=f"a folder with {published.file_name}",
+            got="no weights folder" if weights_dir is None else f"no such file in {weights_dir}",
+        )
+    return read_checkpoint(path)
+
+
+def check_shapes(checkpoint: Checkpoint, expected: Shapes, *, network: str, held: str) -> None:
+    """Make sure that a checkpoint has exactly the tensors of a network, all of them finite.
+
+    Args:
+        checkpoint: what was read.
+        expected: the shape of every tensor by name.
+        network: the network wanted, for the message.
+        held: what the file seems to hold instead, for the message.
+
+    Raises:
+        WeightsError: ``weights.network`` for tensors that are missing, surplus or of another
+            shape; ``weights.values`` for numbers that no network has.
+    """
+    found = {name: array.shape for name, array in checkpoint.tensors.items()}
+    if found != dict(expected):
+        wrong = sorted(set(found.items()) ^ set(expected.items()))
+        name = wrong[0][0]
+        raise WeightsError(
+            "weights.network",
+            f"not the weights of {network} but of {held}; first difference: {name}",
+            field=str(checkpoint.path),
+            expected=str(expected.get(name, "no such tensor")),
+            got=str(found.get(name, "no such tensor")),
+        )
+    for name, array in checkpoint.tensors.items():
+        negative = name.endswith("running_var") and bool((array < 0).any())
+        if negative or not np.isfinite(array).all():
+            raise WeightsError(
+                "weights.values",
+                f"the tensor {name} holds numbers that no network has",
+                field=str(checkpoint.path),
+                expected="finite numbers, variances not negative",
+            )
