@@ -30,6 +30,7 @@ from matplotlib import pyplot as plt
 ROOT = Path(".demo")
 DATASET, MAPS = ROOT / "dataset", ROOT / "maps"
 REPORT, POSES, PICTURE = ROOT / "report.json", ROOT / "poses.txt", ROOT / "picture.png"
+SERVICE_LOG = ROOT / "service.log"
 COMMANDS = Path(sys.executable).parent
 READY_WITHIN_S = 60
 # The sample's poses are exact: this is what the system promises on it.
@@ -81,8 +82,9 @@ def served(http_port: int, grpc_port: int) -> Iterator[None]:
     words = [
         *("--maps-dir", str(MAPS), "--http-port", str(http_port), "--grpc-port", str(grpc_port)),
     ]
-    say(f"\n$ visloc-service {' '.join(words)} &")
-    service = subprocess.Popen([COMMANDS / "visloc-service", *words])
+    say(f"\n$ visloc-service {' '.join(words)} 2> {SERVICE_LOG} &")
+    with SERVICE_LOG.open("wb") as log:
+        service = subprocess.Popen([COMMANDS / "visloc-service", *words], stderr=log)
     try:
         wait_until_ready(service, f"http://127.0.0.1:{http_port}/readyz")
         yield
@@ -101,7 +103,7 @@ def wait_until_ready(service: subprocess.Popen[bytes], url: str) -> None:
         except httpx.TransportError:
             pass
         time.sleep(0.2)
-    raise SystemExit("the service did not become ready")
+    raise SystemExit(f"the service did not become ready; see {SERVICE_LOG}")
 
 
 def free_port() -> int:
@@ -127,7 +129,7 @@ def draw() -> None:
 
     figure, axes = plt.subplots(figsize=(10, 8), layout="constrained")
     some = np.random.default_rng(0).permutation(len(landmarks))[:40_000]
-    axes.scatter(*landmarks[some, :2].T, s=0.3, c="#9aa5b1", linewidths=0, label="landmarks")
+    axes.scatter(*landmarks[some, :2].T, s=1.0, c="#8492a6", linewidths=0, label="landmarks")
     draw_cameras(axes, mapping, "#3b6ea5", "mapping photos")
     draw_cameras(axes, list(found.values()), "#d1495b", "queries, where they were found")
     exact = np.array([pose.center for pose in truth.values() if pose is not None])
