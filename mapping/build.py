@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -24,7 +24,7 @@ from visloc.archive import (
     MapStore,
     write_map,
 )
-from visloc.errors import Conflict, Unavailable
+from visloc.errors import Conflict, DatasetError, InvalidInput, Unavailable
 from visloc.features import (
     DEFAULT_GLOBAL_FEATURES,
     DEFAULT_LOCAL_FEATURES,
@@ -33,7 +33,7 @@ from visloc.features import (
     make_global_descriptor,
     make_local_features,
 )
-from visloc.geometry import Pose
+from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import Dataset, read_dataset
 from visloc.types import Fingerprint, LocalFeatures
@@ -45,7 +45,7 @@ METHODS = ("rgbd",)
 # The vocabulary of a global descriptor is learned from at most this many photos, evenly chosen.
 _VOCABULARY_PHOTOS = 200
 # Raised when the code of a stage changes what comes out.
-_REVISION = {"words": 1, "vocabulary": 1, "pooled": 1, "projection": 1, "lifted": 1}
+_REVISION = {"words": 1, "vocabulary": 1, "pooled": 1, "projection": 1, "lifted": 2}
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,11 +93,13 @@ def build_map(settings: BuildSettings, progress: Progress) -> Path:
     Raises:
         Conflict: ``map.exists`` without ``force``; ``build.running``.
         DatasetError, WeightsError, InvalidInput: with the file or the setting that is wrong.
-        Unavailable: ``storage.write`` when the disk is full.
+        Unavailable: ``storage.failed`` when the disk is full or broken.
     """
+    _check(settings)
     store = MapStore(settings.maps_dir)
     versions = store.versions(settings.map_id)
-    if versions and not settings.force:
+    # Versions of which none is current are what a build left that was killed while it published.
+    if versions and settings.map_id in store.ids() and not settings.force:
         raise Conflict(
             "map.exists",
             f"map {settings.map_id!r} exists (version {versions[-1]}); "
@@ -114,11 +116,34 @@ def build_map(settings: BuildSettings, progress: Progress) -> Path:
             shutil.rmtree(work_root)
     except OSError as error:
         raise Unavailable(
-            "storage.write",
-            f"writing failed: {error.strerror}; finished work is kept, the same command resumes",
+            "storage.failed",
+            f"reading or writing failed: {error.strerror or error}; "
+            "finished work is kept, the same command resumes",
             field=str(error.filename or work_root),
         ) from error
     return folder
+
+
+def _check(settings: BuildSettings) -> None:
+    """Refuse what would otherwise fail after hours, or give a useless map."""
+    if settings.method not in METHODS:
+        raise InvalidInput(
+            "build.method",
+            "unknown method",
+            field="--method",
+            expected=f"one of {', '.join(METHODS)}",
+            got=settings.method,
+        )
+    for name in ("voxel_size", "depth_scale"):
+        value = getattr(settings, name)
+        if not (math.isfinite(value) and value > 0):
+            raise InvalidInput(
+                f"build.{name}",
+                "not usable",
+                field=f"--{name.replace('_', '-')}",
+                expected="metres, more than 0",
+                got=value,
+            )
 
 
 def _build(
@@ -137,6 +162,14 @@ def _build(
         depth_sensor=settings.depth_sensor,
         progress=lambda done, total: progress("photos", done, total),
     )
+    if all(photo.depth is None for photo in photos):
+        raise DatasetError(
+            "dataset.no_depth",
+            "no photo has a depth map",
+            field=str(dataset.root / "sensors" / "records_depth.txt"),
+            expected="depth maps with the timestamps of the photos, of a sensor in their rig or "
+            "with poses of its own; see --depth-sensor",
+        )
     features = _LocalFeaturesStage(work, extractor, settings.max_keypoints)
     for done, photo in enumerate(photos, 1):
         features.compute(photo)
@@ -173,13 +206,15 @@ def _build(
         descriptors=_Rereadable(observed_descriptors),
         global_features=global_features,
     )
-    incoming = Path(tempfile.mkdtemp(prefix="incoming-", dir=work_root))
+    incoming = work_root / "incoming"
+    shutil.rmtree(incoming, ignore_errors=True)  # of a build that was killed here
+    incoming.mkdir()
     try:
         version = write_map(
             incoming,
             content,
             map_id=settings.map_id,
-            version=now.strftime("%Y%m%dT%H%M%SZ-"),
+            version=now.strftime("%Y%m%dT%H%M%S.%f")[:-3] + "Z-",
             created=now.isoformat(timespec="seconds"),
         )
         folder = store.publish(incoming, settings.map_id, version)
@@ -210,6 +245,7 @@ class _LocalFeaturesStage:
             "local_features",
             1,
             photo=photo.sha256,
+            size=[photo.camera.width, photo.camera.height],
             fingerprint=_json(self.extractor.fingerprint),
             max_keypoints=self.max_keypoints,
         )
@@ -220,9 +256,17 @@ class _LocalFeaturesStage:
 
     def read(self, photo: MappingPhoto) -> LocalFeatures:
         def extract() -> Mapping[str, NDArray[np.float32]]:
-            local = self.extractor.extract(
-                read_photo_file(photo.path).rgb, max_keypoints=self.max_keypoints
-            )
+            pixels = read_photo_file(photo.path)
+            if (pixels.width, pixels.height) != (photo.camera.width, photo.camera.height):
+                raise DatasetError(
+                    "dataset.photo_size",
+                    "the photo is not of the size of its camera",
+                    field=str(photo.path),
+                    expected=f"{photo.camera.width} x {photo.camera.height} as sensors.txt has "
+                    f"it for {photo.record.sensor_id}",
+                    got=f"{pixels.width} x {pixels.height}",
+                )
+            local = self.extractor.extract(pixels.rgb, max_keypoints=self.max_keypoints)
             return {
                 "keypoints": local.keypoints,
                 "descriptors": local.descriptors,
@@ -310,7 +354,7 @@ def _landmarks_from_depth(
     progress: Progress,
 ) -> tuple[Landmarks, list[NDArray[np.int64]]]:
     """Landmarks, and of each photo the rows of its features that became observations."""
-    lifted, keypoints = [], []
+    lifted = []
     for done, photo in enumerate(photos, 1):
         local = features.read(photo)
         item = work.get(
@@ -318,13 +362,12 @@ def _landmarks_from_depth(
                 "lifted",
                 _REVISION["lifted"],
                 local=features.key(photo),
-                camera=[photo.camera.model, *photo.camera.params],
+                camera=_camera(photo.camera),
                 pose=_numbers(photo.cam_from_world),
                 depth=photo.depth
                 and [
                     photo.depth_sha256,
-                    photo.depth.camera.model,
-                    *photo.depth.camera.params,
+                    *_camera(photo.depth.camera),
                     *_numbers(photo.depth.cam_from_depth),
                 ],
                 depth_scale=settings.depth_scale,
@@ -334,12 +377,11 @@ def _landmarks_from_depth(
             ),
         )
         lifted.append(LiftedKeypoints(**item))
-        keypoints.append(local.keypoints[item["rows"]])
         progress("depth", done, len(photos))
     progress("landmarks", 0, 1)
-    landmarks = merge_landmarks(photos, keypoints, lifted, settings.voxel_size)
+    merged = merge_landmarks(photos, lifted, settings.voxel_size)
     progress("landmarks", 1, 1)
-    return landmarks, [one.rows for one in lifted]
+    return merged
 
 
 def _known_rigs(dataset: Dataset, cameras: set[str]) -> dict[str, dict[str, Pose]]:
@@ -349,6 +391,10 @@ def _known_rigs(dataset: Dataset, cameras: set[str]) -> dict[str, dict[str, Pose
         for rig, members in dataset.rigs.items()
     }
     return {rig: members for rig, members in rigs.items() if members}
+
+
+def _camera(camera: Camera) -> list[str | float]:
+    return [camera.model, camera.width, camera.height, *camera.params]
 
 
 def _numbers(pose: Pose) -> list[float]:

@@ -6,7 +6,7 @@ import json
 import resource
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -23,7 +23,9 @@ from visloc.features import (
     DEFAULT_LOCAL_FEATURES,
     GLOBAL_FEATURES,
     LOCAL_FEATURES,
+    make_local_features,
 )
+from visloc.localizer import Localizer
 
 app = typer.Typer(
     name="mapping",
@@ -123,23 +125,19 @@ def inspect(
 
 
 @app.command()
-def verify(map_ref: MapArgument, maps_dir: MapsDirOption = Path("maps")) -> None:
-    """Read every byte of a map: checksums, ranges, features that exist here."""
+def verify(
+    map_ref: MapArgument,
+    maps_dir: MapsDirOption = Path("maps"),
+    weights_dir: WeightsDirOption = None,
+) -> None:
+    """Read every byte of a map: checksums and ranges; then compare its features with ours."""
     opened = verify_map(_folder(map_ref, maps_dir))
-    manifest = opened.manifest
-    for fingerprint, known in (
-        (manifest.local_features.fingerprint, LOCAL_FEATURES),
-        *((g.fingerprint, GLOBAL_FEATURES) for g in manifest.global_features),
-    ):
-        if fingerprint.name not in known:
-            raise InvalidInput(
-                "features.unknown",
-                "the map needs a feature that is not installed",
-                field=str(opened.path),
-                expected=f"one of {', '.join(sorted(known))}",
-                got=fingerprint.name,
-            )
-    _out.print(f"{opened.ref}: {len(opened.manifest.files)} files, every byte as published")
+    num_files = len(opened.manifest.files)
+    _out.print(f"{opened.ref}: {num_files} files, every byte as published", soft_wrap=True)
+    name = opened.manifest.local_features.fingerprint.name
+    Localizer(opened, make_local_features(name, weights_dir))  # raises when they differ
+    names = (name, *(record.fingerprint.name for record in opened.manifest.global_features))
+    _out.print(f"{', '.join(names)}: the same features as here", soft_wrap=True)
 
 
 @app.command("export-features")
@@ -178,7 +176,7 @@ def sample(
     size: Annotated[str, typer.Option(help="Size of a photo, WxH.")] = "640x480",
 ) -> None:
     """Make a small synthetic dataset with exact poses."""
-    with StageProgress(_err) as progress:
+    with StageProgress(_err, if_stopped="nothing was left behind") as progress:
         write_sample(
             output,
             images=images,
@@ -194,8 +192,15 @@ def main() -> None:
     try:
         app()
     except VislocError as error:
-        _err.print(f"error [{error.code}] {error}", markup=False, highlight=False, soft_wrap=True)
-        sys.exit(1)
+        _fail(error.code, str(error))
+    except OSError as error:  # a full disk, a folder without permission
+        _fail("system", str(error))
+
+
+def _fail(code: str, message: str) -> NoReturn:
+    line = " ".join(message.splitlines())
+    _err.print(f"error [{code}] {line}", markup=False, highlight=False, soft_wrap=True)
+    sys.exit(1)
 
 
 def _parse_size(text: str) -> tuple[int, int]:

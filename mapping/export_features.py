@@ -13,6 +13,7 @@ from visloc.errors import Conflict
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import (
+    Dataset,
     read_dataset,
     write_dataset,
     write_global_features,
@@ -43,35 +44,39 @@ def export_features(
         weights_dir: folder with network weights.
         max_keypoints: strongest keypoints kept per photo.
         global_from: a map whose global descriptors are computed for the photos; its local
-            features must be the same, since ``localvlad`` is made of them.
+            features must be the same and as many, since ``localvlad`` is made of them.
         progress: told the stage, how much is done, and how much there is.
 
     Raises:
-        Conflict: ``map.features`` when the map has other local features.
+        Conflict: ``map.features`` when the map has other local features;
+            ``export.other_dataset`` when ``output`` holds another dataset.
     """
     dataset = read_dataset(dataset_root)
     extractor = make_local_features(local_features, weights_dir)
     descriptors = {}
     if global_from is not None:
-        built_with = global_from.manifest.local_features.fingerprint
-        if built_with != FingerprintRecord.of(extractor.fingerprint):
+        built_with = global_from.manifest.local_features
+        if (built_with.fingerprint, built_with.max_keypoints) != (
+            FingerprintRecord.of(extractor.fingerprint),
+            max_keypoints,
+        ):
             raise Conflict(
                 "map.features",
                 "the map was built with other local features",
                 field="--map",
-                expected=local_features,
-                got=built_with.name,
+                expected=f"{local_features}, at most {max_keypoints} per photo",
+                got=f"{built_with.fingerprint.name}, at most {built_with.max_keypoints} per photo",
             )
         for features in global_from.manifest.global_features:
             name = features.fingerprint.name
             descriptors[name] = (make_global_descriptor(name), global_from.global_models[name])
-    write_dataset(replace(dataset, root=output))
-    link = output / "sensors" / "records_data"
-    if not link.exists():
-        link.symlink_to((dataset.root / "sensors" / "records_data").resolve())
+    _write_records(dataset, output)
+    reconstruction = output / "reconstruction"
     for done, record in enumerate(dataset.images, 1):
-        finished = output / "reconstruction" / "descriptors" / local_features
-        if not (finished / f"{record.path}.desc").is_file() or descriptors:
+        last_written = [reconstruction / "descriptors" / local_features / f"{record.path}.desc"]
+        for name in descriptors:
+            last_written.append(reconstruction / "global_features" / name / f"{record.path}.gfeat")
+        if not all(path.is_file() for path in last_written):
             rgb = read_photo_file(dataset.path_of(record)).rgb
             local = extractor.extract(rgb, max_keypoints=max_keypoints)
             for name, (descriptor, model) in descriptors.items():
@@ -86,3 +91,21 @@ def export_features(
                 name=local_features,
             )
         progress("features", done, len(dataset.images))
+
+
+def _write_records(dataset: Dataset, output: Path) -> None:
+    """Write the dataset's text files and link its photos, unless an earlier run did."""
+    records = output / "sensors" / "records_data"
+    photos = (dataset.root / "sensors" / "records_data").resolve()
+    if not (records.is_symlink() or records.exists()):
+        records.parent.mkdir(parents=True, exist_ok=True)
+        records.symlink_to(photos)
+    if not (output / "sensors" / "sensors.txt").is_file():
+        write_dataset(replace(dataset, root=output))
+    if records.resolve() != photos or read_dataset(output).images != dataset.images:
+        raise Conflict(
+            "export.other_dataset",
+            "the folder holds another dataset; name another folder or remove it",
+            field=str(output),
+            expected=f"a new folder, or one that was made of {dataset.root}",
+        )

@@ -18,10 +18,18 @@ from rich.progress import (
 
 
 class StageProgress:
-    """Shows how far each stage is. Call it with the stage, how much is done, and how much is."""
+    """Shows how far each stage is. Call it with the stage, how much is done, and how much is.
 
-    def __init__(self, console: Console) -> None:
+    Args:
+        console: where to.
+        if_stopped: what Ctrl-C leaves, for the person who pressed it.
+    """
+
+    def __init__(
+        self, console: Console, if_stopped: str = "the same command resumes where it was"
+    ) -> None:
         self._console = console
+        self._if_stopped = if_stopped
         self._tasks: dict[str, TaskID] = {}
         self._started: dict[str, float] = {}
         self._bars = Progress(
@@ -46,7 +54,7 @@ class StageProgress:
     ) -> None:
         self._bars.stop()
         if kind is KeyboardInterrupt:
-            self._console.print("stopped; the same command resumes where it was")
+            self._console.print(f"stopped; {self._if_stopped}")
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Tell that ``done`` of ``total`` items of a stage are finished."""

@@ -27,11 +27,13 @@ class LiftedKeypoints:
     """Keypoints of one photo that have a depth.
 
     Attributes:
-        rows: (m,) int64 rows of the photo's features.
+        rows: (m,) int64 rows of the photo's features, strongest first.
+        pixels: (m, 2) float32 where the photo sees them.
         points: (m, 3) float64 in the world.
     """
 
     rows: NDArray[np.int64]
+    pixels: NDArray[np.float32]
     points: NDArray[np.float64]
 
 
@@ -44,29 +46,32 @@ def lift_keypoints(
         DatasetError: when the depth map is not what its sensor says.
     """
     if photo.depth is None:
-        return LiftedKeypoints(np.empty(0, dtype=np.int64), np.empty((0, 3)))
+        rows = np.empty(0, dtype=np.int64)
+        return LiftedKeypoints(rows, keypoints[rows], np.empty((0, 3)))
     depth, seen_by = photo_depth(dataset, photo.depth, photo.camera, depth_scale)
     rays = normalized_rays(photo.camera, keypoints)
     # Both cameras now share one centre and one orientation, not always size and focal length.
     distance = depth_at(depth, project(seen_by, rays)).astype(np.float64)
     rows = np.flatnonzero(np.isfinite(distance) & np.isfinite(rays).all(axis=1))
     points = photo.cam_from_world.inverse().apply(rays[rows] * distance[rows, None])
-    return LiftedKeypoints(rows, points)
+    return LiftedKeypoints(rows, keypoints[rows], points)
 
 
 def merge_landmarks(
-    photos: Sequence[MappingPhoto],
-    keypoints: Sequence[NDArray[np.float32]],
-    lifted: Sequence[LiftedKeypoints],
-    voxel_size: float,
-) -> Landmarks:
-    """Merge the lifted keypoints of all photos: one landmark per occupied voxel.
+    photos: Sequence[MappingPhoto], lifted: Sequence[LiftedKeypoints], voxel_size: float
+) -> tuple[Landmarks, list[NDArray[np.int64]]]:
+    """Merge the lifted keypoints of all photos: one landmark per occupied voxel, at their mean.
+
+    Of several keypoints of one photo in a voxel (a corner found at several scales) the strongest
+    stays.
 
     Args:
         photos: n photos.
-        keypoints: of each photo, the (m_i, 2) pixels of its lifted keypoints.
         lifted: of each photo, its lifted keypoints.
         voxel_size: edge of a voxel in the unit of the world.
+
+    Returns:
+        The landmarks, and of each photo the rows of its features that observe them.
 
     Raises:
         InvalidInput: ``rgbd.no_landmarks`` or ``rgbd.voxel_size``.
@@ -83,36 +88,39 @@ def merge_landmarks(
     points -= origin
     landmark, num_landmarks = _voxel_index(points, voxel_size)
     seen_in = np.repeat(np.arange(len(lifted)), [len(one.rows) for one in lifted])
+    # np.unique gives the first row of each pair, which is the strongest keypoint.
+    _, first = np.unique(landmark * len(photos) + seen_in, return_index=True)
+    kept = np.sort(first)
+    points, landmark, seen_in = points[kept], landmark[kept], seen_in[kept]
+    pixels = np.concatenate([one.pixels for one in lifted])[kept]
+    rows = np.concatenate([one.rows for one in lifted])[kept]
 
-    size = np.bincount(landmark, minlength=num_landmarks)
+    tracks = np.bincount(landmark, minlength=num_landmarks)
     mean = np.column_stack(
-        [np.bincount(landmark, points[:, axis], num_landmarks) / size for axis in range(3)]
+        [np.bincount(landmark, points[:, axis], num_landmarks) / tracks for axis in range(3)]
     )
+    by_photo = _rows_by_photo(seen_in, len(photos))
     errors = np.concatenate(
         [
             np.linalg.norm(
-                project(photo.camera, photo.cam_from_world.apply(mean[landmark[rows]] + origin))
-                - pixels,
+                project(photo.camera, photo.cam_from_world.apply(mean[landmark[own]] + origin))
+                - pixels[own],
                 axis=1,
             )
-            for photo, pixels, rows in zip(
-                photos, keypoints, _rows_by_photo(seen_in, len(photos)), strict=True
-            )
+            for photo, own in zip(photos, by_photo, strict=True)
         ]
     )
-    # A photo that sees a landmark twice, at two scales, counts once.
-    distinct = np.unique(landmark * len(photos) + seen_in) // len(photos)
-    tracks = np.bincount(distinct, minlength=num_landmarks)
-    return Landmarks(
+    landmarks = Landmarks(
         origin=origin,
         points=mean.astype(np.float32),
         track_lengths=np.minimum(tracks, 65535).astype(np.uint16),
-        errors_px=(np.bincount(landmark, errors, num_landmarks) / size).astype(np.float32),
+        errors_px=(np.bincount(landmark, errors, num_landmarks) / tracks).astype(np.float32),
         angles_deg=np.full(num_landmarks, np.nan, dtype=np.float32),
-        offsets=np.concatenate([[0], np.cumsum([len(one.rows) for one in lifted])]),
+        offsets=np.array([0, *(own.stop for own in by_photo)], dtype=np.int64),
         observed=landmark.astype(np.uint32),
-        keypoints=np.concatenate([*keypoints, np.empty((0, 2), np.float32)]),
+        keypoints=pixels,
     )
+    return landmarks, [rows[own] for own in by_photo]
 
 
 def _rows_by_photo(seen_in: NDArray[np.int64], num_photos: int) -> list[slice]:

@@ -16,6 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import visloc
 from service.engine import Engine
+from service.incoming import invalid_input
 from service.intake import read_localize_request
 from service.openapi import LOCALIZE_BODY, App, problems
 from service.schemas import (
@@ -26,7 +27,6 @@ from service.schemas import (
     MapNotLoaded,
     Problem,
     Readiness,
-    invalid_input,
 )
 from service.settings import ServiceSettings
 from service.wire import RETRY_AFTER_S, internal_error, request_id, statuses_of

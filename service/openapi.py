@@ -59,11 +59,22 @@ LOCALIZE_BODY: dict[str, Any] = {
 }
 
 
+_PROBLEMS = {
+    404: "no such map or version",
+    409: "the features or weights that the map was built with are not here",
+    413: "over a limit on bytes or pixels",
+    422: "the request cannot be used as it is",
+    429: "too many photos are waiting; try again",
+    500: "a map on disk is damaged, or the server made a mistake",
+    503: "the maps are being loaded; try again",
+}
+
+
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Describe the errors of a route."""
     return {
         status: {
-            "description": "refused",
+            "description": _PROBLEMS[status],
             "content": {
                 "application/problem+json": {"schema": {"$ref": _REF.format(model="Problem")}}
             },

@@ -8,86 +8,33 @@ from __future__ import annotations
 
 import base64
 import binascii
-from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, Field
 from pydantic.json_schema import WithJsonSchema
 
 import visloc.geometry
 import visloc.types
 from service.engine import Localization, LocalizeJob
+from service.incoming import IncomingMessage
 from visloc.archive import Map
 from visloc.errors import InvalidInput
 
 _CAMERA_TEXT = "PINHOLE,640,480,525,525,320,240"
 
 
-class _Request(BaseModel):
-    """A message from outside: unknown fields are refused by name."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-    # Where this message sits in the request, for error messages.
-    path: ClassVar[str] = ""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _check_names(cls, value: Any) -> Any:
-        if not isinstance(value, dict):
-            raise InvalidInput(
-                "request.invalid",
-                "not an object",
-                field=cls.path.rstrip(".") or None,
-                expected=f"an object with {', '.join(cls.model_fields)}",
-                got=type(value).__name__,
-            )
-        for name in value:
-            if name not in cls.model_fields:
-                raise InvalidInput(
-                    "request.unknown_field",
-                    "unknown field",
-                    field=f"{cls.path}{str(name)[:100]}",
-                    expected=f"one of {', '.join(cls.model_fields)}",
-                    got=name,
-                )
-        return value
-
-    @classmethod
-    def read(cls, value: object) -> Self:
-        """Check a message made of Python values.
-
-        Raises:
-            InvalidInput: ``request.missing_field``, ``request.unknown_field``,
-                ``request.invalid``, or a code of the field.
-        """
-        try:
-            return cls.model_validate(value)
-        except ValidationError as refused:
-            raise invalid_input(refused.errors(include_url=False)[0], cls.path) from None
-
-    @classmethod
-    def read_json(cls, text: str | bytes) -> Self:
-        """Check a message written as JSON.
-
-        Raises:
-            InvalidInput: as ``read``, and ``request.malformed``.
-        """
-        try:
-            return cls.model_validate_json(text)
-        except ValidationError as refused:
-            raise invalid_input(refused.errors(include_url=False)[0], cls.path) from None
-
-
-class Camera(_Request):
+class Camera(IncomingMessage):
     """Intrinsics for the pixels as stored."""
 
     path: ClassVar[str] = "camera."
 
     model: Annotated[str, Field(description="COLMAP's name, such as PINHOLE")]
     width: Annotated[int, Field(description="pixels")]
-    height: int
-    params: Annotated[list[float], Field(description="in COLMAP's order")]
+    height: Annotated[int, Field(description="pixels")]
+    params: Annotated[
+        list[float], Field(description="in COLMAP's order, pixels where they are lengths")
+    ]
 
     def to_core(self) -> visloc.geometry.Camera:
         """Return the camera, checked."""
@@ -108,22 +55,48 @@ def _camera_from_text(value: object) -> object:
     }
 
 
-class LocalizeOptions(_Request):
-    """What may be chosen per query; what is left out takes the preset's value."""
+class LocalizeOptions(IncomingMessage):
+    """What may be chosen per query. null is the same as left out."""
 
     path: ClassVar[str] = "options."
 
-    preset: Annotated[str | None, Field(description="default, config1 or config2")] = None
-    top_k: Annotated[int | None, Field(description="mapping photos to match against")] = None
+    preset: Annotated[
+        str | None,
+        Field(description="the thresholds to start from: default, config1 or config2"),
+    ] = None
+    top_k: Annotated[
+        int | None, Field(description="mapping photos to match against: 1 to 1000, by default 20")
+    ] = None
     max_error_px: Annotated[
-        float | None, Field(description="largest reprojection error of an inlier")
+        float | None,
+        Field(
+            description="largest reprojection error of an inlier: 0.1 to 1000 pixels, by default "
+            "the preset's"
+        ),
     ] = None
-    min_inliers: Annotated[int | None, Field(description="fewest inliers of a pose")] = None
-    min_inlier_ratio: Annotated[float | None, Field(description="0 to 1")] = None
+    min_inliers: Annotated[
+        int | None,
+        Field(
+            description="fewest inliers of an accepted pose: 4 to 1000000, by default the preset's"
+        ),
+    ] = None
+    min_inlier_ratio: Annotated[
+        float | None,
+        Field(
+            description="smallest share of inliers among the correspondences: 0 to 1, by default "
+            "the preset's"
+        ),
+    ] = None
     read_as: Annotated[
-        str | None, Field(description="stored (default) or upright (by EXIF orientation)")
+        str | None,
+        Field(
+            description="stored (default), or upright: turn the photo by its EXIF orientation "
+            "before features are found"
+        ),
     ] = None
-    seed: Annotated[int | None, Field(description="of RANSAC")] = None
+    seed: Annotated[int | None, Field(description="of RANSAC: 0 to 2147483647, by default 0")] = (
+        None
+    )
 
     def to_core(self) -> visloc.types.LocalizeOptions:
         """Return the options, checked."""
@@ -161,7 +134,7 @@ def _bytes_from_base64(value: object) -> object:
         ) from None
 
 
-class LocalizeRequest(_Request):
+class LocalizeRequest(IncomingMessage):
     """A photo and the map to find it in."""
 
     map: Annotated[str, Field(description="id, or id@version")]
@@ -213,8 +186,13 @@ class PoseEstimate(BaseModel):
     """Where the photo was taken, and how sure that is."""
 
     cam_from_world: Transform
-    position: Annotated[list[float], Field(description="camera centre in the world")]
-    orientation: Annotated[list[float], Field(description="world_from_cam as w, x, y, z")]
+    position: Annotated[
+        list[float],
+        Field(description="camera centre in the world, metres when the map is metric"),
+    ]
+    orientation: Annotated[
+        list[float], Field(description="rotation of world_from_cam as w, x, y, z")
+    ]
     covariance: Annotated[
         list[float],
         Field(
@@ -222,14 +200,23 @@ class PoseEstimate(BaseModel):
             "R <- Exp(w) R and t <- t + dt of cam_from_world"
         ),
     ]
-    position_std: Annotated[list[float], Field(description="along the world's axes")]
-    orientation_std_deg: Annotated[list[float], Field(description="about the camera's x, y, z")]
+    position_std: Annotated[
+        list[float],
+        Field(description="standard deviations of the position along the world's axes"),
+    ]
+    orientation_std_deg: Annotated[
+        list[float],
+        Field(description="standard deviations about the camera's x, y and z axes, degrees"),
+    ]
 
 
 class Refusal(BaseModel):
     """Why there is no pose."""
 
-    stage: Literal["features", "retrieval", "matching", "pose", "gate"]
+    stage: Annotated[
+        Literal["features", "retrieval", "matching", "pose", "gate"],
+        Field(description="the stage that gave up"),
+    ]
     reason: Annotated[visloc.types.Reason, Field(description="a stable word")]
     message: Annotated[str, Field(description="for a person")]
 
@@ -237,19 +224,25 @@ class Refusal(BaseModel):
 class RetrievedImage(BaseModel):
     """A mapping photo that was matched against."""
 
-    image: str
+    image: Annotated[str, Field(description="its name in the map")]
     score: Annotated[float, Field(description="fused, comparable within one answer only")]
     similarities: Annotated[dict[str, float], Field(description="cosine by global descriptor")]
 
 
 class CameraUsed(BaseModel):
-    """The intrinsics used, and where they came from."""
+    """The intrinsics used, for the pixels as stored."""
 
     model: str
     width: int
     height: int
     params: list[float]
-    source: visloc.types.CameraSource
+    source: Annotated[
+        visloc.types.CameraSource,
+        Field(
+            description="given; given_scaled, for another size of the same aspect; exif, its "
+            "focal length; or guess, 1.2 times the longer side"
+        ),
+    ]
 
 
 class Orientation(BaseModel):
@@ -269,19 +262,23 @@ class MapRef(BaseModel):
 class LocalizeResponse(BaseModel):
     """The answer: a pose, or the reason why there is none."""
 
-    request_id: str
+    request_id: Annotated[str, Field(description="the caller's, or made by the server")]
     status: Literal["localized", "not_localized"]
-    pose: PoseEstimate | None
-    refusal: Refusal | None
-    keypoints: int
-    correspondences: int
-    inliers: int
-    inlier_ratio: float
-    retrieved: list[RetrievedImage]
+    pose: Annotated[PoseEstimate | None, Field(description="null when not localized")]
+    refusal: Annotated[Refusal | None, Field(description="null when localized")]
+    keypoints: Annotated[int, Field(description="found in the photo")]
+    correspondences: Annotated[int, Field(description="2D-3D matches given to the solver")]
+    inliers: Annotated[
+        int, Field(description="of them, those that agree with the best pose, refused or not")
+    ]
+    inlier_ratio: Annotated[float, Field(description="inliers / correspondences; 0 without any")]
+    retrieved: Annotated[
+        list[RetrievedImage], Field(description="mapping photos matched against, best first")
+    ]
     camera: CameraUsed
     orientation: Orientation
     map: MapRef
-    seconds: Annotated[dict[str, float], Field(description="by stage")]
+    seconds: Annotated[dict[str, float], Field(description="wall time by stage that was reached")]
 
     @staticmethod
     def from_localization(found: Localization, request_id: str) -> LocalizeResponse:
@@ -346,14 +343,14 @@ class MapInfo(BaseModel):
     version: str
     created: Annotated[str, Field(description="ISO 8601, UTC")]
     metric: Annotated[bool, Field(description="whether one unit of the world is a metre")]
-    method: str
-    local_features: str
+    method: Annotated[str, Field(description="how the landmarks were made, such as rgbd")]
+    local_features: Annotated[str, Field(description="such as xfeat")]
     global_features: list[str]
-    images: int
-    landmarks: int
-    observations: int
+    images: Annotated[int, Field(description="mapping photos")]
+    landmarks: Annotated[int, Field(description="3D points")]
+    observations: Annotated[int, Field(description="sightings of landmarks in mapping photos")]
     extent: Extent
-    size_bytes: int
+    size_bytes: Annotated[int, Field(description="on the server's disk")]
 
     @staticmethod
     def from_map(opened: Map) -> MapInfo:
@@ -399,9 +396,9 @@ class MapNotLoaded(BaseModel):
 class Readiness(BaseModel):
     """Whether photos are accepted."""
 
-    ready: bool
+    ready: Annotated[bool, Field(description="whether the maps of the start are open and warm")]
     maps: Annotated[list[str], Field(description="id@version of what is loaded")]
-    not_loaded: list[MapNotLoaded]
+    not_loaded: Annotated[list[MapNotLoaded], Field(description="they do not prevent readiness")]
 
 
 class Problem(BaseModel):
@@ -417,18 +414,3 @@ class Problem(BaseModel):
     got: Annotated[str | None, Field(description="what came instead")] = None
     kind: Annotated[str, Field(description="the kind of error, such as InvalidInput")]
     request_id: str
-
-
-def invalid_input(complaint: Mapping[str, Any], path: str = "") -> InvalidInput:
-    """Say one of pydantic's complaints in our words. Never echoes a large value."""
-    kind, message = complaint["type"], complaint["msg"]
-    field = path + ".".join(str(part) for part in complaint["loc"])
-    if kind == "json_invalid":
-        return InvalidInput(
-            "request.malformed", message, field=path.rstrip(".") or None, expected="JSON"
-        )
-    if kind == "missing":
-        return InvalidInput("request.missing_field", "this field is needed", field=field)
-    got = complaint["input"]
-    got = got if isinstance(got, str | int | float | None) else type(got).__name__
-    return InvalidInput("request.invalid", "cannot be used", field=field, expected=message, got=got)

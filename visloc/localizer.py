@@ -221,16 +221,27 @@ def resolve_camera(photo: Photo, given: Camera | None) -> tuple[Camera, CameraSo
 
 
 def _check_fingerprint(built_with: FingerprintRecord, at_hand: Fingerprint, ref: str) -> None:
-    if built_with == FingerprintRecord.of(at_hand):
+    there, here = _flat(built_with), _flat(FingerprintRecord.of(at_hand))
+    differing = [name for name in {**there, **here} if there.get(name) != here.get(name)]
+    if not differing:
         return
     raise Conflict(
         "map.features",
         f"map {ref} was built with another {built_with.name}; use the weights and the version of "
         "visloc that built it, or build it again",
-        field="weights_dir" if built_with.weights_sha256 != at_hand.weights_sha256 else "map",
-        expected=str(built_with.model_dump()),
-        got=str(FingerprintRecord.of(at_hand).model_dump()),
+        field="weights_dir" if "weights_sha256" in differing else "map",
+        expected=", ".join(f"{name} {there.get(name)}" for name in differing),
+        got=", ".join(f"{name} {here.get(name)}" for name in differing),
     )
+
+
+def _flat(record: FingerprintRecord) -> dict[str, int | float | str | None]:
+    return {
+        "name": record.name,
+        "revision": record.revision,
+        "weights_sha256": record.weights_sha256,
+        **record.parameters,
+    }
 
 
 @contextmanager

@@ -53,58 +53,58 @@ def test_a_photo_without_depth_gives_nothing(tmp_path: Path) -> None:
     assert lifted.points.shape == (0, 3)
 
 
-def lifted_at(*points: tuple[float, float, float]) -> LiftedKeypoints:
-    return LiftedKeypoints(np.arange(len(points)), np.array(points).reshape(-1, 3))
-
-
-def pixels_of(photo: MappingPhoto, lifted: LiftedKeypoints) -> NDArray[np.float32]:
-    seen = photo.cam_from_world.apply(lifted.points)
+def lifted_at(photo: MappingPhoto, *points: tuple[float, float, float]) -> LiftedKeypoints:
+    world = np.array(points).reshape(-1, 3)
+    seen = photo.cam_from_world.apply(world)
     u = 60.0 * seen[:, 0] / seen[:, 2] + 31.0
     v = 62.0 * seen[:, 1] / seen[:, 2] + 25.0
-    return np.column_stack([u, v]).astype(np.float32)
+    pixels = np.column_stack([u, v]).astype(np.float32)
+    # every second feature had no depth
+    return LiftedKeypoints(2 * np.arange(len(points)), pixels, world)
 
 
 def test_points_of_one_voxel_become_one_landmark_with_their_observations() -> None:
     photos = [make_photo("a.jpg", Pose.identity()), make_photo("b.jpg", Pose.identity())]
     lifted = [
-        lifted_at((0.011, 0.001, 2.001), (0.5, 0.5, 3.001)),
-        lifted_at((0.013, 0.003, 2.003), (0.014, 0.002, 2.002), (-0.5, 0.5, 4.001)),
+        lifted_at(photos[0], (0.011, 0.001, 2.001), (0.5, 0.5, 3.001)),
+        lifted_at(photos[1], (0.013, 0.003, 2.003), (0.014, 0.002, 2.002), (-0.5, 0.5, 4.001)),
     ]
-    keypoints = [pixels_of(p, one) for p, one in zip(photos, lifted, strict=True)]
 
-    landmarks = merge_landmarks(photos, keypoints, lifted, voxel_size=0.01)
+    landmarks, rows = merge_landmarks(photos, lifted, voxel_size=0.01)
 
     assert len(landmarks.points) == 3
-    assert landmarks.offsets.tolist() == [0, 2, 5]
-    first, second, third, fourth, fifth = landmarks.observed.tolist()
-    assert first == third == fourth
-    assert len({first, second, fifth}) == 3
-    assert landmarks.points[first] == pytest.approx([0.038 / 3, 0.002, 2.002], abs=1e-6)
-    # the second photo sees it twice, which counts once
-    assert landmarks.track_lengths[[first, second, fifth]].tolist() == [2, 1, 1]
+    assert landmarks.offsets.tolist() == [0, 2, 4]
+    first, second, third, fourth = landmarks.observed.tolist()
+    assert first == third
+    assert len({first, second, fourth}) == 3
+    # the second photo sees it twice: its strongest keypoint stays
+    assert [kept.tolist() for kept in rows] == [[0, 2], [0, 4]]
+    assert landmarks.points[first] == pytest.approx([0.012, 0.002, 2.002], abs=1e-6)
+    assert landmarks.track_lengths[[first, second, fourth]].tolist() == [2, 1, 1]
     assert landmarks.errors_px[second] == pytest.approx(0.0, abs=1e-4)
-    # 2 mm at 2 m with a focal length of 60 px
-    assert 0.0 < landmarks.errors_px[first] < 0.1
-    assert np.concatenate(keypoints).tolist() == landmarks.keypoints.tolist()
+    # 1.4 mm at 2 m with a focal length of 60 px
+    assert landmarks.errors_px[first] == pytest.approx(0.042, abs=0.005)
+    assert landmarks.keypoints[3].tolist() == lifted[1].pixels[2].tolist()
 
 
 def test_far_from_the_origin_millimetres_survive() -> None:
     center = np.array([500_000.0, 4_600_000.0, 120.0])
     pose = Pose(np.eye(3), -center)
     photo = make_photo("a.jpg", pose)
-    lifted = LiftedKeypoints(np.arange(2), center + np.array([[0.0011, 0.0, 2.0], [0.5, 0.0, 2.0]]))
-    landmarks = merge_landmarks([photo], [pixels_of(photo, lifted)], [lifted], voxel_size=0.01)
+    x, y, z = center
+    lifted = lifted_at(photo, (x + 0.0011, y, z + 2.0), (x + 0.5, y, z + 2.0))
+    landmarks, _ = merge_landmarks([photo], [lifted], voxel_size=0.01)
     positions = landmarks.points.astype(np.float64) + landmarks.origin
     assert np.sort(positions[:, 0] - center[0]) == pytest.approx([0.0011, 0.5], abs=1e-6)
 
 
 def test_no_depth_anywhere_is_refused_with_a_hint() -> None:
     with pytest.raises(InvalidInput, match="--depth-sensor"):
-        merge_landmarks([make_photo()], [np.empty((0, 2), np.float32)], [lifted_at()], 0.01)
+        merge_landmarks([make_photo()], [lifted_at(make_photo())], 0.01)
 
 
 def test_a_voxel_size_that_would_overflow_is_refused() -> None:
-    lifted = lifted_at((0.0, 0.0, 1.0), (1e7, 1e7, 1e7))
     photo = make_photo()
+    lifted = lifted_at(photo, (0.0, 0.0, 1.0), (1e7, 1e7, 1e7))
     with pytest.raises(InvalidInput, match="--voxel-size"):
-        merge_landmarks([photo], [pixels_of(photo, lifted)], [lifted], voxel_size=1e-6)
+        merge_landmarks([photo], [lifted], voxel_size=1e-6)

@@ -1,9 +1,8 @@
-"""A map of the sample world, and both doors on real sockets."""
+"""Both doors on real sockets."""
 
 from __future__ import annotations
 
 import asyncio
-import shutil
 import threading
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -15,24 +14,11 @@ import grpc
 import httpx
 import pytest
 
-from mapping.build import BuildSettings, build_map
-from mapping.sample import write_sample
 from service.server import Server
 from service.settings import ServiceSettings
-from visloc.geometry import Camera, Pose
-from visloc.kapture import read_dataset
 from visloc_api.v1.localization_pb2_grpc import LocalizationStub
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Query:
-    """A photo with its true pose."""
-
-    image: bytes
-    camera: Camera
-    cam_from_world: Pose
 
 
 @dataclass(frozen=True)
@@ -47,41 +33,6 @@ class Doors:
     @property
     def url(self) -> str:
         return str(self.http.base_url)
-
-
-@pytest.fixture(scope="session")
-def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Small sample dataset: ``mapping/`` and ``query/``."""
-    folder = tmp_path_factory.mktemp("sample")
-    write_sample(folder, images=8, size=(256, 192))
-    return folder
-
-
-@pytest.fixture(scope="session")
-def built_maps(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of maps with the map ``room``; only to be read."""
-    maps = tmp_path_factory.mktemp("maps")
-    build_map(
-        BuildSettings(sample / "mapping", "room", maps, local_features="sift"), lambda *_: None
-    )
-    return maps
-
-
-@pytest.fixture
-def maps_dir(built_maps: Path, tmp_path: Path) -> Path:
-    """A copy of the maps that a test may change."""
-    return Path(shutil.copytree(built_maps, tmp_path / "maps"))
-
-
-@pytest.fixture(scope="session")
-def query(sample: Path) -> Query:
-    """The first query of the sample."""
-    dataset = read_dataset(sample / "query")
-    record = dataset.images[0]
-    camera, pose = dataset.sensors[record.sensor_id].camera, dataset.pose(record)
-    assert camera is not None
-    assert pose is not None
-    return Query(dataset.path_of(record).read_bytes(), camera, pose)
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -130,7 +130,7 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
             # The savez stub takes no mapping of arrays as keywords beside allow_pickle.
             np.savez(file, **features.model)  # type: ignore[arg-type]
     for name, array in arrays.items():
-        np.save(folder / name, array)
+        _write_array(folder / name, array.dtype, array.shape, [array])
     scale = _write_descriptors(
         folder / "observation_descriptors.npy",
         content.descriptors,
@@ -205,12 +205,29 @@ def _write_descriptors(
     """
     largest = max((float(np.abs(block).max(initial=0.0)) for block in descriptors), default=0.0)
     scale = (largest or 1.0) / 127.0
-    stored = np.lib.format.open_memmap(path, mode="w+", dtype="|i1", shape=shape)
-    row = 0
-    for block in descriptors:
-        stored[row : row + len(block)] = np.rint(block / np.float32(scale)).astype(np.int8)
-        row += len(block)
-    if row != shape[0]:
-        raise AssertionError(f"{row} descriptors for {shape[0]} observations")
-    stored.flush()
+    num_rows = 0
+
+    def stored() -> Iterator[NDArray[np.int8]]:
+        nonlocal num_rows
+        for block in descriptors:
+            num_rows += len(block)
+            yield np.rint(block / np.float32(scale)).astype(np.int8)
+
+    _write_array(path, np.dtype(np.int8), shape, stored())
+    if num_rows != shape[0]:
+        raise AssertionError(f"{num_rows} descriptors for {shape[0]} observations")
     return scale
+
+
+def _write_array(
+    path: Path, dtype: np.dtype[Any], shape: tuple[int, ...], blocks: Iterable[NDArray[Any]]
+) -> None:
+    """Write an ``.npy`` block by block.
+
+    On a full disk ``np.save`` does not say what is wrong, and a memory map ends the process.
+    """
+    header = {"descr": dtype.str, "fortran_order": False, "shape": shape}
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+        for block in blocks:
+            file.write(np.ascontiguousarray(block).data)

@@ -16,13 +16,13 @@ class Correspondences:
     Attributes:
         keypoints: (n,) int64 rows of the query's features.
         landmarks: (n,) int64 rows of the map's landmarks.
-        votes: (n,) int64, how many mapping photos proposed the pair.
+        support: (n,) float64, votes of the mapping photos that proposed the pair.
         similarities: (n,) float32, the best cosine similarity among them.
     """
 
     keypoints: NDArray[np.int64]
     landmarks: NDArray[np.int64]
-    votes: NDArray[np.int64]
+    support: NDArray[np.float64]
     similarities: NDArray[np.float32]
 
     def __len__(self) -> int:
@@ -58,43 +58,54 @@ def match_landmarks(
 ) -> Correspondences:
     """Match a query against several mapping photos and settle conflicts by vote.
 
-    Every photo proposes pairs of keypoint and landmark by mutual nearest neighbours. A pair that
-    more photos propose wins over one that fewer propose, then the more similar one; each
-    keypoint and each landmark is used once.
+    Every photo proposes pairs of keypoint and landmark by mutual nearest neighbours and votes for
+    them with 1 / rank: the photo most like the query sees a corner most as the query does, and
+    shares the errors of the map there; several further photos that agree can outvote it. The pair
+    with more support wins, then the more similar one; each keypoint and each landmark is used
+    once. Measured beside the alternatives in docs/decisions/0005-votes-by-rank.md.
 
     Args:
         query: (n, D) unit descriptors of the query.
-        images: of each mapping photo, the landmarks (m,) that it observes and their unit
-            descriptors (m, D).
+        images: of each mapping photo, most similar first, the landmarks (m,) that it observes
+            and their unit descriptors (m, D).
     """
-    keypoints, landmarks, similarities = [], [], []
-    for seen, descriptors in images:
+    keypoints, landmarks, similarities, votes = [], [], [], []
+    for rank, (seen, descriptors) in enumerate(images, 1):
         i, j, similarity = mutual_nearest_neighbours(query, descriptors)
         keypoints.append(i)
         landmarks.append(seen[j].astype(np.int64))
         similarities.append(similarity)
+        votes.append(np.full(len(i), 1.0 / rank))
     if not keypoints:
         none = np.empty(0, dtype=np.int64)
-        return Correspondences(none, none, none, np.empty(0, dtype=np.float32))
-    return _settle(np.concatenate(keypoints), np.concatenate(landmarks), similarities)
+        return Correspondences(none, none, np.empty(0), np.empty(0, dtype=np.float32))
+    return _settle(
+        np.concatenate(keypoints),
+        np.concatenate(landmarks),
+        np.concatenate(votes),
+        np.concatenate(similarities),
+    )
 
 
 def _settle(
     keypoints: NDArray[np.int64],
     landmarks: NDArray[np.int64],
-    similarities: list[NDArray[np.float32]],
+    votes: NDArray[np.float64],
+    similarity: NDArray[np.float32],
 ) -> Correspondences:
-    similarity = np.concatenate(similarities)
-    # One row per distinct pair, with its votes and its best similarity.
-    order = np.lexsort((-similarity, landmarks, keypoints))
-    keypoints, landmarks, similarity = keypoints[order], landmarks[order], similarity[order]
+    if len(keypoints) == 0:
+        return Correspondences(keypoints, landmarks, votes, similarity)
+    # One row per distinct pair, with its support and its best similarity.
+    order = np.lexsort((landmarks, keypoints))
+    keypoints, landmarks = keypoints[order], landmarks[order]
     starts = np.ones(len(keypoints), dtype=bool)
     starts[1:] = (np.diff(keypoints) != 0) | (np.diff(landmarks) != 0)
     first = np.flatnonzero(starts)
-    votes = np.diff(np.append(first, len(keypoints)))
-    keypoints, landmarks, similarity = keypoints[first], landmarks[first], similarity[first]
+    keypoints, landmarks = keypoints[first], landmarks[first]
+    support = np.add.reduceat(votes[order], first)
+    similarity = np.maximum.reduceat(similarity[order], first)
 
-    order = np.lexsort((landmarks, keypoints, -similarity, -votes))
+    order = np.lexsort((landmarks, keypoints, -similarity, -support))
     taken_keypoints: set[int] = set()
     taken_landmarks: set[int] = set()
     kept = []
@@ -106,4 +117,6 @@ def _settle(
             taken_landmarks.add(landmark)
             kept.append(row)
     chosen = np.array(kept, dtype=np.int64)
-    return Correspondences(keypoints[chosen], landmarks[chosen], votes[chosen], similarity[chosen])
+    return Correspondences(
+        keypoints[chosen], landmarks[chosen], support[chosen], similarity[chosen]
+    )

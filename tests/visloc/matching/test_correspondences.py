@@ -44,17 +44,23 @@ def test_nothing_matches_nothing(n: int, m: int) -> None:
     assert len(i) == len(j) == len(similarity) == 0
 
 
-def test_a_pair_that_more_photos_propose_wins_over_a_more_similar_one() -> None:
-    query = np.array([[1.0, 0.0]], dtype=np.float32)
-    near = np.array([[0.9, np.sqrt(1 - 0.81)]], dtype=np.float32)
-    images = [
-        (np.array([7]), query),  # identical descriptor, one photo says landmark 7
-        (np.array([3]), near),  # two photos say landmark 3
-        (np.array([3]), near),
-    ]
-    pairs = match_landmarks(query, images)
-    assert (pairs.landmarks.tolist(), pairs.votes.tolist()) == ([3], [2])
+QUERY = np.array([[1.0, 0.0]], dtype=np.float32)
+NEAR = np.array([[0.9, np.sqrt(1 - 0.81)]], dtype=np.float32)
+
+
+def test_the_photo_most_like_the_query_wins_over_another_one() -> None:
+    pairs = match_landmarks(QUERY, [(np.array([3]), NEAR), (np.array([7]), QUERY)])
+    assert (pairs.landmarks.tolist(), pairs.support.tolist()) == ([3], [1.0])
     assert pairs.similarities == pytest.approx([0.9])
+
+
+def test_photos_that_agree_outvote_a_better_ranked_one() -> None:
+    # 1 against 1/2 + 1/3 + 1/4
+    others = [(np.array([7]), NEAR), (np.array([7]), NEAR), (np.array([7]), QUERY)]
+    pairs = match_landmarks(QUERY, [(np.array([3]), QUERY), *others])
+    assert pairs.landmarks.tolist() == [7]
+    assert pairs.support == pytest.approx([13 / 12])
+    assert pairs.similarities == pytest.approx([1.0])
 
 
 def test_each_keypoint_and_each_landmark_is_used_once() -> None:

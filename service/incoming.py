@@ -1,0 +1,80 @@
+"""Messages from outside: checked by name and type, refused in our words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Self
+
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+
+from visloc.errors import InvalidInput
+
+
+class IncomingMessage(BaseModel):
+    """A message from outside: unknown fields are refused by name."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    # Where this message sits in the request, for error messages.
+    path: ClassVar[str] = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _check_names(cls, value: Any) -> Any:
+        if not isinstance(value, dict):
+            raise InvalidInput(
+                "request.invalid",
+                "not an object",
+                field=cls.path.rstrip(".") or None,
+                expected=f"an object with {', '.join(cls.model_fields)}",
+                got=type(value).__name__,
+            )
+        for name in value:
+            if name not in cls.model_fields:
+                raise InvalidInput(
+                    "request.unknown_field",
+                    "unknown field",
+                    field=f"{cls.path}{str(name)[:100]}",
+                    expected=f"one of {', '.join(cls.model_fields)}",
+                    got=name,
+                )
+        return value
+
+    @classmethod
+    def read(cls, value: object) -> Self:
+        """Check a message made of Python values.
+
+        Raises:
+            InvalidInput: ``request.missing_field``, ``request.unknown_field``,
+                ``request.invalid``, or a code of the field.
+        """
+        try:
+            return cls.model_validate(value)
+        except ValidationError as refused:
+            raise invalid_input(refused.errors(include_url=False)[0], cls.path) from None
+
+    @classmethod
+    def read_json(cls, text: str | bytes) -> Self:
+        """Check a message written as JSON.
+
+        Raises:
+            InvalidInput: as ``read``, and ``request.malformed``.
+        """
+        try:
+            return cls.model_validate_json(text)
+        except ValidationError as refused:
+            raise invalid_input(refused.errors(include_url=False)[0], cls.path) from None
+
+
+def invalid_input(complaint: Mapping[str, Any], path: str = "") -> InvalidInput:
+    """Say one of pydantic's complaints in our words. Never echoes a large value."""
+    kind, message = complaint["type"], complaint["msg"]
+    field = path + ".".join(str(part) for part in complaint["loc"])
+    if kind == "json_invalid":
+        return InvalidInput(
+            "request.malformed", message, field=path.rstrip(".") or None, expected="JSON"
+        )
+    if kind == "missing":
+        return InvalidInput("request.missing_field", "this field is needed", field=field)
+    got = complaint["input"]
+    got = got if isinstance(got, str | int | float | None) else type(got).__name__
+    return InvalidInput("request.invalid", "cannot be used", field=field, expected=message, got=got)
