@@ -133,7 +133,7 @@ class Refusal:
     """Why there is no pose.
 
     Attributes:
-        stage: the stage that gave up: features, retrieval, matching, pose or gate.
+        stage: the stage that gave up: features, matching, pose or gate.
         reason: a stable word.
         message: the reason for a person.
     """

@@ -1,6 +1,6 @@
 """Localize a photo without a server.
 
-    python examples/localize_in_process.py maps/kitchen/VERSION photo.jpg PINHOLE,640,480,525,...
+python examples/localize_in_process.py maps/kitchen/VERSION photo.jpg PINHOLE,640,480,525,...
 """
 
 from __future__ import annotations

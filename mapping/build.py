@@ -111,9 +111,9 @@ def build_map(settings: BuildSettings, progress: Progress) -> Path:
     dataset = read_dataset(settings.dataset)
     work_root = settings.maps_dir / ".work" / settings.map_id
     try:
-        with exclusive(work_root):
+        with exclusive(work_root.with_name(f"{work_root.name}.lock")):
             folder = _build(settings, dataset, extractor, descriptors, store, work_root, progress)
-            shutil.rmtree(work_root)
+            shutil.rmtree(work_root, ignore_errors=True)
     except OSError as error:
         raise Unavailable(
             "storage.failed",
@@ -133,6 +133,15 @@ def _check(settings: BuildSettings) -> None:
             field="--method",
             expected=f"one of {', '.join(METHODS)}",
             got=settings.method,
+        )
+    names = settings.global_features
+    if not names or len(set(names)) < len(names):
+        raise InvalidInput(
+            "build.global_features",
+            "not a set of global features",
+            field="--global-features",
+            expected="one or more names, each once",
+            got=",".join(names),
         )
     for name in ("voxel_size", "depth_scale"):
         value = getattr(settings, name)

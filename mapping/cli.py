@@ -156,7 +156,7 @@ def export_features_command(
     """Write our features of a dataset in kapture's layout, for other tools."""
     opened = None if map_ref is None else open_map(_folder(map_ref, maps_dir))
     with StageProgress(_err) as progress:
-        export_features(
+        absent = export_features(
             dataset,
             output,
             local_features=local_features,
@@ -165,6 +165,8 @@ def export_features_command(
             global_from=opened,
             progress=progress,
         )
+    for name in absent:
+        _err.print(f"absent, without features: {name}", markup=False, soft_wrap=True)
     _out.print(f"kapture with features: {output}", soft_wrap=True)
 
 

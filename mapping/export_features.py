@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,7 +31,7 @@ def export_features(
     max_keypoints: int,
     global_from: Map | None,
     progress: Callable[[str, int, int], None],
-) -> None:
+) -> list[str]:
     """Write a kapture of the same photos with keypoints, descriptors and global descriptors.
 
     ``output`` gets the dataset's text files, a link to its photos, and
@@ -47,9 +48,13 @@ def export_features(
             features must be the same and as many, since ``localvlad`` is made of them.
         progress: told the stage, how much is done, and how much there is.
 
+    Returns:
+        The names of photos that are listed but absent; they have no features.
+
     Raises:
         Conflict: ``map.features`` when the map has other local features;
-            ``export.other_dataset`` when ``output`` holds another dataset.
+            ``export.other_dataset`` or ``export.other_settings`` when ``output`` holds something
+            else.
     """
     dataset = read_dataset(dataset_root)
     extractor = make_local_features(local_features, weights_dir)
@@ -72,7 +77,17 @@ def export_features(
             descriptors[name] = (make_global_descriptor(name), global_from.global_models[name])
     _write_records(dataset, output)
     reconstruction = output / "reconstruction"
+    settings = {
+        "local_features": FingerprintRecord.of(extractor.fingerprint).model_dump(),
+        "max_keypoints": max_keypoints,
+        "global_from": global_from and global_from.manifest.content_hash,
+    }
+    _claim(reconstruction / f"{local_features}.json", settings)
+    absent = []
     for done, record in enumerate(dataset.images, 1):
+        if not dataset.path_of(record).is_file():
+            absent.append(record.path)
+            continue
         last_written = [reconstruction / "descriptors" / local_features / f"{record.path}.desc"]
         for name in descriptors:
             last_written.append(reconstruction / "global_features" / name / f"{record.path}.gfeat")
@@ -91,6 +106,21 @@ def export_features(
                 name=local_features,
             )
         progress("features", done, len(dataset.images))
+    return absent
+
+
+def _claim(path: Path, settings: Mapping[str, object]) -> None:
+    """Note the settings beside the features, so that no other ones join them."""
+    text = json.dumps(settings, indent=1, sort_keys=True) + "\n"
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    elif path.read_text(encoding="utf-8") != text:
+        raise Conflict(
+            "export.other_settings",
+            "the folder holds features made with other settings; name another folder or remove it",
+            field=str(path),
+        )
 
 
 def _write_records(dataset: Dataset, output: Path) -> None:

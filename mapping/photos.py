@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from mapping.depth import DepthMatch, DepthMatcher
-from visloc.archive.checks import sha256_of
+from visloc.archive import sha256_of
 from visloc.errors import DatasetError
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, FileRecord
@@ -63,7 +64,7 @@ def collect_photos(
         path = dataset.path_of(record)
         camera = dataset.sensors[record.sensor_id].camera
         pose = dataset.pose(record)
-        if not path.is_file():
+        if not os.path.isfile(path):  # noqa: PTH113  Path.is_file raises for names too long
             left_out.setdefault("are listed, but the file is absent", []).append(record.path)
         elif camera is None:
             left_out.setdefault("have a camera of unknown model", []).append(record.path)
@@ -77,11 +78,11 @@ def collect_photos(
                 MappingPhoto(
                     record,
                     path,
-                    sha256_of(path),
+                    _checksum(path),
                     camera,
                     pose,
                     depth,
-                    sha256_of(dataset.path_of(depth.record)) if depth else None,
+                    _checksum(dataset.path_of(depth.record)) if depth else None,
                 )
             )
         progress(done, len(dataset.images))
@@ -98,3 +99,12 @@ def collect_photos(
             expected="photos with a file, a camera of a known model, and a pose",
         )
     return photos, notes
+
+
+def _checksum(path: Path) -> str:
+    try:
+        return sha256_of(path)
+    except OSError as error:
+        raise DatasetError(
+            "dataset.unreadable", f"cannot be read: {error.strerror}", field=str(path)
+        ) from error

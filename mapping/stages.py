@@ -73,18 +73,20 @@ class WorkFolder:
 
 
 @contextmanager
-def exclusive(folder: Path) -> Iterator[None]:
-    """Hold a folder against a second build; released when the process ends, however it ends.
+def exclusive(lock: Path) -> Iterator[None]:
+    """Hold a lock file against a second build; released when the process ends, however it ends.
+
+    The file stays: removing it would let two builds hold locks of the same name.
 
     Raises:
         Conflict: ``build.running``.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "lock").open("w") as lock:
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    with lock.open("w") as file:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise Conflict(
-                "build.running", "another build of this map is running", field=str(folder)
+                "build.running", "another build of this map is running", field=str(lock)
             ) from None
         yield

@@ -41,8 +41,10 @@ MAX_IMAGE_SIDE = 1_000_000
 # Parameters that scale with the width (first set) and with the height (second) of the image.
 _SCALES_WITH_WIDTH = {"f", "fx", "cx"}
 _SCALES_WITH_HEIGHT = {"fy", "cy"}
-# 0.5 % lets a thumbnail whose sides were rounded to whole pixels pass as the same aspect.
+# Rounding the sides of a thumbnail to whole pixels moves its aspect by up to half a pixel on each
+# side; 0.5 % covers that from 100 px on. Below, the tolerance grows, but never beyond 2 %.
 _ASPECT_TOLERANCE = 0.005
+_MAX_ASPECT_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -213,8 +215,8 @@ class Camera:
     def has_aspect_of(self, width: int, height: int) -> bool:
         """Tell whether width x height could be this camera's image, resized."""
         ratio = (width * self.height) / (height * self.width)
-        # Rounding to whole pixels moves the ratio by up to half a pixel on each side.
-        tolerance = max(_ASPECT_TOLERANCE, 0.5 / min(width, height, self.width, self.height))
+        rounding = 0.5 / min(width, height, self.width, self.height)
+        tolerance = min(max(_ASPECT_TOLERANCE, rounding), _MAX_ASPECT_TOLERANCE)
         return abs(ratio - 1.0) <= tolerance
 
     def scaled(self, width: int, height: int) -> Camera:

@@ -19,6 +19,7 @@ from visloc.pose.absolute import estimate_absolute_pose
 from visloc.pose.covariance import position_covariance, with_origin
 from visloc.retrieval.index import Retrieved, retrieve
 from visloc.types import (
+    DEFAULT_PRESET,
     Answer,
     CameraSource,
     Evidence,
@@ -29,12 +30,17 @@ from visloc.types import (
     NotLocalized,
     ReadAs,
     Reason,
+    RegistrationPreset,
     RetrievedImage,
 )
 
 # Focal length in units of the longer side when nothing is known: 45 degrees across, between a
 # phone's main camera (0.7 to 0.8) and a long lens. It is COLMAP's guess too.
 GUESSED_FOCAL = 1.2
+# The default max_error_px holds for photos of this longer side and more; for smaller ones it
+# shrinks with them. 12 px are so large a part of a photo of 256 px that poses by chance explain
+# up to 10 % of the matches.
+FULL_ERROR_FROM_PX = 640
 
 
 class Localizer:
@@ -77,7 +83,7 @@ class Localizer:
         used, source = resolve_camera(photo, camera)
         seconds: dict[str, float] = {}
         evidence = Evidence(used, source, photo.exif_orientation, options.read_as, seconds=seconds)
-        registration = options.registration
+        registration = _registration(options, photo)
 
         with _timed(seconds, "local_features"):
             local, rgb = self._find_features(photo, options.read_as)
@@ -116,7 +122,11 @@ class Localizer:
             pixels = local.keypoints[pairs.keypoints].astype(np.float64)
             points = self.map.landmarks[pairs.landmarks].astype(np.float64)
             found = estimate_absolute_pose(
-                pixels, points, used, max_error_px=registration.max_error_px, seed=options.seed
+                pixels,
+                points,
+                used,
+                max_error_px=registration.max_error_px,
+                seed=options.seed,
             )
         if found is None:
             return NotLocalized(
@@ -124,22 +134,9 @@ class Localizer:
             )
 
         evidence = replace(evidence, num_inliers=int(found.inliers.sum()))
-        if evidence.num_inliers < registration.min_inliers:
-            return NotLocalized(
-                evidence,
-                "gate",
-                Reason.TOO_FEW_INLIERS,
-                f"the best pose explains {evidence.num_inliers} matches, "
-                f"{registration.min_inliers} are needed; is this photo of the mapped place?",
-            )
-        if evidence.inlier_ratio < registration.min_inlier_ratio:
-            return NotLocalized(
-                evidence,
-                "gate",
-                Reason.LOW_INLIER_RATIO,
-                f"the best pose explains {evidence.inlier_ratio:.1%} of the matches, "
-                f"{registration.min_inlier_ratio:.1%} are needed",
-            )
+        refused = _gate(evidence, registration)
+        if refused is not None:
+            return NotLocalized(evidence, "gate", *refused)
         if found.covariance is None:
             return NotLocalized(
                 evidence,
@@ -218,6 +215,32 @@ def resolve_camera(photo: Photo, given: Camera | None) -> tuple[Camera, CameraSo
         expected=f"{width} x {height} or another size of the same aspect",
         got=f"{given.width} x {given.height}",
     )
+
+
+def _registration(options: LocalizeOptions, photo: Photo) -> RegistrationPreset:
+    """The thresholds for a photo: the default's inlier distance shrinks with a small photo."""
+    registration = options.registration
+    if options.preset != DEFAULT_PRESET or options.max_error_px is not None:
+        return registration
+    share = min(1.0, max(photo.width, photo.height) / FULL_ERROR_FROM_PX)
+    return replace(registration, max_error_px=registration.max_error_px * share)
+
+
+def _gate(evidence: Evidence, registration: RegistrationPreset) -> tuple[Reason, str] | None:
+    """Why a pose is not believed, or None (docs/decisions/0002-refuse-instead-of-guess.md)."""
+    if evidence.num_inliers < registration.min_inliers:
+        return (
+            Reason.TOO_FEW_INLIERS,
+            f"the best pose explains {evidence.num_inliers} matches, "
+            f"{registration.min_inliers} are needed; is this photo of the mapped place?",
+        )
+    if evidence.inlier_ratio < registration.min_inlier_ratio:
+        return (
+            Reason.LOW_INLIER_RATIO,
+            f"the best pose explains {evidence.inlier_ratio:.1%} of the matches, "
+            f"{registration.min_inlier_ratio:.1%} are needed; is this photo of the mapped place?",
+        )
+    return None
 
 
 def _check_fingerprint(built_with: FingerprintRecord, at_hand: Fingerprint, ref: str) -> None:

@@ -72,7 +72,6 @@ class Reason(StrEnum):
     """Why a photo was not localized."""
 
     NO_KEYPOINTS = "no_keypoints"
-    NO_CANDIDATES = "no_candidates"
     TOO_FEW_MATCHES = "too_few_matches"
     NO_POSE = "no_pose"
     TOO_FEW_INLIERS = "too_few_inliers"
@@ -95,11 +94,12 @@ class RegistrationPreset:
     min_inlier_ratio: float
 
 
+DEFAULT_PRESET = "default"
 # config1 and config2: table 2 of Humenberger et al. 2020 (abs_pose_max_error,
 # abs_pose_min_num_inliers, abs_pose_min_inlier_ratio). config2 was made to give an answer
 # whenever it can; it is for comparisons with the paper, not for robots.
 PRESETS: Mapping[str, RegistrationPreset] = {
-    "default": RegistrationPreset(max_error_px=12.0, min_inliers=30, min_inlier_ratio=0.05),
+    DEFAULT_PRESET: RegistrationPreset(max_error_px=12.0, min_inliers=30, min_inlier_ratio=0.05),
     "config1": RegistrationPreset(max_error_px=12.0, min_inliers=30, min_inlier_ratio=0.25),
     "config2": RegistrationPreset(max_error_px=20.0, min_inliers=4, min_inlier_ratio=0.05),
 }
@@ -112,7 +112,8 @@ class LocalizeOptions:
     Attributes:
         preset: a key of ``PRESETS``.
         top_k: how many mapping photos to match against.
-        max_error_px: largest reprojection error of an inlier, pixels.
+        max_error_px: largest reprojection error of an inlier, pixels. The default preset's is
+            for photos of 640 px and more on the longer side, and shrinks with smaller ones.
         min_inliers: fewest inliers of an accepted pose.
         min_inlier_ratio: smallest share of inliers among the correspondences, 0 to 1.
         read_as: whether to turn the photo upright by its EXIF orientation before finding
@@ -120,7 +121,7 @@ class LocalizeOptions:
         seed: of RANSAC; equal seeds give equal answers.
     """
 
-    preset: str = "default"
+    preset: str = DEFAULT_PRESET
     top_k: int = 20
     max_error_px: float | None = None
     min_inliers: int | None = None
@@ -249,7 +250,7 @@ class NotLocalized:
     """
 
     evidence: Evidence
-    stage: Literal["features", "retrieval", "matching", "pose", "gate"]
+    stage: Literal["features", "matching", "pose", "gate"]
     reason: Reason
     message: str
 

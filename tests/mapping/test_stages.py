@@ -58,8 +58,8 @@ def test_a_failing_computation_leaves_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.rglob("*")) == []
 
 
-def _hold(folder: Path, ready: object, leave: object) -> None:
-    with exclusive(folder):
+def _hold(lock: Path, ready: object, leave: object) -> None:
+    with exclusive(lock):
         ready.set()  # type: ignore[attr-defined]
         leave.wait()  # type: ignore[attr-defined]
 
@@ -67,12 +67,13 @@ def _hold(folder: Path, ready: object, leave: object) -> None:
 def test_a_second_build_of_the_same_map_is_refused_until_the_first_ends(tmp_path: Path) -> None:
     context = multiprocessing.get_context("spawn")
     ready, leave = context.Event(), context.Event()
-    holder = context.Process(target=_hold, args=(tmp_path, ready, leave))
+    lock = tmp_path / "room.lock"
+    holder = context.Process(target=_hold, args=(lock, ready, leave))
     holder.start()
     assert ready.wait(60)
-    with pytest.raises(Conflict, match="another build"), exclusive(tmp_path):
+    with pytest.raises(Conflict, match="another build"), exclusive(lock):
         pass
     holder.kill()
     holder.join()
-    with exclusive(tmp_path):
+    with exclusive(lock):
         pass

@@ -139,8 +139,21 @@ def test_inliers_are_seen_where_the_pose_says(localizer: Localizer, query: Query
     x, y, z = answer.cam_from_world.apply(answer.inlier_points).T
     seen = np.column_stack([fx * x / z + cx, fy * y / z + cy])
     errors = np.linalg.norm(seen - answer.inlier_keypoints, axis=1)
-    assert errors.max() <= 12.0 + 1e-3
+    # The preset's 12 px are for photos of 640 px; this one has 256.
+    assert 4.0 < errors.max() < 4.8 + 1e-3
     assert np.median(errors) < 0.5
+
+
+def test_a_threshold_that_the_caller_names_is_taken_as_it_is(
+    localizer: Localizer, query: Query
+) -> None:
+    photo = read_photo(query.image)
+    by_preset, wider, same = (
+        localized(localizer.localize(photo, query.camera, LocalizeOptions(max_error_px=error)))
+        for error in (None, 12.0, 4.8)
+    )
+    assert wider.evidence.num_inliers > by_preset.evidence.num_inliers
+    assert same_bits(same, by_preset)
 
 
 def test_equal_seeds_give_equal_bits_and_others_nearly_the_same_pose(
@@ -250,7 +263,7 @@ def checkerboard(height: int, width: int) -> NDArray[np.uint8]:
     [
         (np.full((192, 256, 3), 128, np.uint8), "features", Reason.NO_KEYPOINTS),
         (np.zeros((1, 1, 3), np.uint8), "features", Reason.NO_KEYPOINTS),
-        (noise(16, 16), "matching", Reason.TOO_FEW_MATCHES),
+        (noise(16, 16), "features", Reason.NO_KEYPOINTS),
         (noise(192, 256), "gate", Reason.TOO_FEW_INLIERS),
         (checkerboard(192, 256), "gate", Reason.TOO_FEW_INLIERS),
     ],
@@ -278,8 +291,8 @@ def test_photos_of_another_place_are_refused_with_stage_and_reason(
     options = LocalizeOptions(preset=preset)
     for path in photos_of_another_room:
         answer = refused(localizer.localize(read_photo(path.read_bytes()), query.camera, options))
-        # Right poses of this map have more than 500 inliers, the gate asks for 30.
-        assert answer.evidence.num_inliers < 20
+        # Right poses of this map have more than 300 inliers, the gate asks for 30.
+        assert answer.evidence.num_inliers < 15
         assert (answer.stage, answer.reason) == ("gate", Reason.TOO_FEW_INLIERS)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from visloc.archive.checks import sha256_of
 from visloc.archive.reader import Map, open_map, verify_map
 from visloc.archive.schema import FingerprintRecord, ImageRecord, Manifest
 from visloc.archive.store import MapStore
@@ -17,6 +18,7 @@ __all__ = [
     "MapContent",
     "MapStore",
     "open_map",
+    "sha256_of",
     "verify_map",
     "write_map",
 ]

@@ -107,7 +107,7 @@ class Manifest(_Record):
     world: World
     method: Method
     local_features: LocalFeaturesRecord
-    global_features: tuple[GlobalFeaturesRecord, ...]
+    global_features: Annotated[tuple[GlobalFeaturesRecord, ...], Field(min_length=1)]
     counts: Counts
     notes: tuple[str, ...] = ()
     content_hash: Sha256

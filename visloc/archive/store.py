@@ -84,8 +84,23 @@ class MapStore:
         return folder
 
     def open(self, ref: str) -> Map:
-        """Open ``id`` or ``id@version``."""
-        return open_map(self.folder(ref))
+        """Open ``id`` or ``id@version``.
+
+        Raises:
+            MapCorrupt: ``map.renamed`` when the folder was copied or renamed: answers would
+                carry the old name.
+        """
+        folder = self.folder(ref)
+        opened = open_map(folder)
+        if (opened.manifest.id, opened.manifest.version) != (folder.parent.name, folder.name):
+            raise MapCorrupt(
+                "map.renamed",
+                "the map's folder was copied or renamed; build the map under its new id",
+                field=str(folder),
+                expected=f"{opened.manifest.id}/{opened.manifest.version}",
+                got=f"{folder.parent.name}/{folder.name}",
+            )
+        return opened
 
     def publish(self, incoming: Path, map_id: str, version: str) -> Path:
         """Verify a finished map folder, give it its place, and make it current.
@@ -107,8 +122,11 @@ class MapStore:
         parent.mkdir(parents=True, exist_ok=True)
         if target.exists():
             raise Conflict("map.version_exists", "the version exists already", field=str(target))
+        for folder in (*(path for path in incoming.rglob("*") if path.is_dir()), incoming):
+            _sync_folder(folder)
         incoming.rename(target)
         _sync_folder(parent)
+        _sync_folder(self.root)
         switch = parent / f".{CURRENT}.new"
         with switch.open("w", encoding="ascii") as file:
             file.write(version + "\n")

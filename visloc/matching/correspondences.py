@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+_BLOCK_ROWS = 512
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correspondences:
@@ -40,12 +42,19 @@ def mutual_nearest_neighbours(
     if len(a) == 0 or len(b) == 0:
         none = np.empty(0, dtype=np.int64)
         return none, none, np.empty(0, dtype=np.float32)
-    similarity = a @ b.T
-    best_b = np.argmax(similarity, axis=1)
-    rows = np.arange(len(a))
-    best = similarity[rows, best_b]
+    best_b = np.empty(len(a), dtype=np.int64)
+    best = np.empty(len(a), dtype=np.float32)
+    column_best = np.full(len(b), -np.inf, dtype=np.float32)
+    # Blocks bound the memory, whatever the number of keypoints; one buffer serves them all.
+    buffer = np.empty((min(_BLOCK_ROWS, len(a)), len(b)), dtype=np.float32)
+    for start in range(0, len(a), _BLOCK_ROWS):
+        rows = slice(start, min(start + _BLOCK_ROWS, len(a)))
+        similarity = np.matmul(a[rows], b.T, out=buffer[: rows.stop - rows.start])
+        np.argmax(similarity, axis=1, out=best_b[rows])
+        best[rows] = similarity[np.arange(len(similarity)), best_b[rows]]
+        np.maximum(column_best, similarity.max(axis=0), out=column_best)
     # Equality with the column's maximum replaces a second, slower arg-max over the columns.
-    mutual = np.flatnonzero(best == similarity.max(axis=0)[best_b])
+    mutual = np.flatnonzero(best == column_best[best_b])
     # Rows with equal similarity to one column (duplicate descriptors): the first one keeps it.
     _, first = np.unique(best_b[mutual], return_index=True)
     mutual = mutual[np.sort(first)]

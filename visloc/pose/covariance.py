@@ -12,6 +12,7 @@ from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import project
 
 _MIN_POINTS = 4
+_MIN_VARIANCE_PX2 = 1e-12
 # Smallest eigenvalue of the unit-free information matrix, of largest diagonal 1.
 _MIN_INFORMATION = 1e-9
 
@@ -66,7 +67,8 @@ def pose_covariance(
     bread = _inverse(np.einsum("nai,nab,nbj->ij", jacobian, curvature, jacobian))
     if common is None or bread is None:
         return None
-    common *= np.sum(psi**2) / spare / slope**2
+    # Never quite zero: exact correspondences, as in tests, would leave nothing to compare.
+    common *= max(np.sum(psi**2) / spare, _MIN_VARIANCE_PX2) / slope**2
     gradients = np.einsum("nai,na->ni", jacobian, psi)
     sandwich = bread @ (gradients.T @ gradients) @ bread * (num_residuals / spare)
     return _wider(common, sandwich)

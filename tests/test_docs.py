@@ -1,0 +1,413 @@
+"""What README.md and docs/ say is so: examples run, names exist, tables are complete."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+import clients.cli
+import mapping.cli
+from service.schemas import LocalizeRequest, LocalizeResponse, MapInfo, PoseEstimate, Problem
+from service.settings import CONFIG_VARIABLE, PREFIX, ServiceSettings, read_settings
+from service.wire import STATUSES
+from visloc.errors import InvalidInput
+from visloc.geometry import Camera, Pose
+from visloc.pose.covariance import position_covariance
+from visloc.types import PRESETS, LocalizeOptions, Reason
+
+ROOT = Path(__file__).resolve().parents[1]
+README, API = ROOT / "README.md", ROOT / "docs" / "api.md"
+PAGES = [README, ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
+COMMANDS = Path(sys.executable).parent
+
+# Reading
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """The fenced blocks of a language; shell has none."""
+    found = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+    return [text for name, text in found if name == language]
+
+
+def shell_lines(page: Path) -> list[str]:
+    """The commands of a page, each on one line, without comments."""
+    lines = [
+        re.sub(r"\s+#.*", "", line).strip()
+        for block in blocks(page, "")
+        for line in block.replace("\\\n", " ").splitlines()
+    ]
+    known = ("make", "cp", "curl", ".venv/bin/")
+    return [line for line in lines if line.startswith(known)]
+
+
+def table(first_column: str) -> list[list[str]]:
+    """The rows of the table of docs/api.md whose header begins so."""
+    lines = iter(API.read_text().splitlines())
+    next(line for line in lines if line.startswith(f"| {first_column} |"))
+    next(lines)
+    rows = []
+    for line in lines:
+        if not line.startswith("|"):
+            break
+        rows.append([cell.strip() for cell in line.strip("|").split("|")])
+    return rows
+
+
+def words(cell: str) -> list[str]:
+    """What a cell has in backticks."""
+    return re.findall(r"`([^`]+)`", cell)
+
+
+def in_pages(pattern: str) -> list[Any]:
+    """Everything that a pattern finds, on any page."""
+    return [found for page in PAGES for found in re.findall(pattern, page.read_text(), re.M)]
+
+
+# Examples
+
+
+@dataclass(frozen=True)
+class Desk:
+    """Where the examples are pasted: a folder, and a service that runs."""
+
+    folder: Path
+    http: str
+    grpc: str
+    camera: Camera
+    center: NDArray[np.float64]
+
+    @property
+    def camera_text(self) -> str:
+        camera = self.camera
+        return ",".join(map(str, (camera.model, camera.width, camera.height, *camera.params)))
+
+    def paste(self, text: str) -> str:
+        """The text with what is different on every reader's desk replaced."""
+        for pattern, replacement in (
+            (r"127\.0\.0\.1:8000", self.http),
+            (r"127\.0\.0\.1:50051", self.grpc),
+            (r"\.venv/bin/", f"{COMMANDS}/"),
+            (r"\bkitchen\b|(?<=map=)sample\b|(?<=\")sample(?=\")", "room"),
+            (r"PINHOLE,[\d,.]+", self.camera_text),
+            (r'Camera\("PINHOLE".*?\)\)', repr(self.camera)),
+        ):
+            text = re.sub(pattern, replacement, text)
+        return text
+
+    def run(self, *words: str) -> str:
+        """Run a command and return what it printed."""
+        done = subprocess.run(
+            words, cwd=self.folder, capture_output=True, text=True, timeout=60, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+
+@pytest.fixture(scope="module")
+def desk(
+    sample: Path, built_maps: Path, query: Any, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Desk]:
+    """The folder that README.md assumes, and the service as README.md starts it."""
+    folder = tmp_path_factory.mktemp("desk")
+    for name, target in (
+        ("maps", built_maps),
+        ("QUERIES", sample / "query"),
+        (".demo/dataset", sample),
+    ):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).symlink_to(target)
+    (line,) = (line for line in shell_lines(API) if line.startswith("cp "))
+    subprocess.run(line.split(), cwd=folder, check=True)
+    assert (folder / "photo.jpg").read_bytes() == query.image
+    (line,) = (line for line in shell_lines(README) if "visloc-service" in line)
+    arguments = line.replace("8000", "0").replace("50051", "0").split()
+    arguments[0] = f"{COMMANDS}/visloc-service"
+    with subprocess.Popen(arguments, cwd=folder, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stderr is not None
+            ready = re.compile(r"ready: http://(\S+) grpc://(\S+), maps: room@")
+            log = ""
+            for log_line in process.stderr:
+                log += log_line
+                if found := ready.search(log_line):
+                    http, grpc = found.groups()
+                    yield Desk(folder, http, grpc, query.camera, query.cam_from_world.center)
+                    break
+            else:
+                pytest.fail(f"the service did not start:\n{log}")
+        finally:
+            process.terminate()
+            process.communicate()
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        pytest.param(code, id=f"{page.name}-{number}")
+        for page in PAGES
+        for number, code in enumerate(blocks(page, "python"))
+    ],
+)
+def test_python_examples_say_where_the_photo_was_taken(code: str, desk: Desk) -> None:
+    printed = desk.run(sys.executable, "-c", desk.paste(code))
+
+    position = [float(number) for number in re.findall(r"-?\d+\.\d+(?:e-?\d+)?", printed)[:3]]
+    np.testing.assert_allclose(position, desk.center, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        line
+        for page in PAGES
+        for line in shell_lines(page)
+        # cp and the service are run above, for the targets of make see below; building takes long
+        # and has tests of its own.
+        if not re.match(r"make|cp|\.venv/bin/(visloc-service|mapping build)", line)
+    ],
+)
+def test_shell_examples_run(line: str, desk: Desk) -> None:
+    name, *arguments = shlex.split(desk.paste(line))
+    if shutil.which(name) is None:
+        pytest.skip(f"{name} is not on this machine")
+    if name.endswith("localize"):
+        arguments += ["--server", f"http://{desk.http}"]
+
+    printed = desk.run(name, *arguments)
+
+    if name == "curl":
+        assert json.loads(printed)["status"] == "localized"
+
+
+def test_the_example_without_a_server_localizes_a_photo(built_maps: Path, desk: Desk) -> None:
+    (manifest,) = (built_maps / "room").glob("*/manifest.json")
+    example = ROOT / "examples" / "localize_in_process.py"
+
+    printed = desk.run(
+        sys.executable, str(example), str(manifest.parent), "photo.jpg", desk.camera_text
+    )
+
+    found = re.fullmatch(r"at (\S+) (\S+) (\S+), \d+ inliers\n", printed)
+    assert found is not None, printed
+    np.testing.assert_allclose([float(x) for x in found.groups()], desk.center, atol=0.05)
+
+
+JSON_EXAMPLES = [json.loads(text) for page in PAGES for text in blocks(page, "json")]
+
+
+def model_of(example: dict[str, Any]) -> type[BaseModel]:
+    models = (LocalizeResponse, MapInfo, Problem)
+    (model,) = (model for model in models if model.model_fields.keys() == example.keys())
+    return model
+
+
+@pytest.mark.parametrize("example", JSON_EXAMPLES, ids=lambda example: model_of(example).__name__)
+def test_json_examples_are_what_the_api_sends(example: dict[str, Any]) -> None:
+    assert model_of(example).model_validate(example).model_dump(mode="json") == example
+
+
+def test_an_answer_and_a_refusal_are_shown() -> None:
+    statuses = {e["status"] for e in JSON_EXAMPLES if model_of(e) is LocalizeResponse}
+    assert statuses == {"localized", "not_localized"}
+
+
+def test_the_numbers_of_the_example_follow_the_conventions_that_it_explains() -> None:
+    (answer,) = (example for example in JSON_EXAMPLES if example.get("pose"))
+    pose = answer["pose"]
+    cam_from_world = Pose.from_quaternion(*pose["cam_from_world"].values())
+    covariance = np.array(pose["covariance"]).reshape(6, 6)
+
+    np.testing.assert_allclose(pose["position"], cam_from_world.center, atol=1e-4)
+    world_from_cam = cam_from_world.inverse()
+    np.testing.assert_allclose(pose["orientation"], world_from_cam.rotation_wxyz, atol=1e-5)
+    np.testing.assert_array_equal(covariance, covariance.T)
+    variance = np.diag(position_covariance(cam_from_world, covariance))
+    np.testing.assert_allclose(pose["position_std"], np.sqrt(variance), rtol=0.02)
+    orientation_std_deg = np.degrees(np.sqrt(np.diag(covariance)[:3]))
+    np.testing.assert_allclose(pose["orientation_std_deg"], orientation_std_deg, rtol=0.02)
+
+
+# Names
+
+
+def test_every_make_target_exists() -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
+    texts = [line for page in PAGES for line in shell_lines(page) if line.startswith("make ")]
+    texts += in_pages(r"`(make [a-z -]+)`")
+    named = {word for text in texts for word in text.split()[1:]}
+
+    assert {"demo", "test", "install"} <= named <= targets
+
+
+def options_of(app: typer.Typer) -> dict[str, set[str]]:
+    """The flags of each of a program's commands."""
+    commands: Any = typer.main.get_command(app)
+    return {
+        name: {flag for parameter in command.params for flag in parameter.opts}
+        for name, command in commands.commands.items()
+    }
+
+
+def test_every_command_and_flag_exists(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        read_settings(["--help"], {})
+    of_service = set(re.findall(r"--[a-z-]+", capsys.readouterr().out))
+    programs = {
+        "mapping": options_of(mapping.cli.app),
+        "localize": options_of(clients.cli.app),
+        "visloc-service": {"": of_service},
+    }
+    for line in (line for page in PAGES for line in shell_lines(page)):
+        name, *arguments = line.removeprefix(".venv/bin/").split()
+        if name in programs:
+            command = "" if name == "visloc-service" else arguments[0]
+            flags = {word for word in arguments if word.startswith("--")}
+            assert flags <= programs[name][command], line
+
+    for name, command in in_pages(r"`(mapping|localize) ([a-z][a-z-]*)"):
+        assert command in programs[name], f"{name} {command}"
+    known = {
+        flag for commands in programs.values() for flags in commands.values() for flag in flags
+    }
+    assert set(in_pages(r"`(--[a-z-]+)")) <= known
+
+
+def test_every_variable_of_the_environment_is_a_setting() -> None:
+    known = {f"{PREFIX}{name.upper()}" for name in ServiceSettings.model_fields}
+
+    assert set(in_pages(rf"{PREFIX}[A-Z_]+")) <= {*known, CONFIG_VARIABLE}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_relative_link_leads_somewhere(page: Path) -> None:
+    for link in re.findall(r"\]\((?!\w+:)([^)]+)\)", page.read_text()):
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        assert target.exists(), link
+        if anchor:
+            headings = re.findall(r"^#+ (.*)", target.read_text(), re.M)
+            assert anchor in {heading.lower().replace(" ", "-") for heading in headings}, link
+
+
+# docs/api.md and the code
+
+CODE = re.compile(r"(request|image|camera|options|map|features|weights|server)\.[a-z0-9_]+")
+# Modules that take part in an answer, and the codes of theirs that no client meets.
+ANSWERING = (
+    *("service/*.py", "visloc/*.py", "visloc/archive/*.py", "visloc/features/*.py"),
+    *("clients/requests.py", "clients/errors.py", "clients/types.py"),
+)
+NOT_MET = {
+    "image.missing",  # reading a file, in process
+    *("map.checksum", "map.manifest_hash", "map.range", "map.version_exists"),  # publishing
+}
+
+
+def codes_in(node: ast.AST) -> Iterator[str]:
+    """The codes among the strings of a module; ``field=`` names fields, which look the same."""
+    if isinstance(node, ast.keyword) and node.arg == "field":
+        return
+    if (
+        isinstance(node, ast.Constant)
+        and isinstance(node.value, str)
+        and CODE.fullmatch(node.value)
+    ):
+        yield node.value
+    for child in ast.iter_child_nodes(node):
+        yield from codes_in(child)
+
+
+def test_the_codes_listed_are_those_that_a_client_may_meet() -> None:
+    in_source = {
+        code
+        for pattern in ANSWERING
+        for path in ROOT.glob(pattern)
+        if path.name != "openapi.py"  # examples
+        for code in codes_in(ast.parse(path.read_text()))
+    }
+    of_options = {f"options.{name}" for name in LocalizeOptions.__slots__}
+    of_http = {f"http.{status.name.lower()}" for status in HTTPStatus}
+    listed = [code for row in table("codes") for code in words(row[0])]
+
+    assert len(listed) == len(set(listed))
+    assert set(listed) - of_http == (in_source | of_options) - NOT_MET
+
+
+def test_the_errors_have_the_statuses_that_are_listed() -> None:
+    listed = {
+        kind: (int(http), grpc) for kinds, http, grpc, _ in table("kind") for kind in words(kinds)
+    }
+
+    assert listed == {
+        kind.__name__: (http.value, grpc.name) for kind, (http, grpc) in STATUSES.items()
+    }
+
+
+def test_every_reason_is_listed_with_the_stage_that_gives_it() -> None:
+    listed = {words(reason)[0]: stage for stage, reason, *_ in table("stage")}
+    localizer = ast.parse((ROOT / "visloc" / "localizer.py").read_text())
+    given = {}
+    for node in ast.walk(localizer):
+        match node:
+            case ast.Call(
+                func=ast.Name(id="NotLocalized"),
+                args=[_, ast.Constant(value=str(stage)), ast.Attribute(attr=reason), *_],
+            ):
+                given[Reason[reason].value] = stage
+
+    assert set(listed) == set(Reason)
+    assert given
+    assert given.items() <= listed.items()
+
+
+def test_the_fields_of_the_request_and_the_answer_are_listed() -> None:
+    assert [words(row[0])[0] for row in table("field")] == list(LocalizeRequest.model_fields)
+    answer = API.read_text().partition("## The answer")[2].partition("## ")[0]
+    for model, prefix in ((LocalizeResponse, ""), (PoseEstimate, "pose.")):
+        for name in model.model_fields:
+            assert f"`{prefix}{name}" in answer
+
+
+def test_the_options_have_the_defaults_and_ranges_that_are_listed() -> None:
+    rows = table("option")
+    defaults = asdict(LocalizeOptions())
+    assert [words(row[0])[0] for row in rows] == list(defaults)
+    for name_cell, default, span, _ in rows:
+        (name,) = words(name_cell)
+        value = defaults[name]
+        assert default == ("the preset's" if value is None else str(value))
+        if " to " in span:
+            low, high = (json.loads(end) for end in span.split(" to "))
+            LocalizeOptions(**{name: low})
+            LocalizeOptions(**{name: high})
+            for outside in (low - 0.01, high + 1):
+                with pytest.raises(InvalidInput):
+                    LocalizeOptions(**{name: outside})
+
+
+def test_the_presets_are_those_of_the_code() -> None:
+    listed = {
+        words(name)[0]: tuple(float(number) for number in numbers)
+        for name, *numbers, _ in table("preset")
+    }
+
+    assert listed == {
+        name: (preset.max_error_px, preset.min_inliers, preset.min_inlier_ratio)
+        for name, preset in PRESETS.items()
+    }
