@@ -59,7 +59,9 @@ class Batch:
 
 
 def open_batch(batch: Batch, *, restart: bool) -> set[str]:
-    """Make the folder ready and return the names of the photos that it has results of.
+    """Make the folder ready and return the names of the photos that need not be asked about.
+
+    Those are the photos that it has results of, but for errors of the server.
 
     Raises:
         Conflict: ``batch.other_run`` when the folder holds results of something else, and
@@ -81,7 +83,8 @@ def open_batch(batch: Batch, *, restart: bool) -> set[str]:
     else:
         write_whole(batch.description, [json.dumps(described, indent=2).encode() + b"\n"])
     drop_torn_line(batch.results)
-    return {result.name for result in read_results(batch.results)}
+    newest = {result.name: result for result in read_results(batch.results)}
+    return {name for name, result in newest.items() if result.is_final}
 
 
 async def run_batch(
@@ -108,6 +111,8 @@ async def run_batch(
 
 def finish_batch(batch: Batch, queries: Sequence[Query]) -> Counter[str]:
     """Bring ``results.jsonl`` into the order of the dataset and write ``poses.txt``.
+
+    Of a photo that was asked about again the newest result is kept.
 
     Returns:
         How many photos are localized, not_localized, and error.

@@ -17,7 +17,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from clients.batch import Batch, finish_batch, open_batch, run_batch
 from clients.benchmark import make_report, parse_threshold
 from clients.client import DEFAULT_TIMEOUT_S, AsyncClient, Client
-from clients.display import print_failed, print_line, print_report, print_result, unit_of
+from clients.display import (
+    UNKNOWN_UNIT,
+    print_failed,
+    print_line,
+    print_report,
+    print_result,
+    unit_of,
+)
 from clients.queries import read_queries
 from clients.results import check_can_be_written, write_poses, write_whole
 from clients.running import Outcome, localize_all
@@ -111,8 +118,7 @@ def image(
         if as_json:
             typer.echo(json.dumps(result.raw, indent=2))
         else:
-            info = client.map(f"{result.map.id}@{result.map.version}")
-            print_result(_out, result, unit_of(info))
+            print_result(_out, result, _unit(client, f"{result.map.id}@{result.map.version}"))
     if not result.localized:
         raise typer.Exit(EXIT_NOT_LOCALIZED)
 
@@ -135,7 +141,8 @@ def localize_batch(
 
     Writes results.jsonl, one answer per line, and at the end poses.txt with lines
     'name qw qx qy qz tx ty tz' (cam_from_world) of the localized photos. The same command takes
-    up a stopped run where it was. A photo that cannot be answered is recorded and passed over.
+    up a stopped run where it was. A photo that cannot be answered is recorded and passed over;
+    where that was the server's fault, the same command asks again.
 
     Exits with 0 when every photo has its line, 1 on an error, 130 when stopped.
     """
@@ -229,6 +236,14 @@ def benchmark(
     num_with_truth = sum(query.truth is not None for query in queries)
     print_report(_out, figures, num_with_truth, len(failed), unit_of(info))
     print_failed(_err, failed)
+
+
+def _unit(client: Client, map_ref: str) -> str:
+    try:
+        return unit_of(client.map(map_ref))
+    except VislocError as error:  # the pose is here already, and worth more than its unit
+        print_line(_err, "unit unknown", f"[{error.code}] {error}", "yellow")
+        return UNKNOWN_UNIT
 
 
 def _options(texts: Sequence[str] | None, seed: int | None) -> LocalizeOptions:

@@ -23,9 +23,13 @@ _CAMERA_SOURCES: Mapping[str, str] = {
 }
 
 
+# Lengths in a world that is not metric, or may not be.
+UNKNOWN_UNIT = "units of the map"
+
+
 def unit_of(map_info: MapInfo) -> str:
     """The unit of lengths in a map's world."""
-    return "m" if map_info.metric else "units of the map"
+    return "m" if map_info.metric else UNKNOWN_UNIT
 
 
 def print_result(console: Console, result: LocalizeResult, unit: str) -> None:

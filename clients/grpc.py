@@ -8,7 +8,7 @@ from typing import Any, assert_never, cast
 import grpc
 from google.protobuf.json_format import MessageToDict
 from google.protobuf.message import DecodeError, Message
-from google.rpc import error_details_pb2, status_pb2  # type: ignore[import-untyped]
+from google.rpc import error_details_pb2, status_pb2
 
 from clients import errors
 from clients.requests import (
@@ -37,8 +37,8 @@ _FALLBACKS: Mapping[grpc.StatusCode, errors.Fallback] = {
     grpc.StatusCode.ALREADY_EXISTS: errors.CONFLICT,
     grpc.StatusCode.FAILED_PRECONDITION: errors.CONFLICT,
     grpc.StatusCode.ABORTED: errors.CONFLICT,
-    # Without our details it comes from gRPC itself, about a message over the server's limit.
-    grpc.StatusCode.RESOURCE_EXHAUSTED: errors.TOO_LARGE,
+    # Without our details it comes from gRPC itself: too many calls at once, or as below.
+    grpc.StatusCode.RESOURCE_EXHAUSTED: errors.OVERLOADED,
 }
 
 
@@ -189,6 +189,8 @@ def _failure(server: str, timeout_s: float, error: grpc.RpcError) -> VislocError
         case grpc.StatusCode.UNIMPLEMENTED:
             return errors.not_understood(server, details)
     message = f"the server answered {code.name}: {details}"
+    if code is grpc.StatusCode.RESOURCE_EXHAUSTED and "larger than max" in details:
+        return errors.received({}, errors.TOO_LARGE, message)
     return errors.received({}, _FALLBACKS.get(code, errors.INTERNAL), message)
 
 

@@ -37,7 +37,7 @@ _FALLBACKS = {
     422: errors.INVALID,
     429: errors.OVERLOADED,
     502: errors.UNAVAILABLE,
-    503: errors.UNAVAILABLE,
+    503: errors.OVERLOADED,  # without our words: uvicorn's, when too many requests come at once
     504: errors.UNAVAILABLE,
 }
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import httpx
+
 from clients.types import LocalizeOptions
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera
@@ -18,7 +20,8 @@ JsonObject = dict[str, Any]
 _MAP = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]*")
 _REQUEST_ID = re.compile(r"[\x21-\x7e]{1,128}")
 _SERVER = re.compile(
-    r"(?:(?P<scheme>https?)|grpc)://(?P<host>[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])"
+    r"(?:(?P<scheme>https?)|grpc)://"
+    r"(?:(?:[A-Za-z0-9_-]{1,63}\.)*[A-Za-z0-9_-]{1,63}\.?|\[[0-9A-Fa-f:.]+\])"
     r"(?::(?P<port>\d{1,5}))?(?(scheme)(?:/[^\s?#]*)?|/?)"
 )
 
@@ -118,7 +121,7 @@ def checked_server(server: str) -> str:
         InvalidInput: ``server.url``.
     """
     match = _SERVER.fullmatch(server)
-    if match is None or not 0 < int(match["port"] or 80) < 65536:
+    if match is None or not 0 < int(match["port"] or 80) < 65536 or not _is_url(server):
         raise InvalidInput(
             "server.url",
             "not the address of a server",
@@ -127,6 +130,13 @@ def checked_server(server: str) -> str:
             got=server,
         )
     return server
+
+
+def _is_url(text: str) -> bool:
+    try:
+        return bool(httpx.URL(text).host)  # knows which IP addresses and names are none
+    except (httpx.InvalidURL, UnicodeError):
+        return False
 
 
 def _checked(map_ref: str) -> str:

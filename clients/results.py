@@ -16,6 +16,9 @@ from visloc.errors import DatasetError, InvalidInput
 
 _ERROR = "error"
 _STATUSES = ("localized", "not_localized", _ERROR)
+# Errors that say nothing about the photo: it may be answered when it is asked about again.
+_PASSING_CODES = ("server.internal", "server.timeout")
+_PASSING_KINDS = ("Unavailable", "Overloaded")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,6 +29,7 @@ class StoredResult:
         name: of the photo.
         status: localized, not_localized or error.
         pose: when localized.
+        is_final: whether asking again is pointless; False for errors of the server.
         offset: where the line begins in the file, bytes.
         length: of the line with its end, bytes.
     """
@@ -33,6 +37,7 @@ class StoredResult:
     name: str
     status: str
     pose: PoseEstimate | None
+    is_final: bool
     offset: int
     length: int
 
@@ -87,7 +92,7 @@ def read_results(path: Path) -> Iterator[StoredResult]:
     with path.open("rb") as file:
         for number, line in enumerate(file, start=1):
             try:
-                name, status, pose = _parse_line(line)
+                name, status, pose, is_final = _parse_line(line)
             except (KeyError, TypeError, ValueError, InvalidInput) as error:
                 raise DatasetError(
                     "results.line",
@@ -95,7 +100,7 @@ def read_results(path: Path) -> Iterator[StoredResult]:
                     field=f"{path}:{number}",
                     got=str(error),
                 ) from error
-            yield StoredResult(name, status, pose, offset, len(line))
+            yield StoredResult(name, status, pose, is_final, offset, len(line))
             offset += len(line)
 
 
@@ -143,12 +148,16 @@ def check_can_be_written(paths: Sequence[Path]) -> None:
             )
 
 
-def _parse_line(line: bytes) -> tuple[str, str, PoseEstimate | None]:
+def _parse_line(line: bytes) -> tuple[str, str, PoseEstimate | None, bool]:
     entry = json.loads(line)
     name, status = entry["name"], entry["status"]
     if not isinstance(name, str) or status not in _STATUSES:
         raise ValueError(f"name {name!r}, status {status!r}")
-    return name, status, parse_pose(entry["pose"]) if status == "localized" else None
+    pose = parse_pose(entry["pose"]) if status == "localized" else None
+    is_final = status != _ERROR or not (
+        entry["error"]["code"] in _PASSING_CODES or entry["error"]["kind"] in _PASSING_KINDS
+    )
+    return name, status, pose, is_final
 
 
 def _pose_line(name: str, pose: PoseEstimate) -> str:

@@ -1,25 +1,31 @@
-"""Localize a photo without a server.
+"""Localize a photo in process, without a server.
 
-python examples/localize_in_process.py maps/kitchen/VERSION photo.jpg PINHOLE,640,480,525,...
+python examples/localize_in_process.py MAPS_DIR MAP PHOTO [MODEL,W,H,PARAMS...]
+
+Maps of r2d2 and faster2d2 find their weights in the folder that VISLOC_WEIGHTS_DIR names.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
 from visloc import Camera
-from visloc.archive import open_map
+from visloc.archive import MapStore
 from visloc.features import make_local_features
 from visloc.images import read_photo_file
 from visloc.localizer import Localizer
 from visloc.types import Localized, LocalizeOptions
 
 
-def main(map_folder: str, photo_path: str, camera: str | None = None) -> None:
+def main(maps_dir: str, map_ref: str, photo_path: str, camera: str | None = None) -> None:
     """Print where the photo was taken, or why that is not known."""
-    opened = open_map(Path(map_folder))
-    extractor = make_local_features(opened.manifest.local_features.fingerprint.name)
+    opened = MapStore(Path(maps_dir)).open(map_ref)
+    weights_dir = os.environ.get("VISLOC_WEIGHTS_DIR")
+    extractor = make_local_features(
+        opened.manifest.local_features.fingerprint.name, Path(weights_dir) if weights_dir else None
+    )
     localizer = Localizer(opened, extractor)
     answer = localizer.localize(
         read_photo_file(Path(photo_path)),

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.features import LocalFeaturesStage, Progress, describe_photos
 from mapping.photos import MappingPhoto, collect_photos
 from mapping.rgbd import LiftedKeypoints, lift_keypoints, merge_landmarks
-from mapping.stages import WorkFolder, exclusive, key_of
+from mapping.stages import Item, WorkFolder, exclusive, key_of
 from visloc.archive import (
     FingerprintRecord,
-    GlobalFeatures,
     ImageRecord,
     Landmarks,
     MapContent,
@@ -34,18 +35,11 @@ from visloc.features import (
     make_local_features,
 )
 from visloc.geometry import Camera, Pose
-from visloc.images import read_photo_file
 from visloc.kapture import Dataset, read_dataset
-from visloc.types import Fingerprint, LocalFeatures
-
-Progress = Callable[[str, int, int], None]
-"""Told the stage, how much of it is done, and how much there is."""
 
 METHODS = ("rgbd",)
-# The vocabulary of a global descriptor is learned from at most this many photos, evenly chosen.
-_VOCABULARY_PHOTOS = 200
-# Raised when the code of a stage changes what comes out.
-_REVISION = {"words": 1, "vocabulary": 1, "pooled": 1, "projection": 1, "lifted": 2}
+# Raised when the code of the stage changes what comes out.
+_LIFTED_REVISION = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,12 +173,12 @@ def _build(
             expected="depth maps with the timestamps of the photos, of a sensor in their rig or "
             "with poses of its own; see --depth-sensor",
         )
-    features = _LocalFeaturesStage(work, extractor, settings.max_keypoints)
+    features = LocalFeaturesStage(work, extractor, settings.max_keypoints)
     for done, photo in enumerate(photos, 1):
         features.compute(photo)
         progress("local features", done, len(photos))
     global_features = tuple(
-        _global_features(work, photos, features, descriptor, progress) for descriptor in descriptors
+        describe_photos(work, photos, features, descriptor, progress) for descriptor in descriptors
     )
     landmarks, rows = _landmarks_from_depth(work, dataset, photos, features, settings, progress)
 
@@ -212,7 +206,7 @@ def _build(
         local_fingerprint=FingerprintRecord.of(extractor.fingerprint),
         max_keypoints=settings.max_keypoints,
         descriptor_dim=extractor.descriptor_dim,
-        descriptors=_Rereadable(observed_descriptors),
+        descriptors=observed_descriptors,
         global_features=global_features,
     )
     incoming = work_root / "incoming"
@@ -233,143 +227,26 @@ def _build(
     return folder
 
 
-@dataclass(frozen=True, slots=True)
-class _Rereadable:
-    """An iterable that starts anew each time, for data that does not fit in memory."""
-
-    start: Callable[[], Iterator[NDArray[np.float32]]]
-
-    def __iter__(self) -> Iterator[NDArray[np.float32]]:
-        return self.start()
-
-
-@dataclass(frozen=True, slots=True)
-class _LocalFeaturesStage:
-    work: WorkFolder
-    extractor: LocalFeatureExtractor
-    max_keypoints: int
-
-    def key(self, photo: MappingPhoto) -> str:
-        return key_of(
-            "local_features",
-            1,
-            photo=photo.sha256,
-            size=[photo.camera.width, photo.camera.height],
-            fingerprint=_json(self.extractor.fingerprint),
-            max_keypoints=self.max_keypoints,
-        )
-
-    def compute(self, photo: MappingPhoto) -> None:
-        if not self.work.has(self.key(photo)):
-            self.read(photo)
-
-    def read(self, photo: MappingPhoto) -> LocalFeatures:
-        def extract() -> Mapping[str, NDArray[np.float32]]:
-            pixels = read_photo_file(photo.path)
-            if (pixels.width, pixels.height) != (photo.camera.width, photo.camera.height):
-                raise DatasetError(
-                    "dataset.photo_size",
-                    "the photo is not of the size of its camera",
-                    field=str(photo.path),
-                    expected=f"{photo.camera.width} x {photo.camera.height} as sensors.txt has "
-                    f"it for {photo.record.sensor_id}",
-                    got=f"{pixels.width} x {pixels.height}",
-                )
-            local = self.extractor.extract(pixels.rgb, max_keypoints=self.max_keypoints)
-            return {
-                "keypoints": local.keypoints,
-                "descriptors": local.descriptors,
-                "scores": local.scores,
-                "scales": local.scales,
-            }
-
-        return LocalFeatures(**self.work.get(self.key(photo), extract))
-
-
-def _global_features(
-    work: WorkFolder,
-    photos: Sequence[MappingPhoto],
-    features: _LocalFeaturesStage,
-    descriptor: GlobalDescriptor,
-    progress: Progress,
-) -> GlobalFeatures:
-    fingerprint = _json(descriptor.fingerprint)
-    stage = f"{descriptor.fingerprint.name}"
-
-    chosen = np.unique(np.linspace(0, len(photos) - 1, _VOCABULARY_PHOTOS).astype(int)).tolist()
-    word_keys = []
-    for done, row in enumerate(chosen, 1):
-        photo = photos[row]
-        key = key_of(
-            "words", _REVISION["words"], fingerprint=fingerprint, local=features.key(photo)
-        )
-        work.get(
-            key,
-            lambda photo=photo: {  # type: ignore[misc]  # mypy infers no type with a default
-                "words": descriptor.training_words(
-                    read_photo_file(photo.path).rgb, features.read(photo), seed=0
-                )
-            },
-        )
-        word_keys.append(key)
-        progress(f"{stage} words", done, len(chosen))
-
-    vocabulary_key = key_of(
-        "vocabulary", _REVISION["vocabulary"], fingerprint=fingerprint, words=word_keys
-    )
-    vocabulary = work.get(
-        vocabulary_key,
-        lambda: descriptor.learn_vocabulary(
-            np.concatenate([work.read(key)["words"] for key in word_keys]), seed=0
-        ),
-    )
-    pooled_keys = []
-    for done, photo in enumerate(photos, 1):
-        key = key_of(
-            "pooled", _REVISION["pooled"], vocabulary=vocabulary_key, local=features.key(photo)
-        )
-        work.get(
-            key,
-            lambda photo=photo: {  # type: ignore[misc]
-                "pooled": descriptor.pool(
-                    read_photo_file(photo.path).rgb, features.read(photo), vocabulary
-                )
-            },
-        )
-        pooled_keys.append(key)
-        progress(stage, done, len(photos))
-
-    def read_pooled() -> NDArray[np.float32]:
-        return np.stack([work.read(key)["pooled"] for key in pooled_keys])
-
-    projection = work.get(
-        key_of("projection", _REVISION["projection"], pooled=pooled_keys),
-        lambda: descriptor.learn_projection(read_pooled()),
-    )
-    model = {**vocabulary, **projection}
-    return GlobalFeatures(
-        FingerprintRecord.of(descriptor.fingerprint),
-        descriptor.project(read_pooled(), model),
-        model,
-    )
-
-
 def _landmarks_from_depth(
     work: WorkFolder,
     dataset: Dataset,
     photos: Sequence[MappingPhoto],
-    features: _LocalFeaturesStage,
+    features: LocalFeaturesStage,
     settings: BuildSettings,
     progress: Progress,
 ) -> tuple[Landmarks, list[NDArray[np.int64]]]:
     """Landmarks, and of each photo the rows of its features that became observations."""
+
+    def lift(photo: MappingPhoto) -> Item:
+        keypoints = features.read(photo).keypoints
+        return asdict(lift_keypoints(dataset, photo, keypoints, settings.depth_scale))
+
     lifted = []
     for done, photo in enumerate(photos, 1):
-        local = features.read(photo)
         item = work.get(
             key_of(
                 "lifted",
-                _REVISION["lifted"],
+                _LIFTED_REVISION,
                 local=features.key(photo),
                 camera=_camera(photo.camera),
                 pose=_numbers(photo.cam_from_world),
@@ -381,9 +258,7 @@ def _landmarks_from_depth(
                 ],
                 depth_scale=settings.depth_scale,
             ),
-            lambda photo=photo, local=local: asdict(  # type: ignore[misc]
-                lift_keypoints(dataset, photo, local.keypoints, settings.depth_scale)
-            ),
+            partial(lift, photo),
         )
         lifted.append(LiftedKeypoints(**item))
         progress("depth", done, len(photos))
@@ -408,7 +283,3 @@ def _camera(camera: Camera) -> list[str | float]:
 
 def _numbers(pose: Pose) -> list[float]:
     return [*pose.rotation.ravel().tolist(), *pose.translation.tolist()]
-
-
-def _json(fingerprint: Fingerprint) -> dict[str, object]:
-    return FingerprintRecord.of(fingerprint).model_dump()

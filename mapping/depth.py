@@ -95,7 +95,7 @@ class DepthMatcher:
             self._cameras = {depth_sensor: self._cameras[depth_sensor]}
         self._by_timestamp: dict[int, list[FileRecord]] = {}
         for record in dataset.depth_maps:
-            if record.sensor_id in self._cameras and dataset.path_of(record).is_file():
+            if record.sensor_id in self._cameras and dataset.has_file(record):
                 self._by_timestamp.setdefault(record.timestamp, []).append(record)
 
     def match(self, image: FileRecord) -> DepthMatch | None:

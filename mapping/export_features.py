@@ -85,8 +85,9 @@ def export_features(
     _claim(reconstruction / f"{local_features}.json", settings)
     absent = []
     for done, record in enumerate(dataset.images, 1):
-        if not dataset.path_of(record).is_file():
+        if not dataset.has_file(record):
             absent.append(record.path)
+            progress("features", done, len(dataset.images))
             continue
         last_written = [reconstruction / "descriptors" / local_features / f"{record.path}.desc"]
         for name in descriptors:

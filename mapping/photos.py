@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,7 +63,7 @@ def collect_photos(
         path = dataset.path_of(record)
         camera = dataset.sensors[record.sensor_id].camera
         pose = dataset.pose(record)
-        if not os.path.isfile(path):  # noqa: PTH113  Path.is_file raises for names too long
+        if not dataset.has_file(record):
             left_out.setdefault("are listed, but the file is absent", []).append(record.path)
         elif camera is None:
             left_out.setdefault("have a camera of unknown model", []).append(record.path)

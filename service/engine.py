@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -23,6 +24,9 @@ from visloc.localizer import Localizer
 from visloc.types import Answer, LocalizeOptions
 
 logger = logging.getLogger(__name__)
+
+# How long a published version that could not take over is left alone before it is tried again.
+RETRY_AFTER_S = 30.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,12 +62,28 @@ class Status:
     Attributes:
         ready: whether the maps that were there at the start are open and warm.
         maps: ``id@version`` of what is loaded.
-        not_loaded: why, by map id, of maps that cannot be loaded.
+        not_loaded: why the current version of a map cannot be served, by map id. An older
+            version of it may be in ``maps``.
     """
 
     ready: bool
     maps: tuple[str, ...]
     not_loaded: Mapping[str, VislocError]
+
+
+@dataclass(frozen=True, slots=True)
+class _Refused:
+    """What is current on disk and could not be loaded.
+
+    Attributes:
+        ref: ``id@version``; ``id`` when the map does not say which version is current.
+        error: why.
+        at: when, by ``perf_counter``.
+    """
+
+    ref: str
+    error: VislocError
+    at: float
 
 
 class Engine:
@@ -103,8 +123,7 @@ class Engine:
         self._localizers: dict[str, Localizer] = {}  # by id@version
         self._extractors: dict[str, LocalFeatureExtractor] = {}  # by name
         self._serving: dict[str, str] = {}  # id -> id@version last served as the current one
-        self._refused: set[str] = set()  # id@version that could not take over
-        self._not_loaded: dict[str, VislocError] = {}
+        self._refused: dict[str, _Refused] = {}  # by map id
         self._ready = False
 
     async def start(self) -> None:
@@ -119,8 +138,17 @@ class Engine:
 
     @property
     def status(self) -> Status:
-        """What is loaded now."""
-        return Status(self._ready, tuple(sorted(self._localizers)), dict(self._not_loaded))
+        """What is loaded now, of the maps that are still there."""
+        ids = set(self._store.ids())
+        return Status(
+            self._ready,
+            tuple(ref for ref in sorted(self._localizers) if ref.partition("@")[0] in ids),
+            {
+                map_id: refused.error
+                for map_id, refused in sorted(self._refused.items())
+                if map_id in ids
+            },
+        )
 
     async def localize(self, job: LocalizeJob) -> Localization:
         """Decode and localize a photo in a worker thread.
@@ -176,32 +204,44 @@ class Engine:
             try:
                 self._localizer(map_id)
             except VislocError as error:
-                self._not_loaded[map_id] = error
                 logger.error("map %s is not loaded: %s", map_id, error)  # noqa: TRY400
 
     def _localizer(self, ref: str) -> Localizer:
         """Return the localizer of a map, opened now if it was not before."""
         if "@" in ref:
             return self._loaded(ref)
-        current = f"{ref}@{self._store.current_version(ref)}"
-        before = self._serving.get(ref)
-        if before is not None and current in self._refused:
+        try:
+            current = f"{ref}@{self._store.current_version(ref)}"
+        except MapCorrupt as error:
+            return self._fall_back(ref, ref, error)
+        before, refused = self._serving.get(ref), self._refused.get(ref)
+        if (
+            before is not None
+            and refused is not None
+            and refused.ref == current
+            and perf_counter() < refused.at + RETRY_AFTER_S
+        ):
             return self._loaded(before)
         try:
             localizer = self._loaded(current)
         except VislocError as error:
-            if before is None:
-                raise
-            self._refused.add(current)
-            message = "map %s cannot take over, %s stays in service: %s"
-            logger.error(message, current, before, error)  # noqa: TRY400
-            return self._loaded(before)
+            return self._fall_back(ref, current, error)
+        self._refused.pop(ref, None)
         if before != current:
             self._serving[ref] = current
-            self._not_loaded.pop(ref, None)
             if before is not None:
                 self._localizers.pop(before, None)
         return localizer
+
+    def _fall_back(self, map_id: str, current: str, error: VislocError) -> Localizer:
+        """Note that what is current cannot be served, and return what was served before it."""
+        before, known = self._serving.get(map_id), self._refused.get(map_id)
+        self._refused[map_id] = _Refused(current, error, perf_counter())
+        if before is None:
+            raise error
+        if known is None or known.ref != current:
+            logger.error("map %s cannot take over, %s stays in service: %s", current, before, error)
+        return self._loaded(before)
 
     def _loaded(self, ref: str) -> Localizer:
         found = self._localizers.get(ref)
@@ -216,32 +256,69 @@ class Engine:
 
     def _load(self, ref: str) -> Localizer:
         start = perf_counter()
-        opened = self._store.open(ref)
-        name = opened.manifest.local_features.fingerprint.name
-        try:
-            if name not in self._extractors:
-                self._extractors[name] = make_local_features(name, self._weights_dir)
-            localizer = Localizer(opened, self._extractors[name])
-        except InvalidInput as error:  # features that are not here: not the caller's mistake
-            raise Conflict(
-                error.code, error.message, field=error.field, expected=error.expected, got=error.got
-            ) from error
-        localizer.warm_up()
+        with _damage_named(ref):
+            opened = self._store.open(ref)
+            name = opened.manifest.local_features.fingerprint.name
+            try:
+                if name not in self._extractors:
+                    self._extractors[name] = make_local_features(name, self._weights_dir)
+                localizer = Localizer(opened, self._extractors[name])
+            except InvalidInput as error:  # features that are not here: not the caller's mistake
+                raise Conflict(
+                    error.code,
+                    error.message,
+                    field=error.field,
+                    expected=error.expected,
+                    got=error.got,
+                ) from error
+            localizer.warm_up()
         logger.info("map %s loaded in %.1f s", opened.ref, perf_counter() - start)
         return localizer
 
     def _find_map(self, ref: str) -> Map:
-        if ref not in self._serving:
-            return self._store.open(ref)
-        current = f"{ref}@{self._store.current_version(ref)}"
-        serving = self._localizers.get(self._serving[ref] if current in self._refused else current)
-        return self._store.open(ref) if serving is None else serving.map
+        wanted = ref if "@" in ref else self._served(ref)
+        loaded = self._localizers.get(wanted)
+        if loaded is not None:
+            return loaded.map
+        with _damage_named(wanted):
+            return self._store.open(wanted)
+
+    def _served(self, map_id: str) -> str:
+        """Return ``id@version`` of what ``id`` stands for."""
+        before, refused = self._serving.get(map_id), self._refused.get(map_id)
+        try:
+            current = f"{map_id}@{self._store.current_version(map_id)}"
+        except MapCorrupt:
+            if before is None:
+                raise
+            return before
+        return before if before and refused and refused.ref == current else current
 
     def _list_maps(self) -> list[Map]:
         found = []
         for map_id in self._store.ids():
             try:
                 found.append(self._find_map(map_id))
-            except MapCorrupt as error:
+            except VislocError as error:
                 logger.warning("map %s is not listed: %s", map_id, error)
         return found
+
+
+@contextmanager
+def _damage_named(ref: str) -> Iterator[None]:
+    """Turn what should not happen while a map is opened into MapCorrupt ``map.unusable``.
+
+    A damaged map can break the code that reads it in any way, and must not stop the others.
+    """
+    try:
+        yield
+    except VislocError:
+        raise
+    except Exception as error:
+        logger.exception("map %s cannot be used", ref)
+        raise MapCorrupt(
+            "map.unusable",
+            "the map cannot be used; rebuild it, or see the server's log for the cause",
+            field=ref,
+            got=type(error).__name__,
+        ) from error

@@ -12,8 +12,8 @@ import grpc
 from google.protobuf.any_pb2 import Any as AnyMessage
 from google.protobuf.json_format import ParseDict
 from google.protobuf.message import Message
-from google.rpc.error_details_pb2 import ErrorInfo  # type: ignore[import-untyped]
-from google.rpc.status_pb2 import Status  # type: ignore[import-untyped]
+from google.rpc.error_details_pb2 import ErrorInfo
+from google.rpc.status_pb2 import Status
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 from pydantic import BaseModel
@@ -92,7 +92,8 @@ class GrpcServer:
             options=[
                 ("grpc.max_receive_message_length", settings.max_request_bytes),
                 ("grpc.so_reuseport", 0),  # a second server on the port is a mistake
-            ]
+            ],
+            maximum_concurrent_rpcs=settings.max_requests,
         )
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]
         pb2_grpc.add_LocalizationServicer_to_server(LocalizationServicer(engine), self._server)

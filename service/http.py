@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
+from collections.abc import Coroutine
 from http import HTTPStatus
 from time import perf_counter
+from typing import Any, TypeVar
 
 from fastapi import Request, Response
 from fastapi.exceptions import RequestValidationError
@@ -34,6 +37,8 @@ from visloc.errors import InvalidInput, NotFound, Unavailable, VislocError
 
 logger = logging.getLogger(__name__)
 
+T = TypeVar("T")
+
 
 def create_app(engine: Engine, settings: ServiceSettings) -> App:
     """Make the ASGI application. Starting and closing the engine is the caller's."""
@@ -61,7 +66,7 @@ def create_app(engine: Engine, settings: ServiceSettings) -> App:
         A photo that cannot be localized is an answer (`status: not_localized`), not an error.
         """
         message = await read_localize_request(request, settings)
-        found = await engine.localize(message.to_job())
+        found = await _while_connected(request, engine.localize(message.to_job()))
         return _json(LocalizeResponse.from_localization(found, request.state.request_id))
 
     @app.get("/maps", response_model=ListMapsResponse)
@@ -120,7 +125,7 @@ class RequestEnvelope:
         try:
             await self._app(scope, receive, send_with_id)
         except ClientDisconnect:
-            logger.info("the client of request %s left before it was read", id_)
+            logger.info("the client of request %s left before it was answered", id_)
         except Exception:  # the last line of defence: whatever it is, the caller gets an answer
             logger.exception("request %s broke", id_)
             if status:
@@ -132,6 +137,28 @@ class RequestEnvelope:
                 *(scope["method"], scope["path"], status),
                 *((perf_counter() - started) * 1000, id_),
             )
+
+
+async def _while_connected(request: Request, work: Coroutine[Any, Any, T]) -> T:
+    """Do the work, or drop it when the client hangs up: nobody waits for its answer.
+
+    Raises:
+        ClientDisconnect: when the client hung up.
+    """
+
+    async def hang_up() -> None:
+        while (await request.receive())["type"] != "http.disconnect":
+            pass
+
+    working, leaving = asyncio.create_task(work), asyncio.create_task(hang_up())
+    try:
+        await asyncio.wait({working, leaving}, return_when=asyncio.FIRST_COMPLETED)
+        if not working.done():
+            raise ClientDisconnect
+        return working.result()
+    finally:
+        working.cancel()
+        leaving.cancel()
 
 
 def _json(message: BaseModel, status: int = 200) -> Response:

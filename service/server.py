@@ -53,6 +53,7 @@ class Server:
                 log_config=None,
                 log_level="warning",
                 access_log=False,
+                limit_concurrency=settings.max_requests + 1,  # uvicorn refuses the one that fills
             )
         )
 

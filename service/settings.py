@@ -25,6 +25,8 @@ Count = Annotated[int, Field(ge=1)]
 
 # Room in a request for everything but the photo.
 REQUEST_OVERHEAD_BYTES = 64 * 1024
+# Room for requests besides the photos that are worked on or wait: health, maps, refusals.
+REQUESTS_BESIDES = 32
 
 
 class SettingsError(ValueError):
@@ -53,13 +55,20 @@ class ServiceSettings(BaseModel):
     )
     """processor threads for one photo; default: cores / workers"""
     max_queue: Annotated[int, Field(ge=0)] = 64
-    """photos that may wait for a worker; beyond it a request is refused at once"""
+    """photos that may wait for a worker; beyond it a request is refused. At each door, workers +
+    this + 32 connections (HTTP) or calls (gRPC) are served at once, which bounds the uploads held
+    in memory"""
     max_image_bytes: Count = 20 * 2**20
     """largest encoded photo, bytes"""
     max_image_pixels: Count = 50_000_000
     """largest photo, width times height"""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """what is logged to stderr: debug, info, warning or error"""
+
+    @property
+    def max_requests(self) -> int:
+        """Requests that one door serves at once; more are refused before they are read."""
+        return self.workers + self.max_queue + REQUESTS_BESIDES
 
     @property
     def max_request_bytes(self) -> int:

@@ -142,6 +142,44 @@ def test_a_rerun_asks_only_for_what_is_missing(
     assert asked(service) == []
 
 
+def test_a_rerun_asks_again_where_the_server_failed_and_keeps_one_line_per_photo(
+    url: str, make_dataset: Dataset, tmp_path: Path, service: Any
+) -> None:
+    names = ["a", "b", "c"]
+    dataset = make_dataset(dict(zip(names, [b"photo", b"broken", b"crash"], strict=True)))
+    output = tmp_path / "out"
+    command = (dataset, "--map", "room", "--output", output, "--server", url)
+    assert batch(*command) == 0
+    service.seen.clear()
+
+    assert batch(*command) == 0
+    assert asked(service) == [b"crash"]
+    assert [line["name"] for line in lines_of(output)] == names
+
+    (dataset / "sensors" / "records_data" / "c").write_bytes(b"photo")
+    assert batch(*command) == 0
+    assert [line["status"] for line in lines_of(output)] == ["localized", "error", "localized"]
+    assert len((output / "poses.txt").read_text().splitlines()) == 2
+    service.seen.clear()
+    assert batch(*command) == 0
+    assert asked(service) == []
+
+
+@pytest.mark.parametrize("kind", ["Unavailable", "Overloaded"])
+def test_a_stored_error_of_an_unavailable_server_is_not_final(
+    kind: str, http_url: str, make_dataset: Dataset, tmp_path: Path, service: Any
+) -> None:
+    output = tmp_path / "out"
+    dataset = make_dataset({"a": b"photo"})
+    command = (dataset, "--map", "room", "--output", output, "--server", http_url)
+    assert batch(*command) == 0
+    entry = {"name": "a", "status": "error", "error": {"kind": kind, "code": "x"}}
+    (output / "results.jsonl").write_text(json.dumps(entry) + "\n")
+    service.seen.clear()
+    assert batch(*command) == 0
+    assert asked(service) == [b"photo"]
+
+
 @pytest.mark.parametrize("change", ["version", "option", "dataset", "run.json"])
 def test_results_of_another_run_are_not_mixed(
     change: str,

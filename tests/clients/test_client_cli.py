@@ -56,6 +56,21 @@ def test_a_photo_that_is_not_localized_has_its_own_exit_code_and_says_why(
     assert "position" not in out
 
 
+def test_a_pose_is_printed_even_when_the_unit_cannot_be_asked_for(
+    url: str,
+    photo: Path,
+    capsys: pytest.CaptureFixture[str],
+    service: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    map_info = service.map_info
+    monkeypatch.setattr(service, "map_info", lambda ref: map_info("hall" if "@" in ref else ref))
+    assert localize("image", photo, "--map", "room", "--server", url) == 0
+    captured = capsys.readouterr()
+    assert "1 0.3 -3.5 units of the map" in captured.out
+    assert "map.unknown" in captured.err
+
+
 def test_json_is_the_answer_as_received(
     url: str, photo: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -75,6 +90,8 @@ def test_json_is_the_answer_as_received(
         (("--map", "hall"), "map.unknown"),
         (("--map", ""), "map.id"),
         (("--server", "localhost:8000"), "server.url"),
+        (("--server", "http://[:]:80"), "server.url"),
+        (("--server", "http://a..b:80"), "server.url"),
         (("--server", "http://127.0.0.1:1"), "server.unreachable"),
         (("--server", "grpc://127.0.0.1:1"), "server.unreachable"),
         (("--option", "top_k=1.5"), "options.top_k"),

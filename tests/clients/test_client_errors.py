@@ -94,6 +94,15 @@ def test_the_asynchronous_client_says_the_same(scheme: str, closed_port: int) ->
         "http://host:80/?x=1",
         "grpc://host:50051/path",
         "grpc://host:1\n",
+        "http://[:]:80",
+        "grpc://[:]:80",
+        "http://a..b:80",
+        "http://.:80",
+        f"http://{'a' * 64}:80",
+        "http://999.1.1.1:80",
+        "http://xn--0.example:80",
+        "http://host/\x7f",
+        "http://host/\udcff",
     ],
 )
 def test_an_address_that_cannot_be_used_is_refused_at_once(address: str) -> None:
@@ -125,7 +134,7 @@ def test_usual_addresses_are_accepted() -> None:
         (429, Overloaded, "server.overloaded"),
         (500, Unavailable, "server.internal"),
         (502, Unavailable, "server.unavailable"),
-        (503, Unavailable, "server.unavailable"),
+        (503, Overloaded, "server.overloaded"),
     ],
 )
 def test_an_error_without_our_words_goes_by_its_status(

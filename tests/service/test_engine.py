@@ -5,10 +5,11 @@ import json
 import logging
 import shutil
 import threading
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+import numpy as np
 import pytest
 
 from service import engine as engine_module
@@ -162,6 +163,127 @@ def test_a_broken_map_does_not_keep_the_others_from_being_served(
 
     run(play())
     assert "map hall is not loaded" in caplog.text
+
+
+def without_an_array(folder: Path) -> None:
+    model = next((folder / "global").glob("*.model.npz"))
+    with np.load(model) as arrays:
+        kept = {name: arrays[name] for name in arrays.files[1:]}
+    np.savez(model, **kept)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["files"][f"global/{model.name}"]["size"] = model.stat().st_size
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
+def with_a_folder_as_manifest(folder: Path) -> None:
+    (folder / "manifest.json").unlink()
+    (folder / "manifest.json").mkdir()
+
+
+@pytest.mark.parametrize("damage", [without_an_array, with_a_folder_as_manifest])
+def test_whatever_a_damaged_map_breaks_the_others_are_served(
+    damage: Callable[[Path], None], maps_dir: Path, query: Query, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def play() -> None:
+        publish(maps_dir, "v1", map_id="hall")
+        damage(maps_dir / "hall" / "v1")
+        engine = make(maps_dir)
+        await engine.start()
+
+        assert engine.status.ready
+        assert engine.status.not_loaded.keys() == {"hall"}
+        assert engine.status.not_loaded["hall"].code == "map.unusable"
+        assert "room" in [m.manifest.id for m in await engine.maps()]
+        assert (await engine.localize(job_for(query))).map_id == "room"
+        with pytest.raises(MapCorrupt):
+            await engine.localize(job_for(query, "hall"))
+
+        before = (await engine.localize(job_for(query))).map_version
+        publish(maps_dir, "v2")
+        damage(maps_dir / "room" / "v2")
+        assert (await engine.localize(job_for(query))).map_version == before
+        assert engine.status.not_loaded["room"].field == "room@v2"
+        engine.close()
+
+    run(play())
+    assert "Traceback" in caplog.text
+
+
+def test_a_refused_version_is_named_left_alone_for_a_while_and_tried_again(
+    maps_dir: Path, query: Query, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def play() -> None:
+        engine = make(maps_dir)
+        await engine.start()
+        old = (await engine.localize(job_for(query))).map_version
+        publish(maps_dir, "v2")
+        landmarks = maps_dir / "room" / "v2" / "landmarks.npy"
+        landmarks.rename(landmarks.with_name("away"))
+
+        assert (await engine.localize(job_for(query))).map_version == old
+        assert engine.status.maps == (f"room@{old}",)
+        assert "v2" in str(engine.status.not_loaded["room"])
+
+        landmarks.with_name("away").rename(landmarks)
+        assert (await engine.localize(job_for(query))).map_version == old
+        monkeypatch.setattr(engine_module, "RETRY_AFTER_S", 0.0)
+        assert (await engine.localize(job_for(query))).map_version == "v2"
+        assert engine.status.not_loaded == {}
+        engine.close()
+
+    run(play())
+
+
+def test_a_damaged_name_of_the_current_version_leaves_the_one_before_in_service(
+    maps_dir: Path, query: Query
+) -> None:
+    async def play() -> None:
+        engine = make(maps_dir)
+        await engine.start()
+        old = (await engine.localize(job_for(query))).map_version
+        (maps_dir / "room" / "current").write_bytes(b"\xff")
+
+        assert (await engine.localize(job_for(query))).map_version == old
+        assert (await engine.map("room")).manifest.version == old
+        assert engine.status.not_loaded["room"].code == "map.current"
+        engine.close()
+
+    run(play())
+
+
+def test_deleted_maps_disappear(maps_dir: Path, query: Query) -> None:
+    async def play() -> None:
+        for map_id in ("hall", "yard"):
+            publish(maps_dir, "v1", map_id=map_id)
+        (maps_dir / "yard" / "v1" / "landmarks.npy").unlink()
+        engine = make(maps_dir)
+        await engine.start()
+        assert len(engine.status.maps) == 2
+        assert engine.status.not_loaded.keys() == {"yard"}
+
+        for map_id in ("hall", "yard"):
+            shutil.rmtree(maps_dir / map_id)
+        assert [ref.partition("@")[0] for ref in engine.status.maps] == ["room"]
+        assert engine.status.not_loaded == {}
+        with pytest.raises(NotFound):
+            await engine.localize(job_for(query, "hall"))
+        engine.close()
+
+    run(play())
+
+
+def test_a_loaded_map_is_described_without_opening_it_again(
+    maps_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def play() -> None:
+        engine = make(maps_dir)
+        await engine.start()
+        monkeypatch.setattr(MapStore, "open", None)
+        by_id = await engine.map("room")
+        assert await engine.map(by_id.ref) is by_id
+        engine.close()
+
+    run(play())
 
 
 def test_a_map_whose_features_are_not_here_is_a_conflict_not_the_callers_mistake(

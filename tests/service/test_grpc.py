@@ -180,6 +180,20 @@ def test_a_message_over_the_limit_is_not_taken(doors: Any, query: Any) -> None:
     assert call.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
 
 
+def test_calls_over_the_limit_are_refused(serve: Any, tmp_path: Any) -> None:
+    with serve(tmp_path, max_queue=0) as doors:
+        stub = health_pb2_grpc.HealthStub(doors.channel)
+        watching = [stub.Watch(health_pb2.HealthCheckRequest()) for _ in range(33)]
+        for watch in watching:
+            next(watch)
+        with pytest.raises(grpc.RpcError) as caught:
+            doors.stub.ListMaps(pb2.ListMapsRequest())
+        call: Any = caught.value
+        assert call.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+        for watch in watching:
+            watch.cancel()
+
+
 def test_what_breaks_inside_is_internal_without_its_insides(
     serve: Any,
     tmp_path: Any,

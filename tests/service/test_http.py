@@ -4,10 +4,14 @@ import asyncio
 import base64
 import io
 import json
+import logging
 import socket
 import struct
+import threading
+import time
 import zlib
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import httpx
@@ -16,6 +20,7 @@ import pytest
 from PIL import Image
 
 import visloc
+from service import engine as engine_module
 from service.http import create_app
 from service.openapi import EXAMPLE_REQUEST
 from visloc.geometry import Pose, rotation_angle
@@ -295,6 +300,54 @@ def test_a_full_queue_is_429_with_retry_after(serve: Any, tmp_path: Any, query: 
 
     assert problem(response, 429, "server.busy")["kind"] == "Overloaded"
     assert response.headers["retry-after"] == "1"
+
+
+def test_connections_over_the_limit_are_503(serve: Any, tmp_path: Any) -> None:
+    with serve(tmp_path, max_queue=0) as doors:
+        address = ("127.0.0.1", doors.server.http_port)
+        idle = [socket.create_connection(address) for _ in range(32)]
+        assert doors.http.get("/healthz").status_code == 200  # the 33rd
+        idle.append(socket.create_connection(address))
+        assert doors.http.get("/healthz").status_code == 503
+        for connection in idle:
+            connection.close()
+
+
+def test_a_photo_whose_client_hung_up_is_dropped_from_the_queue(
+    serve: Any,
+    built_maps: Any,
+    query: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    opened, entered = threading.Event(), threading.Semaphore(0)
+    read_photo = engine_module.read_photo
+
+    def waiting(*arguments: Any) -> Any:
+        entered.release()
+        assert opened.wait(30)
+        return read_photo(*arguments)
+
+    with serve(built_maps, workers=1) as doors, ThreadPoolExecutor() as pool:
+        monkeypatch.setattr(engine_module, "read_photo", waiting)
+        running = pool.submit(post, doors, query.image)
+        assert entered.acquire(timeout=10)
+        with caplog.at_level(logging.INFO), pytest.raises(httpx.ReadTimeout):
+            httpx.post(
+                f"{doors.url}/localize",
+                data={"map": "room"},
+                files={"image": query.image},
+                timeout=httpx.Timeout(10, read=0.3),
+            )
+        deadline = time.monotonic() + 10
+        while "left before it was answered" not in caplog.text:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        opened.set()
+        assert running.result().status_code == 200
+        assert post(doors, query.image).status_code == 200
+    entered.acquire()
+    assert not entered.acquire(blocking=False), "the photo of the client that left was decoded"
 
 
 def test_what_breaks_inside_is_a_500_without_its_insides(

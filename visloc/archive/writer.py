@@ -61,7 +61,7 @@ class GlobalFeatures:
 class MapContent:
     """Everything a map holds, but its id, version and creation time.
 
-    ``descriptors`` yields, photo by photo, the unit descriptors (m_i, D) float32 of that photo's
+    ``descriptors()`` yields, photo by photo, the unit descriptors (m_i, D) float32 of that photo's
     observations in the order of ``landmarks``; it is read twice.
     """
 
@@ -77,7 +77,7 @@ class MapContent:
     local_fingerprint: FingerprintRecord
     max_keypoints: int
     descriptor_dim: int
-    descriptors: Iterable[NDArray[np.float32]]
+    descriptors: Callable[[], Iterator[NDArray[np.float32]]]
     global_features: tuple[GlobalFeatures, ...]
 
 
@@ -197,19 +197,19 @@ def _write_json(path: Path, value: object) -> None:
 
 
 def _write_descriptors(
-    path: Path, descriptors: Iterable[NDArray[np.float32]], shape: tuple[int, int]
+    path: Path, descriptors: Callable[[], Iterator[NDArray[np.float32]]], shape: tuple[int, int]
 ) -> float:
     """Store unit descriptors in 8 bits and return the value of one step.
 
     One step for the whole map: it keeps products of stored integers comparable.
     """
-    largest = max((float(np.abs(block).max(initial=0.0)) for block in descriptors), default=0.0)
+    largest = max((float(np.abs(block).max(initial=0.0)) for block in descriptors()), default=0.0)
     scale = (largest or 1.0) / 127.0
     num_rows = 0
 
     def stored() -> Iterator[NDArray[np.int8]]:
         nonlocal num_rows
-        for block in descriptors:
+        for block in descriptors():
             num_rows += len(block)
             yield np.rint(block / np.float32(scale)).astype(np.int8)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -139,6 +140,11 @@ class Dataset:
     def path_of(self, record: FileRecord) -> Path:
         """Return where the record's file should lie; it may be missing."""
         return self.root / "sensors" / "records_data" / record.path
+
+    def has_file(self, record: FileRecord) -> bool:
+        """Tell whether the record's file is there."""
+        # Path.is_file raises for names that are longer than a file's name can be.
+        return os.path.isfile(self.path_of(record))  # noqa: PTH113
 
 
 def _shortest(value: float) -> str:

@@ -17,11 +17,6 @@ def colmap_camera(camera: Camera) -> pycolmap.Camera:
     )
 
 
-def colmap_pose(pose: Pose) -> pycolmap.Rigid3d:
-    """Return the same transform for pycolmap."""
-    return pycolmap.Rigid3d(np.column_stack([pose.rotation, pose.translation]))
-
-
 def pose_from_colmap(rigid: pycolmap.Rigid3d) -> Pose:
     """Return pycolmap's transform as ours, with a rotation that is a copy, not a view."""
     matrix = np.array(rigid.matrix(), dtype=np.float64)

@@ -1,20 +1,15 @@
 """Late fusion: one score per mapping photo from its cosine similarities to the query.
 
-Section 3.2 of Humenberger et al. 2020. A further operator is one function and one line in
-``FUSION_OPERATORS``.
+Section 3.2 of Humenberger et al. 2020. An operator takes similarities (m, n), one row per global
+descriptor, and gives fused scores (n,).
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 GHARM_GAMMA = 0.5
-
-FusionOperator = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""Similarities (m, n) in [-1, 1], one row per global descriptor -> fused scores (n,)."""
 
 
 def gharm(similarities: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -32,6 +27,3 @@ def gharm(similarities: NDArray[np.float64]) -> NDArray[np.float64]:
     # With m >= 2 and s >= -1 nothing is negative but by rounding; the tiny floor is the limit.
     shifted = np.maximum(shifted, 1e-12)
     return np.asarray(m / np.sum(1.0 / shifted, axis=0) - GHARM_GAMMA)
-
-
-FUSION_OPERATORS: Mapping[str, FusionOperator] = {"gharm": gharm}

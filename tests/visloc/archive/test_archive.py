@@ -54,7 +54,7 @@ def make_content(seed: int = 0) -> MapContent:
         local_fingerprint=FingerprintRecord(name="sift", revision=1, parameters={"max_size": 1600}),
         max_keypoints=100,
         descriptor_dim=8,
-        descriptors=[rows[:3], rows[3:3], rows[3:]],
+        descriptors=lambda: iter([rows[:3], rows[3:3], rows[3:]]),
         global_features=(
             GlobalFeatures(
                 FingerprintRecord(name="densevlad", revision=1, parameters={}),
@@ -92,7 +92,7 @@ def test_a_written_map_reads_back_as_it_was(folder: Path) -> None:
     assert landmarks.tolist() == [0, 2, 3, 4]
     # eight bits: half a step of the largest value
     assert descriptors == pytest.approx(
-        np.concatenate(list(content.descriptors))[3:], abs=0.5 / 127
+        np.concatenate(list(content.descriptors()))[3:], abs=0.5 / 127
     )
     assert len(opened.observations(1)[0]) == 0
 
