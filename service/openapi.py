@@ -7,6 +7,7 @@ from typing import Any
 from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
+from service import examples
 from service.schemas import Camera, LocalizeRequest, Problem
 
 # A grey photo of 64 x 48 pixels: small enough to read, real enough to be posted as it is.
@@ -58,6 +59,16 @@ LOCALIZE_BODY: dict[str, Any] = {
     },
 }
 
+_ANSWERS: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {
+    ("/localize", "post", "200"): {
+        "localized": examples.LOCALIZED,
+        "not_localized": examples.NOT_LOCALIZED,
+    },
+    ("/maps", "get", "200"): {"maps": {"maps": [examples.MAP]}},
+    ("/maps/{ref}", "get", "200"): {"map": examples.MAP},
+    ("/readyz", "get", "200"): {"ready": examples.READY},
+    ("/readyz", "get", "503"): {"loading": examples.LOADING},
+}
 
 _PROBLEMS = {
     404: "no such map or version",
@@ -111,4 +122,10 @@ class App(FastAPI):
                 "kind": "InvalidInput",
                 "request_id": "3f1d5c0b8a7e4e1f9d2c6b5a49382716",
             }
+            # Not given to the routes: FastAPI would drop their nulls.
+            for (path, method, status), shown in _ANSWERS.items():
+                response = schema["paths"][path][method]["responses"][status]
+                response["content"]["application/json"]["examples"] = {
+                    name: {"value": answer} for name, answer in shown.items()
+                }
         return super().openapi()

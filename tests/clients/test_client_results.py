@@ -88,7 +88,9 @@ def test_an_error_is_stored_with_all_its_parts(tmp_path: Path) -> None:
         b"[]",
         b"\xff",
         b"{}",
-        b'{"name": 1, "status": "error"}',
+        b'{"name": 1, "status": "not_localized"}',
+        b'{"name": "a", "status": "error"}',
+        b'{"name": "a", "status": "error", "error": "x"}',
         b'{"name": "a", "status": "maybe"}',
         b'{"name": "a", "status": "localized", "pose": null}',
         b'{"name": "a", "status": []}',
@@ -97,7 +99,7 @@ def test_an_error_is_stored_with_all_its_parts(tmp_path: Path) -> None:
 )
 def test_a_damaged_line_is_named_by_file_and_line(line: bytes, tmp_path: Path) -> None:
     path = tmp_path / "results.jsonl"
-    path.write_bytes(b'{"name": "z", "status": "error"}\n' + line + b"\n")
+    path.write_bytes(b'{"name": "z", "status": "not_localized"}\n' + line + b"\n")
     with pytest.raises(DatasetError) as caught:
         list(read_results(path))
     assert caught.value.code == "results.line"
@@ -106,7 +108,7 @@ def test_a_damaged_line_is_named_by_file_and_line(line: bytes, tmp_path: Path) -
 
 def test_lines_can_be_brought_into_another_order_in_place(tmp_path: Path) -> None:
     path = tmp_path / "results.jsonl"
-    lines = [b'{"name": "%s", "status": "error"}\n' % name for name in (b"b", b"ccc", b"a")]
+    lines = [b'{"name": "%s", "status": "not_localized"}\n' % name for name in (b"b", b"ccc", b"a")]
     path.write_bytes(b"".join(lines))
     b, c, a = read_results(path)
     copy_lines(path, [a, b, c], path)

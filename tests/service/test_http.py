@@ -18,9 +18,11 @@ import httpx
 import numpy as np
 import pytest
 from PIL import Image
+from pydantic import BaseModel
 
 import visloc
 from service import engine as engine_module
+from service import schemas
 from service.http import create_app
 from service.openapi import EXAMPLE_REQUEST
 from visloc.geometry import Pose, rotation_angle
@@ -332,7 +334,8 @@ def test_a_photo_whose_client_hung_up_is_dropped_from_the_queue(
         monkeypatch.setattr(engine_module, "read_photo", waiting)
         running = pool.submit(post, doors, query.image)
         assert entered.acquire(timeout=10)
-        with caplog.at_level(logging.INFO), pytest.raises(httpx.ReadTimeout):
+        caplog.set_level(logging.INFO)
+        with pytest.raises(httpx.ReadTimeout):
             httpx.post(
                 f"{doors.url}/localize",
                 data={"map": "room"},
@@ -447,6 +450,27 @@ def test_openapi_describes_both_kinds_of_bodies_and_every_reference_resolves(doo
     assert "#/components/schemas/Problem" in found
     for reference in found:
         assert reference.removeprefix("#/components/schemas/") in schema["components"]["schemas"]
+
+
+@pytest.mark.parametrize(
+    ("path", "method", "status", "model", "names"),
+    [
+        ("/localize", "post", "200", schemas.LocalizeResponse, {"localized", "not_localized"}),
+        ("/maps", "get", "200", schemas.ListMapsResponse, {"maps"}),
+        ("/maps/{ref}", "get", "200", schemas.MapInfo, {"map"}),
+        ("/readyz", "get", "200", schemas.Readiness, {"ready"}),
+        ("/readyz", "get", "503", schemas.Readiness, {"loading"}),
+    ],
+)
+def test_openapi_shows_answers_that_are_whole(
+    path: str, method: str, status: str, model: type[BaseModel], names: set[str], doors: Any
+) -> None:
+    schema = doors.http.get("/openapi.json").json()
+    content = schema["paths"][path][method]["responses"][status]["content"]["application/json"]
+    assert content["schema"]["$ref"].endswith(f"/{model.__name__}")
+    assert content["examples"].keys() == names
+    for example in content["examples"].values():
+        assert model.model_validate(example["value"]).model_dump() == example["value"]
 
 
 def test_the_example_of_the_documentation_is_answered(doors: Any) -> None:

@@ -1,0 +1,137 @@
+"""Answers as a server gave them, with fewer digits and photos, for /openapi.json."""
+
+from __future__ import annotations
+
+from typing import Any
+
+LOCALIZED: dict[str, Any] = {
+    "request_id": "f59a93b60e064f19b50d9e646d1fa166",
+    "status": "localized",
+    "pose": {
+        "cam_from_world": {
+            "rotation_wxyz": [0.645181, 0.692537, -0.242278, 0.213158],
+            "translation": [-0.524988, 1.61195, -0.709412],
+        },
+        "position": [0.944435, 0.32084, 1.54349],
+        "orientation": [0.645181, -0.692537, 0.242278, -0.213158],
+        "covariance": [
+            *(2.71e-08, -3.02e-09, -1.61e-10, 7.96e-09, 7.05e-08, 4.09e-08),
+            *(-3.02e-09, 2.83e-08, 1.15e-09, -7.72e-08, -7.76e-09, 3.84e-09),
+            *(-1.61e-10, 1.15e-09, 6.55e-09, -1.36e-08, -3.53e-09, -1.53e-10),
+            *(7.96e-09, -7.72e-08, -1.36e-08, 2.32e-07, 2.56e-08, -1.19e-08),
+            *(7.05e-08, -7.76e-09, -3.53e-09, 2.56e-08, 1.9e-07, 1.06e-07),
+            *(4.09e-08, 3.84e-09, -1.53e-10, -1.19e-08, 1.06e-07, 8.96e-08),
+        ],
+        "position_std": [0.000301, 0.000223, 0.000318],
+        "orientation_std_deg": [0.00942, 0.00964, 0.00464],
+    },
+    "refusal": None,
+    "keypoints": 5000,
+    "correspondences": 3740,
+    "inliers": 3528,
+    "inlier_ratio": 0.943,
+    "retrieved": [
+        {
+            "image": "mapping/right/0003.jpg",
+            "score": 0.38,
+            "similarities": {"densevlad": 0.746, "localvlad": 0.776},
+        },
+        {
+            "image": "mapping/left/0002.jpg",
+            "score": 0.317,
+            "similarities": {"densevlad": 0.721, "localvlad": 0.555},
+        },
+    ],
+    "camera": {
+        "model": "PINHOLE",
+        "width": 640,
+        "height": 480,
+        "params": [457.6, 457.6, 321.92, 238.08],
+        "source": "given",
+    },
+    "orientation": {"exif": 1, "read_as": "stored"},
+    "map": {"id": "sample", "version": "20261121T111436.881Z-7f9cafe0"},
+    "seconds": {
+        "queued": 7.9e-05,
+        "open_map": 0.00011,
+        "decode": 0.0021,
+        "local_features": 0.58,
+        "global_features": 0.072,
+        "retrieval": 0.00018,
+        "matching": 0.41,
+        "pose": 0.13,
+    },
+}
+NOT_LOCALIZED: dict[str, Any] = {
+    "request_id": "0a6d0ac8ef994eeeab1467fce2531da0",
+    "status": "not_localized",
+    "pose": None,
+    "refusal": {
+        "stage": "gate",
+        "reason": "too_few_inliers",
+        "message": "the best pose explains 18 matches, 30 are needed; "
+        "is this photo of the mapped place?",
+    },
+    "keypoints": 5000,
+    "correspondences": 1598,
+    "inliers": 18,
+    "inlier_ratio": 0.0113,
+    "retrieved": [
+        {
+            "image": "mapping/left/0004.jpg",
+            "score": 0.124,
+            "similarities": {"densevlad": 0.347, "localvlad": 0.162},
+        },
+        {
+            "image": "mapping/right/0003.jpg",
+            "score": 0.117,
+            "similarities": {"densevlad": 0.354, "localvlad": 0.134},
+        },
+    ],
+    "camera": {
+        "model": "SIMPLE_PINHOLE",
+        "width": 1536,
+        "height": 1024,
+        "params": [1843.2, 768.0, 512.0],
+        "source": "guess",
+    },
+    "orientation": {"exif": 1, "read_as": "stored"},
+    "map": {"id": "sample", "version": "20261121T111436.881Z-7f9cafe0"},
+    "seconds": {
+        "queued": 0.0022,
+        "open_map": 0.0002,
+        "decode": 0.013,
+        "local_features": 1.2,
+        "global_features": 0.071,
+        "retrieval": 0.00014,
+        "matching": 0.54,
+        "pose": 0.43,
+    },
+}
+MAP: dict[str, Any] = {
+    "id": "sample",
+    "version": "20261121T111436.881Z-7f9cafe0",
+    "created": "2026-11-21T11:14:36+00:00",
+    "metric": True,
+    "method": "rgbd",
+    "local_features": "xfeat",
+    "global_features": ["densevlad", "localvlad"],
+    "images": 60,
+    "landmarks": 199676,
+    "observations": 297457,
+    "extent": {"min": [-3.0, -2.25, -9.4e-08], "max": [3.0, 2.25, 2.8]},
+    "size_bytes": 33037821,
+}
+READY: dict[str, Any] = {
+    "ready": True,
+    "maps": ["sample@20261121T111436.881Z-7f9cafe0"],
+    "not_loaded": [
+        {
+            "id": "hall",
+            "code": "map.file_missing",
+            "message": "maps/hall/20261121T090211.240Z-51c09f3e/landmarks.npy: "
+            "a file of the map is missing",
+        }
+    ],
+}
+LOADING: dict[str, Any] = {"ready": False, "maps": [], "not_loaded": []}
