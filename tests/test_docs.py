@@ -129,6 +129,7 @@ def desk(
         ("maps", built_maps),
         ("QUERIES", sample / "query"),
         (".demo/dataset", sample),
+        ("examples", ROOT / "examples"),
     ):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).symlink_to(target)

@@ -63,7 +63,10 @@ def test_the_kitchen_is_localized_to_centimetres(localizer: Localizer, kitchen: 
     assert np.median(orientation_deg) < 1.1
 
 
-@pytest.mark.parametrize("width", [None, 256], ids=["as it is", "256 px"])
+@pytest.mark.parametrize(
+    "width",
+    [pytest.param(None, marks=pytest.mark.slow, id="as it is"), pytest.param(256, id="256 px")],
+)
 def test_the_courtyard_is_refused(localizer: Localizer, castle: Dataset, width: int | None) -> None:
     inliers = []
     for record in castle.images:
