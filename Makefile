@@ -43,7 +43,7 @@ contracts: install ## who may import whom
 	$(BIN)/lint-imports
 
 proto: install ## generate visloc_api from proto/
-	$(BIN)/python -m grpc_tools.protoc --proto_path=proto --python_out=. --grpc_python_out=. \
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m grpc_tools.protoc --proto_path=proto --python_out=. --grpc_python_out=. \
 		--mypy_out=. --mypy_grpc_out=. proto/visloc_api/v1/localization.proto
 
 proto-check: proto ## the committed stubs are those of the proto

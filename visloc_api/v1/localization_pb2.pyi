@@ -252,7 +252,7 @@ class Refusal(_message.Message):
     REASON_FIELD_NUMBER: _builtins.int
     MESSAGE_FIELD_NUMBER: _builtins.int
     stage: _builtins.str
-    """features, retrieval, matching, pose or gate"""
+    """features, matching, pose or gate"""
     reason: _builtins.str
     """a stable word"""
     message: _builtins.str
