@@ -281,8 +281,11 @@ def test_a_stopped_run_keeps_what_is_done_and_goes_on_later(
     dataset, output = make_dataset(photos), tmp_path / "out"
     service.slow_s = 5.0
     command = (dataset, "--map", "room", "--output", output, "--server", url, "--concurrency", 2)
+    # A shell starts what it runs in the background with SIGINT ignored, tests perhaps too.
+    heed_sigint = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    run = f"{heed_sigint}; from clients.cli import main; main()"
     process = subprocess.Popen(
-        [sys.executable, "-m", "clients", "batch", *map(str, command)],
+        [sys.executable, "-c", run, "batch", *map(str, command)],
         stderr=subprocess.PIPE,
         env=os.environ | {"PYTHONFAULTHANDLER": ""},
     )
