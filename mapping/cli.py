@@ -174,7 +174,7 @@ def export_features_command(
 def sample(
     output: Annotated[Path, typer.Argument(help="Folder to make; holds mapping/ and query/.")],
     images: Annotated[int, typer.Option(help="Mapping photos.")] = 60,
-    seed: Annotated[int, typer.Option(help="Another seed, another room.")] = 0,
+    seed: Annotated[int, typer.Option(help="Another seed, other pictures in the room.")] = 0,
     size: Annotated[str, typer.Option(help="Size of a photo, WxH.")] = "640x480",
 ) -> None:
     """Make a small synthetic dataset with exact poses."""
