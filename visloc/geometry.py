@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,6 +46,18 @@ _SCALES_WITH_HEIGHT = {"fy", "cy"}
 # side; 0.5 % covers that from 100 px on. Below, the tolerance grows, but never beyond 2 %.
 _ASPECT_TOLERANCE = 0.005
 _MAX_ASPECT_TOLERANCE = 0.02
+
+
+class PixelOrigin(StrEnum):
+    """Where a dataset's principal points and ready-made keypoints count from."""
+
+    CORNER = "corner"  # the centre of the top-left pixel is (0.5, 0.5), as here and in COLMAP
+    CENTER = "center"  # ... is (0, 0), as array indices are
+
+    @property
+    def shift(self) -> float:
+        """What to add to its pixel coordinates to have ours."""
+        return 0.5 if self is PixelOrigin.CENTER else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,6 +245,14 @@ class Camera:
             for name, value in zip(CAMERA_MODELS[self.model], self.params, strict=True)
         )
         return Camera(self.model, width, height, params)
+
+    def with_pixels_from(self, origin: PixelOrigin) -> Camera:
+        """Return this camera in our convention, when its principal point counts from ``origin``."""
+        params = tuple(
+            value + origin.shift if name in ("cx", "cy") else value
+            for name, value in zip(CAMERA_MODELS[self.model], self.params, strict=True)
+        )
+        return Camera(self.model, self.width, self.height, params)
 
 
 def _whole(field: str) -> int:

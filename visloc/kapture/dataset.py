@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from visloc.geometry import Camera, Pose
+from visloc.geometry import Camera, PixelOrigin, Pose
 
 UNKNOWN_CAMERA = "UNKNOWN_CAMERA"
 
@@ -140,6 +140,18 @@ class Dataset:
     def path_of(self, record: FileRecord) -> Path:
         """Return where the record's file should lie; it may be missing."""
         return self.root / "sensors" / "records_data" / record.path
+
+    def with_pixels_from(self, origin: PixelOrigin) -> Dataset:
+        """Return this dataset in our convention, when its calibrations count from ``origin``."""
+        sensors = {
+            key: sensor
+            if sensor.camera is None
+            else Sensor.with_camera(
+                key, sensor.camera.with_pixels_from(origin), sensor.kind, sensor.name
+            )
+            for key, sensor in self.sensors.items()
+        }
+        return replace(self, sensors=sensors)
 
     def has_file(self, record: FileRecord) -> bool:
         """Tell whether the record's file is there."""
