@@ -1,6 +1,7 @@
 """Clients of the localization service: synchronous and asynchronous, over HTTP and gRPC."""
 
 from clients.client import AsyncClient, Client
+from clients.features import Features
 from clients.types import (
     CameraUsed,
     LocalizeOptions,
@@ -18,6 +19,7 @@ __all__ = [
     "AsyncClient",
     "CameraUsed",
     "Client",
+    "Features",
     "LocalizeOptions",
     "LocalizeResult",
     "MapInfo",

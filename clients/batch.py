@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from clients.client import AsyncClient
+from clients.features import Features
 from clients.queries import Query
 from clients.results import (
     copy_lines,
@@ -22,6 +23,7 @@ from clients.results import (
 from clients.running import Outcome, localize_all
 from clients.types import LocalizeOptions
 from visloc.errors import Conflict
+from visloc.geometry import PixelOrigin
 
 _FORMAT = 1
 
@@ -33,12 +35,16 @@ class Batch:
     Attributes:
         output: holds ``results.jsonl``, ``poses.txt`` and ``run.json``.
         source: the dataset or list.
+        features_dir: where the features of the photos are, when not in the dataset.
+        pixel_origin: where its cameras and keypoints count from.
         map_ref: ``id@version``, so that all results are of one map.
         options: for every photo.
     """
 
     output: Path
     source: Path
+    features_dir: Path | None
+    pixel_origin: PixelOrigin
     map_ref: str
     options: LocalizeOptions
 
@@ -76,6 +82,8 @@ def open_batch(batch: Batch, *, restart: bool) -> set[str]:
         "format": _FORMAT,
         "map": batch.map_ref,
         "queries": str(batch.source.resolve()),
+        "features": None if batch.features_dir is None else str(batch.features_dir.resolve()),
+        "pixel_origin": batch.pixel_origin,
         "options": batch.options.given(),
     }
     if batch.results.exists():
@@ -93,6 +101,7 @@ async def run_batch(
     queries: Sequence[Query],
     concurrency: int,
     on_outcome: Callable[[Outcome], None],
+    read: Callable[[Query], bytes | Features],
 ) -> None:
     """Localize ``queries`` and append each result to the folder at once.
 
@@ -106,7 +115,7 @@ async def run_batch(
             file.flush()
             on_outcome(outcome)
 
-        await localize_all(client, queries, batch.map_ref, batch.options, concurrency, keep)
+        await localize_all(client, queries, batch.map_ref, batch.options, concurrency, keep, read)
 
 
 def finish_batch(batch: Batch, queries: Sequence[Query]) -> Counter[str]:

@@ -28,10 +28,11 @@ from clients.display import (
 from clients.queries import read_queries
 from clients.results import check_can_be_written, write_poses, write_whole
 from clients.running import Outcome, localize_all
+from clients.sending import choose_reader
 from clients.types import LocalizeOptions
 from visloc.errors import VislocError
 from visloc.evaluation import DEFAULT_THRESHOLDS
-from visloc.geometry import Camera
+from visloc.geometry import Camera, PixelOrigin
 
 EXIT_ERROR = 1  # 2 is wrong usage, by convention
 EXIT_NOT_LOCALIZED = 3
@@ -74,6 +75,22 @@ Source = Annotated[
         metavar="DATASET_OR_LIST",
         help="A kapture folder, or a text file with lines 'image_name' or "
         "'image_name MODEL width height params...', names relative to its folder.",
+    ),
+]
+FeaturesDir = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        help="For a map of ready-made features (kapture:TYPE): the features of the photos, where "
+        "they are not in the dataset.",
+    ),
+]
+Origin = Annotated[
+    PixelOrigin,
+    typer.Option(
+        "--pixel-origin",
+        help="What the dataset's principal points and ready-made keypoints call the centre of the "
+        "top-left pixel: corner, (0.5, 0.5), or center, (0, 0).",
     ),
 ]
 DEFAULT_SERVER = "http://127.0.0.1:8000"
@@ -132,12 +149,14 @@ def localize_batch(
     option: Options = None,
     seed: Seed = None,
     concurrency: Concurrency = 1,
+    features_dir: FeaturesDir = None,
+    pixel_origin: Origin = PixelOrigin.CORNER,
     restart: Annotated[
         bool, typer.Option("--restart", help="Remove the results in the folder and begin again.")
     ] = False,
     timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
 ) -> None:
-    """Localize all photos of a dataset or list.
+    """Localize all photos of a dataset or list, or their features for a map of ready-made ones.
 
     Writes results.jsonl, one answer per line, and at the end poses.txt with lines
     'name qw qx qy qz tx ty tz' (cam_from_world) of the localized photos. The same command takes
@@ -147,9 +166,11 @@ def localize_batch(
     Exits with 0 when every photo has its line, 1 on an error, 130 when stopped.
     """
     options = _options(option, seed)
-    queries = read_queries(source)
+    queries = read_queries(source, pixel_origin)
     with Client(server, timeout_s=timeout_s) as client:
-        batch = Batch(output, source, client.map(map_ref).ref, options)
+        info = client.map(map_ref)
+    read = choose_reader(source, info, features_dir, pixel_origin)
+    batch = Batch(output, source, features_dir, pixel_origin, info.ref, options)
     done = open_batch(batch, restart=restart)
     waiting = [query for query in queries if query.name not in done]
     if len(waiting) < len(queries):
@@ -163,7 +184,7 @@ def localize_batch(
                 failed.append(outcome)
 
         async with AsyncClient(server, timeout_s=timeout_s) as client:
-            await run_batch(batch, client, waiting, concurrency, count)
+            await run_batch(batch, client, waiting, concurrency, count, read)
 
     _run(run, len(waiting), "the same command takes the run up where it was")
     counts = finish_batch(batch, queries)
@@ -184,6 +205,8 @@ def benchmark(
     option: Options = None,
     seed: Seed = None,
     concurrency: Concurrency = 1,
+    features_dir: FeaturesDir = None,
+    pixel_origin: Origin = PixelOrigin.CORNER,
     threshold: Annotated[
         list[str] | None,
         typer.Option(
@@ -207,9 +230,10 @@ def benchmark(
     options = _options(option, seed)
     thresholds = [parse_threshold(text) for text in threshold or ()] or DEFAULT_THRESHOLDS
     check_can_be_written([report] if poses is None else [report, poses])
-    queries = read_queries(source)
+    queries = read_queries(source, pixel_origin)
     with Client(server, timeout_s=timeout_s) as client:
         info, about = client.map(map_ref), client.server_info()
+    read = choose_reader(source, info, features_dir, pixel_origin)
     outcomes: dict[str, Outcome] = {}
     seconds = 0.0
 
@@ -221,7 +245,7 @@ def benchmark(
         nonlocal seconds
         async with AsyncClient(server, timeout_s=timeout_s) as client:
             started = time.perf_counter()
-            await localize_all(client, queries, info.ref, options, concurrency, keep)
+            await localize_all(client, queries, info.ref, options, concurrency, keep, read)
             seconds = time.perf_counter() - started
 
     _run(run, len(queries), "no report was written")

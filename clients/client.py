@@ -7,7 +7,6 @@ Requests are built and answers are parsed in one place (``requests``, ``answers`
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
 
@@ -19,6 +18,7 @@ from clients.requests import (
     GetServer,
     JsonObject,
     ListMaps,
+    PhotoOrFeatures,
     Request,
     checked_server,
     get_map_request,
@@ -58,24 +58,25 @@ class Client:
 
     def localize(
         self,
-        image: bytes | str | Path,
+        query: PhotoOrFeatures,
         map: str,
         camera: Camera | None = None,
         options: LocalizeOptions | Mapping[str, Any] | None = None,
         request_id: str | None = None,
     ) -> LocalizeResult:
-        """Estimate the camera pose of one photo in one map.
+        """Estimate the camera pose of one photo, or of its features, in one map.
 
         A photo that cannot be localized is an answer without a pose, not an error.
 
         Args:
-            image: the encoded photo (JPEG, PNG, ...), or the path of the file that holds it.
+            query: the encoded photo (JPEG, PNG, ...), the path of the file that holds it, or
+                the features that were found in it, which need a camera.
             map: ``id`` or ``id@version``.
             camera: intrinsics; without them the server uses EXIF or guesses, and says so.
             options: choices for this photo.
             request_id: names the request in the server's logs; made up there when None.
         """
-        request = localize_request(image, map, camera, options, request_id)
+        request = localize_request(query, map, camera, options, request_id)
         raw = self._transport.send(request)
         return answers.parse_answer(self.server, answers.parse_result, raw)
 
@@ -125,14 +126,14 @@ class AsyncClient:
 
     async def localize(
         self,
-        image: bytes | str | Path,
+        query: PhotoOrFeatures,
         map: str,
         camera: Camera | None = None,
         options: LocalizeOptions | Mapping[str, Any] | None = None,
         request_id: str | None = None,
     ) -> LocalizeResult:
         """As ``Client.localize``. A path is read in the loop; give bytes where that matters."""
-        request = localize_request(image, map, camera, options, request_id)
+        request = localize_request(query, map, camera, options, request_id)
         raw = await self._transport.send(request)
         return answers.parse_answer(self.server, answers.parse_result, raw)
 

@@ -9,8 +9,10 @@ import grpc
 from google.protobuf.json_format import MessageToDict
 from google.protobuf.message import DecodeError, Message
 from google.rpc import error_details_pb2, status_pb2
+from numpy.typing import NDArray
 
 from clients import errors
+from clients.features import Features
 from clients.requests import (
     CheckReady,
     GetMap,
@@ -121,7 +123,11 @@ def _encode(request: Request) -> tuple[str, bytes, _Decode]:
 
 
 def _localize_message(request: Localize) -> wire.LocalizeRequest:
-    message = wire.LocalizeRequest(map=request.map, image=request.image)
+    message = wire.LocalizeRequest(map=request.map)
+    if isinstance(request.query, Features):
+        message.features.CopyFrom(_features_message(request.query))
+    else:
+        message.image = request.query
     if request.camera is not None:
         camera = request.camera
         message.camera.model = camera.model
@@ -133,6 +139,21 @@ def _localize_message(request: Localize) -> wire.LocalizeRequest:
     if request.request_id is not None:
         message.request_id = request.request_id
     return message
+
+
+def _features_message(features: Features) -> wire.Features:
+    return wire.Features(
+        kind=features.kind,
+        keypoints=_array_message(features.keypoints),
+        descriptors=_array_message(features.descriptors),
+        global_descriptors={
+            name: _array_message(row) for name, row in features.global_descriptors.items()
+        },
+    )
+
+
+def _array_message(array: NDArray[Any]) -> wire.Array:
+    return wire.Array(dtype=array.dtype.name, shape=array.shape, data=array.tobytes())
 
 
 def _decoded(server: str, decode: _Decode, answer: bytes, metadata: _Metadata) -> JsonObject:

@@ -10,6 +10,7 @@ from typing import Any, assert_never
 import httpx
 
 from clients import errors
+from clients.features import Features
 from clients.requests import (
     CheckReady,
     GetMap,
@@ -99,9 +100,8 @@ def _encode(request: Request) -> tuple[str, str, dict[str, Any]]:
             fields = {"map": request.map, "options": json.dumps(request.options.given())}
             if request.camera is not None:
                 fields["camera"] = json.dumps(asdict(request.camera))
-            image = ("photo", request.image, "application/octet-stream")
             headers = {} if request.request_id is None else {"X-Request-ID": request.request_id}
-            parts = {"data": fields, "files": {"image": image}, "headers": headers}
+            parts = {"data": fields, "files": _file(request.query), "headers": headers}
             return "POST", "/localize", parts
         case ListMaps():
             return "GET", "/maps", {}
@@ -112,6 +112,13 @@ def _encode(request: Request) -> tuple[str, str, dict[str, Any]]:
         case CheckReady():
             return "GET", "/readyz", {}
     assert_never(request)
+
+
+def _file(query: bytes | Features) -> dict[str, tuple[str, bytes, str]]:
+    if isinstance(query, Features):
+        text = json.dumps(query.as_json()).encode()
+        return {"features": ("features.json", text, "application/json")}
+    return {"image": ("photo", query, "application/octet-stream")}
 
 
 def _decode(server: str, request: Request, response: httpx.Response) -> JsonObject:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from visloc.errors import DatasetError, InvalidInput
-from visloc.geometry import Camera, Pose
+from visloc.geometry import Camera, PixelOrigin, Pose
 from visloc.kapture import read_dataset
 from visloc.kapture.text import relative_path
 
@@ -31,21 +31,22 @@ class Query:
     truth: Pose | None
 
 
-def read_queries(source: Path) -> list[Query]:
+def read_queries(source: Path, origin: PixelOrigin = PixelOrigin.CORNER) -> list[Query]:
     """Read a kapture folder or a text file that lists photos, in their order.
 
     Each line of a list is ``image_name`` or ``image_name MODEL width height params...``,
     separated by blanks, with names relative to the folder of the list. Empty lines and those
     that begin with ``#`` are skipped. UNKNOWN_CAMERA, here or in kapture, sends no camera.
+    Principal points count from ``origin``.
 
     Raises:
         DatasetError: codes ``kapture.*``, ``list.*``, ``camera.*``; ``queries.missing`` when
             there is nothing at ``source``, ``queries.empty`` when it holds no photo.
     """
     if source.is_dir():
-        queries = _read_kapture(source)
+        queries = _read_kapture(source, origin)
     elif source.is_file():
-        queries = _read_list(source)
+        queries = _read_list(source, origin)
     else:
         raise DatasetError(
             "queries.missing",
@@ -63,8 +64,8 @@ def read_queries(source: Path) -> list[Query]:
     return queries
 
 
-def _read_kapture(root: Path) -> list[Query]:
-    dataset = read_dataset(root)
+def _read_kapture(root: Path, origin: PixelOrigin) -> list[Query]:
+    dataset = read_dataset(root).with_pixels_from(origin)
     return [
         Query(
             record.path,
@@ -76,7 +77,7 @@ def _read_kapture(root: Path) -> list[Query]:
     ]
 
 
-def _read_list(path: Path) -> list[Query]:
+def _read_list(path: Path, origin: PixelOrigin) -> list[Query]:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -98,7 +99,10 @@ def _read_list(path: Path) -> list[Query]:
             raise DatasetError(
                 "list.duplicate", "listed twice", field=where, expected="every name once", got=name
             )
-        queries[name] = Query(name, path.parent / name, _parse_camera(where, fields[1:]), None)
+        camera = _parse_camera(where, fields[1:])
+        if camera is not None:
+            camera = camera.with_pixels_from(origin)
+        queries[name] = Query(name, path.parent / name, camera, None)
     return list(queries.values())
 
 

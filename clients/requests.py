@@ -10,11 +10,14 @@ from typing import Any
 
 import httpx
 
+from clients.features import Features
 from clients.types import LocalizeOptions
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera
 
 JsonObject = dict[str, Any]
+# The encoded photo, the path of the file that holds it, or what was found in it.
+PhotoOrFeatures = bytes | str | Path | Features
 
 # The first character keeps ``.`` and ``..`` out of the path of a URL; the server has the rest.
 _MAP = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]*")
@@ -28,9 +31,9 @@ _SERVER = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Localize:
-    """Localize one photo; see ``localize_request``."""
+    """Localize one photo, or its features; see ``localize_request``."""
 
-    image: bytes
+    query: bytes | Features
     map: str
     camera: Camera | None
     options: LocalizeOptions
@@ -63,7 +66,7 @@ Request = Localize | ListMaps | GetMap | GetServer | CheckReady
 
 
 def localize_request(
-    image: bytes | str | Path,
+    query: PhotoOrFeatures,
     map_ref: str,
     camera: Camera | None,
     options: LocalizeOptions | Mapping[str, Any] | None,
@@ -84,8 +87,9 @@ def localize_request(
         )
     if not isinstance(options, LocalizeOptions):
         options = LocalizeOptions.from_mapping(options or {})
-    data = image if isinstance(image, bytes) else read_image(Path(image))
-    return Localize(data, _checked(map_ref), camera, options, request_id)
+    if isinstance(query, str | Path):
+        query = read_image(Path(query))
+    return Localize(query, _checked(map_ref), camera, options, request_id)
 
 
 def get_map_request(map_ref: str) -> GetMap:

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from clients.client import AsyncClient
+from clients.features import Features
 from clients.queries import Query
-from clients.requests import read_image
 from clients.types import LocalizeOptions, LocalizeResult
 from visloc.errors import InvalidInput, Overloaded, VislocError, WeightsError
 
@@ -18,7 +18,7 @@ _RETRY_AFTER_S = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 # What may go wrong with one photo while the others are fine ...
 _CODES_OF_ONE_PHOTO = ("server.internal", "server.timeout")
 # ... and what would be refused with every photo.
-_CODES_OF_ALL_PHOTOS = ("options.", "map.")
+_CODES_OF_ALL_PHOTOS = ("options.", "map.", "features.required", "features.kind")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,8 +46,11 @@ async def localize_all(
     options: LocalizeOptions,
     concurrency: int,
     on_outcome: Callable[[Outcome], None],
+    read: Callable[[Query], bytes | Features],
 ) -> None:
     """Localize photos, ``concurrency`` at a time, and report each one as it is done.
+
+    ``read`` gives what is sent of a photo: the photo, or its features.
 
     A photo that cannot be read, or that the server refuses or fails on, fails alone. Cancelling
     abandons the photos under way; those reported are done.
@@ -59,7 +62,7 @@ async def localize_all(
 
     async def work() -> None:
         for query in waiting:
-            on_outcome(await _localize(client, query, map_ref, options))
+            on_outcome(await _localize(client, query, map_ref, options, read))
 
     try:
         async with asyncio.TaskGroup() as group:
@@ -70,13 +73,17 @@ async def localize_all(
 
 
 async def _localize(
-    client: AsyncClient, query: Query, map_ref: str, options: LocalizeOptions
+    client: AsyncClient,
+    query: Query,
+    map_ref: str,
+    options: LocalizeOptions,
+    read: Callable[[Query], bytes | Features],
 ) -> Outcome:
     started = time.perf_counter()
     try:
-        image = await asyncio.to_thread(read_image, query.path)
+        sent = await asyncio.to_thread(read, query)
         started = time.perf_counter()
-        result = await _ask_patiently(client, image, query, map_ref, options)
+        result = await _ask_patiently(client, sent, query, map_ref, options)
     except VislocError as error:
         if not _concerns_one_photo(error):
             raise
@@ -91,11 +98,15 @@ def _concerns_one_photo(error: VislocError) -> bool:
 
 
 async def _ask_patiently(
-    client: AsyncClient, image: bytes, query: Query, map_ref: str, options: LocalizeOptions
+    client: AsyncClient,
+    sent: bytes | Features,
+    query: Query,
+    map_ref: str,
+    options: LocalizeOptions,
 ) -> LocalizeResult:
     for wait_s in _RETRY_AFTER_S:
         try:
-            return await client.localize(image, map_ref, query.camera, options)
+            return await client.localize(sent, map_ref, query.camera, options)
         except Overloaded:
             await asyncio.sleep(wait_s)
-    return await client.localize(image, map_ref, query.camera, options)
+    return await client.localize(sent, map_ref, query.camera, options)

@@ -5,41 +5,54 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import JsonValue
 
-from mapping.features import LocalFeaturesStage, Progress, describe_photos
+from mapping.features import (
+    ExtractedFeatures,
+    LocalFeaturesSource,
+    Progress,
+    ReadyMadeFeatures,
+    describe_photos,
+    find_local_features,
+    read_global_features,
+)
+from mapping.known_model import landmarks_from_reconstruction
+from mapping.landmarks import MadeLandmarks
+from mapping.pairing import PAIRINGS, write_pairs
 from mapping.photos import MappingPhoto, collect_photos
-from mapping.rgbd import LiftedKeypoints, lift_keypoints, merge_landmarks
-from mapping.stages import Item, WorkFolder, exclusive, key_of
+from mapping.rgbd import DepthSettings, landmarks_from_depth
+from mapping.sfm import SfmSettings, known_rigs, landmarks_from_matches, settings_record
+from mapping.stages import WorkFolder, exclusive
+from mapping.triangulation import MAPPER_CONFIGS, REFINABLE
+from mapping.workers import Workers
 from visloc.archive import (
     FingerprintRecord,
+    GlobalFeatures,
     ImageRecord,
-    Landmarks,
     MapContent,
     MapStore,
     write_map,
 )
-from visloc.errors import Conflict, DatasetError, InvalidInput, Unavailable
+from visloc.errors import Conflict, InvalidInput, Unavailable
 from visloc.features import (
     DEFAULT_GLOBAL_FEATURES,
     DEFAULT_LOCAL_FEATURES,
-    GlobalDescriptor,
-    LocalFeatureExtractor,
     make_global_descriptor,
     make_local_features,
 )
-from visloc.geometry import Camera, Pose
-from visloc.kapture import Dataset, read_dataset
+from visloc.features.readymade import is_ready_made, ready_made_type
+from visloc.geometry import PixelOrigin
+from visloc.kapture import Dataset, open_features, open_local_features, read_dataset
 
-METHODS = ("rgbd",)
-# Raised when the code of the stage changes what comes out.
-_LIFTED_REVISION = 2
+# How landmarks are made: from depth, from matches, or from points that the dataset brings along.
+METHODS = ("rgbd", "sfm", "model")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,13 +64,18 @@ class BuildSettings:
         map_id: id of the map.
         maps_dir: folder of maps.
         method: a name of ``METHODS``.
-        local_features: a name of ``visloc.features.LOCAL_FEATURES``.
-        global_features: names of ``visloc.features.GLOBAL_FEATURES``.
+        local_features: a name of ``visloc.features.LOCAL_FEATURES``, or ``kapture:TYPE`` for
+            features that the dataset brings along.
+        global_features: names of ``visloc.features.GLOBAL_FEATURES``, or ``kapture:TYPE``.
+        features_dir: where ready-made features lie, when not in the dataset.
+        pixel_origin: what the dataset's principal points and ready-made keypoints count from.
         weights_dir: folder with network weights.
         max_keypoints: strongest keypoints kept per photo, in the map and in queries.
-        voxel_size: edge in which lifted keypoints become one landmark, in metres.
+        metric: whether a unit of the dataset's poses is a metre.
+        depth: settings of ``rgbd``.
         depth_sensor: the depth sensor to use, when several go with a photo.
-        depth_scale: metres per unit of 16-bit PNG depth.
+        sfm: settings of ``sfm``.
+        workers: processes that work on photos and pairs.
         force: publish a new version of a map that exists.
     """
 
@@ -67,11 +85,15 @@ class BuildSettings:
     method: str = "rgbd"
     local_features: str = DEFAULT_LOCAL_FEATURES
     global_features: tuple[str, ...] = DEFAULT_GLOBAL_FEATURES
+    features_dir: Path | None = None
+    pixel_origin: PixelOrigin = PixelOrigin.CORNER
     weights_dir: Path | None = None
     max_keypoints: int = 5000
-    voxel_size: float = 0.01
+    metric: bool = True
+    depth: DepthSettings = field(default_factory=DepthSettings)
     depth_sensor: str | None = None
-    depth_scale: float = 0.001
+    sfm: SfmSettings = field(default_factory=SfmSettings)
+    workers: int = 1
     force: bool = False
 
 
@@ -100,13 +122,13 @@ def build_map(settings: BuildSettings, progress: Progress) -> Path:
             "--force publishes a new version and keeps the old one",
             field="--map",
         )
-    extractor = make_local_features(settings.local_features, settings.weights_dir)
-    descriptors = [make_global_descriptor(name) for name in settings.global_features]
-    dataset = read_dataset(settings.dataset)
+    if not is_ready_made(settings.local_features):
+        make_local_features(settings.local_features, settings.weights_dir)  # raises when it cannot
+    dataset = read_dataset(settings.dataset).with_pixels_from(settings.pixel_origin)
     work_root = settings.maps_dir / ".work" / settings.map_id
     try:
         with exclusive(work_root.with_name(f"{work_root.name}.lock")):
-            folder = _build(settings, dataset, extractor, descriptors, store, work_root, progress)
+            folder = _build(settings, dataset, store, work_root, progress)
             shutil.rmtree(work_root, ignore_errors=True)
     except OSError as error:
         raise Unavailable(
@@ -137,8 +159,19 @@ def _check(settings: BuildSettings) -> None:
             expected="one or more names, each once",
             got=",".join(names),
         )
+    for name in names:
+        if is_ready_made(name):
+            continue
+        if make_global_descriptor(name).needs_image and is_ready_made(settings.local_features):
+            raise InvalidInput(
+                "build.global_features",
+                f"{name} is made of the photo, which is not there when features are sent instead",
+                field="--global-features",
+                expected="kapture:TYPE, or localvlad, with ready-made local features",
+                got=name,
+            )
     for name in ("voxel_size", "depth_scale"):
-        value = getattr(settings, name)
+        value = getattr(settings.depth, name)
         if not (math.isfinite(value) and value > 0):
             raise InvalidInput(
                 f"build.{name}",
@@ -147,72 +180,187 @@ def _check(settings: BuildSettings) -> None:
                 expected="metres, more than 0",
                 got=value,
             )
+    sfm = settings.sfm
+    _check_names("--pairs", sfm.pairs, tuple(PAIRINGS))
+    _check_names("--refine", sfm.refine, REFINABLE)
+    _check_names("--mapper", (sfm.mapper,), tuple(MAPPER_CONFIGS))
+    if sfm.estimate_poses and settings.method != "sfm":
+        raise InvalidInput(
+            "build.poses",
+            "poses are estimated from matches",
+            field="--poses",
+            expected="given, or --method sfm",
+            got=f"estimate with --method {settings.method}",
+        )
+    if sfm.estimate_poses and sfm.refine:
+        raise InvalidInput(
+            "build.refine",
+            "with --poses estimate everything that is not known is refined anyway",
+            field="--refine",
+            expected="none",
+            got=",".join(sfm.refine),
+        )
+
+
+def _check_names(option: str, names: Sequence[str], known: Sequence[str]) -> None:
+    unknown = [name for name in names if name not in known]
+    if unknown or len(set(names)) < len(names):
+        raise InvalidInput(
+            f"build.{option[2:]}",
+            "unknown name" if unknown else "a name is given twice",
+            field=option,
+            expected=f"of {', '.join(known)}, each once",
+            got=",".join(names),
+        )
 
 
 def _build(
     settings: BuildSettings,
     dataset: Dataset,
-    extractor: LocalFeatureExtractor,
-    descriptors: Sequence[GlobalDescriptor],
     store: MapStore,
     work_root: Path,
     progress: Progress,
 ) -> Path:
-    work = WorkFolder(work_root)
+    work, workers = WorkFolder(work_root), Workers(settings.workers)
+    features = _local_features(work, settings)
     photos, notes = collect_photos(
         dataset,
-        with_depth=True,
+        posed=not settings.sfm.estimate_poses,
+        with_files=isinstance(features, ExtractedFeatures),
+        has_features=features.has if isinstance(features, ReadyMadeFeatures) else None,
+        with_depth=settings.method == "rgbd",
         depth_sensor=settings.depth_sensor,
         progress=lambda done, total: progress("photos", done, total),
     )
-    if all(photo.depth is None for photo in photos):
-        raise DatasetError(
-            "dataset.no_depth",
-            "no photo has a depth map",
-            field=str(dataset.root / "sensors" / "records_depth.txt"),
-            expected="depth maps with the timestamps of the photos, of a sensor in their rig or "
-            "with poses of its own; see --depth-sensor",
+    find_local_features(features, photos, workers, progress)
+    global_features = [
+        read_global_features(
+            open_features(
+                dataset.root, "global_features", ready_made_type(name), settings.features_dir
+            ),
+            photos,
         )
-    features = LocalFeaturesStage(work, extractor, settings.max_keypoints)
-    for done, photo in enumerate(photos, 1):
-        features.compute(photo)
-        progress("local features", done, len(photos))
-    global_features = tuple(
-        describe_photos(work, photos, features, descriptor, progress) for descriptor in descriptors
+        if is_ready_made(name)
+        else describe_photos(work, photos, features, name, workers, progress)
+        for name in settings.global_features
+    ]
+    made = _make_landmarks(
+        settings, dataset, work, photos, features, global_features, workers, progress
     )
-    landmarks, rows = _landmarks_from_depth(work, dataset, photos, features, settings, progress)
+    progress("archive", 0, 1)
+    content = _content(
+        settings, dataset, photos, features, global_features, made, (*dataset.notes, *notes)
+    )
+    folder = _publish(settings, content, made, store, work_root)
+    progress("archive", 1, 1)
+    return folder
+
+
+def _local_features(work: WorkFolder, settings: BuildSettings) -> LocalFeaturesSource:
+    name = settings.local_features
+    if not is_ready_made(name):
+        return ExtractedFeatures(work, name, settings.weights_dir, settings.max_keypoints)
+    keypoints, descriptors = open_local_features(
+        settings.dataset, ready_made_type(name), settings.features_dir
+    )
+    return ReadyMadeFeatures(keypoints, descriptors, settings.pixel_origin)
+
+
+def _make_landmarks(
+    settings: BuildSettings,
+    dataset: Dataset,
+    work: WorkFolder,
+    photos: Sequence[MappingPhoto],
+    features: LocalFeaturesSource,
+    global_features: Sequence[GlobalFeatures],
+    workers: Workers,
+    progress: Progress,
+) -> MadeLandmarks:
+    if settings.method == "rgbd":
+        return landmarks_from_depth(
+            work, dataset, photos, features, settings.depth, settings.metric, workers, progress
+        )
+    if settings.method == "model":
+        return landmarks_from_reconstruction(
+            dataset, photos, features, settings.pixel_origin, settings.metric, progress
+        )
+    return landmarks_from_matches(
+        work,
+        dataset,
+        photos,
+        features,
+        global_features,
+        settings.sfm,
+        settings.metric,
+        workers,
+        progress,
+    )
+
+
+def _content(
+    settings: BuildSettings,
+    dataset: Dataset,
+    photos: Sequence[MappingPhoto],
+    features: LocalFeaturesSource,
+    global_features: Sequence[GlobalFeatures],
+    made: MadeLandmarks,
+    notes: tuple[str, ...],
+) -> MapContent:
+    placed = [photos[row] for row in made.photos]
 
     def observed_descriptors() -> Iterator[NDArray[np.float32]]:
-        for photo, kept in zip(photos, rows, strict=True):
+        for photo, kept in zip(placed, made.rows, strict=True):
             yield features.read(photo).descriptors[kept]
 
-    progress("archive", 0, 1)
-    now = datetime.now(UTC)
-    content = MapContent(
-        metric=True,
+    method_settings = {
+        "rgbd": lambda: asdict(settings.depth),
+        "sfm": lambda: settings_record(settings.sfm),
+        "model": dict,
+    }[settings.method]()
+    return MapContent(
+        metric=made.metric,
         method=settings.method,
-        settings={"voxel_size": settings.voxel_size, "depth_scale": settings.depth_scale},
-        notes=(*dataset.notes, *notes),
-        cameras={photo.record.sensor_id: photo.camera for photo in photos},
-        rigs=_known_rigs(dataset, {photo.record.sensor_id for photo in photos}),
+        settings=cast("dict[str, JsonValue]", method_settings),
+        notes=(*notes, *made.notes),
+        cameras={
+            photo.record.sensor_id: view.camera
+            for photo, view in zip(placed, made.views, strict=True)
+        },
+        rigs=known_rigs(dataset, {photo.record.sensor_id for photo in placed}),
         images=tuple(
             ImageRecord(
                 name=photo.name, camera=photo.record.sensor_id, timestamp=photo.record.timestamp
             )
-            for photo in photos
+            for photo in placed
         ),
-        image_poses=tuple(photo.cam_from_world for photo in photos),
-        landmarks=landmarks,
-        local_fingerprint=FingerprintRecord.of(extractor.fingerprint),
-        max_keypoints=settings.max_keypoints,
-        descriptor_dim=extractor.descriptor_dim,
+        image_poses=tuple(view.cam_from_world for view in made.views),
+        landmarks=made.landmarks,
+        local_fingerprint=FingerprintRecord.of(features.fingerprint),
+        max_keypoints=features.max_keypoints,
+        descriptor_dim=features.descriptor_dim,
         descriptors=observed_descriptors,
-        global_features=global_features,
+        global_features=tuple(
+            GlobalFeatures(one.fingerprint, one.descriptors[made.photos], one.model)
+            for one in global_features
+        ),
+        anchor=made.anchor,
     )
+
+
+def _publish(
+    settings: BuildSettings,
+    content: MapContent,
+    made: MadeLandmarks,
+    store: MapStore,
+    work_root: Path,
+) -> Path:
+    now = datetime.now(UTC)
     incoming = work_root / "incoming"
     shutil.rmtree(incoming, ignore_errors=True)  # of a build that was killed here
-    incoming.mkdir()
+    incoming.mkdir(parents=True)
     try:
+        if made.pairs is not None:
+            write_pairs(incoming / "pairs.txt", *made.pairs)
         version = write_map(
             incoming,
             content,
@@ -220,66 +368,6 @@ def _build(
             version=now.strftime("%Y%m%dT%H%M%S.%f")[:-3] + "Z-",
             created=now.isoformat(timespec="seconds"),
         )
-        folder = store.publish(incoming, settings.map_id, version)
+        return store.publish(incoming, settings.map_id, version)
     finally:
         shutil.rmtree(incoming, ignore_errors=True)
-    progress("archive", 1, 1)
-    return folder
-
-
-def _landmarks_from_depth(
-    work: WorkFolder,
-    dataset: Dataset,
-    photos: Sequence[MappingPhoto],
-    features: LocalFeaturesStage,
-    settings: BuildSettings,
-    progress: Progress,
-) -> tuple[Landmarks, list[NDArray[np.int64]]]:
-    """Landmarks, and of each photo the rows of its features that became observations."""
-
-    def lift(photo: MappingPhoto) -> Item:
-        keypoints = features.read(photo).keypoints
-        return asdict(lift_keypoints(dataset, photo, keypoints, settings.depth_scale))
-
-    lifted = []
-    for done, photo in enumerate(photos, 1):
-        item = work.get(
-            key_of(
-                "lifted",
-                _LIFTED_REVISION,
-                local=features.key(photo),
-                camera=_camera(photo.camera),
-                pose=_numbers(photo.cam_from_world),
-                depth=photo.depth
-                and [
-                    photo.depth_sha256,
-                    *_camera(photo.depth.camera),
-                    *_numbers(photo.depth.cam_from_depth),
-                ],
-                depth_scale=settings.depth_scale,
-            ),
-            partial(lift, photo),
-        )
-        lifted.append(LiftedKeypoints(**item))
-        progress("depth", done, len(photos))
-    progress("landmarks", 0, 1)
-    merged = merge_landmarks(photos, lifted, settings.voxel_size)
-    progress("landmarks", 1, 1)
-    return merged
-
-
-def _known_rigs(dataset: Dataset, cameras: set[str]) -> dict[str, dict[str, Pose]]:
-    """cam_from_rig of the map's cameras, where the dataset knows it."""
-    rigs = {
-        rig: {sensor: pose for sensor, pose in members.items() if sensor in cameras and pose}
-        for rig, members in dataset.rigs.items()
-    }
-    return {rig: members for rig, members in rigs.items() if members}
-
-
-def _camera(camera: Camera) -> list[str | float]:
-    return [camera.model, camera.width, camera.height, *camera.params]
-
-
-def _numbers(pose: Pose) -> list[float]:
-    return [*pose.rotation.ravel().tolist(), *pose.translation.tolist()]

@@ -14,8 +14,12 @@ from rich.table import Table
 
 from mapping.build import METHODS, BuildSettings, build_map
 from mapping.export_features import export_features
+from mapping.pairing import PAIRINGS, PairSettings
 from mapping.progress import StageProgress
+from mapping.rgbd import DepthSettings
 from mapping.sample import write_sample
+from mapping.sfm import SfmSettings
+from mapping.triangulation import MAPPER_CONFIGS, REFINABLE
 from visloc.archive import Map, MapStore, open_map, verify_map
 from visloc.errors import InvalidInput, VislocError
 from visloc.features import (
@@ -25,6 +29,7 @@ from visloc.features import (
     LOCAL_FEATURES,
     make_local_features,
 )
+from visloc.geometry import PixelOrigin
 from visloc.localizer import Localizer
 
 app = typer.Typer(
@@ -36,6 +41,8 @@ app = typer.Typer(
 )
 _out = Console()
 _err = Console(stderr=True)
+_RGBD, _SFM = "Method rgbd", "Method sfm"
+_DEPTH_DEFAULTS, _SFM_DEFAULTS, _PAIR_DEFAULTS = DepthSettings(), SfmSettings(), PairSettings()
 
 MapsDirOption = Annotated[
     Path, typer.Option("--maps-dir", envvar="VISLOC_MAPS_DIR", help="Folder of maps.")
@@ -51,6 +58,24 @@ WeightsDirOption = Annotated[
 LocalFeaturesOption = Annotated[
     str, typer.Option(help=f"One of {', '.join(sorted(LOCAL_FEATURES))}.")
 ]
+BuildLocalFeaturesOption = Annotated[
+    str,
+    typer.Option(
+        help=f"One of {', '.join(sorted(LOCAL_FEATURES))}, or kapture:TYPE for features that the "
+        "dataset brings along."
+    ),
+]
+GlobalFeaturesOption = Annotated[
+    str,
+    typer.Option(help=f"Comma-separated, of {', '.join(sorted(GLOBAL_FEATURES))}, kapture:TYPE."),
+]
+MetricOption = Annotated[
+    bool,
+    typer.Option("--metric/--not-metric", help="Whether a unit of the dataset's poses is a metre."),
+]
+WorkersOption = Annotated[
+    int, typer.Option(min=1, max=256, help="Processes that work on photos and pairs.")
+]
 MaxKeypointsOption = Annotated[
     int, typer.Option(min=100, max=100_000, help="Strongest keypoints kept per photo.")
 ]
@@ -63,50 +88,161 @@ def build(
     dataset: DatasetArgument,
     map_id: Annotated[str, typer.Option("--map", help="Id of the map.")],
     maps_dir: MapsDirOption = Path("maps"),
-    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = METHODS[0],
-    local_features: LocalFeaturesOption = DEFAULT_LOCAL_FEATURES,
-    global_features: Annotated[
-        str, typer.Option(help=f"Comma-separated, of {', '.join(sorted(GLOBAL_FEATURES))}.")
-    ] = ",".join(DEFAULT_GLOBAL_FEATURES),
+    method: Annotated[
+        str,
+        typer.Option(
+            help="Where landmarks come from. rgbd: depth maps. sfm: matches, triangulated. "
+            "model: points that the dataset brings along."
+        ),
+    ] = METHODS[0],
+    local_features: BuildLocalFeaturesOption = DEFAULT_LOCAL_FEATURES,
+    global_features: GlobalFeaturesOption = ",".join(DEFAULT_GLOBAL_FEATURES),
+    features_dir: Annotated[
+        Path | None,
+        typer.Option(help="Where kapture:TYPE features lie, when not in the dataset."),
+    ] = None,
+    pixel_origin: Annotated[
+        PixelOrigin,
+        typer.Option(
+            help="The middle of the first pixel, in the dataset's principal points and in "
+            "kapture:TYPE keypoints, is (0.5, 0.5): corner, or (0, 0): center."
+        ),
+    ] = PixelOrigin.CORNER,
     weights_dir: WeightsDirOption = None,
     max_keypoints: MaxKeypointsOption = 5000,
-    voxel_size: Annotated[
-        float, typer.Option(help="Points of one such cell become one landmark, metres.")
-    ] = 0.01,
-    depth_sensor: Annotated[
-        str | None, typer.Option(help="Depth sensor to use, when several go with a photo.")
-    ] = None,
-    depth_scale: Annotated[
-        float, typer.Option(help="Metres per unit of 16-bit PNG depth.")
-    ] = 0.001,
+    metric: MetricOption = True,
+    workers: WorkersOption = 1,
     force: Annotated[
         bool, typer.Option("--force", help="Publish a new version of a map that exists.")
     ] = False,
+    voxel_size: Annotated[
+        float,
+        typer.Option(
+            help="Points of one such cell become one landmark, metres.", rich_help_panel=_RGBD
+        ),
+    ] = _DEPTH_DEFAULTS.voxel_size,
+    depth_sensor: Annotated[
+        str | None,
+        typer.Option(
+            help="Depth sensor to use, when several go with a photo.", rich_help_panel=_RGBD
+        ),
+    ] = None,
+    depth_scale: Annotated[
+        float,
+        typer.Option(help="Metres per unit of 16-bit PNG depth.", rich_help_panel=_RGBD),
+    ] = _DEPTH_DEFAULTS.depth_scale,
+    pairs: Annotated[
+        str,
+        typer.Option(
+            help=f"Which photos to match: comma-separated, of {', '.join(PAIRINGS)}.",
+            rich_help_panel=_SFM,
+        ),
+    ] = ",".join(_SFM_DEFAULTS.pairs),
+    top_k: Annotated[
+        int,
+        typer.Option(
+            min=1, help="Best pairs of a photo that each pairing keeps.", rich_help_panel=_SFM
+        ),
+    ] = _PAIR_DEFAULTS.top_k,
+    max_distance: Annotated[
+        float,
+        typer.Option(help="distance: most between camera centres, metres.", rich_help_panel=_SFM),
+    ] = _PAIR_DEFAULTS.max_distance,
+    max_angle: Annotated[
+        float,
+        typer.Option(help="distance: most between directions, degrees.", rich_help_panel=_SFM),
+    ] = _PAIR_DEFAULTS.max_angle_deg,
+    near: Annotated[
+        float, typer.Option(help="frustum: where views begin, metres.", rich_help_panel=_SFM)
+    ] = _PAIR_DEFAULTS.near,
+    far: Annotated[
+        float, typer.Option(help="frustum: where views end, metres.", rich_help_panel=_SFM)
+    ] = _PAIR_DEFAULTS.far,
+    covisible_in: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MAP",
+            help="covisibility: the map that tells; else the dataset's own points.",
+            rich_help_panel=_SFM,
+        ),
+    ] = None,
+    pairs_file: Annotated[
+        Path | None,
+        typer.Option(
+            help="Pairs to match instead of --pairs, such as pairs.txt of a map.",
+            rich_help_panel=_SFM,
+        ),
+    ] = None,
+    mapper: Annotated[
+        str,
+        typer.Option(
+            help=f"Thresholds of the paper: {' or '.join(MAPPER_CONFIGS)} (relaxed).",
+            rich_help_panel=_SFM,
+        ),
+    ] = _SFM_DEFAULTS.mapper,
+    refine: Annotated[
+        str,
+        typer.Option(
+            help="What bundle adjustment may change after triangulation: comma-separated, of "
+            f"{', '.join(REFINABLE)}.",
+            rich_help_panel=_SFM,
+        ),
+    ] = "",
+    poses: Annotated[
+        str,
+        typer.Option(
+            help="given: the dataset's. estimate: find them too; poses or GNSS of some photos "
+            "then say where the map lies.",
+            rich_help_panel=_SFM,
+        ),
+    ] = "given",
 ) -> None:
-    """Turn a posed dataset into a map.
+    """Turn a dataset into a map.
 
     Killed at any moment, the same command resumes; the map in use stays until the new one is
     complete.
     """
-    names = tuple(name.strip() for name in global_features.split(","))
+    if poses not in ("given", "estimate"):
+        raise InvalidInput(
+            "build.poses", "unknown", field="--poses", expected="given or estimate", got=poses
+        )
     settings = BuildSettings(
         dataset=dataset,
         map_id=map_id,
         maps_dir=maps_dir,
         method=method,
         local_features=local_features,
-        global_features=names,
+        global_features=_names(global_features),
+        features_dir=features_dir,
+        pixel_origin=pixel_origin,
         weights_dir=weights_dir,
         max_keypoints=max_keypoints,
-        voxel_size=voxel_size,
+        metric=metric,
+        depth=DepthSettings(voxel_size=voxel_size, depth_scale=depth_scale),
         depth_sensor=depth_sensor,
-        depth_scale=depth_scale,
+        sfm=SfmSettings(
+            pairs=_names(pairs),
+            pairing=PairSettings(
+                top_k=top_k, max_distance=max_distance, max_angle_deg=max_angle, near=near, far=far
+            ),
+            pairs_file=pairs_file,
+            covisible_in=None
+            if covisible_in is None
+            else open_map(_folder(covisible_in, maps_dir)),
+            mapper=mapper,
+            refine=_names(refine),
+            estimate_poses=poses == "estimate",
+        ),
+        workers=workers,
         force=force,
     )
+    _build(settings)
+
+
+def _build(settings: BuildSettings) -> None:
     with StageProgress(_err) as progress:
         folder = build_map(settings, progress)
-    opened = open_map(folder)
-    _print_map(opened)
+    _print_map(open_map(folder))
     _out.print(f"peak memory {_peak_memory_bytes() / 2**30:.2f} GiB")
 
 
@@ -205,6 +341,10 @@ def _fail(code: str, message: str) -> NoReturn:
     sys.exit(1)
 
 
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",")) if text.strip() else ()
+
+
 def _parse_size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
     if not (width.isdecimal() and height.isdecimal()):
@@ -264,7 +404,9 @@ def _print_map(opened: Map) -> None:
 
 
 def _peak_memory_bytes() -> int:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    """The largest of this process and its workers, each at its peak."""
+    kinds = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    return max(resource.getrusage(kind).ru_maxrss for kind in kinds) * 1024
 
 
 if __name__ == "__main__":

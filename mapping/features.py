@@ -2,43 +2,98 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import asdict, dataclass, field
+from functools import cache, partial
+from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapping.photos import MappingPhoto
 from mapping.stages import Item, WorkFolder, key_of
+from mapping.workers import Workers
 from visloc.archive import FingerprintRecord, GlobalFeatures
 from visloc.errors import DatasetError
-from visloc.features import GlobalDescriptor, LocalFeatureExtractor
+from visloc.features import (
+    GlobalDescriptor,
+    LocalFeatureExtractor,
+    make_global_descriptor,
+    make_local_features,
+)
+from visloc.features.readymade import (
+    ready_made_fingerprint,
+    to_global_descriptor,
+    to_local_features,
+)
+from visloc.geometry import PixelOrigin
 from visloc.images import read_photo_file
+from visloc.kapture import FeatureSet, read_local
 from visloc.types import Fingerprint, LocalFeatures
 
 Progress = Callable[[str, int, int], None]
 """Told the stage, how much of it is done, and how much there is."""
 
+# Most keypoints of a photo with ready-made features, in the dataset and in queries.
+MAX_READY_MADE_KEYPOINTS = 100_000
 # The vocabulary of a global descriptor is learned from at most this many photos, evenly chosen.
 _VOCABULARY_PHOTOS = 200
 # Raised when the code of a stage here changes what comes out.
 _REVISION = {"local_features": 1, "words": 1, "vocabulary": 1, "pooled": 1, "projection": 1}
 
 
+class LocalFeaturesSource(Protocol):
+    """Where the local features of the mapping photos come from. It travels to workers."""
+
+    @property
+    def fingerprint(self) -> Fingerprint:
+        """Of the feature."""
+
+    @property
+    def descriptor_dim(self) -> int:
+        """Length of a descriptor."""
+
+    @property
+    def max_keypoints(self) -> int:
+        """Most keypoints that a photo has."""
+
+    def key(self, photo: MappingPhoto) -> str:
+        """Name of a photo's features in the keys of what is made of them."""
+
+    def prepare(self, photo: MappingPhoto) -> None:
+        """Have the features of a photo, so that reading them is quick from now on."""
+
+    def read(self, photo: MappingPhoto) -> LocalFeatures:
+        """Return the features of a photo, found now if need be."""
+
+
 @dataclass(frozen=True, slots=True)
-class LocalFeaturesStage:
-    """Local features of mapping photos, kept in the work folder.
+class ExtractedFeatures:
+    """Local features found in the photos, kept in the work folder.
 
     Attributes:
         work: where they are kept.
-        extractor: what finds them.
+        name: of the extractor, in ``visloc.features.LOCAL_FEATURES``.
+        weights_dir: folder with network weights.
         max_keypoints: strongest ones kept per photo.
     """
 
     work: WorkFolder
-    extractor: LocalFeatureExtractor
+    name: str
+    weights_dir: Path | None
     max_keypoints: int
+
+    @property
+    def fingerprint(self) -> Fingerprint:
+        """Of the extractor."""
+        return _extractor(self.name, self.weights_dir).fingerprint
+
+    @property
+    def descriptor_dim(self) -> int:
+        """Length of a descriptor."""
+        return _extractor(self.name, self.weights_dir).descriptor_dim
 
     def key(self, photo: MappingPhoto) -> str:
         """Name of a photo's features in the work folder."""
@@ -46,17 +101,21 @@ class LocalFeaturesStage:
             "local_features",
             photo=photo.sha256,
             size=[photo.camera.width, photo.camera.height],
-            fingerprint=_json(self.extractor.fingerprint),
+            fingerprint=_json(self.fingerprint),
             max_keypoints=self.max_keypoints,
         )
 
-    def compute(self, photo: MappingPhoto) -> None:
+    def prepare(self, photo: MappingPhoto) -> None:
         """Find the features of a photo unless that is done."""
         if not self.work.has(self.key(photo)):
             self.read(photo)
 
     def read(self, photo: MappingPhoto) -> LocalFeatures:
-        """Return the features of a photo, found now if need be."""
+        """Return the features of a photo, found now if need be.
+
+        Raises:
+            DatasetError: ``dataset.photo_size``, and what ``read_photo_file`` raises.
+        """
         return LocalFeatures(**self.work.get(self.key(photo), partial(self._extract, photo)))
 
     def _extract(self, photo: MappingPhoto) -> Item:
@@ -70,50 +129,106 @@ class LocalFeaturesStage:
                 f"it for {photo.record.sensor_id}",
                 got=f"{pixels.width} x {pixels.height}",
             )
-        return asdict(self.extractor.extract(pixels.rgb, max_keypoints=self.max_keypoints))
+        extractor = _extractor(self.name, self.weights_dir)
+        return asdict(extractor.extract(pixels.rgb, max_keypoints=self.max_keypoints))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReadyMadeFeatures:
+    """Local features that the dataset brings along, read where they lie.
+
+    Attributes:
+        keypoints: the files with keypoints.
+        descriptors: the files with their descriptors.
+        origin: what the keypoints count from.
+    """
+
+    keypoints: FeatureSet
+    descriptors: FeatureSet
+    origin: PixelOrigin
+    _keys: dict[str, str] = field(default_factory=dict, repr=False)
+
+    @property
+    def fingerprint(self) -> Fingerprint:
+        """Of the type of features."""
+        return ready_made_fingerprint(self.descriptors)
+
+    @property
+    def descriptor_dim(self) -> int:
+        """Length of a descriptor."""
+        return self.descriptors.dsize
+
+    @property
+    def max_keypoints(self) -> int:
+        """Most keypoints of a photo: all that there are are taken."""
+        return MAX_READY_MADE_KEYPOINTS
+
+    def has(self, image_path: str) -> bool:
+        """Tell whether a photo has features."""
+        return self.keypoints.has(image_path) and self.descriptors.has(image_path)
+
+    def key(self, photo: MappingPhoto) -> str:
+        """Name of a photo's features: what they are."""
+        if photo.name not in self._keys:
+            digest = hashlib.sha256()
+            for array in asdict(self.read(photo)).values():
+                digest.update(array.tobytes())
+            self._keys[photo.name] = f"ready_made/{digest.hexdigest()[:32]}"
+        return self._keys[photo.name]
+
+    def prepare(self, photo: MappingPhoto) -> None:
+        """Check the features of a photo."""
+        self.read(photo)
+
+    def read(self, photo: MappingPhoto) -> LocalFeatures:
+        """Return the features of a photo.
+
+        Raises:
+            DatasetError: with the file that is wrong.
+        """
+        size = (photo.camera.width, photo.camera.height)
+        return to_local_features(
+            *read_local(self.keypoints, self.descriptors, photo.name, size, self.origin)
+        )
+
+
+def find_local_features(
+    source: LocalFeaturesSource,
+    photos: Sequence[MappingPhoto],
+    workers: Workers,
+    progress: Progress,
+) -> None:
+    """Have the features of all photos, so that reading them is quick from now on."""
+    workers.run(source.prepare, photos, partial(progress, "local features"))
 
 
 def describe_photos(
     work: WorkFolder,
     photos: Sequence[MappingPhoto],
-    features: LocalFeaturesStage,
-    descriptor: GlobalDescriptor,
+    features: LocalFeaturesSource,
+    name: str,
+    workers: Workers,
     progress: Progress,
 ) -> GlobalFeatures:
     """Learn one global descriptor's model on the photos, and describe them with it."""
-    name = descriptor.fingerprint.name
+    descriptor = make_global_descriptor(name)
     fingerprint = _json(descriptor.fingerprint)
-
-    def training_words(photo: MappingPhoto) -> Item:
-        rgb = read_photo_file(photo.path).rgb
-        return {"words": descriptor.training_words(rgb, features.read(photo), seed=0)}
-
-    def pool(photo: MappingPhoto) -> Item:
-        rgb = read_photo_file(photo.path).rgb
-        return {"pooled": descriptor.pool(rgb, features.read(photo), vocabulary)}
+    task = _DescribeTask(work, features, name, fingerprint)
 
     def read_all(entry: str, keys: list[str]) -> list[NDArray[np.float32]]:
         return [work.read(key)[entry] for key in keys]
 
     chosen = np.unique(np.linspace(0, len(photos) - 1, _VOCABULARY_PHOTOS).astype(int)).tolist()
-    word_keys = []
-    for done, row in enumerate(chosen, 1):
-        photo = photos[row]
-        word_keys.append(_key("words", fingerprint=fingerprint, local=features.key(photo)))
-        work.get(word_keys[-1], partial(training_words, photo))
-        progress(f"{name} words", done, len(chosen))
-
+    learned_from = [photos[row] for row in chosen]
+    workers.run(task.find_words, learned_from, partial(progress, f"{name} words"))
+    word_keys = [task.words_key(photo) for photo in learned_from]
     vocabulary_key = _key("vocabulary", fingerprint=fingerprint, words=word_keys)
     vocabulary = work.get(
         vocabulary_key,
         lambda: descriptor.learn_vocabulary(np.concatenate(read_all("words", word_keys)), seed=0),
     )
-    pooled_keys = []
-    for done, photo in enumerate(photos, 1):
-        pooled_keys.append(_key("pooled", vocabulary=vocabulary_key, local=features.key(photo)))
-        work.get(pooled_keys[-1], partial(pool, photo))
-        progress(name, done, len(photos))
-
+    workers.run(partial(task.pool, vocabulary_key), photos, partial(progress, name))
+    pooled_keys = [task.pooled_key(vocabulary_key, photo) for photo in photos]
     pooled = np.stack(read_all("pooled", pooled_keys))
     projection = work.get(
         _key("projection", pooled=pooled_keys), lambda: descriptor.learn_projection(pooled)
@@ -122,6 +237,70 @@ def describe_photos(
     return GlobalFeatures(
         FingerprintRecord.of(descriptor.fingerprint), descriptor.project(pooled, model), model
     )
+
+
+def read_global_features(features: FeatureSet, photos: Sequence[MappingPhoto]) -> GlobalFeatures:
+    """Take the global descriptors that the dataset brings along.
+
+    Raises:
+        DatasetError: with the file that is wrong or missing.
+    """
+    rows = [to_global_descriptor(features.read(photo.name)[0]) for photo in photos]
+    fingerprint = FingerprintRecord.of(ready_made_fingerprint(features))
+    return GlobalFeatures(fingerprint, np.stack(rows), {})
+
+
+@dataclass(frozen=True, slots=True)
+class _DescribeTask:
+    """What workers do for one global descriptor."""
+
+    work: WorkFolder
+    features: LocalFeaturesSource
+    name: str
+    fingerprint: Mapping[str, object]
+
+    def words_key(self, photo: MappingPhoto) -> str:
+        return _key("words", fingerprint=self.fingerprint, local=self.features.key(photo))
+
+    def pooled_key(self, vocabulary_key: str, photo: MappingPhoto) -> str:
+        return _key("pooled", vocabulary=vocabulary_key, local=self.features.key(photo))
+
+    def find_words(self, photo: MappingPhoto) -> None:
+        def compute() -> Item:
+            descriptor, local = _descriptor(self.name), self.features.read(photo)
+            rgb = _pixels(descriptor, photo)
+            return {"words": descriptor.training_words(rgb, local, seed=0)}
+
+        self.work.get(self.words_key(photo), compute)
+
+    def pool(self, vocabulary_key: str, photo: MappingPhoto) -> None:
+        def compute() -> Item:
+            descriptor, local = _descriptor(self.name), self.features.read(photo)
+            vocabulary = _vocabulary(self.work, vocabulary_key)
+            return {"pooled": descriptor.pool(_pixels(descriptor, photo), local, vocabulary)}
+
+        self.work.get(self.pooled_key(vocabulary_key, photo), compute)
+
+
+def _pixels(descriptor: GlobalDescriptor, photo: MappingPhoto) -> NDArray[np.uint8]:
+    if descriptor.needs_image:
+        return read_photo_file(photo.path).rgb
+    return np.empty((0, 0, 3), dtype=np.uint8)
+
+
+@cache
+def _extractor(name: str, weights_dir: Path | None) -> LocalFeatureExtractor:
+    return make_local_features(name, weights_dir)
+
+
+@cache
+def _descriptor(name: str) -> GlobalDescriptor:
+    return make_global_descriptor(name)
+
+
+@cache
+def _vocabulary(work: WorkFolder, key: str) -> Item:
+    return work.read(key)
 
 
 def _key(stage: str, **inputs: object) -> str:

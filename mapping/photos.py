@@ -11,6 +11,7 @@ from visloc.archive import sha256_of
 from visloc.errors import DatasetError
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, FileRecord
+from visloc.localizer import GUESSED_FOCAL
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -19,19 +20,21 @@ class MappingPhoto:
 
     Attributes:
         record: its name, sensor and timestamp in the dataset.
-        path: the file.
+        path: the file; it exists when ``sha256`` is not None.
         sha256: of the file.
         camera: intrinsics.
-        cam_from_world: pose.
+        camera_known: whether they are the dataset's; else a guess to start from.
+        cam_from_world: pose, when known.
         depth: its depth map, if it has one.
         depth_sha256: of the depth map's file.
     """
 
     record: FileRecord
     path: Path
-    sha256: str
+    sha256: str | None
     camera: Camera
-    cam_from_world: Pose
+    camera_known: bool
+    cam_from_world: Pose | None
     depth: DepthMatch | None
     depth_sha256: str | None
 
@@ -40,15 +43,34 @@ class MappingPhoto:
         """The photo's name in the dataset and in the map."""
         return self.record.path
 
+    @property
+    def pose(self) -> Pose:
+        """``cam_from_world`` of a photo that was collected with poses."""
+        assert self.cam_from_world is not None
+        return self.cam_from_world
+
 
 def collect_photos(
     dataset: Dataset,
     *,
-    with_depth: bool,
-    depth_sensor: str | None,
+    posed: bool = True,
+    with_files: bool = True,
+    has_features: Callable[[str], bool] | None = None,
+    with_depth: bool = False,
+    depth_sensor: str | None = None,
     progress: Callable[[int, int], None],
 ) -> tuple[list[MappingPhoto], list[str]]:
-    """Gather the photos that have a file, intrinsics and a pose, and their depth maps.
+    """Gather the photos that can be used, and their depth maps.
+
+    Args:
+        dataset: the dataset.
+        posed: take only photos with intrinsics and a pose; else those without get guessed
+            intrinsics (SIMPLE_RADIAL) and stay without a pose.
+        with_files: take only photos whose file exists.
+        has_features: tells whether a photo, by name, has ready-made features; others are left out.
+        with_depth: look for depth maps.
+        depth_sensor: the depth sensor to use, when several go with a photo.
+        progress: told how many photos are done, and how many there are.
 
     Returns:
         The photos in the dataset's order, and notes on what was left out.
@@ -63,11 +85,13 @@ def collect_photos(
         path = dataset.path_of(record)
         camera = dataset.sensors[record.sensor_id].camera
         pose = dataset.pose(record)
-        if not dataset.has_file(record):
+        if with_files and not dataset.has_file(record):
             left_out.setdefault("are listed, but the file is absent", []).append(record.path)
-        elif camera is None:
+        elif has_features is not None and not has_features(record.path):
+            left_out.setdefault("have no ready-made features", []).append(record.path)
+        elif posed and camera is None:
             left_out.setdefault("have a camera of unknown model", []).append(record.path)
-        elif pose is None:
+        elif posed and pose is None:
             left_out.setdefault("have no pose", []).append(record.path)
         else:
             depth = matcher.match(record) if matcher else None
@@ -77,8 +101,9 @@ def collect_photos(
                 MappingPhoto(
                     record,
                     path,
-                    _checksum(path),
-                    camera,
+                    _checksum(path) if with_files else None,
+                    camera or _guessed_camera(dataset, record),
+                    camera is not None,
                     pose,
                     depth,
                     _checksum(dataset.path_of(depth.record)) if depth else None,
@@ -91,13 +116,26 @@ def collect_photos(
         for why, names in left_out.items()
     ]
     if not photos:
+        needed = [
+            *(["a file"] if with_files else []),
+            *(["ready-made features"] if has_features is not None else []),
+            *(["a camera of a known model", "a pose"] if posed else []),
+        ]
         raise DatasetError(
             "dataset.no_photos",
             "no photo of the dataset can be used" + "".join(f"; {note}" for note in notes),
             field=str(dataset.root / "sensors" / "records_camera.txt"),
-            expected="photos with a file, a camera of a known model, and a pose",
+            expected=f"photos with {', '.join(needed)}",
         )
     return photos, notes
+
+
+def _guessed_camera(dataset: Dataset, record: FileRecord) -> Camera:
+    size = dataset.sensors[record.sensor_id].image_size
+    assert size is not None  # every sensor of a photo has one
+    width, height = size
+    focal = GUESSED_FOCAL * max(width, height)
+    return Camera("SIMPLE_RADIAL", width, height, (focal, width / 2, height / 2, 0.0))
 
 
 def _checksum(path: Path) -> str:

@@ -8,18 +8,26 @@ point.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import asdict, dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapping.depth import depth_at, photo_depth
+from mapping.features import LocalFeaturesSource, Progress
+from mapping.landmarks import MadeLandmarks, Observations, View, assemble_landmarks
+from mapping.matching import camera_values, pose_values
 from mapping.photos import MappingPhoto
-from visloc.archive import Landmarks
-from visloc.errors import InvalidInput
+from mapping.stages import Item, WorkFolder, key_of
+from mapping.workers import Workers
+from visloc.archive import Anchor, Landmarks
+from visloc.errors import DatasetError, InvalidInput
 from visloc.kapture import Dataset
 from visloc.pose.colmap import normalized_rays, project
+
+# Raised when the code of the stage changes what comes out.
+_LIFTED_REVISION = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +43,92 @@ class LiftedKeypoints:
     rows: NDArray[np.int64]
     pixels: NDArray[np.float32]
     points: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class DepthSettings:
+    """How depth becomes landmarks.
+
+    Attributes:
+        voxel_size: edge in which lifted keypoints become one landmark, in metres.
+        depth_scale: metres per unit of 16-bit PNG depth.
+    """
+
+    voxel_size: float = 0.01
+    depth_scale: float = 0.001
+
+
+def landmarks_from_depth(
+    work: WorkFolder,
+    dataset: Dataset,
+    photos: Sequence[MappingPhoto],
+    features: LocalFeaturesSource,
+    settings: DepthSettings,
+    metric: bool,
+    workers: Workers,
+    progress: Progress,
+) -> MadeLandmarks:
+    """Lift the keypoints of all photos and merge them.
+
+    Raises:
+        DatasetError: ``dataset.no_depth``, and what ``lift_keypoints`` raises.
+        InvalidInput: what ``merge_landmarks`` raises.
+    """
+    if all(photo.depth is None for photo in photos):
+        raise DatasetError(
+            "dataset.no_depth",
+            "no photo has a depth map",
+            field=str(dataset.root / "sensors" / "records_depth.txt"),
+            expected="depth maps with the timestamps of the photos, of a sensor in their rig or "
+            "with poses of its own; see --depth-sensor. Without depth: --method sfm",
+        )
+    task = _LiftTask(work, dataset, features, settings.depth_scale)
+    workers.run(task.lift, photos, partial(progress, "depth"))
+    lifted = [LiftedKeypoints(**work.read(task.key(photo))) for photo in photos]
+    progress("landmarks", 0, 1)
+    landmarks, rows = merge_landmarks(photos, lifted, settings.voxel_size)
+    progress("landmarks", 1, 1)
+    return MadeLandmarks(
+        photos=np.arange(len(photos)),
+        views=tuple(View(photo.camera, photo.pose) for photo in photos),
+        landmarks=landmarks,
+        rows=tuple(rows),
+        metric=metric,
+        anchor=Anchor(kind="dataset", images=len(photos)),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _LiftTask:
+    """What workers do for a photo."""
+
+    work: WorkFolder
+    dataset: Dataset
+    features: LocalFeaturesSource
+    depth_scale: float
+
+    def key(self, photo: MappingPhoto) -> str:
+        return key_of(
+            "lifted",
+            _LIFTED_REVISION,
+            local=self.features.key(photo),
+            camera=camera_values(photo.camera),
+            pose=pose_values(photo.pose),
+            depth=photo.depth
+            and [
+                photo.depth_sha256,
+                *camera_values(photo.depth.camera),
+                *pose_values(photo.depth.cam_from_depth),
+            ],
+            depth_scale=self.depth_scale,
+        )
+
+    def lift(self, photo: MappingPhoto) -> None:
+        def compute() -> Item:
+            keypoints = self.features.read(photo).keypoints
+            return asdict(lift_keypoints(self.dataset, photo, keypoints, self.depth_scale))
+
+        self.work.get(self.key(photo), compute)
 
 
 def lift_keypoints(
@@ -53,7 +147,7 @@ def lift_keypoints(
     # Both cameras now share one centre and one orientation, not always size and focal length.
     distance = depth_at(depth, project(seen_by, rays)).astype(np.float64)
     rows = np.flatnonzero(np.isfinite(distance) & np.isfinite(rays).all(axis=1))
-    points = photo.cam_from_world.inverse().apply(rays[rows] * distance[rows, None])
+    points = photo.pose.inverse().apply(rays[rows] * distance[rows, None])
     return LiftedKeypoints(rows, keypoints[rows], points)
 
 
@@ -84,7 +178,8 @@ def merge_landmarks(
             field="dataset",
             expected="depth maps that go with the photos; see --depth-sensor and --depth-scale",
         )
-    origin = _choose_origin(photos)
+    # Voxels are counted from near the photos, wherever in the world they are.
+    origin = np.round(np.mean([photo.pose.center for photo in photos], axis=0))
     points -= origin
     landmark, num_landmarks = _voxel_index(points, voxel_size)
     seen_in = np.repeat(np.arange(len(lifted)), [len(one.rows) for one in lifted])
@@ -99,40 +194,8 @@ def merge_landmarks(
     mean = np.column_stack(
         [np.bincount(landmark, points[:, axis], num_landmarks) / tracks for axis in range(3)]
     )
-    by_photo = _rows_by_photo(seen_in, len(photos))
-    errors = np.concatenate(
-        [
-            np.linalg.norm(
-                project(photo.camera, photo.cam_from_world.apply(mean[landmark[own]] + origin))
-                - pixels[own],
-                axis=1,
-            )
-            for photo, own in zip(photos, by_photo, strict=True)
-        ]
-    )
-    landmarks = Landmarks(
-        origin=origin,
-        points=mean.astype(np.float32),
-        track_lengths=np.minimum(tracks, 65535).astype(np.uint16),
-        errors_px=(np.bincount(landmark, errors, num_landmarks) / tracks).astype(np.float32),
-        angles_deg=np.full(num_landmarks, np.nan, dtype=np.float32),
-        offsets=np.array([0, *(own.stop for own in by_photo)], dtype=np.int64),
-        observed=landmark.astype(np.uint32),
-        keypoints=pixels,
-    )
-    return landmarks, [rows[own] for own in by_photo]
-
-
-def _rows_by_photo(seen_in: NDArray[np.int64], num_photos: int) -> list[slice]:
-    bounds = np.searchsorted(seen_in, np.arange(num_photos + 1))
-    return [slice(int(a), int(b)) for a, b in pairwise(bounds)]
-
-
-def _choose_origin(photos: Sequence[MappingPhoto]) -> NDArray[np.float64]:
-    """Whole units near the photos when they are so far off that float32 would lose millimetres."""
-    center = np.mean([photo.cam_from_world.center for photo in photos], axis=0)
-    far_off = np.abs(center).max() > 1000.0
-    return np.asarray(np.round(center) if far_off else np.zeros(3), dtype=np.float64)
+    views = [View(photo.camera, photo.pose) for photo in photos]
+    return assemble_landmarks(views, mean + origin, Observations(landmark, seen_in, rows, pixels))
 
 
 def _voxel_index(points: NDArray[np.float64], voxel_size: float) -> tuple[NDArray[np.int64], int]:

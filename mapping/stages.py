@@ -14,6 +14,7 @@ import os
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,11 +38,11 @@ def key_of(stage: str, revision: int, **inputs: object) -> str:
     return f"{stage}/{hashlib.sha256(text.encode()).hexdigest()[:32]}"
 
 
+@dataclass(frozen=True, slots=True)
 class WorkFolder:
     """Finished items of a build, found again after an interruption."""
 
-    def __init__(self, root: Path) -> None:
-        self.root = root
+    root: Path
 
     def has(self, key: str) -> bool:
         """Tell whether an item is finished."""

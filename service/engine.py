@@ -18,10 +18,11 @@ import torch
 from visloc.archive import Map, MapStore
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, Overloaded, Unavailable, VislocError
 from visloc.features import LocalFeatureExtractor, make_local_features
+from visloc.features.readymade import is_ready_made
 from visloc.geometry import Camera
 from visloc.images import ImageLimits, read_photo
 from visloc.localizer import Localizer
-from visloc.types import Answer, LocalizeOptions
+from visloc.types import Answer, LocalizeOptions, QueryFeatures
 
 logger = logging.getLogger(__name__)
 
@@ -35,13 +36,13 @@ class LocalizeJob:
 
     Attributes:
         map: ``id``, for its current version, or ``id@version``.
-        image: the encoded photo.
+        query: the encoded photo, or the features that were found in it.
         camera: its intrinsics for the pixels as stored; None when unknown.
         options: thresholds and the like.
     """
 
     map: str
-    image: bytes
+    query: bytes | QueryFeatures
     camera: Camera | None
     options: LocalizeOptions
 
@@ -151,12 +152,12 @@ class Engine:
         )
 
     async def localize(self, job: LocalizeJob) -> Localization:
-        """Decode and localize a photo in a worker thread.
+        """Localize a photo, decoded first, or its features, in a worker thread.
 
         Raises:
             Overloaded: ``server.busy`` when too many photos are waiting.
             Unavailable: ``server.starting`` before ``start`` is done.
-            VislocError: what the store, ``read_photo`` and ``Localizer.localize`` raise.
+            VislocError: what the store, ``read_photo`` and the ``Localizer`` raise.
         """
         if not self._ready:
             raise Unavailable("server.starting", "the maps are being loaded; try again shortly")
@@ -183,15 +184,14 @@ class Engine:
         started = perf_counter()
         localizer = self._localizer(job.map)
         loaded = perf_counter()
-        photo = read_photo(job.image, self._limits)
-        decoded = perf_counter()
-        answer = localizer.localize(photo, job.camera, job.options)
-        seconds = {
-            "queued": started - submitted,
-            "open_map": loaded - started,
-            "decode": decoded - loaded,
-            **answer.evidence.seconds,
-        }
+        before = {"queued": started - submitted, "open_map": loaded - started}
+        if isinstance(job.query, QueryFeatures):
+            answer = localizer.localize_features(job.query, job.camera, job.options)
+        else:
+            photo = read_photo(job.query, self._limits)
+            before["decode"] = perf_counter() - loaded
+            answer = localizer.localize(photo, job.camera, job.options)
+        seconds = {**before, **answer.evidence.seconds}
         manifest = localizer.map.manifest
         return Localization(
             replace(answer, evidence=replace(answer.evidence, seconds=seconds)),
@@ -260,9 +260,9 @@ class Engine:
             opened = self._store.open(ref)
             name = opened.manifest.local_features.fingerprint.name
             try:
-                if name not in self._extractors:
+                if name not in self._extractors and not is_ready_made(name):
                     self._extractors[name] = make_local_features(name, self._weights_dir)
-                localizer = Localizer(opened, self._extractors[name])
+                localizer = Localizer(opened, self._extractors.get(name))
             except InvalidInput as error:  # features that are not here: not the caller's mistake
                 raise Conflict(
                     error.code,

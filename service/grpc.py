@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -21,7 +22,9 @@ from pydantic import BaseModel
 import visloc
 from service.engine import Engine
 from service.schemas import (
+    Array,
     Camera,
+    Features,
     ListMapsResponse,
     LocalizeOptions,
     LocalizeRequest,
@@ -56,10 +59,12 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
     async def Localize(  # noqa: N802  the name in the proto
         self, request: pb2.LocalizeRequest, context: Context
     ) -> pb2.LocalizeResponse:
-        """Estimate the camera pose of one photo in one map."""
+        """Estimate the camera pose of one photo, or of its features, in one map."""
         id_ = request_id(request.request_id)
         async with _envelope("Localize", id_, context):
-            found = await self._engine.localize(_localize_request(request).to_job())
+            # Features take a moment to check: off the event loop with them.
+            job = await asyncio.to_thread(lambda: _localize_request(request).to_job())
+            found = await self._engine.localize(job)
             answer = LocalizeResponse.from_localization(found, id_)
             return _message(answer, pb2.LocalizeResponse())
 
@@ -127,7 +132,8 @@ def _localize_request(request: pb2.LocalizeRequest) -> LocalizeRequest:
     camera = request.camera
     return LocalizeRequest(
         map=request.map,
-        image=request.image,
+        image=request.image if request.HasField("image") else None,
+        features=_features(request.features) if request.HasField("features") else None,
         camera=Camera(
             model=camera.model,
             width=camera.width,
@@ -140,6 +146,21 @@ def _localize_request(request: pb2.LocalizeRequest) -> LocalizeRequest:
             **{field.name: value for field, value in request.options.ListFields()}
         ),
     )
+
+
+def _features(features: pb2.Features) -> Features:
+    return Features(
+        kind=features.kind,
+        keypoints=_array(features.keypoints),
+        descriptors=_array(features.descriptors),
+        global_descriptors={
+            name: _array(features.global_descriptors[name]) for name in features.global_descriptors
+        },
+    )
+
+
+def _array(array: pb2.Array) -> Array:
+    return Array(dtype=array.dtype, shape=list(array.shape), data=array.data)
 
 
 def _message(answer: BaseModel, message: MessageT) -> MessageT:

@@ -20,7 +20,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 import visloc
 from service.engine import Engine
 from service.incoming import invalid_input
-from service.intake import read_localize_request
+from service.intake import read_localize_job
 from service.openapi import LOCALIZE_BODY, App, problems
 from service.schemas import (
     Health,
@@ -61,12 +61,12 @@ def create_app(engine: Engine, settings: ServiceSettings) -> App:
         openapi_extra={"requestBody": LOCALIZE_BODY},
     )
     async def localize(request: Request) -> Response:
-        """Estimate the camera pose of one photo in one map.
+        """Estimate the camera pose of one photo, or of its features, in one map.
 
         A photo that cannot be localized is an answer (`status: not_localized`), not an error.
         """
-        message = await read_localize_request(request, settings)
-        found = await _while_connected(request, engine.localize(message.to_job()))
+        job = await read_localize_job(request, settings)
+        found = await _while_connected(request, engine.localize(job))
         return _json(LocalizeResponse.from_localization(found, request.state.request_id))
 
     @app.get("/maps", response_model=ListMapsResponse)

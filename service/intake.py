@@ -9,14 +9,17 @@ from starlette.datastructures import Headers, UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import Request
 
+from service.engine import LocalizeJob
 from service.schemas import LocalizeRequest
 from service.settings import REQUEST_OVERHEAD_BYTES, ServiceSettings
 from visloc.errors import InvalidInput, TooLarge
 
 _CHUNK_BYTES = 64 * 1024
+# The parts of a form that are files, and how curl sends them.
+_FILES = {"image": "photo.jpg", "features": "photo.json"}
 
 
-async def read_localize_request(request: Request, settings: ServiceSettings) -> LocalizeRequest:
+async def read_localize_job(request: Request, settings: ServiceSettings) -> LocalizeJob:
     """Read the body of ``POST /localize``, as a form or as JSON.
 
     Raises:
@@ -24,13 +27,14 @@ async def read_localize_request(request: Request, settings: ServiceSettings) -> 
         InvalidInput: ``request...``, or a code of the field that is wrong.
     """
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    # Photos and features take milliseconds to parse and decode: off the event loop with them.
     if media_type == "multipart/form-data":
         body = await _read_body(request, settings.max_request_bytes)
-        return LocalizeRequest.read(await _read_form(request.headers, body))
+        fields = await _read_form(request.headers, body)
+        return await asyncio.to_thread(lambda: LocalizeRequest.read(fields).to_job())
     if media_type == "application/json":
         body = await _read_body(request, settings.max_json_bytes)
-        # A photo takes milliseconds to parse and decode: off the event loop with it.
-        return await asyncio.to_thread(LocalizeRequest.read_json, body)
+        return await asyncio.to_thread(lambda: LocalizeRequest.read_json(body).to_job())
     raise InvalidInput(
         "request.content_type",
         "this kind of body is not read here",
@@ -57,7 +61,6 @@ def _too_large(limit: int, got: str) -> TooLarge:
     return TooLarge(
         "request.too_large",
         "the request has too many bytes",
-        field="image",
         expected=f"at most {limit} bytes",
         got=got,
     )
@@ -72,18 +75,18 @@ async def _read_form(headers: Headers, body: bytes) -> dict[str, str | bytes]:
     parser = MultiPartParser(
         headers,
         stream(),
-        max_files=1,
+        max_files=len(_FILES),
         max_fields=len(LocalizeRequest.model_fields),
         max_part_size=REQUEST_OVERHEAD_BYTES,
     )
-    parser.spool_max_size = len(body) + 1  # the photo stays in memory: no temporary files
+    parser.spool_max_size = len(body) + 1  # files stay in memory, none on disk
     try:
         form = await parser.parse()
     except MultiPartException as error:
         raise InvalidInput(
             "request.malformed",
             error.message,
-            expected="a form with the file image and the texts map, camera and options",
+            expected="a form with a file image or features, and texts map, camera, options",
         ) from None
     fields: dict[str, str | bytes] = {}
     try:
@@ -91,14 +94,14 @@ async def _read_form(headers: Headers, body: bytes) -> dict[str, str | bytes]:
             if name in fields:
                 raise InvalidInput("request.duplicate_field", "given twice", field=name[:100])
             is_file = isinstance(value, UploadFile)
-            if name in LocalizeRequest.model_fields and is_file != (name == "image"):
+            if name in LocalizeRequest.model_fields and is_file != (name in _FILES):
                 raise InvalidInput(
                     "request.invalid",
                     "the wrong kind of form part",
                     field=name,
                     expected="a text, without a file name"
                     if is_file
-                    else "a file, as of curl -F image=@photo.jpg",
+                    else f"a file, as of curl -F {name}=@{_FILES[name]}",
                 )
             fields[name] = await value.read() if isinstance(value, UploadFile) else value
     finally:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import json
 from typing import Any
 
 from fastapi import FastAPI
@@ -21,6 +23,21 @@ EXAMPLE_REQUEST = {
     "camera": {"model": "PINHOLE", "width": 64, "height": 48, "params": [52.5, 52.5, 32, 24]},
     "options": {"top_k": 10, "seed": 1},
 }
+# Two keypoints of a map of XFeat features (64 numbers each) and localvlad, which is not sent.
+EXAMPLE_FEATURES_REQUEST = {
+    "map": "office",
+    "features": {
+        "kind": "xfeat",
+        "keypoints": {"dtype": "float32", "shape": [2, 2], "data": "AABIQQAAyEEAAABCAACQQQ=="},
+        "descriptors": {
+            "dtype": "int8",
+            "shape": [2, 64],
+            "data": base64.b64encode(bytes(range(128))).decode(),
+        },
+        "global_descriptors": {},
+    },
+    "camera": {"model": "PINHOLE", "width": 64, "height": 48, "params": [52.5, 52.5, 32, 24]},
+}
 _REF = "#/components/schemas/{model}"
 
 LOCALIZE_BODY: dict[str, Any] = {
@@ -29,7 +46,8 @@ LOCALIZE_BODY: dict[str, Any] = {
         "multipart/form-data": {
             "schema": {
                 "type": "object",
-                "required": ["map", "image"],
+                "required": ["map"],
+                "oneOf": [{"required": ["image"]}, {"required": ["features", "camera"]}],
                 "additionalProperties": False,
                 "properties": {
                     "map": {"type": "string", "description": "id, or id@version"},
@@ -38,6 +56,11 @@ LOCALIZE_BODY: dict[str, Any] = {
                         "contentMediaType": "application/octet-stream",
                         "description": "the file: JPEG, PNG, WebP, TIFF or BMP",
                     },
+                    "features": {
+                        "type": "string",
+                        "contentMediaType": "application/json",
+                        "description": "instead of the image, a file: Features as JSON",
+                    },
                     "camera": {
                         "type": "string",
                         "description": "MODEL,width,height,params... or a Camera as JSON",
@@ -45,16 +68,30 @@ LOCALIZE_BODY: dict[str, Any] = {
                     "options": {"type": "string", "description": "LocalizeOptions as JSON"},
                 },
             },
-            "example": {
-                "map": "office",
-                "image": "(the bytes of the file)",
-                "camera": "PINHOLE,640,480,525,525,320,240",
-                "options": '{"top_k": 10, "seed": 1}',
+            "examples": {
+                "photo": {
+                    "value": {
+                        "map": "office",
+                        "image": "(the bytes of the file)",
+                        "camera": "PINHOLE,640,480,525,525,320,240",
+                        "options": '{"top_k": 10, "seed": 1}',
+                    }
+                },
+                "features": {
+                    "value": {
+                        "map": "office",
+                        "features": json.dumps(EXAMPLE_FEATURES_REQUEST["features"]),
+                        "camera": "PINHOLE,64,48,52.5,52.5,32,24",
+                    }
+                },
             },
         },
         "application/json": {
             "schema": {"$ref": _REF.format(model="LocalizeRequest")},
-            "example": EXAMPLE_REQUEST,
+            "examples": {
+                "photo": {"value": EXAMPLE_REQUEST},
+                "features": {"value": EXAMPLE_FEATURES_REQUEST},
+            },
         },
     },
 }

@@ -1,22 +1,25 @@
-"""One query from pixels to answer: the whole pipeline on one screen."""
+"""One query from pixels, or from features, to answer: the whole pipeline on one screen."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
+from numpy.typing import NDArray
 
 from visloc.archive import FingerprintRecord, Map
 from visloc.errors import Conflict, InvalidInput
-from visloc.features import LocalFeatureExtractor, make_global_descriptor
+from visloc.features import GlobalDescriptor, LocalFeatureExtractor, make_global_descriptor
+from visloc.features.readymade import is_ready_made
 from visloc.geometry import Camera
 from visloc.images import Photo, stored_from_upright, upright
 from visloc.matching.correspondences import match_landmarks
 from visloc.pose.absolute import estimate_absolute_pose
 from visloc.pose.covariance import position_covariance, with_origin
+from visloc.query_features import checked_global_descriptors, checked_local_features
 from visloc.retrieval.index import Retrieved, retrieve
 from visloc.types import (
     DEFAULT_PRESET,
@@ -28,6 +31,7 @@ from visloc.types import (
     Localized,
     LocalizeOptions,
     NotLocalized,
+    QueryFeatures,
     ReadAs,
     Reason,
     RegistrationPreset,
@@ -41,33 +45,58 @@ GUESSED_FOCAL = 1.2
 # shrinks with them. 12 px are so large a part of a photo of 256 px that poses by chance explain
 # up to 10 % of the matches.
 FULL_ERROR_FROM_PX = 640
+# For global descriptors that do not look at the photo.
+_NO_PIXELS = np.empty((0, 0, 3), np.uint8)
 
 
 class Localizer:
-    """Localizes photos in one map. Safe to use from several threads.
+    """Localizes photos, or the features of photos, in one map. Safe to use from several threads.
+
+    Args:
+        opened: the map.
+        extractor: of its local features; None when only features are to be localized, as in maps
+            of ready-made features.
 
     Raises:
         Conflict: ``map.features`` when the map was built with other features than those at hand.
     """
 
-    def __init__(self, opened: Map, extractor: LocalFeatureExtractor) -> None:
+    def __init__(self, opened: Map, extractor: LocalFeatureExtractor | None) -> None:
         self.map = opened
         self._extractor = extractor
         manifest = opened.manifest
-        _check_fingerprint(manifest.local_features.fingerprint, extractor.fingerprint, opened.ref)
-        self._descriptors = {}
+        if extractor is not None:
+            _check_fingerprint(
+                manifest.local_features.fingerprint, extractor.fingerprint, opened.ref
+            )
+        self._descriptors: dict[str, GlobalDescriptor] = {}  # those that can be computed here
         for record in manifest.global_features:
-            descriptor = make_global_descriptor(record.fingerprint.name)
-            _check_fingerprint(record.fingerprint, descriptor.fingerprint, opened.ref)
-            self._descriptors[record.fingerprint.name] = descriptor
+            name = record.fingerprint.name
+            if not is_ready_made(name):
+                descriptor = make_global_descriptor(name)
+                _check_fingerprint(record.fingerprint, descriptor.fingerprint, opened.ref)
+                self._descriptors[name] = descriptor
+        self._takes_photos = extractor is not None and len(self._descriptors) == len(
+            manifest.global_features
+        )
         self._origin = np.array(manifest.world.origin)
 
     def warm_up(self) -> None:
-        """Run once on noise, so that the first photo does not pay for the first use."""
-        noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
-        self.localize(
-            Photo(noise, exif_orientation=1, focal_length_px=None), None, LocalizeOptions()
+        """Run once on noise, so that the first query does not pay for the first use."""
+        random = np.random.default_rng(0)
+        if self._takes_photos:
+            noise = random.integers(0, 255, (480, 640, 3), dtype=np.uint8)
+            self.localize(Photo(noise), None, LocalizeOptions())
+            return
+        manifest = self.map.manifest
+        features = QueryFeatures(
+            manifest.local_features.fingerprint.name,
+            random.uniform(0, 480, (1000, 2)),
+            random.normal(size=(1000, manifest.local_features.descriptor_dim)),
+            {g.fingerprint.name: random.normal(size=g.dim) for g in manifest.global_features},
         )
+        camera = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
+        self.localize_features(features, camera, LocalizeOptions())
 
     def localize(self, photo: Photo, camera: Camera | None, options: LocalizeOptions) -> Answer:
         """Estimate the pose of one photo.
@@ -78,15 +107,69 @@ class Localizer:
             options: thresholds and the like.
 
         Raises:
-            InvalidInput: ``camera.size_mismatch``.
+            InvalidInput: ``camera.size_mismatch``; ``features.required`` when features of the map
+                are not computed here.
         """
+        if self._extractor is None or not self._takes_photos:
+            raise self._features_required()
         used, source = resolve_camera(photo, camera)
         seconds: dict[str, float] = {}
         evidence = Evidence(used, source, photo.exif_orientation, options.read_as, seconds=seconds)
-        registration = _registration(options, photo)
-
         with _timed(seconds, "local_features"):
-            local, rgb = self._find_features(photo, options.read_as)
+            local, rgb = self._find_features(self._extractor, photo, options.read_as)
+        return self._answer(local, rgb, {}, evidence, seconds, options)
+
+    def localize_features(
+        self, features: QueryFeatures, camera: Camera | None, options: LocalizeOptions
+    ) -> Answer:
+        """Estimate the pose of the photo whose features these are.
+
+        Args:
+            features: of the map's kind; with every global descriptor of the map, but for those
+                that are made of local features, which are computed when they are not sent.
+            camera: the intrinsics of the photo that the keypoints are of.
+            options: thresholds and the like.
+
+        Raises:
+            InvalidInput: ``camera.required``, ``options.read_as``, ``features.kind``,
+                ``features.keypoints``, ``features.descriptors``, ``features.global_descriptors``.
+            TooLarge: ``features.too_many``.
+        """
+        if camera is None:
+            raise InvalidInput(
+                "camera.required",
+                "features cannot be localized without the camera that they were seen with",
+                field="camera",
+                expected="its model, size and parameters",
+            )
+        if options.read_as is not ReadAs.STORED:
+            raise InvalidInput(
+                "options.read_as",
+                "features are taken as they are: turn the photo before they are looked for",
+                field="options.read_as",
+                expected=ReadAs.STORED,
+                got=options.read_as,
+            )
+        seconds: dict[str, float] = {}
+        evidence = Evidence(camera, CameraSource.GIVEN, 1, ReadAs.STORED, seconds=seconds)
+        optional = {name for name, d in self._descriptors.items() if not d.needs_image}
+        with _timed(seconds, "local_features"):
+            local = checked_local_features(features, camera, self.map.manifest)
+            sent = checked_global_descriptors(features, self.map.manifest, optional)
+        return self._answer(local, _NO_PIXELS, sent, evidence, seconds, options)
+
+    def _answer(
+        self,
+        local: LocalFeatures,
+        rgb: NDArray[np.uint8],
+        sent: Mapping[str, NDArray[np.float32]],
+        evidence: Evidence,
+        seconds: dict[str, float],
+        options: LocalizeOptions,
+    ) -> Answer:
+        """Find the pose from local features; global descriptors not ``sent`` are computed."""
+        camera = evidence.camera
+        registration = _registration(options, camera)
         evidence = replace(evidence, num_keypoints=len(local))
         if len(local) == 0:
             return NotLocalized(
@@ -98,8 +181,8 @@ class Localizer:
 
         with _timed(seconds, "global_features"):
             query = {
-                name: descriptor.describe(rgb, local, self.map.global_models[name])
-                for name, descriptor in self._descriptors.items()
+                name: sent[name] if name in sent else self._describe(name, rgb, local)
+                for name in self.map.global_descriptors
             }
         with _timed(seconds, "retrieval"):
             retrieved = retrieve(query, self.map.global_descriptors, options.top_k)
@@ -124,7 +207,7 @@ class Localizer:
             found = estimate_absolute_pose(
                 pixels,
                 points,
-                used,
+                camera,
                 max_error_px=registration.max_error_px,
                 seed=options.seed,
             )
@@ -159,18 +242,35 @@ class Localizer:
         )
 
     def _find_features(
-        self, photo: Photo, read_as: ReadAs
-    ) -> tuple[LocalFeatures, np.ndarray[tuple[int, ...], np.dtype[np.uint8]]]:
+        self, extractor: LocalFeatureExtractor, photo: Photo, read_as: ReadAs
+    ) -> tuple[LocalFeatures, NDArray[np.uint8]]:
         """Features with keypoints in the stored pixels, and the image they were found in."""
         max_keypoints = self.map.manifest.local_features.max_keypoints
         if read_as is ReadAs.STORED or photo.exif_orientation == 1:
-            return self._extractor.extract(photo.rgb, max_keypoints=max_keypoints), photo.rgb
+            return extractor.extract(photo.rgb, max_keypoints=max_keypoints), photo.rgb
         rgb = upright(photo.rgb, photo.exif_orientation)
-        local = self._extractor.extract(rgb, max_keypoints=max_keypoints)
+        local = extractor.extract(rgb, max_keypoints=max_keypoints)
         keypoints = stored_from_upright(
             local.keypoints, photo.exif_orientation, photo.width, photo.height
         )
         return replace(local, keypoints=keypoints), rgb
+
+    def _describe(
+        self, name: str, rgb: NDArray[np.uint8], local: LocalFeatures
+    ) -> NDArray[np.float32]:
+        return self._descriptors[name].describe(rgb, local, self.map.global_models[name])
+
+    def _features_required(self) -> InvalidInput:
+        manifest = self.map.manifest
+        names = (g.fingerprint.name for g in manifest.global_features)
+        return InvalidInput(
+            "features.required",
+            "the map's features are not computed here: send the features of the photo instead",
+            field="image",
+            expected=f"features of kind {manifest.local_features.fingerprint.name}, with "
+            + ", ".join(names),
+            got="a photo",
+        )
 
     def _describe_retrieved(self, retrieved: Retrieved) -> Iterator[RetrievedImage]:
         for rank, image in enumerate(retrieved.images):
@@ -217,12 +317,12 @@ def resolve_camera(photo: Photo, given: Camera | None) -> tuple[Camera, CameraSo
     )
 
 
-def _registration(options: LocalizeOptions, photo: Photo) -> RegistrationPreset:
+def _registration(options: LocalizeOptions, camera: Camera) -> RegistrationPreset:
     """The thresholds for a photo: the default's inlier distance shrinks with a small photo."""
     registration = options.registration
     if options.preset != DEFAULT_PRESET or options.max_error_px is not None:
         return registration
-    share = min(1.0, max(photo.width, photo.height) / FULL_ERROR_FROM_PX)
+    share = min(1.0, max(camera.width, camera.height) / FULL_ERROR_FROM_PX)
     return replace(registration, max_error_px=registration.max_error_px * share)
 
 

@@ -52,6 +52,24 @@ class Fingerprint:
     weights_sha256: str | None = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class QueryFeatures:
+    """The features of one photo, sent instead of it; nothing in them is checked yet.
+
+    Attributes:
+        kind: the name of the local features, as the map has it.
+        keypoints: (N, 2) numbers, (x, y) in pixels of the camera; the centre of the top-left pixel
+            is (0.5, 0.5).
+        descriptors: (N, D) numbers of any length.
+        global_descriptors: by name, as the map has it, (D,) numbers of any length.
+    """
+
+    kind: str
+    keypoints: NDArray[np.generic]
+    descriptors: NDArray[np.generic]
+    global_descriptors: Mapping[str, NDArray[np.generic]] = field(default_factory=dict)
+
+
 class CameraSource(StrEnum):
     """Where the intrinsics of a query came from."""
 
@@ -188,9 +206,9 @@ class Evidence:
     Attributes:
         camera: the intrinsics used, for the pixels as stored.
         camera_source: where they came from.
-        exif_orientation: the photo's EXIF orientation, 1 to 8; 1 when it has none.
+        exif_orientation: the photo's EXIF orientation, 1 to 8; 1 when it has none or was not sent.
         read_as: the orientation in which features were found.
-        num_keypoints: keypoints found in the photo.
+        num_keypoints: keypoints found in the photo, or sent.
         num_correspondences: 2D-3D correspondences given to the solver.
         num_inliers: those that agree with the pose (of the best pose, when it was refused).
         retrieved: the mapping photos matched against, best first.

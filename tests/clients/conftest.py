@@ -55,7 +55,7 @@ STATUSES = {
 
 @dataclass
 class CannedService:
-    """What a photo's bytes begin with decides what becomes of it.
+    """What a photo's bytes begin with decides what becomes of it; features give ``POSE``.
 
     ``refuse``: not localized; ``broken``, ``huge``, ``crash``: errors; ``busy``: overloaded twice;
     ``slow``: waits; ``gone``, ``weights``, ``preset``: errors of all photos; JSON: the pose to
@@ -67,9 +67,14 @@ class CannedService:
     is_ready: bool = True
     slow_s: float = 0.3
     busy: Counter[bytes] = field(default_factory=Counter)
+    local_features: str = "xfeat"
+    global_features: tuple[str, ...] = ("densevlad", "localvlad")
 
-    def localize(self, image: bytes, asked: dict[str, Any]) -> dict[str, Any]:
-        self.seen.append({"image": image, **asked})
+    def localize(
+        self, image: bytes, asked: dict[str, Any], features: dict[str, Any] | None = None
+    ) -> dict[str, Any]:
+        self.seen.append({"image": image} if features is None else {"features": features})
+        self.seen[-1] |= asked
         self.map_info(asked["map"])
         match image.partition(b" ")[0]:
             case b"broken":
@@ -132,8 +137,8 @@ class CannedService:
             "created": "2026-01-02T03:04:05Z",
             "metric": True,
             "method": "rgbd",
-            "local_features": "xfeat",
-            "global_features": ["densevlad", "localvlad"],
+            "local_features": self.local_features,
+            "global_features": list(self.global_features),
             "images": 300,
             "landmarks": 0,
             "observations": 5,
@@ -190,21 +195,25 @@ def _servers() -> Iterator[tuple[CannedService, str, str]]:
 
 
 def _http_app(canned: CannedService) -> Starlette:
-    def localize(image: bytes, asked: dict[str, Any]) -> Response:
-        return JSONResponse(canned.localize(image, asked))
+    def localize(image: bytes, *rest: Any) -> Response:
+        return JSONResponse(canned.localize(image, *rest))
 
     async def post(request: Request) -> Response:
         async with request.form() as form:
-            assert set(form) <= {"image", "map", "camera", "options"}
-            image = form["image"]
-            assert not isinstance(image, str)
+            assert set(form) <= {"image", "features", "map", "camera", "options"}
+            assert ("image" in form) != ("features" in form)
+            file = form["image" if "image" in form else "features"]
+            assert not isinstance(file, str)
+            content = await file.read()
             asked = {
                 "map": form["map"],
                 "camera": json.loads(str(form["camera"])) if "camera" in form else None,
                 "options": json.loads(str(form["options"])),
                 "request_id": request.headers.get("x-request-id"),
             }
-            return await run_in_threadpool(localize, await image.read(), asked)
+            if "image" in form:
+                return await run_in_threadpool(localize, content, asked)
+            return await run_in_threadpool(localize, b"", asked, json.loads(content))
 
     async def maps(_: Request) -> Response:
         return JSONResponse({"maps": [canned.map_info("room")]})
@@ -260,9 +269,15 @@ class _Servicer(pb2_grpc.LocalizationServicer):
             "options": options,
             "request_id": request.request_id or None,
         }
+        features = None
+        if request.WhichOneof("query") == "features":
+            # protobuf writes bytes in base64, and no empty maps.
+            features = {"global_descriptors": {}} | MessageToDict(
+                request.features, preserving_proto_field_name=True
+            )
         return self._answer(
             context,
-            lambda: _without_nulls(self._canned.localize(request.image, asked)),
+            lambda: _without_nulls(self._canned.localize(request.image, asked, features)),
             pb2.LocalizeResponse(),
         )
 

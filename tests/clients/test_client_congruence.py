@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clients import AsyncClient, Client, LocalizeOptions
+from clients import AsyncClient, Client, Features, LocalizeOptions
 from visloc.errors import InvalidInput, NotFound, Overloaded, TooLarge, Unavailable, VislocError
 from visloc.geometry import Camera
 
@@ -106,6 +106,21 @@ def test_all_clients_send_the_same_request(
         ]
         * 4
     )
+
+
+def test_all_clients_send_the_same_features(http_url: str, grpc_url: str, service: Any) -> None:
+    rng = np.random.default_rng(0)
+    features = Features(
+        "kapture:r2d2",
+        rng.uniform(0, 480, (3, 2)),
+        rng.integers(0, 255, (3, 8), dtype=np.uint8),
+        {"kapture:AP-GeM": rng.normal(size=5).astype(np.float16)},
+    )
+    answers = ask_all(http_url, grpc_url, lambda c: c.localize(features, "room", CAMERA))
+
+    assert all(answer.localized for answer in answers)
+    assert [seen["features"] for seen in service.seen] == [features.as_json()] * 4
+    assert service.seen[0]["features"]["keypoints"]["shape"] == [3, 2]
 
 
 def test_what_is_not_given_is_not_sent(http_url: str, grpc_url: str, service: Any) -> None:

@@ -41,7 +41,7 @@ def test_a_full_request_becomes_the_job_that_it_says() -> None:
 
     job = LocalizeRequest.read_json(json.dumps(request(camera=CAMERA, options=options))).to_job()
 
-    assert (job.map, job.image) == ("room", b"photo")
+    assert (job.map, job.query) == ("room", b"photo")
     assert job.camera is not None
     assert job.camera.params == (525.0, 525.5, 320.0, 240.0)
     assert job.options == CoreOptions("config1", 5, 8.0, 12, 0.5, ReadAs.UPRIGHT, 9)
@@ -70,9 +70,14 @@ def test_options_may_be_text() -> None:
     ("message", "code", "field", "expected"),
     [
         ({}, "request.missing_field", "map", None),
-        ({"map": "room"}, "request.missing_field", "image", None),
-        ([], "request.invalid", None, "an object with map, image, camera, options"),
-        (request(extra=1), "request.unknown_field", "extra", "one of map, image, camera, options"),
+        ({"map": "room"}, "request.query", "image", "one of image, features"),
+        ([], "request.invalid", None, "an object with map, image, features, camera, options"),
+        (
+            request(extra=1),
+            "request.unknown_field",
+            "extra",
+            "one of map, image, features, camera, options",
+        ),
         (
             request(options={"topk": 1}),
             "request.unknown_field",

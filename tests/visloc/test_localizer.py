@@ -13,13 +13,18 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from visloc.archive import MapStore
-from visloc.errors import Conflict, InvalidInput
+from visloc.errors import Conflict, InvalidInput, TooLarge
 from visloc.evaluation import pose_error
-from visloc.features import LocalFeatureExtractor, make_local_features
+from visloc.features import (
+    LocalFeatureExtractor,
+    make_global_descriptor,
+    make_local_features,
+)
 from visloc.features.sift import SiftExtractor
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo, read_photo
 from visloc.localizer import Localizer, resolve_camera
+from visloc.query_features import MAX_KEYPOINTS
 from visloc.types import (
     Answer,
     CameraSource,
@@ -28,6 +33,7 @@ from visloc.types import (
     Localized,
     LocalizeOptions,
     NotLocalized,
+    QueryFeatures,
     ReadAs,
     Reason,
 )
@@ -381,3 +387,267 @@ def test_without_a_camera_exif_is_used_and_else_a_stated_guess() -> None:
     assert (camera.params, source) == ((1.2 * 256, 128.0, 96.0), CameraSource.GUESS)
     given = Camera("PINHOLE", 256, 192, (250.0, 251.0, 128.0, 96.0))
     assert resolve_camera(Photo(rgb, 1, 300.0), given) == (given, CameraSource.GIVEN)
+
+
+# Features instead of a photo
+
+
+@pytest.fixture(scope="module")
+def ready_made(localizer: Localizer) -> Localizer:
+    """The same map, as if its SIFT and DenseVLAD had come from elsewhere."""
+    opened = localizer.map
+    manifest = opened.manifest
+    local = manifest.local_features
+    densevlad, localvlad = manifest.global_features
+    renamed = {
+        "local_features": local.model_copy(
+            update={"fingerprint": local.fingerprint.model_copy(update={"name": "kapture:SIFT"})}
+        ),
+        "global_features": (
+            densevlad.model_copy(
+                update={
+                    "fingerprint": densevlad.fingerprint.model_copy(update={"name": "kapture:DV"})
+                }
+            ),
+            localvlad,
+        ),
+    }
+    vectors, models = opened.global_descriptors, opened.global_models
+    return Localizer(
+        replace(
+            opened,
+            manifest=manifest.model_copy(update=renamed),
+            global_descriptors={
+                "kapture:DV": vectors["densevlad"],
+                "localvlad": vectors["localvlad"],
+            },
+            global_models={"kapture:DV": {}, "localvlad": models["localvlad"]},
+        ),
+        None,
+    )
+
+
+@pytest.fixture(scope="module")
+def features(query: Query, localizer: Localizer) -> QueryFeatures:
+    """What a robot with our extractors sends."""
+    rgb = read_photo(query.image).rgb
+    local = make_local_features("sift").extract(rgb, max_keypoints=5000)
+    densevlad = make_global_descriptor("densevlad")
+    vector = densevlad.describe(rgb, local, localizer.map.global_models["densevlad"])
+    return QueryFeatures("sift", local.keypoints, local.descriptors, {"densevlad": vector})
+
+
+def as_ready_made(features: QueryFeatures) -> QueryFeatures:
+    return replace(
+        features,
+        kind="kapture:SIFT",
+        global_descriptors={"kapture:DV": features.global_descriptors["densevlad"]},
+    )
+
+
+def test_features_are_localized_as_the_photo_that_they_are_of(
+    localizer: Localizer, ready_made: Localizer, query: Query, features: QueryFeatures
+) -> None:
+    expected = localized(localizer.localize(read_photo(query.image), query.camera, OPTIONS))
+
+    found = localized(localizer.localize_features(features, query.camera, OPTIONS))
+    renamed = localized(
+        ready_made.localize_features(as_ready_made(features), query.camera, OPTIONS)
+    )
+
+    assert same_bits(found, renamed)
+    # Normalized once more, descriptors differ in their last bits.
+    assert pose_error(found.cam_from_world, expected.cam_from_world) < (1e-5, 1e-3)
+    evidence = found.evidence
+    assert evidence.num_keypoints == expected.evidence.num_keypoints
+    assert [r.name for r in evidence.retrieved] == [r.name for r in expected.evidence.retrieved]
+    assert list(evidence.retrieved[0].similarities) == ["densevlad", "localvlad"]
+    assert list(evidence.seconds) == list(expected.evidence.seconds)
+    assert (evidence.camera, evidence.camera_source) == (query.camera, CameraSource.GIVEN)
+    assert (evidence.exif_orientation, evidence.read_as) == (1, ReadAs.STORED)
+
+
+def test_a_descriptor_made_of_local_features_may_be_sent_or_left_out(
+    localizer: Localizer, query: Query, features: QueryFeatures
+) -> None:
+    opened = localizer.map
+    local = LocalFeatures(
+        features.keypoints, features.descriptors, *2 * (np.ones(len(features.keypoints)),)
+    )
+    vector = make_global_descriptor("localvlad").describe(
+        np.empty((0, 0, 3), np.uint8), local, opened.global_models["localvlad"]
+    )
+    sent = replace(
+        features, global_descriptors={**features.global_descriptors, "localvlad": vector}
+    )
+
+    left_out = localized(localizer.localize_features(features, query.camera, OPTIONS))
+    given = localized(localizer.localize_features(sent, query.camera, OPTIONS))
+
+    assert pose_error(given.cam_from_world, left_out.cam_from_world) < (1e-5, 1e-3)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.uint8, np.int8])
+def test_descriptors_of_few_bits_and_any_length_are_localized(
+    dtype: type[np.generic], localizer: Localizer, query: Query, features: QueryFeatures
+) -> None:
+    largest = features.descriptors.max()  # SIFT's are not negative
+    small = (features.descriptors * (120.0 / largest)).astype(dtype)
+    answer = localizer.localize_features(
+        replace(features, descriptors=small), query.camera, OPTIONS
+    )
+    position_m, orientation_deg = pose_error(localized(answer).cam_from_world, query.cam_from_world)
+    assert position_m < 0.004
+    assert orientation_deg < 0.1
+
+
+def test_a_photo_without_keypoints_is_an_answer(
+    localizer: Localizer, query: Query, features: QueryFeatures
+) -> None:
+    blank = QueryFeatures(
+        "sift",
+        features.keypoints[:0],
+        features.descriptors[:0],
+        {"densevlad": np.zeros_like(features.global_descriptors["densevlad"])},
+    )
+    answer = refused(localizer.localize_features(blank, query.camera, OPTIONS))
+    assert (answer.stage, answer.reason) == ("features", Reason.NO_KEYPOINTS)
+
+
+def test_features_of_another_place_are_refused(
+    localizer: Localizer, query: Query, features: QueryFeatures
+) -> None:
+    shuffled = np.random.default_rng(0).permutation(features.keypoints)
+    answer = localizer.localize_features(
+        replace(features, keypoints=shuffled), query.camera, OPTIONS
+    )
+    assert refused(answer).reason is Reason.TOO_FEW_INLIERS
+
+
+def test_a_photo_is_refused_by_a_map_of_ready_made_features(
+    ready_made: Localizer, query: Query
+) -> None:
+    with pytest.raises(InvalidInput) as caught:
+        ready_made.localize(read_photo(query.image), query.camera, OPTIONS)
+    assert (caught.value.code, caught.value.field) == ("features.required", "image")
+    assert caught.value.expected == "features of kind kapture:SIFT, with kapture:DV, localvlad"
+
+
+def test_both_kinds_of_maps_warm_up(localizer: Localizer, ready_made: Localizer) -> None:
+    localizer.warm_up()
+    ready_made.warm_up()
+
+
+def changed(rows: NDArray[np.float32], row: int, value: float) -> NDArray[np.float32]:
+    rows = rows.copy()
+    rows[row] = value
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "field", "expected"),
+    [
+        (lambda _: {"kind": "xfeat"}, "features.kind", "features.kind", "sift"),
+        (
+            lambda f: {"keypoints": f.keypoints[:, :1]},
+            *("features.keypoints", "features.keypoints", "(N, 2): x, y"),
+        ),
+        (
+            lambda f: {"keypoints": changed(f.keypoints, 7, np.nan)},
+            *("features.keypoints", "features.keypoints", "0 to 256, 0 to 192"),
+        ),
+        (
+            lambda f: {"keypoints": changed(f.keypoints, 7, 194.0)},
+            *("features.keypoints", "features.keypoints", "0 to 256, 0 to 192"),
+        ),
+        (
+            lambda f: {"keypoints": changed(f.keypoints, 7, -1.1)},
+            *("features.keypoints", "features.keypoints", "0 to 256, 0 to 192"),
+        ),
+        (
+            lambda f: {"descriptors": f.descriptors[:, :64]},
+            *("features.descriptors", "features.descriptors", None),
+        ),
+        (
+            lambda f: {"descriptors": f.descriptors[1:]},
+            *("features.descriptors", "features.descriptors", None),
+        ),
+        (
+            lambda f: {"descriptors": changed(f.descriptors, 3, np.inf)},
+            *("features.descriptors", "features.descriptors", "finite numbers"),
+        ),
+        (
+            lambda f: {"descriptors": f.descriptors.astype(np.float64) * 1e300},
+            *("features.descriptors", "features.descriptors", "finite numbers"),
+        ),
+        (
+            lambda f: {"descriptors": changed(f.descriptors, 3, 0.0)},
+            *("features.descriptors", "features.descriptors", "not all zero"),
+        ),
+        (
+            lambda _: {"global_descriptors": {}},
+            *("features.global_descriptors", "features.global_descriptors"),
+            "densevlad (must be sent), localvlad (may be sent)",
+        ),
+        (
+            lambda f: {"global_descriptors": {**f.global_descriptors, "netvlad": np.ones(9)}},
+            *("features.global_descriptors", "features.global_descriptors"),
+            "densevlad (must be sent), localvlad (may be sent)",
+        ),
+        (
+            lambda _: {"global_descriptors": {"densevlad": np.ones(3)}},
+            *("features.global_descriptors", "features.global_descriptors.densevlad", None),
+        ),
+        (
+            lambda f: {
+                "global_descriptors": {
+                    "densevlad": changed(f.global_descriptors["densevlad"], 1, np.nan)
+                }
+            },
+            *("features.global_descriptors", "features.global_descriptors.densevlad"),
+            "finite numbers",
+        ),
+    ],
+)
+def test_features_that_do_not_fit_the_map_or_the_camera_are_refused(
+    change: Callable[[QueryFeatures], dict[str, object]],
+    code: str,
+    field: str,
+    expected: str | None,
+    localizer: Localizer,
+    query: Query,
+    features: QueryFeatures,
+) -> None:
+    bad = replace(features, **change(features))  # type: ignore[arg-type]
+    with pytest.raises(InvalidInput) as caught:
+        localizer.localize_features(bad, query.camera, OPTIONS)
+    assert (caught.value.code, caught.value.field) == (code, field)
+    assert expected is None or caught.value.expected == expected
+
+
+def test_keypoints_a_hair_beyond_the_edge_are_taken(
+    localizer: Localizer, query: Query, features: QueryFeatures
+) -> None:
+    edge = features.keypoints.copy()
+    edge[:2] = [[-0.5, -1.0], [257.0, 192.5]]
+    localized(localizer.localize_features(replace(features, keypoints=edge), query.camera, OPTIONS))
+
+
+def test_more_keypoints_than_the_limit_are_refused(
+    localizer: Localizer, query: Query, features: QueryFeatures
+) -> None:
+    many = replace(features, keypoints=np.zeros((MAX_KEYPOINTS + 1, 2), np.uint8))
+    with pytest.raises(TooLarge) as caught:
+        localizer.localize_features(many, query.camera, OPTIONS)
+    assert (caught.value.code, caught.value.got) == ("features.too_many", "100001")
+
+
+def test_features_need_a_camera_and_have_no_orientation_to_be_read_in(
+    localizer: Localizer, query: Query, features: QueryFeatures
+) -> None:
+    with pytest.raises(InvalidInput) as caught:
+        localizer.localize_features(features, None, OPTIONS)
+    assert (caught.value.code, caught.value.field) == ("camera.required", "camera")
+    with pytest.raises(InvalidInput) as caught:
+        localizer.localize_features(features, query.camera, UPRIGHT)
+    assert caught.value.code == "options.read_as"

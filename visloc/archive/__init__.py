@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from visloc.archive.checks import sha256_of
 from visloc.archive.reader import Map, open_map, verify_map
-from visloc.archive.schema import FingerprintRecord, ImageRecord, Manifest
+from visloc.archive.schema import Anchor, FingerprintRecord, Geodetic, ImageRecord, Manifest
 from visloc.archive.store import MapStore
 from visloc.archive.writer import GlobalFeatures, Landmarks, MapContent, write_map
 
 __all__ = [
+    "Anchor",
     "FingerprintRecord",
+    "Geodetic",
     "GlobalFeatures",
     "ImageRecord",
     "Landmarks",

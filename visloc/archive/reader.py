@@ -40,6 +40,7 @@ class Map:
         track_lengths: (P,) uint16, mapping photos that see each landmark.
         errors_px: (P,) float32, mean reprojection error; NaN where it does not apply.
         angles_deg: (P,) float32, largest angle between viewing rays; NaN where not computed.
+        colors: (P, 3) uint8 RGB; None when the map has none.
         observation_offsets: (n + 1,) int64; rows offsets[i]:offsets[i + 1] belong to photo i.
         observation_landmarks: (M,) uint32 rows of ``landmarks``.
         observation_descriptors: (M, D) int8; times the manifest's ``descriptor_scale``.
@@ -58,6 +59,7 @@ class Map:
     track_lengths: NDArray[np.uint16]
     errors_px: NDArray[np.float32]
     angles_deg: NDArray[np.float32]
+    colors: NDArray[np.uint8] | None
     observation_offsets: NDArray[np.int64]
     observation_landmarks: NDArray[np.uint32]
     observation_descriptors: NDArray[np.int8]
@@ -97,8 +99,18 @@ def open_map(folder: Path) -> Map:
     check_files(folder, manifest)
     counts, local = manifest.counts, manifest.local_features
     n, num_landmarks, m = counts.images, counts.landmarks, counts.observations
-    names = [record.fingerprint.name for record in manifest.global_features]
-    for name in (*_ARRAYS, *(f"global/{g}{end}" for g in names for end in (".npy", ".model.npz"))):
+    files = {
+        record.fingerprint.name: f"global/{record.fingerprint.file_stem}"
+        for record in manifest.global_features
+    }
+    if len(set(files.values())) != len(manifest.global_features):
+        raise MapCorrupt(
+            "map.manifest",
+            "two global descriptors of one name",
+            field=str(folder / "manifest.json"),
+            got=", ".join(record.fingerprint.name for record in manifest.global_features),
+        )
+    for name in (*_ARRAYS, *(f + end for f in files.values() for end in (".npy", ".model.npz"))):
         if name not in manifest.files:
             raise MapCorrupt(
                 "map.file_missing", "a file that every such map has is not listed", field=name
@@ -132,6 +144,9 @@ def open_map(folder: Path) -> Map:
         track_lengths=map_array(folder, "landmark_track_length.npy", "<u2", (num_landmarks,)),
         errors_px=map_array(folder, "landmark_error_px.npy", "<f4", (num_landmarks,)),
         angles_deg=map_array(folder, "landmark_angle_deg.npy", "<f4", (num_landmarks,)),
+        colors=map_array(folder, "landmark_rgb.npy", "|u1", (num_landmarks, 3))
+        if "landmark_rgb.npy" in manifest.files
+        else None,
         observation_offsets=map_array(
             folder, "observation_offsets.npy", "<i8", (n + 1,), load=True
         ),
@@ -142,11 +157,11 @@ def open_map(folder: Path) -> Map:
         observation_keypoints=map_array(folder, "observation_keypoints.npy", "<f4", (m, 2)),
         global_descriptors={
             record.fingerprint.name: map_array(
-                folder, f"global/{record.fingerprint.name}.npy", "<f4", (n, record.dim)
+                folder, f"{files[record.fingerprint.name]}.npy", "<f4", (n, record.dim)
             )
             for record in manifest.global_features
         },
-        global_models={name: read_model(folder, f"global/{name}.model.npz") for name in names},
+        global_models={name: read_model(folder, f"{f}.model.npz") for name, f in files.items()},
     )
 
 
@@ -170,8 +185,10 @@ def verify_map(folder: Path) -> Map:
         "observation_landmarks.npy": int(opened.observation_landmarks.max()) < counts.landmarks,
         "observation_keypoints.npy": is_finite(opened.observation_keypoints),
         **{
-            f"global/{name}.npy": is_finite(rows)
-            for name, rows in opened.global_descriptors.items()
+            f"global/{record.fingerprint.file_stem}.npy": is_finite(
+                opened.global_descriptors[record.fingerprint.name]
+            )
+            for record in opened.manifest.global_features
         },
     }
     for name, good in fine.items():

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 from visloc.types import Fingerprint
 
 FORMAT = "visloc-map"
-FORMAT_MAJOR, FORMAT_MINOR = 1, 0
+FORMAT_MAJOR, FORMAT_MINOR = 1, 1
 
 ID_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -31,9 +31,11 @@ class FileEntry(_Record):
 
 
 class FingerprintRecord(_Record):
-    """``visloc.types.Fingerprint`` as JSON."""
+    """``visloc.types.Fingerprint`` as JSON; ready-made features are named ``kapture:TYPE``."""
 
-    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_.-]*$")]
+    name: Annotated[
+        str, Field(pattern=r"^([a-z0-9][a-z0-9_.-]*|kapture:[A-Za-z0-9][A-Za-z0-9_.-]{0,63})$")
+    ]
     revision: int
     parameters: dict[str, int | float | str]
     weights_sha256: Sha256 | None = None
@@ -47,6 +49,11 @@ class FingerprintRecord(_Record):
             parameters=dict(fingerprint.parameters),
             weights_sha256=fingerprint.weights_sha256,
         )
+
+    @property
+    def file_stem(self) -> str:
+        """Its name in file names, which cannot have a colon everywhere."""
+        return self.name.replace(":", "-")
 
 
 class LocalFeaturesRecord(_Record):
@@ -73,12 +80,41 @@ class Extent(_Record):
     max: Vector
 
 
+class Geodetic(_Record):
+    """A place on Earth, WGS84."""
+
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)]
+    longitude_deg: Annotated[float, Field(ge=-180, le=180)]
+    altitude_m: float
+
+
+class Anchor(_Record):
+    """What the world's position, orientation and scale rest on.
+
+    Attributes:
+        kind: ``dataset``: poses that the dataset gave; ``model``: those of an imported
+            reconstruction; ``gnss`` or ``positions``: aligned to fixes or known positions;
+            ``none``: nothing, the frame is arbitrary.
+        images: photos that it rests on.
+        rms: distance between those photos and where they were said to be, in units of the world,
+            root mean square; None where nothing was fitted.
+        geodetic: where the world's (0, 0, 0) lies, its axes pointing east, north and up; None
+            when that is unknown.
+    """
+
+    kind: Literal["dataset", "model", "gnss", "positions", "none"]
+    images: Annotated[int, Field(ge=0)]
+    rms: Annotated[float, Field(ge=0)] | None = None
+    geodetic: Geodetic | None = None
+
+
 class World(_Record):
-    """The frame of the map."""
+    """The frame of the map; maps of format 1.0 do not tell their anchor."""
 
     metric: bool
     origin: Vector
     extent: Extent
+    anchor: Anchor | None = None
 
 
 class Counts(_Record):

@@ -17,6 +17,7 @@ from visloc.archive.schema import (
     FORMAT,
     FORMAT_MAJOR,
     FORMAT_MINOR,
+    Anchor,
     FingerprintRecord,
     ImageRecord,
 )
@@ -36,6 +37,7 @@ class Landmarks:
         offsets: (n + 1,) int64, rows of the next two by photo.
         observed: (M,) uint32 rows of ``points``.
         keypoints: (M, 2) float32 pixels.
+        colors: (P, 3) uint8 RGB; None if they are not known.
     """
 
     origin: NDArray[np.float64]
@@ -46,11 +48,12 @@ class Landmarks:
     offsets: NDArray[np.int64]
     observed: NDArray[np.uint32]
     keypoints: NDArray[np.float32]
+    colors: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GlobalFeatures:
-    """One global descriptor of all mapping photos, with its model."""
+    """One global descriptor of all mapping photos, with its model: empty if it is ready-made."""
 
     fingerprint: FingerprintRecord
     descriptors: NDArray[np.float32]
@@ -79,6 +82,7 @@ class MapContent:
     descriptor_dim: int
     descriptors: Callable[[], Iterator[NDArray[np.float32]]]
     global_features: tuple[GlobalFeatures, ...]
+    anchor: Anchor | None = None
 
 
 def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, created: str) -> str:
@@ -123,10 +127,12 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
         "observation_landmarks.npy": landmarks.observed.astype("<u4", copy=False),
         "observation_keypoints.npy": landmarks.keypoints.astype("<f4", copy=False),
     }
+    if landmarks.colors is not None:
+        arrays["landmark_rgb.npy"] = landmarks.colors.astype("u1", copy=False)
     for features in content.global_features:
-        name = features.fingerprint.name
-        arrays[f"global/{name}.npy"] = features.descriptors.astype("<f4", copy=False)
-        with (folder / f"global/{name}.model.npz").open("wb") as file:
+        stem = features.fingerprint.file_stem
+        arrays[f"global/{stem}.npy"] = features.descriptors.astype("<f4", copy=False)
+        with (folder / f"global/{stem}.model.npz").open("xb") as file:
             # The savez stub takes no mapping of arrays as keywords beside allow_pickle.
             np.savez(file, **features.model)  # type: ignore[arg-type]
     for name, array in arrays.items():
@@ -149,6 +155,7 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
                 "min": (landmarks.origin + extent[0]).tolist(),
                 "max": (landmarks.origin + extent[1]).tolist(),
             },
+            **({} if content.anchor is None else {"anchor": content.anchor.model_dump()}),
         },
         "method": {"name": content.method, "settings": dict(content.settings)},
         "local_features": {

@@ -43,6 +43,10 @@ class GlobalDescriptor(Protocol):
     def fingerprint(self) -> Fingerprint:
         """Name and parameters; kept in the manifest of every map."""
 
+    @property
+    def needs_image(self) -> bool:
+        """Whether it looks at the pixels; if not, ``rgb`` may be an image without any."""
+
     def training_words(
         self, rgb: NDArray[np.uint8], local: LocalFeatures, seed: int
     ) -> NDArray[np.float32]:

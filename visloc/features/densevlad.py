@@ -47,6 +47,11 @@ class DenseVlad(VladDescriptor):
             },
         )
 
+    @property
+    def needs_image(self) -> bool:
+        """True: its words lie on a grid, not at keypoints."""
+        return True
+
     def words(
         self,
         rgb: NDArray[np.uint8],

@@ -18,9 +18,14 @@ class LocalVlad(VladDescriptor):
         """Name and parameters; the local features have a fingerprint of their own."""
         return Fingerprint("localvlad", revision=1, parameters=dict(VLAD_PARAMETERS))
 
+    @property
+    def needs_image(self) -> bool:
+        """False: the local features say it all."""
+        return False
+
     def words(
         self,
-        rgb: NDArray[np.uint8],  # noqa: ARG002 - the local features say it all
+        rgb: NDArray[np.uint8],  # noqa: ARG002 - not needed
         local: LocalFeatures,
     ) -> NDArray[np.float32]:
         """Return the local features' descriptors (N, D)."""

@@ -134,6 +134,11 @@ class VladDescriptor(ABC):
     def fingerprint(self) -> Fingerprint:
         """Name and parameters; kept in the manifest of every map."""
 
+    @property
+    @abstractmethod
+    def needs_image(self) -> bool:
+        """Whether it looks at the pixels; if not, ``rgb`` may be an image without any."""
+
     @abstractmethod
     def words(self, rgb: NDArray[np.uint8], local: LocalFeatures) -> NDArray[np.float32]:
         """Return the words (n, d) of one photo, rows of unit length; n may be 0."""

@@ -7,26 +7,14 @@ and without a header; one line in ``keypoints.txt`` says of which type and how m
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from visloc.errors import Conflict, DatasetError, InvalidInput
+from visloc.kapture.feature_layout import COLUMNS, DTYPES, SUFFIXES, FeatureKind
 from visloc.kapture.text import is_field, is_folder_name, relative_path
 from visloc.kapture.writer import VERSION_LINE, write_atomically
-
-_DTYPES: dict[str, np.dtype[Any]] = {
-    "float32": np.dtype("<f4"),
-    "float64": np.dtype("<f8"),
-    "uint8": np.dtype("u1"),
-    "int32": np.dtype("<i4"),
-}
-_COLUMNS = {
-    "keypoints": "name, dtype, dsize",
-    "descriptors": "name, dtype, dsize, keypoints_type, metric_type",
-    "global_features": "name, dtype, dsize, metric_type",
-}
 
 
 def write_local_features(
@@ -62,17 +50,8 @@ def write_local_features(
             expected="(N, 2 or more) keypoints and as many descriptors",
             got=f"{keypoints.shape} and {descriptors.shape}",
         )
-    _write("keypoints", ".kpt", root, feature_type, image_path, keypoints, name, ())
-    _write(
-        "descriptors",
-        ".desc",
-        root,
-        feature_type,
-        image_path,
-        descriptors,
-        name,
-        (feature_type, "L2"),
-    )
+    _write("keypoints", root, feature_type, image_path, keypoints, name, ())
+    _write("descriptors", root, feature_type, image_path, descriptors, name, (feature_type, "L2"))
 
 
 def write_global_features(
@@ -84,12 +63,11 @@ def write_global_features(
         Conflict, InvalidInput, DatasetError: as ``write_local_features``.
     """
     rows = vector[np.newaxis]
-    _write("global_features", ".gfeat", root, feature_type, image_path, rows, name, ("L2",))
+    _write("global_features", root, feature_type, image_path, rows, name, ("L2",))
 
 
 def _write(
-    kind: str,
-    suffix: str,
+    kind: FeatureKind,
     root: Path,
     feature_type: str,
     image_path: str,
@@ -116,26 +94,26 @@ def _write(
             got=image_path,
         ) from None
     dtype_name = rows.dtype.newbyteorder("=").name
-    if rows.ndim != 2 or rows.shape[1] == 0 or dtype_name not in _DTYPES:
+    if rows.ndim != 2 or rows.shape[1] == 0 or dtype_name not in DTYPES:
         raise InvalidInput(
             "kapture.features",
             "kapture cannot hold these features",
             field=kind,
-            expected=f"(N, D) numbers of {', '.join(_DTYPES)}",
+            expected=f"(N, D) numbers of {', '.join(DTYPES)}",
             got=f"{rows.shape} {rows.dtype}",
         )
     folder = root / "reconstruction" / kind / feature_type
     fields = (name, dtype_name, str(rows.shape[1]), *last_fields)
-    _declare(folder / f"{kind}.txt", fields)
-    path = folder / f"{relative}{suffix}"
+    _declare(folder / f"{kind}.txt", COLUMNS[kind], fields)
+    path = folder / f"{relative}{SUFFIXES[kind]}"
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, np.ascontiguousarray(rows, dtype=_DTYPES[dtype_name]).tobytes())
+    write_atomically(path, np.ascontiguousarray(rows, dtype=DTYPES[dtype_name]).tobytes())
 
 
-def _declare(path: Path, fields: tuple[str, ...]) -> None:
+def _declare(path: Path, columns: tuple[str, ...], fields: tuple[str, ...]) -> None:
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
-        text = f"{VERSION_LINE}\n# {_COLUMNS[path.stem]}\n{', '.join(fields)}\n"
+        text = f"{VERSION_LINE}\n# {', '.join(columns)}\n{', '.join(fields)}\n"
         write_atomically(path, text.encode("utf-8"))
         return
     lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()

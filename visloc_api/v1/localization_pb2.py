@@ -24,13 +24,15 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n visloc_api/v1/localization.proto\x12\tvisloc.v1\"F\n\x06\x43\x61mera\x12\r\n\x05model\x18\x01 \x01(\t\x12\r\n\x05width\x18\x02 \x01(\r\x12\x0e\n\x06height\x18\x03 \x01(\r\x12\x0e\n\x06params\x18\x04 \x03(\x01\"\x97\x02\n\x0fLocalizeOptions\x12\x13\n\x06preset\x18\x01 \x01(\tH\x00\x88\x01\x01\x12\x12\n\x05top_k\x18\x02 \x01(\rH\x01\x88\x01\x01\x12\x19\n\x0cmax_error_px\x18\x03 \x01(\x01H\x02\x88\x01\x01\x12\x18\n\x0bmin_inliers\x18\x04 \x01(\rH\x03\x88\x01\x01\x12\x1d\n\x10min_inlier_ratio\x18\x05 \x01(\x01H\x04\x88\x01\x01\x12\x14\n\x07read_as\x18\x06 \x01(\tH\x05\x88\x01\x01\x12\x11\n\x04seed\x18\x07 \x01(\rH\x06\x88\x01\x01\x42\t\n\x07_presetB\x08\n\x06_top_kB\x0f\n\r_max_error_pxB\x0e\n\x0c_min_inliersB\x13\n\x11_min_inlier_ratioB\n\n\x08_read_asB\x07\n\x05_seed\"\x91\x01\n\x0fLocalizeRequest\x12\x0b\n\x03map\x18\x01 \x01(\t\x12\r\n\x05image\x18\x02 \x01(\x0c\x12!\n\x06\x63\x61mera\x18\x03 \x01(\x0b\x32\x11.visloc.v1.Camera\x12+\n\x07options\x18\x04 \x01(\x0b\x32\x1a.visloc.v1.LocalizeOptions\x12\x12\n\nrequest_id\x18\x05 \x01(\t\"7\n\tTransform\x12\x15\n\rrotation_wxyz\x18\x01 \x03(\x01\x12\x13\n\x0btranslation\x18\x02 \x03(\x01\"\xaa\x01\n\x0cPoseEstimate\x12,\n\x0e\x63\x61m_from_world\x18\x01 \x01(\x0b\x32\x14.visloc.v1.Transform\x12\x10\n\x08position\x18\x02 \x03(\x01\x12\x13\n\x0borientation\x18\x03 \x03(\x01\x12\x12\n\ncovariance\x18\x04 \x03(\x01\x12\x14\n\x0cposition_std\x18\x05 \x03(\x01\x12\x1b\n\x13orientation_std_deg\x18\x06 \x03(\x01\"9\n\x07Refusal\x12\r\n\x05stage\x18\x01 \x01(\t\x12\x0e\n\x06reason\x18\x02 \x01(\t\x12\x0f\n\x07message\x18\x03 \x01(\t\"\xa6\x01\n\x0eRetrievedImage\x12\r\n\x05image\x18\x01 \x01(\t\x12\r\n\x05score\x18\x02 \x01(\x01\x12\x41\n\x0csimilarities\x18\x03 \x03(\x0b\x32+.visloc.v1.RetrievedImage.SimilaritiesEntry\x1a\x33\n\x11SimilaritiesEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\"Z\n\nCameraUsed\x12\r\n\x05model\x18\x01 \x01(\t\x12\r\n\x05width\x18\x02 \x01(\r\x12\x0e\n\x06height\x18\x03 \x01(\r\x12\x0e\n\x06params\x18\x04 \x03(\x01\x12\x0e\n\x06source\x18\x05 \x01(\t\",\n\x0bOrientation\x12\x0c\n\x04\x65xif\x18\x01 \x01(\r\x12\x0f\n\x07read_as\x18\x02 \x01(\t\"%\n\x06MapRef\x12\n\n\x02id\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\t\"\x81\x04\n\x10LocalizeResponse\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\x0e\n\x06status\x18\x02 \x01(\t\x12*\n\x04pose\x18\x03 \x01(\x0b\x32\x17.visloc.v1.PoseEstimateH\x00\x88\x01\x01\x12(\n\x07refusal\x18\x04 \x01(\x0b\x32\x12.visloc.v1.RefusalH\x01\x88\x01\x01\x12\x11\n\tkeypoints\x18\x05 \x01(\r\x12\x17\n\x0f\x63orrespondences\x18\x06 \x01(\r\x12\x0f\n\x07inliers\x18\x07 \x01(\r\x12\x14\n\x0cinlier_ratio\x18\x08 \x01(\x01\x12,\n\tretrieved\x18\t \x03(\x0b\x32\x19.visloc.v1.RetrievedImage\x12%\n\x06\x63\x61mera\x18\n \x01(\x0b\x32\x15.visloc.v1.CameraUsed\x12+\n\x0borientation\x18\x0b \x01(\x0b\x32\x16.visloc.v1.Orientation\x12\x1e\n\x03map\x18\x0c \x01(\x0b\x32\x11.visloc.v1.MapRef\x12\x39\n\x07seconds\x18\r \x03(\x0b\x32(.visloc.v1.LocalizeResponse.SecondsEntry\x1a.\n\x0cSecondsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\x42\x07\n\x05_poseB\n\n\x08_refusal\"\x11\n\x0fListMapsRequest\"4\n\x10ListMapsResponse\x12 \n\x04maps\x18\x01 \x03(\x0b\x32\x12.visloc.v1.MapInfo\"\x1c\n\rGetMapRequest\x12\x0b\n\x03map\x18\x01 \x01(\t\"\"\n\x06\x45xtent\x12\x0b\n\x03min\x18\x01 \x03(\x01\x12\x0b\n\x03max\x18\x02 \x03(\x01\"\xf8\x01\n\x07MapInfo\x12\n\n\x02id\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\t\x12\x0f\n\x07\x63reated\x18\x03 \x01(\t\x12\x0e\n\x06metric\x18\x04 \x01(\x08\x12\x0e\n\x06method\x18\x05 \x01(\t\x12\x16\n\x0elocal_features\x18\x06 \x01(\t\x12\x17\n\x0fglobal_features\x18\x07 \x03(\t\x12\x0e\n\x06images\x18\x08 \x01(\r\x12\x11\n\tlandmarks\x18\t \x01(\r\x12\x14\n\x0cobservations\x18\n \x01(\r\x12!\n\x06\x65xtent\x18\x0b \x01(\x0b\x32\x11.visloc.v1.Extent\x12\x12\n\nsize_bytes\x18\x0c \x01(\x04\x32\xd0\x01\n\x0cLocalization\x12\x43\n\x08Localize\x12\x1a.visloc.v1.LocalizeRequest\x1a\x1b.visloc.v1.LocalizeResponse\x12\x43\n\x08ListMaps\x12\x1a.visloc.v1.ListMapsRequest\x1a\x1b.visloc.v1.ListMapsResponse\x12\x36\n\x06GetMap\x12\x18.visloc.v1.GetMapRequest\x1a\x12.visloc.v1.MapInfob\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n visloc_api/v1/localization.proto\x12\tvisloc.v1\"F\n\x06\x43\x61mera\x12\r\n\x05model\x18\x01 \x01(\t\x12\r\n\x05width\x18\x02 \x01(\r\x12\x0e\n\x06height\x18\x03 \x01(\r\x12\x0e\n\x06params\x18\x04 \x03(\x01\"\x97\x02\n\x0fLocalizeOptions\x12\x13\n\x06preset\x18\x01 \x01(\tH\x00\x88\x01\x01\x12\x12\n\x05top_k\x18\x02 \x01(\rH\x01\x88\x01\x01\x12\x19\n\x0cmax_error_px\x18\x03 \x01(\x01H\x02\x88\x01\x01\x12\x18\n\x0bmin_inliers\x18\x04 \x01(\rH\x03\x88\x01\x01\x12\x1d\n\x10min_inlier_ratio\x18\x05 \x01(\x01H\x04\x88\x01\x01\x12\x14\n\x07read_as\x18\x06 \x01(\tH\x05\x88\x01\x01\x12\x11\n\x04seed\x18\x07 \x01(\rH\x06\x88\x01\x01\x42\t\n\x07_presetB\x08\n\x06_top_kB\x0f\n\r_max_error_pxB\x0e\n\x0c_min_inliersB\x13\n\x11_min_inlier_ratioB\n\n\x08_read_asB\x07\n\x05_seed\"3\n\x05\x41rray\x12\r\n\x05\x64type\x18\x01 \x01(\t\x12\r\n\x05shape\x18\x02 \x03(\r\x12\x0c\n\x04\x64\x61ta\x18\x03 \x01(\x0c\"\xf8\x01\n\x08\x46\x65\x61tures\x12\x0c\n\x04kind\x18\x01 \x01(\t\x12#\n\tkeypoints\x18\x02 \x01(\x0b\x32\x10.visloc.v1.Array\x12%\n\x0b\x64\x65scriptors\x18\x03 \x01(\x0b\x32\x10.visloc.v1.Array\x12\x46\n\x12global_descriptors\x18\x04 \x03(\x0b\x32*.visloc.v1.Features.GlobalDescriptorsEntry\x1aJ\n\x16GlobalDescriptorsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\x1f\n\x05value\x18\x02 \x01(\x0b\x32\x10.visloc.v1.Array:\x02\x38\x01\"\xc5\x01\n\x0fLocalizeRequest\x12\x0b\n\x03map\x18\x01 \x01(\t\x12\x0f\n\x05image\x18\x02 \x01(\x0cH\x00\x12\'\n\x08\x66\x65\x61tures\x18\x06 \x01(\x0b\x32\x13.visloc.v1.FeaturesH\x00\x12!\n\x06\x63\x61mera\x18\x03 \x01(\x0b\x32\x11.visloc.v1.Camera\x12+\n\x07options\x18\x04 \x01(\x0b\x32\x1a.visloc.v1.LocalizeOptions\x12\x12\n\nrequest_id\x18\x05 \x01(\tB\x07\n\x05query\"7\n\tTransform\x12\x15\n\rrotation_wxyz\x18\x01 \x03(\x01\x12\x13\n\x0btranslation\x18\x02 \x03(\x01\"\xaa\x01\n\x0cPoseEstimate\x12,\n\x0e\x63\x61m_from_world\x18\x01 \x01(\x0b\x32\x14.visloc.v1.Transform\x12\x10\n\x08position\x18\x02 \x03(\x01\x12\x13\n\x0borientation\x18\x03 \x03(\x01\x12\x12\n\ncovariance\x18\x04 \x03(\x01\x12\x14\n\x0cposition_std\x18\x05 \x03(\x01\x12\x1b\n\x13orientation_std_deg\x18\x06 \x03(\x01\"9\n\x07Refusal\x12\r\n\x05stage\x18\x01 \x01(\t\x12\x0e\n\x06reason\x18\x02 \x01(\t\x12\x0f\n\x07message\x18\x03 \x01(\t\"\xa6\x01\n\x0eRetrievedImage\x12\r\n\x05image\x18\x01 \x01(\t\x12\r\n\x05score\x18\x02 \x01(\x01\x12\x41\n\x0csimilarities\x18\x03 \x03(\x0b\x32+.visloc.v1.RetrievedImage.SimilaritiesEntry\x1a\x33\n\x11SimilaritiesEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\"Z\n\nCameraUsed\x12\r\n\x05model\x18\x01 \x01(\t\x12\r\n\x05width\x18\x02 \x01(\r\x12\x0e\n\x06height\x18\x03 \x01(\r\x12\x0e\n\x06params\x18\x04 \x03(\x01\x12\x0e\n\x06source\x18\x05 \x01(\t\",\n\x0bOrientation\x12\x0c\n\x04\x65xif\x18\x01 \x01(\r\x12\x0f\n\x07read_as\x18\x02 \x01(\t\"%\n\x06MapRef\x12\n\n\x02id\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\t\"\x81\x04\n\x10LocalizeResponse\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\x0e\n\x06status\x18\x02 \x01(\t\x12*\n\x04pose\x18\x03 \x01(\x0b\x32\x17.visloc.v1.PoseEstimateH\x00\x88\x01\x01\x12(\n\x07refusal\x18\x04 \x01(\x0b\x32\x12.visloc.v1.RefusalH\x01\x88\x01\x01\x12\x11\n\tkeypoints\x18\x05 \x01(\r\x12\x17\n\x0f\x63orrespondences\x18\x06 \x01(\r\x12\x0f\n\x07inliers\x18\x07 \x01(\r\x12\x14\n\x0cinlier_ratio\x18\x08 \x01(\x01\x12,\n\tretrieved\x18\t \x03(\x0b\x32\x19.visloc.v1.RetrievedImage\x12%\n\x06\x63\x61mera\x18\n \x01(\x0b\x32\x15.visloc.v1.CameraUsed\x12+\n\x0borientation\x18\x0b \x01(\x0b\x32\x16.visloc.v1.Orientation\x12\x1e\n\x03map\x18\x0c \x01(\x0b\x32\x11.visloc.v1.MapRef\x12\x39\n\x07seconds\x18\r \x03(\x0b\x32(.visloc.v1.LocalizeResponse.SecondsEntry\x1a.\n\x0cSecondsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\x42\x07\n\x05_poseB\n\n\x08_refusal\"\x11\n\x0fListMapsRequest\"4\n\x10ListMapsResponse\x12 \n\x04maps\x18\x01 \x03(\x0b\x32\x12.visloc.v1.MapInfo\"\x1c\n\rGetMapRequest\x12\x0b\n\x03map\x18\x01 \x01(\t\"\"\n\x06\x45xtent\x12\x0b\n\x03min\x18\x01 \x03(\x01\x12\x0b\n\x03max\x18\x02 \x03(\x01\"\xf8\x01\n\x07MapInfo\x12\n\n\x02id\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\t\x12\x0f\n\x07\x63reated\x18\x03 \x01(\t\x12\x0e\n\x06metric\x18\x04 \x01(\x08\x12\x0e\n\x06method\x18\x05 \x01(\t\x12\x16\n\x0elocal_features\x18\x06 \x01(\t\x12\x17\n\x0fglobal_features\x18\x07 \x03(\t\x12\x0e\n\x06images\x18\x08 \x01(\r\x12\x11\n\tlandmarks\x18\t \x01(\r\x12\x14\n\x0cobservations\x18\n \x01(\r\x12!\n\x06\x65xtent\x18\x0b \x01(\x0b\x32\x11.visloc.v1.Extent\x12\x12\n\nsize_bytes\x18\x0c \x01(\x04\x32\xd0\x01\n\x0cLocalization\x12\x43\n\x08Localize\x12\x1a.visloc.v1.LocalizeRequest\x1a\x1b.visloc.v1.LocalizeResponse\x12\x43\n\x08ListMaps\x12\x1a.visloc.v1.ListMapsRequest\x1a\x1b.visloc.v1.ListMapsResponse\x12\x36\n\x06GetMap\x12\x18.visloc.v1.GetMapRequest\x1a\x12.visloc.v1.MapInfob\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'visloc_api.v1.localization_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
+  _globals['_FEATURES_GLOBALDESCRIPTORSENTRY']._loaded_options = None
+  _globals['_FEATURES_GLOBALDESCRIPTORSENTRY']._serialized_options = b'8\001'
   _globals['_RETRIEVEDIMAGE_SIMILARITIESENTRY']._loaded_options = None
   _globals['_RETRIEVEDIMAGE_SIMILARITIESENTRY']._serialized_options = b'8\001'
   _globals['_LOCALIZERESPONSE_SECONDSENTRY']._loaded_options = None
@@ -39,38 +41,44 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_CAMERA']._serialized_end=117
   _globals['_LOCALIZEOPTIONS']._serialized_start=120
   _globals['_LOCALIZEOPTIONS']._serialized_end=399
-  _globals['_LOCALIZEREQUEST']._serialized_start=402
-  _globals['_LOCALIZEREQUEST']._serialized_end=547
-  _globals['_TRANSFORM']._serialized_start=549
-  _globals['_TRANSFORM']._serialized_end=604
-  _globals['_POSEESTIMATE']._serialized_start=607
-  _globals['_POSEESTIMATE']._serialized_end=777
-  _globals['_REFUSAL']._serialized_start=779
-  _globals['_REFUSAL']._serialized_end=836
-  _globals['_RETRIEVEDIMAGE']._serialized_start=839
-  _globals['_RETRIEVEDIMAGE']._serialized_end=1005
-  _globals['_RETRIEVEDIMAGE_SIMILARITIESENTRY']._serialized_start=954
-  _globals['_RETRIEVEDIMAGE_SIMILARITIESENTRY']._serialized_end=1005
-  _globals['_CAMERAUSED']._serialized_start=1007
-  _globals['_CAMERAUSED']._serialized_end=1097
-  _globals['_ORIENTATION']._serialized_start=1099
-  _globals['_ORIENTATION']._serialized_end=1143
-  _globals['_MAPREF']._serialized_start=1145
-  _globals['_MAPREF']._serialized_end=1182
-  _globals['_LOCALIZERESPONSE']._serialized_start=1185
-  _globals['_LOCALIZERESPONSE']._serialized_end=1698
-  _globals['_LOCALIZERESPONSE_SECONDSENTRY']._serialized_start=1631
-  _globals['_LOCALIZERESPONSE_SECONDSENTRY']._serialized_end=1677
-  _globals['_LISTMAPSREQUEST']._serialized_start=1700
-  _globals['_LISTMAPSREQUEST']._serialized_end=1717
-  _globals['_LISTMAPSRESPONSE']._serialized_start=1719
-  _globals['_LISTMAPSRESPONSE']._serialized_end=1771
-  _globals['_GETMAPREQUEST']._serialized_start=1773
-  _globals['_GETMAPREQUEST']._serialized_end=1801
-  _globals['_EXTENT']._serialized_start=1803
-  _globals['_EXTENT']._serialized_end=1837
-  _globals['_MAPINFO']._serialized_start=1840
-  _globals['_MAPINFO']._serialized_end=2088
-  _globals['_LOCALIZATION']._serialized_start=2091
-  _globals['_LOCALIZATION']._serialized_end=2299
+  _globals['_ARRAY']._serialized_start=401
+  _globals['_ARRAY']._serialized_end=452
+  _globals['_FEATURES']._serialized_start=455
+  _globals['_FEATURES']._serialized_end=703
+  _globals['_FEATURES_GLOBALDESCRIPTORSENTRY']._serialized_start=629
+  _globals['_FEATURES_GLOBALDESCRIPTORSENTRY']._serialized_end=703
+  _globals['_LOCALIZEREQUEST']._serialized_start=706
+  _globals['_LOCALIZEREQUEST']._serialized_end=903
+  _globals['_TRANSFORM']._serialized_start=905
+  _globals['_TRANSFORM']._serialized_end=960
+  _globals['_POSEESTIMATE']._serialized_start=963
+  _globals['_POSEESTIMATE']._serialized_end=1133
+  _globals['_REFUSAL']._serialized_start=1135
+  _globals['_REFUSAL']._serialized_end=1192
+  _globals['_RETRIEVEDIMAGE']._serialized_start=1195
+  _globals['_RETRIEVEDIMAGE']._serialized_end=1361
+  _globals['_RETRIEVEDIMAGE_SIMILARITIESENTRY']._serialized_start=1310
+  _globals['_RETRIEVEDIMAGE_SIMILARITIESENTRY']._serialized_end=1361
+  _globals['_CAMERAUSED']._serialized_start=1363
+  _globals['_CAMERAUSED']._serialized_end=1453
+  _globals['_ORIENTATION']._serialized_start=1455
+  _globals['_ORIENTATION']._serialized_end=1499
+  _globals['_MAPREF']._serialized_start=1501
+  _globals['_MAPREF']._serialized_end=1538
+  _globals['_LOCALIZERESPONSE']._serialized_start=1541
+  _globals['_LOCALIZERESPONSE']._serialized_end=2054
+  _globals['_LOCALIZERESPONSE_SECONDSENTRY']._serialized_start=1987
+  _globals['_LOCALIZERESPONSE_SECONDSENTRY']._serialized_end=2033
+  _globals['_LISTMAPSREQUEST']._serialized_start=2056
+  _globals['_LISTMAPSREQUEST']._serialized_end=2073
+  _globals['_LISTMAPSRESPONSE']._serialized_start=2075
+  _globals['_LISTMAPSRESPONSE']._serialized_end=2127
+  _globals['_GETMAPREQUEST']._serialized_start=2129
+  _globals['_GETMAPREQUEST']._serialized_end=2157
+  _globals['_EXTENT']._serialized_start=2159
+  _globals['_EXTENT']._serialized_end=2193
+  _globals['_MAPINFO']._serialized_start=2196
+  _globals['_MAPINFO']._serialized_end=2444
+  _globals['_LOCALIZATION']._serialized_start=2447
+  _globals['_LOCALIZATION']._serialized_end=2655
 # @@protoc_insertion_point(module_scope)

@@ -125,11 +125,105 @@ class LocalizeOptions(_message.Message):
 Global___LocalizeOptions: _TypeAlias = LocalizeOptions  # noqa: Y015
 
 @_typing.final
+class Array(_message.Message):
+    """Numbers in little-endian order, the last index running fastest."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    DTYPE_FIELD_NUMBER: _builtins.int
+    SHAPE_FIELD_NUMBER: _builtins.int
+    DATA_FIELD_NUMBER: _builtins.int
+    dtype: _builtins.str
+    """float32, float16, uint8 or int8"""
+    data: _builtins.bytes
+    """as many bytes as dtype and shape say"""
+    @_builtins.property
+    def shape(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]: ...
+    def __init__(
+        self,
+        *,
+        dtype: _builtins.str = ...,
+        shape: _abc.Iterable[_builtins.int] | None = ...,
+        data: _builtins.bytes = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["data", b"data", "dtype", b"dtype", "shape", b"shape"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Array: _TypeAlias = Array  # noqa: Y015
+
+@_typing.final
+class Features(_message.Message):
+    """What was found in one photo. Descriptors may have any length: the server normalizes them."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    @_typing.final
+    class GlobalDescriptorsEntry(_message.Message):
+        DESCRIPTOR: _descriptor.Descriptor
+
+        KEY_FIELD_NUMBER: _builtins.int
+        VALUE_FIELD_NUMBER: _builtins.int
+        key: _builtins.str
+        @_builtins.property
+        def value(self) -> Global___Array: ...
+        def __init__(
+            self,
+            *,
+            key: _builtins.str = ...,
+            value: Global___Array | None = ...,
+        ) -> None: ...
+        _HasFieldArgType: _TypeAlias = _typing.Literal["value", b"value"]  # noqa: Y015
+        def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+        _ClearFieldArgType: _TypeAlias = _typing.Literal["key", b"key", "value", b"value"]  # noqa: Y015
+        def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+        def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+    KIND_FIELD_NUMBER: _builtins.int
+    KEYPOINTS_FIELD_NUMBER: _builtins.int
+    DESCRIPTORS_FIELD_NUMBER: _builtins.int
+    GLOBAL_DESCRIPTORS_FIELD_NUMBER: _builtins.int
+    kind: _builtins.str
+    """the map's local_features"""
+    @_builtins.property
+    def keypoints(self) -> Global___Array:
+        """N x 2: x, y in pixels; the centre of the top-left pixel is (0.5, 0.5)"""
+
+    @_builtins.property
+    def descriptors(self) -> Global___Array:
+        """N x D"""
+
+    @_builtins.property
+    def global_descriptors(self) -> _containers.MessageMap[_builtins.str, Global___Array]:
+        """By name in the map's global_features, one row each. One that is made of local features
+        (localvlad) may be left out.
+        """
+
+    def __init__(
+        self,
+        *,
+        kind: _builtins.str = ...,
+        keypoints: Global___Array | None = ...,
+        descriptors: Global___Array | None = ...,
+        global_descriptors: _abc.Mapping[_builtins.str, Global___Array] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["descriptors", b"descriptors", "keypoints", b"keypoints"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["descriptors", b"descriptors", "global_descriptors", b"global_descriptors", "keypoints", b"keypoints", "kind", b"kind"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Features: _TypeAlias = Features  # noqa: Y015
+
+@_typing.final
 class LocalizeRequest(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
     MAP_FIELD_NUMBER: _builtins.int
     IMAGE_FIELD_NUMBER: _builtins.int
+    FEATURES_FIELD_NUMBER: _builtins.int
     CAMERA_FIELD_NUMBER: _builtins.int
     OPTIONS_FIELD_NUMBER: _builtins.int
     REQUEST_ID_FIELD_NUMBER: _builtins.int
@@ -139,6 +233,10 @@ class LocalizeRequest(_message.Message):
     """the encoded photo (JPEG, PNG, WebP, TIFF, BMP)"""
     request_id: _builtins.str
     """chosen by the caller for the logs; made by the server when empty"""
+    @_builtins.property
+    def features(self) -> Global___Features:
+        """needs a camera"""
+
     @_builtins.property
     def camera(self) -> Global___Camera:
         """left out: EXIF focal length, else a guess that the answer marks"""
@@ -150,15 +248,18 @@ class LocalizeRequest(_message.Message):
         *,
         map: _builtins.str = ...,
         image: _builtins.bytes = ...,
+        features: Global___Features | None = ...,
         camera: Global___Camera | None = ...,
         options: Global___LocalizeOptions | None = ...,
         request_id: _builtins.str = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "options", b"options"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "features", b"features", "image", b"image", "options", b"options", "query", b"query"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "image", b"image", "map", b"map", "options", b"options", "request_id", b"request_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "features", b"features", "image", b"image", "map", b"map", "options", b"options", "query", b"query", "request_id", b"request_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
+    _WhichOneofReturnType_query: _TypeAlias = _typing.Literal["image", "features"]  # noqa: Y015
+    _WhichOneofArgType_query: _TypeAlias = _typing.Literal["query", b"query"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType_query) -> _WhichOneofReturnType_query | None: ...
 
 Global___LocalizeRequest: _TypeAlias = LocalizeRequest  # noqa: Y015
 

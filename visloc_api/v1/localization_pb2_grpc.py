@@ -55,8 +55,8 @@ class LocalizationServicer:
     """Missing associated documentation comment in .proto file."""
 
     def Localize(self, request, context):
-        """Estimates the camera pose of one photo in one map. A photo that cannot be localized is an
-        answer (status "not_localized"), not an error.
+        """Estimates the camera pose of one photo in one map, from the photo or from its features. A photo
+        that cannot be localized is an answer (status "not_localized"), not an error.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -34,8 +34,8 @@ class LocalizationStub:
     @_typing.overload
     def __new__(cls, channel: _aio.Channel) -> LocalizationAsyncStub: ...
     Localize: _grpc.UnaryUnaryMultiCallable[_localization_pb2.LocalizeRequest, _localization_pb2.LocalizeResponse]
-    """Estimates the camera pose of one photo in one map. A photo that cannot be localized is an
-    answer (status "not_localized"), not an error.
+    """Estimates the camera pose of one photo in one map, from the photo or from its features. A photo
+    that cannot be localized is an answer (status "not_localized"), not an error.
     """
     ListMaps: _grpc.UnaryUnaryMultiCallable[_localization_pb2.ListMapsRequest, _localization_pb2.ListMapsResponse]
     GetMap: _grpc.UnaryUnaryMultiCallable[_localization_pb2.GetMapRequest, _localization_pb2.MapInfo]
@@ -44,8 +44,8 @@ class LocalizationStub:
 class LocalizationAsyncStub(LocalizationStub):
     def __init__(self, channel: _aio.Channel) -> None: ...
     Localize: _aio.UnaryUnaryMultiCallable[_localization_pb2.LocalizeRequest, _localization_pb2.LocalizeResponse]  # type: ignore[assignment]
-    """Estimates the camera pose of one photo in one map. A photo that cannot be localized is an
-    answer (status "not_localized"), not an error.
+    """Estimates the camera pose of one photo in one map, from the photo or from its features. A photo
+    that cannot be localized is an answer (status "not_localized"), not an error.
     """
     ListMaps: _aio.UnaryUnaryMultiCallable[_localization_pb2.ListMapsRequest, _localization_pb2.ListMapsResponse]  # type: ignore[assignment]
     GetMap: _aio.UnaryUnaryMultiCallable[_localization_pb2.GetMapRequest, _localization_pb2.MapInfo]  # type: ignore[assignment]
@@ -57,8 +57,8 @@ class LocalizationServicer(metaclass=_abc_1.ABCMeta):
         request: _localization_pb2.LocalizeRequest,
         context: _ServicerContext,
     ) -> _typing.Union[_localization_pb2.LocalizeResponse, _abc.Awaitable[_localization_pb2.LocalizeResponse]]:
-        """Estimates the camera pose of one photo in one map. A photo that cannot be localized is an
-        answer (status "not_localized"), not an error.
+        """Estimates the camera pose of one photo in one map, from the photo or from its features. A photo
+        that cannot be localized is an answer (status "not_localized"), not an error.
         """
 
     @_abc_1.abstractmethod

@@ -3,13 +3,16 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from visloc.archive import (
+    Anchor,
     FingerprintRecord,
+    Geodetic,
     GlobalFeatures,
     ImageRecord,
     Landmarks,
@@ -21,6 +24,7 @@ from visloc.archive import (
 )
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound
 from visloc.geometry import Camera, Pose
+from visloc.types import Fingerprint
 
 CREATED = "2026-01-02T03:04:05+00:00"
 
@@ -229,6 +233,143 @@ def test_numbers_that_lie_are_found_even_when_checksums_agree(tmp_path: Path) ->
     write_map(target, content, map_id="room", version="v1", created=CREATED)
     with pytest.raises(MapCorrupt, match="observation_landmarks"):
         verify_map(target)
+
+
+COLORS = np.arange(15, dtype=np.uint8).reshape(5, 3)
+ANCHOR = Anchor(
+    kind="gnss",
+    images=3,
+    rms=0.25,
+    geodetic=Geodetic(latitude_deg=45.2, longitude_deg=5.7, altitude_m=212.5),
+)
+
+
+def make_ready_made_content() -> MapContent:
+    """A map of ready-made features, with colours and an anchor; nothing sees landmark 3."""
+    content = make_content()
+    lonely = np.where(content.landmarks.observed == 3, 0, content.landmarks.observed)
+    (densevlad,) = content.global_features
+    name = "kapture:AP-GeM-LM18"
+    return replace(
+        content,
+        local_fingerprint=FingerprintRecord.of(Fingerprint("kapture:D2-Net", 1, {"dsize": 8})),
+        landmarks=replace(
+            content.landmarks,
+            colors=COLORS,
+            observed=lonely.astype(np.uint32),
+            track_lengths=np.array([2, 1, 1, 0, 1], dtype=np.uint16),
+        ),
+        global_features=(
+            GlobalFeatures(
+                FingerprintRecord(name=name, revision=1, parameters={"metric_type": "l2"}),
+                np.eye(3, 5, dtype=np.float32),
+                {},
+            ),
+            densevlad,
+        ),
+        anchor=ANCHOR,
+    )
+
+
+def write_content(folder: Path, content: MapContent) -> Path:
+    folder.mkdir(parents=True)
+    write_map(folder, content, map_id="room", version="v1", created=CREATED)
+    return folder
+
+
+def test_a_map_of_ready_made_features_with_colours_and_anchor_reads_back(tmp_path: Path) -> None:
+    folder = write_content(tmp_path / "incoming", make_ready_made_content())
+    MapStore(tmp_path / "maps").publish(folder, "room", "v1")
+    opened = MapStore(tmp_path / "maps").open("room")
+    assert opened.manifest.format_version == "1.1"
+    assert opened.manifest.world.anchor == ANCHOR
+    assert opened.manifest.local_features.fingerprint.name == "kapture:D2-Net"
+    assert opened.colors is not None
+    assert opened.colors.dtype == np.uint8
+    assert np.array_equal(opened.colors, COLORS)
+    assert opened.track_lengths.tolist() == [2, 1, 1, 0, 1]
+    assert list(opened.global_descriptors) == ["kapture:AP-GeM-LM18", "densevlad"]
+    assert np.array_equal(opened.global_descriptors["kapture:AP-GeM-LM18"], np.eye(3, 5))
+    assert opened.global_models["kapture:AP-GeM-LM18"] == {}
+    assert sorted(path.name for path in (opened.path / "global").iterdir()) == [
+        "densevlad.model.npz",
+        "densevlad.npy",
+        "kapture-AP-GeM-LM18.model.npz",
+        "kapture-AP-GeM-LM18.npy",
+    ]
+
+
+def test_a_map_without_colours_and_anchor_says_so(folder: Path) -> None:
+    opened = verify_map(folder)
+    assert opened.colors is None
+    assert opened.manifest.world.anchor is None
+    assert "anchor" not in json.loads((folder / "manifest.json").read_text())["world"]
+
+
+def test_a_map_of_format_1_0_opens(folder: Path) -> None:
+    edit_manifest(format_version="1.0")(folder)
+    assert open_map(folder).manifest.format_version == "1.0"
+
+
+@pytest.mark.parametrize(
+    "anchor",
+    [
+        {"kind": "guess", "images": 1},
+        {"kind": "gnss", "images": -1},
+        {"kind": "gnss", "images": 1, "rms": -1.0},
+        {"kind": "gnss", "images": 1, "geodetic": {"latitude_deg": 91}},
+        {
+            "kind": "gnss",
+            "images": 1,
+            "geodetic": {"latitude_deg": 91, "longitude_deg": 0, "altitude_m": 0},
+        },
+    ],
+)
+def test_an_anchor_that_cannot_be_is_refused(folder: Path, anchor: dict[str, object]) -> None:
+    world = json.loads((folder / "manifest.json").read_text())["world"]
+    edit_manifest(world={**world, "anchor": anchor})(folder)
+    with pytest.raises(MapCorrupt, match=r"world\.anchor") as caught:
+        open_map(folder)
+    assert caught.value.code == "map.manifest"
+
+
+@pytest.mark.parametrize(
+    ("damage", "code"),
+    [
+        (replace_array("landmark_rgb.npy", COLORS[:4]), "map.array"),
+        (replace_array("landmark_rgb.npy", COLORS.astype(np.float32)), "map.array"),
+        (lambda f: (f / "landmark_rgb.npy").unlink(), "map.file_missing"),
+    ],
+)
+def test_damaged_colours_are_refused(
+    tmp_path: Path, damage: Callable[[Path], None], code: str
+) -> None:
+    folder = write_content(tmp_path / "map", make_ready_made_content())
+    damage(folder)
+    with pytest.raises(MapCorrupt, match="landmark_rgb") as caught:
+        open_map(folder)
+    assert caught.value.code == code
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["kapture:", "kapture:../a", "kapture:a/b", "kapture:.a", "Kapture:a", "a:b", "SIFT", "a\n",
+     "kapture:a\n", "kapture:" + "a" * 65],
+)  # fmt: skip
+def test_names_that_are_no_features_are_refused(name: str) -> None:
+    with pytest.raises(ValueError, match="name"):
+        FingerprintRecord(name=name, revision=1, parameters={})
+
+
+def test_two_global_descriptors_of_one_file_are_refused(tmp_path: Path) -> None:
+    folder = write_content(tmp_path / "map", make_ready_made_content())
+    features = json.loads((folder / "manifest.json").read_text())["global_features"]
+    features[1]["fingerprint"]["name"] = "kapture-AP-GeM-LM18".lower()
+    features[0]["fingerprint"]["name"] = "kapture:ap-gem-lm18"
+    edit_manifest(global_features=features)(folder)
+    with pytest.raises(MapCorrupt, match="two global descriptors") as caught:
+        open_map(folder)
+    assert caught.value.code == "map.manifest"
 
 
 def test_publishing_switches_current_and_keeps_the_older_version(tmp_path: Path) -> None:

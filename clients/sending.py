@@ -1,0 +1,114 @@
+"""What is sent of a query: the photo, or its ready-made features."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from clients.features import Features
+from clients.queries import Query
+from clients.requests import read_image
+from clients.types import MapInfo
+from visloc.errors import InvalidInput
+from visloc.geometry import PixelOrigin
+from visloc.kapture import FeatureSet, open_features, open_local_features, read_local
+
+# What a map calls the features of type TYPE that a kapture dataset brought along.
+_READY_MADE = "kapture:"
+
+Reader = Callable[[Query], bytes | Features]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FeatureReader:
+    """Reads the ready-made features of a dataset's photos.
+
+    Attributes:
+        kind: what the map calls the local features.
+        keypoints: of the dataset.
+        descriptors: of these keypoints.
+        global_features: by what the map calls them.
+        origin: what the keypoints count from.
+    """
+
+    kind: str
+    keypoints: FeatureSet
+    descriptors: FeatureSet
+    global_features: dict[str, FeatureSet]
+    origin: PixelOrigin
+
+    def __call__(self, query: Query) -> Features:
+        """Read the features of one photo.
+
+        Raises:
+            InvalidInput: ``camera.required`` when the dataset does not know the camera.
+            DatasetError: ``kapture.*``, with the file that is missing or wrong.
+        """
+        if query.camera is None:
+            raise InvalidInput(
+                "camera.required",
+                "features cannot be localized without the camera that they were seen with",
+                field=query.name,
+                expected="its model, size and parameters in sensors.txt",
+            )
+        size = query.camera.width, query.camera.height
+        keypoints, descriptors = read_local(
+            self.keypoints, self.descriptors, query.name, size, self.origin
+        )
+        if descriptors.dtype != np.uint8:  # of what kapture has, only these can be sent as they are
+            descriptors = descriptors.astype(np.float32, copy=False)
+        return Features(
+            self.kind,
+            keypoints,
+            descriptors,
+            {
+                name: features.read(query.name)[0].astype(np.float32)
+                for name, features in self.global_features.items()
+            },
+        )
+
+
+def choose_reader(
+    source: Path, info: MapInfo, features_dir: Path | None, origin: PixelOrigin
+) -> Reader:
+    """Return what reads of a query that which this map takes.
+
+    A map of ready-made features takes those of the same types, from the dataset or from
+    ``features_dir``; any other takes photos.
+
+    Raises:
+        InvalidInput: ``queries.no_features`` for a list of photos and a map that takes features;
+            ``queries.features_dir`` for a map that takes photos.
+        DatasetError: ``kapture.*`` when the dataset has no such features.
+    """
+    if not info.local_features.startswith(_READY_MADE):
+        if features_dir is not None:
+            raise InvalidInput(
+                "queries.features_dir",
+                f"map {info.ref} takes photos; ready-made features are of no use to it",
+                field="features_dir",
+                expected=f"a map with local features {_READY_MADE}TYPE",
+                got=info.local_features,
+            )
+        return lambda query: read_image(query.path)
+    if not source.is_dir():
+        raise InvalidInput(
+            "queries.no_features",
+            f"map {info.ref} takes features of kind {info.local_features}, and a list of photos "
+            "has none",
+            field=str(source),
+            expected="a kapture folder",
+        )
+    kind = info.local_features
+    keypoints, descriptors = open_local_features(
+        source, kind.removeprefix(_READY_MADE), features_dir
+    )
+    global_features = {
+        name: open_features(source, "global_features", name.removeprefix(_READY_MADE), features_dir)
+        for name in info.global_features
+        if name.startswith(_READY_MADE)
+    }
+    return FeatureReader(kind, keypoints, descriptors, global_features, origin)

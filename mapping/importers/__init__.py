@@ -1,0 +1,140 @@
+"""Foreign reconstructions and photos as kapture datasets, by format.
+
+A further format is one file with ``read(path, photos)`` and one line in the registry below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import cast
+
+from mapping.importers.dataset import write_imported
+from mapping.importers.model import ImportedImage, ImportedModel
+from mapping.outputs import refuse_existing
+from visloc.errors import InvalidInput
+
+__all__ = [
+    "IMPORTERS",
+    "ImportSummary",
+    "ImportedImage",
+    "ImportedModel",
+    "import_dataset",
+    "read_model",
+    "write_imported",
+]
+
+# name -> module and function (path, folder of photos or None) -> ImportedModel
+IMPORTERS: Mapping[str, tuple[str, str]] = {
+    "bundler": ("mapping.importers.bundler", "read"),
+    "colmap": ("mapping.importers.colmap", "read"),
+    "images": ("mapping.importers.images", "read"),
+    "nerfstudio": ("mapping.importers.nerfstudio", "read"),
+    "nvm": ("mapping.importers.nvm", "read"),
+    "openmvg": ("mapping.importers.openmvg", "read"),
+    "opensfm": ("mapping.importers.opensfm", "read"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ImportSummary:
+    """What an import brought.
+
+    Attributes:
+        images: photos.
+        posed: photos with a pose.
+        cameras: cameras, those of unknown intrinsics included.
+        depth_maps: depth maps.
+        gnss: GNSS fixes.
+        points: 3D points.
+        observations: keypoints that see a point.
+        keypoints_type: folder name of the keypoints; None without.
+        with_descriptors: whether every photo with keypoints has descriptors for them.
+        metric: whether a unit of the world is known to be a metre.
+        notes: what was left out or assumed, one sentence each.
+    """
+
+    images: int
+    posed: int
+    cameras: int
+    depth_maps: int
+    gnss: int
+    points: int
+    observations: int
+    keypoints_type: str | None
+    with_descriptors: bool
+    metric: bool
+    notes: tuple[str, ...]
+
+
+def read_model(name: str, path: Path, photos: Path | None = None) -> ImportedModel:
+    """Read a foreign reconstruction.
+
+    Args:
+        name: a key of ``IMPORTERS``.
+        path: the file or folder that the format consists of.
+        photos: the folder that names of photos are relative to; None takes the usual place.
+
+    Raises:
+        InvalidInput: ``import.unknown_format``, ``import.photos``.
+        DatasetError: with the file, and the line or image, that is wrong.
+    """
+    if name not in IMPORTERS:
+        raise InvalidInput(
+            "import.unknown_format",
+            "no such format",
+            field="FORMAT",
+            expected=f"one of {', '.join(IMPORTERS)}",
+            got=name,
+        )
+    if photos is not None and not photos.is_dir():
+        raise InvalidInput(
+            "import.photos",
+            "not a folder",
+            field="--photos",
+            expected="the folder that the names of photos are relative to",
+            got=str(photos),
+        )
+    module, function = IMPORTERS[name]
+    read = cast(
+        "Callable[[Path, Path | None], ImportedModel]", getattr(import_module(module), function)
+    )
+    return read(path, photos)
+
+
+def import_dataset(
+    name: str, path: Path, output: Path, photos: Path | None = None
+) -> ImportSummary:
+    """Read a foreign reconstruction and write it as a kapture 1.1 dataset.
+
+    Args:
+        name: a key of ``IMPORTERS``.
+        path: the file or folder that the format consists of.
+        output: the dataset to make; it must not exist, and does not if this fails.
+        photos: the folder that names of photos are relative to; None takes the usual place.
+
+    Raises:
+        Conflict: ``import.exists``.
+        InvalidInput, DatasetError: as ``read_model`` and ``write_imported``.
+    """
+    refuse_existing(output, "import.exists")  # before the long work
+    model = read_model(name, path, photos)
+    notes = write_imported(model, output)
+    with_keypoints = [image for image in model.images if image.keypoints is not None]
+    kinds = [sensor.kind for sensor in model.sensors.values()]
+    return ImportSummary(
+        images=len(model.images),
+        posed=sum(image.cam_from_world is not None for image in model.images),
+        cameras=kinds.count("camera"),
+        depth_maps=sum(image.depth is not None for image in model.images),
+        gnss=len(model.gnss),
+        points=len(model.points),
+        observations=len(model.observations),
+        keypoints_type=model.keypoints_type if with_keypoints else None,
+        with_descriptors=bool(with_keypoints)
+        and all(image.descriptors is not None for image in with_keypoints),
+        metric=model.metric,
+        notes=notes,
+    )

@@ -1,0 +1,433 @@
+"""COLMAP's models (text or binary, with or without rigs) and databases, read through pycolmap.
+
+COLMAP's conventions of poses, cameras and pixels are ours. Photos have no timestamps: the rank of
+the name takes their place, and photos of one rig frame share the rank of the first.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image  # noqa: F401  Pillow saves PNGs only when it was imported before pycolmap
+import pycolmap
+from numpy.typing import NDArray
+
+from mapping.importers.colmap_checks import check_model, has_model
+from mapping.importers.model import ImportedImage, ImportedModel
+from visloc.errors import DatasetError, InvalidInput, NotFound
+from visloc.geometry import CAMERA_MODELS, Camera, Pose
+from visloc.kapture import GnssRecord, Sensor
+from visloc.kapture.dataset import UNKNOWN_CAMERA
+
+_GNSS = "gnss"
+# What pycolmap raises on files that it cannot read; seen by damaging them.
+_REFUSALS = (ValueError, RuntimeError, IndexError, KeyError, MemoryError, OSError)
+_SQLITE = b"SQLite format 3\0"
+# A model's keypoints are the database's if they are this near: text models have few digits.
+_SAME_PX = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _DatabaseImage:
+    camera: int
+    frame: tuple[str, int]
+    keypoints: NDArray[np.float32] | None
+    descriptors: NDArray[Any] | None
+    fix: tuple[float, float, float] | None  # longitude, latitude in degrees, altitude in metres
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Database:
+    path: Path
+    cameras: Mapping[int, pycolmap.Camera]
+    images: Mapping[str, _DatabaseImage]
+    keypoints_type: str
+    notes: tuple[str, ...]
+
+
+def read(path: Path, photos: Path | None = None) -> ImportedModel:
+    """Read a model, a database, or a model with the database that it was made of.
+
+    Args:
+        path: a folder with a model, a folder with ``sparse/0`` or ``sparse``, or a database; a
+            folder with nothing but a ``database.db`` (or a single ``*.db``) is taken for that.
+        photos: folder that names are relative to; None takes ``images`` in or beside ``path``.
+
+    Raises:
+        NotFound: ``import.missing`` if there is neither a model nor a database.
+        DatasetError: ``import.colmap`` for a damaged file, ``camera.model`` for a camera that
+            kapture cannot hold, ``import.duplicate_image``.
+    """
+    folder = _model_folder(path)
+    places = _places(path, folder)
+    database_path = path if path.is_file() else _database_in(places)
+    if folder is None and database_path is None:
+        raise NotFound(
+            "import.missing",
+            "there is neither a COLMAP model nor a database",
+            field=str(path),
+            expected="cameras, images and points3D (.bin or .txt), there, in sparse/0 or sparse; "
+            "or a database.db",
+        )
+    if photos is None:
+        photos = next((p / "images" for p in places if (p / "images").is_dir()), None)
+    database = None if database_path is None else _read_database(database_path)
+    if folder is not None:
+        return _model(_reconstruction(folder), folder, database, photos)
+    assert database is not None
+    return _model_of_database(database, photos)
+
+
+def _model_folder(path: Path) -> Path | None:
+    candidates = (path, path / "sparse" / "0", path / "sparse")
+    return next((folder for folder in candidates if has_model(folder)), None)
+
+
+def _places(path: Path, folder: Path | None) -> list[Path]:
+    """Return where the photos and the database of a model may be; of a database, its folder."""
+    if folder is None:
+        return [path if path.is_dir() else path.parent]
+    folder = folder.absolute()
+    places = [folder, folder.parent]
+    if folder.parent.name == "sparse":
+        places.append(folder.parent.parent)
+    return places
+
+
+def _database_in(places: Iterable[Path]) -> Path | None:
+    for place in places:
+        if (place / "database.db").is_file():
+            return place / "database.db"
+        found = sorted(place.glob("*.db"))
+        if len(found) == 1:
+            return found[0]
+    return None
+
+
+def _reconstruction(folder: Path) -> pycolmap.Reconstruction:
+    check_model(folder)
+    try:
+        return pycolmap.Reconstruction(folder)
+    except _REFUSALS as error:
+        raise DatasetError(
+            "import.colmap",
+            "not a COLMAP model, or a damaged one",
+            field=str(folder),
+            expected="files that belong together",
+            got=str(error),
+        ) from error
+
+
+def _model(
+    model: pycolmap.Reconstruction,
+    folder: Path,
+    database: _Database | None,
+    photos: Path | None,
+) -> ImportedModel:
+    notes: list[str] = []
+    colmap_images = sorted(model.images.values(), key=lambda image: image.name)
+    rows = {image.image_id: row for row, image in enumerate(colmap_images)}
+    keypoints = [_points2d(image) for image in colmap_images]
+    names = [image.name for image in colmap_images]
+    from_database = database is not None and _belongs(database, names, keypoints, notes)
+    known = database.images if from_database and database is not None else {}
+    timestamps = _timestamps([(image.name, image.frame_id) for image in colmap_images])
+    with_keypoints = any(map(len, keypoints))
+    images = tuple(
+        ImportedImage(
+            name=image.name,
+            sensor=_sensor_id(image.camera_id),
+            timestamp=timestamps[image.name],
+            cam_from_world=_pose(image, folder),
+            keypoints=known[image.name].keypoints if known else (own if with_keypoints else None),
+            descriptors=known[image.name].descriptors if known else None,
+        )
+        for image, own in zip(colmap_images, keypoints, strict=True)
+    )
+    num_rigs = sum(rig.num_sensors() > 1 for rig in model.rigs.values())
+    if num_rigs:
+        notes.append(
+            f"{num_rigs} rigs of several cameras: every photo has its own pose, the rigs "
+            "themselves are left out"
+        )
+    if database is not None:
+        notes += database.notes
+    points, colors, observations = _points(model, rows)
+    users = {image.camera_id: image.name for image in colmap_images}
+    sensors = {
+        _sensor_id(key): _sensor(camera, folder, users.get(key))
+        for key, camera in sorted(model.cameras.items())
+    }
+    gnss = _gnss(known, timestamps)
+    return ImportedModel(
+        sensors=sensors | _gnss_sensors(gnss),
+        images=images,
+        photos=photos,
+        points=points,
+        colors=colors,
+        observations=observations,
+        keypoints_type=database.keypoints_type if known and database is not None else "colmap",
+        gnss=gnss,
+        notes=tuple(notes),
+    )
+
+
+def _model_of_database(database: _Database, photos: Path | None) -> ImportedModel:
+    names = sorted(database.images)
+    timestamps = _timestamps([(name, database.images[name].frame) for name in names])
+    users = {database.images[name].camera: name for name in names}
+    notes = [*database.notes, "a database has no poses: mapping build --poses estimate finds them"]
+    sensors = {}
+    guessed = []
+    for key, camera in sorted(database.cameras.items()):
+        sensor = _sensor(camera, database.path, users.get(key))
+        if not camera.has_prior_focal_length:
+            guessed.append(str(key))
+            size = (UNKNOWN_CAMERA, str(camera.width), str(camera.height))
+            sensor = Sensor(sensor.id, sensor.name, sensor.kind, size, None)
+        sensors[sensor.id] = sensor
+    if guessed:
+        notes.append(
+            f"{len(guessed)} cameras have a focal length that COLMAP guessed, and become cameras "
+            f"of unknown intrinsics: {', '.join(guessed[:3])}" + (", ..." if guessed[3:] else "")
+        )
+    gnss = _gnss(database.images, timestamps)
+    return ImportedModel(
+        sensors=sensors | _gnss_sensors(gnss),
+        images=tuple(
+            ImportedImage(
+                name=name,
+                sensor=_sensor_id(database.images[name].camera),
+                timestamp=timestamps[name],
+                cam_from_world=None,
+                keypoints=database.images[name].keypoints,
+                descriptors=database.images[name].descriptors,
+            )
+            for name in names
+        ),
+        photos=photos,
+        points=np.empty((0, 3)),
+        colors=np.empty((0, 3), np.uint8),
+        observations=np.empty((0, 3), np.int64),
+        keypoints_type=database.keypoints_type,
+        gnss=gnss,
+        notes=tuple(notes),
+    )
+
+
+def _belongs(
+    database: _Database,
+    names: list[str],
+    keypoints: list[NDArray[np.float32]],
+    notes: list[str],
+) -> bool:
+    """Tell whether a database has the model's keypoints, row by row."""
+    for name, own in zip(names, keypoints, strict=True):
+        image = database.images.get(name)
+        other = None if image is None else image.keypoints
+        if (
+            other is None
+            or len(other) != len(own)
+            or np.abs(other[:, :2] - own).max(initial=0.0) > _SAME_PX
+        ):
+            notes.append(
+                f"{database.path.name} was not used: it does not have the keypoints of {name!r} "
+                "as the model has them"
+            )
+            return False
+    if len(database.images) > len(names):
+        notes.append(
+            f"{len(database.images) - len(names)} images of {database.path.name} are not in the "
+            "model and left out"
+        )
+    return True
+
+
+def _points2d(image: pycolmap.Image) -> NDArray[np.float32]:
+    return np.array([point.xy for point in image.points2D], np.float32).reshape(-1, 2)
+
+
+def _points(
+    model: pycolmap.Reconstruction, rows: Mapping[int, int]
+) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.int64]]:
+    """Return points in the order of their ids, colours, and observations."""
+    ordered = [model.points3D[key] for key in sorted(model.points3D)]
+    observations = [
+        (index, rows[element.image_id], element.point2D_idx)
+        for index, point in enumerate(ordered)
+        for element in point.track.elements
+    ]
+    return (
+        np.array([point.xyz for point in ordered], np.float64).reshape(-1, 3),
+        np.array([point.color for point in ordered], np.uint8).reshape(-1, 3),
+        np.array(observations, np.int64).reshape(-1, 3),
+    )
+
+
+def _pose(image: pycolmap.Image, folder: Path) -> Pose | None:
+    if not image.has_pose:
+        return None
+    rigid = image.cam_from_world()
+    x, y, z, w = rigid.rotation.quat
+    try:
+        return Pose.from_quaternion((w, x, y, z), rigid.translation)
+    except InvalidInput as error:
+        raise DatasetError(
+            error.code,
+            error.message,
+            field=f"{folder}: image {image.name!r}",
+            expected=error.expected,
+            got=error.got,
+        ) from error
+
+
+def _sensor_id(camera_id: int) -> str:
+    return f"camera{camera_id}"
+
+
+def _sensor(camera: pycolmap.Camera, source: Path, image: str | None) -> Sensor:
+    where = f"{source}: camera {camera.camera_id}" + ("" if image is None else f" of {image!r}")
+    model = camera.model.name
+    if model not in CAMERA_MODELS:
+        raise DatasetError(
+            "camera.model",
+            "kapture has no such camera model; in COLMAP, undistort the images first, or estimate "
+            "with another model",
+            field=where,
+            expected=f"one of {', '.join(CAMERA_MODELS)}",
+            got=model,
+        )
+    try:
+        return Sensor.with_camera(
+            _sensor_id(camera.camera_id),
+            Camera(model, camera.width, camera.height, tuple(map(float, camera.params))),
+        )
+    except InvalidInput as error:
+        raise DatasetError(
+            error.code, error.message, field=where, expected=error.expected, got=error.got
+        ) from error
+
+
+def _timestamps(frames: Iterable[tuple[str, object]]) -> dict[str, int]:
+    """Return the rank of each image, given in order with their frames."""
+    ranks: dict[object, int] = {}
+    return {name: ranks.setdefault(frame, len(ranks)) for name, frame in frames}
+
+
+def _gnss(
+    images: Mapping[str, _DatabaseImage], timestamps: Mapping[str, int]
+) -> tuple[GnssRecord, ...]:
+    fixes: dict[int, GnssRecord] = {}
+    for name, timestamp in timestamps.items():
+        fix = images[name].fix if name in images else None
+        if fix is not None:  # of the images of one frame, the first
+            fixes.setdefault(timestamp, GnssRecord(timestamp, _GNSS, *fix, utc=0.0, dop=0.0))
+    return tuple(fixes.values())
+
+
+def _gnss_sensors(gnss: tuple[GnssRecord, ...]) -> dict[str, Sensor]:
+    return {_GNSS: Sensor(_GNSS, "", "gnss", ("EPSG:4326",), None)} if gnss else {}
+
+
+def _read_database(path: Path) -> _Database:
+    try:
+        with path.open("rb") as file:
+            is_database = file.read(len(_SQLITE)) == _SQLITE
+    except OSError as error:
+        raise DatasetError(
+            "import.unreadable", "cannot be read", field=str(path), got=error.strerror
+        ) from error
+    if not is_database:
+        raise DatasetError(
+            "import.colmap", "not a COLMAP database", field=str(path), expected="an SQLite file"
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "database.db"  # pycolmap migrates old databases in place
+        shutil.copyfile(path, copy)
+        journal = path.with_name(path.name + "-wal")  # where COLMAP's last writes may still be
+        if journal.is_file():
+            shutil.copyfile(journal, copy.with_name(copy.name + "-wal"))
+        try:
+            database = pycolmap.Database.open(copy)
+            try:
+                return _contents(path, database)
+            finally:
+                database.close()
+        except _REFUSALS as error:
+            raise DatasetError(
+                "import.colmap",
+                "not a COLMAP database, or a damaged one",
+                field=str(path),
+                got=str(error),
+            ) from error
+
+
+def _contents(path: Path, database: pycolmap.Database) -> _Database:
+    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    frames = {
+        data.id: frame.frame_id
+        for frame in database.read_all_frames()
+        for data in frame.data_ids
+        if data.sensor_id.type == pycolmap.SensorType.CAMERA
+    }
+    fixes, notes = _fixes(database)
+    images: dict[str, _DatabaseImage] = {}
+    kinds: set[str] = set()
+    for image in database.read_all_images():
+        if image.camera_id not in cameras:
+            raise DatasetError(
+                "import.colmap",
+                f"image {image.name!r} is of a camera that the database does not have",
+                field=str(path),
+                expected=f"one of {', '.join(map(str, sorted(cameras)[:10]))}",
+                got=image.camera_id,
+            )
+        key = image.image_id
+        keypoints = (
+            np.array(database.read_keypoints(key)) if database.exists_keypoints(key) else None
+        )
+        descriptors = None
+        if keypoints is not None and database.exists_descriptors(key):
+            found = database.read_descriptors(key)
+            kinds.add(found.type.name)
+            # Other types are floating point numbers in the same bytes, how is not documented.
+            if found.type == pycolmap.FeatureExtractorType.SIFT:
+                descriptors = np.array(found.data)
+        frame = ("frame", frames[key]) if key in frames else ("image", key)
+        images[image.name] = _DatabaseImage(
+            image.camera_id, frame, keypoints, descriptors, fixes.get(key)
+        )
+    others = sorted(kinds - {"SIFT"})
+    if others:
+        notes.append(f"descriptors of type {', '.join(others)} were left out: only SIFT is read")
+    kind = kinds.pop().lower() if len(kinds) == 1 else "colmap"
+    return _Database(path, cameras, images, kind, tuple(notes))
+
+
+def _fixes(
+    database: pycolmap.Database,
+) -> tuple[dict[int, tuple[float, float, float]], list[str]]:
+    """Return the priors of positions on Earth by image id."""
+    fixes: dict[int, tuple[float, float, float]] = {}
+    num_others = 0
+    for prior in database.read_all_pose_priors():
+        if prior.corr_data_id.sensor_id.type != pycolmap.SensorType.CAMERA:
+            continue
+        latitude, longitude, altitude = map(float, prior.position.ravel())
+        if (
+            prior.coordinate_system != pycolmap.PosePriorCoordinateSystem.WGS84
+            or not (abs(latitude) <= 90 and abs(longitude) <= 180)  # NaN is not
+            or not np.isfinite(altitude)
+        ):
+            num_others += 1
+        else:
+            fixes[prior.corr_data_id.id] = (longitude, latitude, altitude)
+    if not num_others:
+        return fixes, []
+    return fixes, [f"{num_others} pose priors that are not positions on Earth were left out"]

@@ -1,0 +1,313 @@
+"""An imported model as a kapture dataset: checked whole, then written whole."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Hashable, Iterable
+from pathlib import Path
+
+import numpy as np
+
+from mapping.importers.model import ImportedImage, ImportedModel
+from mapping.outputs import complete_output
+from visloc.errors import DatasetError
+from visloc.kapture import (
+    Dataset,
+    FileRecord,
+    Reconstruction,
+    write_dataset,
+    write_local_features,
+    write_reconstruction,
+)
+from visloc.kapture.features import _write as write_feature_file
+from visloc.kapture.text import is_field, is_folder_name, relative_path
+
+_NAMED = 3  # how many names an error or note lists
+
+
+def depth_sensor_id(sensor: str) -> str:
+    """Return the id of the sensor that the depth maps of a camera's photos belong to.
+
+    They have the pose of their photo.
+    """
+    return f"{sensor}_depth"
+
+
+def write_imported(model: ImportedModel, output: Path) -> tuple[str, ...]:
+    """Write a kapture 1.1 dataset: sensors, poses, records, keypoints, descriptors and points.
+
+    Photos are not copied: ``sensors/records_data`` is a symbolic link to their folder. A photo
+    without its file stays in the dataset, with a note.
+
+    Args:
+        model: the model. The depth map of a photo is of the sensor ``depth_sensor_id`` of the
+            photo's camera.
+        output: the folder to make; it must not exist, and does not if this fails.
+
+    Returns:
+        The model's notes, and those on missing photos.
+
+    Raises:
+        Conflict: ``import.exists``.
+        DatasetError: ``import.empty``, ``import.name``, ``import.duplicate_image``,
+            ``import.duplicate_record``, ``import.sensor``, ``import.features``,
+            ``import.points``, ``import.observations``; ``import.photos_missing`` if no photo has
+            its file and the model lacks descriptors, which would have to be made of photos.
+    """
+    _check_images(model)
+    _check_features(model)
+    _check_points(model)
+    notes = (*model.notes, *_check_photos(model))
+    with complete_output(output, "import.exists") as root:
+        sensors = root / "sensors"
+        sensors.mkdir(parents=True)
+        if model.photos is not None:
+            (sensors / "records_data").symlink_to(model.photos.resolve())
+        write_dataset(_dataset(model, root))
+        _write_features(model, root)
+        if len(model.points):
+            write_reconstruction(root, _reconstruction(model))
+    return notes
+
+
+def _dataset(model: ImportedModel, root: Path) -> Dataset:
+    poses = {}
+    depth_maps = []
+    for image in model.images:
+        pose = image.cam_from_world
+        if pose is not None:
+            poses[image.timestamp, image.sensor] = pose
+        if image.depth is not None:
+            depth_sensor = depth_sensor_id(image.sensor)
+            depth_maps.append(FileRecord(image.timestamp, depth_sensor, image.depth))
+            if pose is not None:
+                poses[image.timestamp, depth_sensor] = pose
+    return Dataset(
+        root=root,
+        sensors=model.sensors,
+        rigs={},
+        trajectories=poses,
+        images=_sorted(FileRecord(i.timestamp, i.sensor, i.name) for i in model.images),
+        depth_maps=_sorted(depth_maps),
+        gnss=tuple(sorted(model.gnss, key=lambda record: (record.timestamp, record.sensor_id))),
+    )
+
+
+def _sorted(records: Iterable[FileRecord]) -> tuple[FileRecord, ...]:
+    return tuple(sorted(records, key=lambda r: (r.timestamp, r.sensor_id, r.path)))
+
+
+def _write_features(model: ImportedModel, root: Path) -> None:
+    kind = model.keypoints_type
+    for image in model.images:
+        if image.keypoints is None:
+            continue
+        if image.descriptors is None:
+            write_feature_file("keypoints", root, kind, image.name, image.keypoints, kind, ())
+        else:
+            write_local_features(
+                root, kind, image.name, image.keypoints, image.descriptors, name=kind
+            )
+
+
+def _reconstruction(model: ImportedModel) -> Reconstruction:
+    observing, rows = np.unique(model.observations[:, 1], return_inverse=True)
+    observations = model.observations.copy()
+    observations[:, 1] = rows.reshape(-1)
+    return Reconstruction(
+        points=model.points,
+        colors=model.colors if len(model.colors) else None,
+        keypoints_type=model.keypoints_type if len(observations) else None,
+        images=tuple(model.images[index].name for index in observing),
+        observations=observations,
+    )
+
+
+def _check_images(model: ImportedModel) -> None:
+    if not model.images:
+        raise DatasetError("import.empty", "there are no photos in it", expected="photos")
+    for image in model.images:
+        _check_path(image.name, image.name)
+        _check_sensor(model, image, image.sensor, "camera")
+        if image.depth is not None:
+            _check_path(image.depth, image.name)
+            _check_sensor(model, image, depth_sensor_id(image.sensor), "depth")
+    _refuse_twice(
+        model.images,
+        lambda image: image.name,
+        "import.duplicate_image",
+        "two photos have the same name",
+        "every name once",
+    )
+    _refuse_twice(
+        model.images,
+        lambda image: (image.timestamp, image.sensor),
+        "import.duplicate_record",
+        "a camera has two photos of the same time",
+        "every timestamp once per camera",
+    )
+    fixes = [(record.timestamp, record.sensor_id) for record in model.gnss]
+    if len(set(fixes)) < len(fixes):
+        raise DatasetError(
+            "import.duplicate_record",
+            "a GNSS receiver has two fixes of the same time",
+            expected="every timestamp once",
+            got=next(fix for fix in fixes if fixes.count(fix) > 1),
+        )
+
+
+def _check_path(path: str, image: str) -> None:
+    try:
+        usable = relative_path(path) == path and is_field(path)
+    except ValueError:
+        usable = False
+    if not usable:
+        raise DatasetError(
+            "import.name",
+            "kapture cannot hold this name; rename the file, and in the model",
+            field=f"image {image!r}",
+            expected="a path below the folder of photos, with forward slashes, without commas, "
+            "control characters, or blanks around it",
+            got=path,
+        )
+
+
+def _check_sensor(model: ImportedModel, image: ImportedImage, sensor: str, kind: str) -> None:
+    found = model.sensors.get(sensor)
+    if found is None or found.kind != kind:
+        raise DatasetError(
+            "import.sensor",
+            f"the photo is of a {kind} sensor that the model does not have",
+            field=f"image {image.name!r}",
+            expected=f"one of {', '.join(s.id for s in model.sensors.values() if s.kind == kind)}",
+            got=sensor,
+        )
+
+
+def _refuse_twice(
+    images: Iterable[ImportedImage],
+    key_of: Callable[[ImportedImage], Hashable],
+    code: str,
+    message: str,
+    expected: str,
+) -> None:
+    seen: dict[Hashable, str] = {}
+    for image in images:
+        key = key_of(image)
+        if key in seen:
+            raise DatasetError(
+                code,
+                message,
+                field=f"image {image.name!r}",
+                expected=expected,
+                got=f"also {seen[key]!r} (timestamp {image.timestamp}, camera {image.sensor!r})",
+            )
+        seen[key] = image.name
+
+
+def _check_features(model: ImportedModel) -> None:
+    if not is_folder_name(model.keypoints_type):
+        raise DatasetError(
+            "import.features",
+            "not the name of a feature type",
+            expected="a folder name without commas",
+            got=model.keypoints_type,
+        )
+    kinds: dict[str, tuple[tuple[int, str], str]] = {}
+    for image in model.images:
+        keypoints, descriptors = image.keypoints, image.descriptors
+        if keypoints is None and descriptors is None:
+            continue
+        where = f"image {image.name!r}"
+        if keypoints is None or (descriptors is not None and len(keypoints) != len(descriptors)):
+            raise DatasetError(
+                "import.features",
+                "the numbers of keypoints and descriptors differ",
+                field=where,
+                expected="one descriptor per keypoint",
+                got=f"{0 if keypoints is None else len(keypoints)} keypoints, "
+                f"{0 if descriptors is None else len(descriptors)} descriptors",
+            )
+        if keypoints.ndim != 2 or keypoints.shape[1] < 2 or not np.isfinite(keypoints).all():
+            raise DatasetError(
+                "import.features",
+                "keypoints are not usable",
+                field=where,
+                expected="(n, 2 or more) finite numbers",
+                got=f"shape {keypoints.shape}",
+            )
+        for what, array in (("keypoints", keypoints), ("descriptors", descriptors)):
+            if array is None:
+                continue
+            kind = (array.shape[1], array.dtype.name)
+            known, first = kinds.setdefault(what, (kind, image.name))
+            if kind != known:
+                raise DatasetError(
+                    "import.features",
+                    f"{what} are not of one kind",
+                    field=where,
+                    expected=f"{known[0]} {known[1]} each, as of {first!r}",
+                    got=f"{kind[0]} {kind[1]}",
+                )
+
+
+def _check_points(model: ImportedModel) -> None:
+    points, colors, observations = model.points, model.colors, model.observations
+    if len(colors) not in (0, len(points)):
+        raise DatasetError(
+            "import.points",
+            "the numbers of points and colours differ",
+            expected=f"{len(points)} colours",
+            got=len(colors),
+        )
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise DatasetError(
+            "import.points",
+            "a point is not at a place",
+            field=f"point {bad[0]} (counted from 0)",
+            expected="finite coordinates",
+            got=points[bad[0]].tolist(),
+        )
+    counts = np.array([0 if i.keypoints is None else len(i.keypoints) for i in model.images])
+    if not len(observations):
+        return
+    point, image, keypoint = observations.T
+    outside = (point < 0) | (point >= len(points)) | (image < 0) | (image >= len(counts))
+    outside |= (keypoint < 0) | (keypoint >= counts[np.where(outside, 0, image)])
+    if outside.any():
+        row = observations[np.flatnonzero(outside)[0]].tolist()
+        name = model.images[row[1]].name if 0 <= row[1] < len(counts) else "?"
+        raise DatasetError(
+            "import.observations",
+            "a point is seen by a keypoint that does not exist",
+            field=f"image {name!r}",
+            expected=f"points up to {len(points) - 1}, images up to {len(counts) - 1}, keypoints "
+            "up to their number, counted from 0",
+            got=f"point {row[0]}, image {row[1]}, keypoint {row[2]}",
+        )
+
+
+def _check_photos(model: ImportedModel) -> list[str]:
+    """Return notes on photos without a file; refuse a model that cannot do without them."""
+    if model.photos is None:
+        missing = [image.name for image in model.images]
+    else:
+        # Path.is_file raises for names that are longer than a file's name can be.
+        folder = model.photos
+        exists = os.path.isfile
+        missing = [image.name for image in model.images if not exists(folder / image.name)]
+    if not missing:
+        return []
+    text = ", ".join(missing[:_NAMED]) + (", ..." if len(missing) > _NAMED else "")
+    has_features = all(image.descriptors is not None for image in model.images)
+    if len(missing) == len(model.images) and not has_features:
+        raise DatasetError(
+            "import.photos_missing",
+            "none of the photos is there, and there are no descriptors to use instead; name their "
+            "folder with --photos",
+            field="--photos" if model.photos is None else str(model.photos),
+            expected=f"{len(model.images)} photos: {text}",
+            got="no folder of photos" if model.photos is None else "none of them",
+        )
+    return [f"{len(missing)} of {len(model.images)} photos are missing: {text}"]

@@ -1,0 +1,289 @@
+"""A plain folder of photos: intrinsics and GPS from EXIF, no poses.
+
+The photo's rank takes the place of a timestamp: by EXIF time if every photo has one, else by path.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import ExifTags, Image
+
+from mapping.importers.model import ImportedImage, ImportedModel
+from visloc.errors import DatasetError, InvalidInput, NotFound, VislocError
+from visloc.geometry import Camera
+from visloc.images import FORMATS, ImageLimits, read_photo
+from visloc.kapture import GnssRecord, Sensor
+from visloc.kapture.dataset import UNKNOWN_CAMERA
+from visloc.kapture.text import has_control_characters
+
+_SUFFIXES = {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
+_LIMITS = ImageLimits()
+_GNSS = "gnss"
+_NAMED = 3
+# What Pillow raises on malformed EXIF beside giving none; found by fuzzing ``visloc.images``.
+_MALFORMED = (
+    *(OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, AttributeError),
+    *(EOFError, OverflowError, ZeroDivisionError, RuntimeError),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """A readable photo.
+
+    Attributes:
+        name: path relative to the folder.
+        camera: make and model; may be empty.
+        focal_length_px: from EXIF; None without.
+        width: of the stored pixels.
+        height: of the stored pixels.
+        taken: EXIF time, as text that sorts; None without.
+        fix: longitude, latitude in degrees; None without.
+        altitude_m: above sea level; None without.
+        dop: dilution of precision, 0 when unknown.
+    """
+
+    name: str
+    camera: str
+    focal_length_px: float | None
+    width: int
+    height: int
+    taken: str | None
+    fix: tuple[float, float] | None
+    altitude_m: float | None
+    dop: float
+
+
+def read(path: Path, photos: Path | None = None) -> ImportedModel:
+    """Read a folder of photos, with the folders in it.
+
+    Links that lead out of the folder, and linked folders, are not followed. A camera is what has
+    the same maker, model, focal length and size: SIMPLE_RADIAL without distortion if EXIF tells
+    the focal length, else of unknown intrinsics. Files that are no readable photos are left out,
+    with a note.
+
+    Args:
+        path: the folder.
+        photos: must be None: the folder is that of the photos.
+
+    Raises:
+        InvalidInput: ``import.photos`` if ``photos`` is given.
+        NotFound: ``import.missing`` if there is no such folder.
+        DatasetError: ``import.empty`` if it holds no readable photo.
+    """
+    if photos is not None:
+        raise InvalidInput(
+            "import.photos",
+            "a folder of photos has no other one beside it",
+            field="--photos",
+            expected="only PATH",
+            got=str(photos),
+        )
+    if not path.is_dir():
+        raise NotFound(
+            "import.missing", "no such folder", field=str(path), expected="a folder of photos"
+        )
+    found: list[_Found] = []
+    unreadable: list[str] = []
+    for name in sorted(_photo_names(path)):
+        try:
+            found.append(_read_photo(path, name))
+        except VislocError as error:
+            unreadable.append(str(error))
+    if not found:
+        raise DatasetError(
+            "import.empty",
+            "the folder holds no readable photo" + "".join(f"; {text}" for text in unreadable[:1]),
+            field=str(path),
+            expected=f"photos of {FORMATS}",
+        )
+    notes = []
+    if unreadable:
+        notes.append(
+            f"{len(unreadable)} files cannot be read and were left out: "
+            + "; ".join(unreadable[:_NAMED])
+            + ("; ..." if len(unreadable) > _NAMED else "")
+        )
+    dated = [photo for photo in found if photo.taken is not None]
+    if len(dated) == len(found):
+        found.sort(key=lambda photo: (photo.taken or "", photo.name))
+    elif dated:
+        notes.append(
+            f"{len(found) - len(dated)} photos have no EXIF time: the order is that of the names"
+        )
+    cameras = _cameras(found)
+    gnss = _gnss(found, notes)
+    sensors = {sensor.id: sensor for sensor in cameras.values()}
+    if gnss:
+        sensors[_GNSS] = Sensor(_GNSS, "EXIF", "gnss", ("EPSG:4326",), None)
+    unknown = sum(photo.focal_length_px is None for photo in found)
+    if unknown:
+        notes.append(f"{unknown} of {len(found)} photos do not tell their focal length")
+    return ImportedModel(
+        sensors=sensors,
+        images=tuple(
+            ImportedImage(photo.name, cameras[_camera_key(photo)].id, rank, None)
+            for rank, photo in enumerate(found)
+        ),
+        photos=path,
+        points=np.empty((0, 3)),
+        colors=np.empty((0, 3), np.uint8),
+        observations=np.empty((0, 3), np.int64),
+        gnss=gnss,
+        notes=tuple(notes),
+    )
+
+
+def _photo_names(folder: Path) -> Iterator[str]:
+    inside = Path(os.path.realpath(folder))  # unlike Path.resolve, silent on links in a circle
+    for where, _, files in os.walk(folder, followlinks=False):
+        for file in files:
+            path = Path(where) / file
+            if path.suffix.lower() not in _SUFFIXES:
+                continue
+            if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(inside):
+                continue
+            if path.exists() and not path.is_file():  # reading from a pipe would wait for ever
+                continue
+            yield path.relative_to(folder).as_posix()
+
+
+def _read_photo(folder: Path, name: str) -> _Found:
+    path = folder / name
+    try:
+        with path.open("rb") as file:
+            data = file.read(_LIMITS.max_bytes + 1)
+        photo = read_photo(data, _LIMITS)  # decodes, as a build will
+    except OSError as error:
+        raise InvalidInput(
+            "image.unreadable", "cannot be read", field=name, got=error.strerror
+        ) from error
+    except InvalidInput as error:
+        raise InvalidInput(
+            error.code, error.message, field=name, expected=error.expected, got=error.got
+        ) from error
+    top, details, gps = _exif(data)
+    camera = " ".join(
+        _text(top.get(tag)) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)
+    ).strip()
+    taken = _text(details.get(ExifTags.Base.DateTimeOriginal)) or None
+    if taken is not None:
+        taken += "." + _text(details.get(ExifTags.Base.SubsecTimeOriginal))
+    return _Found(
+        name=name,
+        camera=camera,
+        focal_length_px=photo.focal_length_px,
+        width=photo.width,
+        height=photo.height,
+        taken=taken,
+        fix=_fix(gps),
+        altitude_m=_altitude(gps),
+        dop=max(_number(gps.get(ExifTags.GPS.GPSDOP)) or 0.0, 0.0),
+    )
+
+
+def _camera_key(photo: _Found) -> tuple[object, ...]:
+    return photo.camera, photo.focal_length_px, photo.width, photo.height
+
+
+def _cameras(found: list[_Found]) -> dict[tuple[object, ...], Sensor]:
+    cameras: dict[tuple[object, ...], Sensor] = {}
+    for photo in found:
+        key = _camera_key(photo)
+        if key in cameras:
+            continue
+        sensor_id, width, height = f"camera{len(cameras) + 1}", photo.width, photo.height
+        if photo.focal_length_px is None:
+            params = (UNKNOWN_CAMERA, str(width), str(height))
+            cameras[key] = Sensor(sensor_id, photo.camera, "camera", params, None)
+        else:
+            params_px = (photo.focal_length_px, width / 2, height / 2, 0.0)
+            camera = Camera("SIMPLE_RADIAL", width, height, params_px)
+            cameras[key] = Sensor.with_camera(sensor_id, camera, name=photo.camera)
+    return cameras
+
+
+def _gnss(found: list[_Found], notes: list[str]) -> tuple[GnssRecord, ...]:
+    fixes = []
+    num_flat = 0
+    for rank, photo in enumerate(found):
+        if photo.fix is None:
+            continue
+        num_flat += photo.altitude_m is None
+        altitude = photo.altitude_m or 0.0
+        fixes.append(GnssRecord(rank, _GNSS, *photo.fix, z=altitude, utc=0.0, dop=photo.dop))
+    if num_flat:
+        notes.append(f"{num_flat} GPS positions have no altitude: 0 was taken")
+    return tuple(fixes)
+
+
+_Tags = dict[int, object]
+
+
+def _exif(data: bytes) -> tuple[_Tags, _Tags, _Tags]:
+    """Return the tags of a photo at the top, in the Exif part and of GPS; none if broken."""
+    try:
+        # Its size is within our limits, which are below those that Pillow warns at.
+        with Image.open(io.BytesIO(data)) as image:
+            exif = Image.Image.getexif(image)  # that of PNGs would decode all pixels first
+            return (
+                dict(exif),
+                dict(exif.get_ifd(ExifTags.IFD.Exif)),
+                dict(exif.get_ifd(ExifTags.IFD.GPSInfo)),
+            )
+    except _MALFORMED:
+        return {}, {}, {}
+
+
+def _text(value: object) -> str:
+    """Return a text of EXIF as kapture can hold it; nothing for what is not a text."""
+    if not isinstance(value, str):
+        return ""
+    text = " ".join(value.replace("\0", " ").replace(",", " ").split())
+    return "" if has_control_characters(text) else text
+
+
+def _number(value: object) -> float | None:
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _fix(gps: _Tags) -> tuple[float, float] | None:
+    tags = ExifTags.GPS
+    longitude = _degrees(gps.get(tags.GPSLongitude), gps.get(tags.GPSLongitudeRef), "EW", 180)
+    latitude = _degrees(gps.get(tags.GPSLatitude), gps.get(tags.GPSLatitudeRef), "NS", 90)
+    if longitude is None or latitude is None or (longitude, latitude) == (0.0, 0.0):
+        return None  # 0, 0 is what receivers write before they know
+    return longitude, latitude
+
+
+def _degrees(value: object, letter: object, letters: str, limit: float) -> float | None:
+    """Return degrees of degrees, minutes, seconds and the letter of the hemisphere."""
+    if not isinstance(value, tuple) or len(value) != 3 or letter not in tuple(letters):
+        return None
+    parts = [_number(part) for part in value]
+    if any(part is None or part < 0 for part in parts):
+        return None
+    degrees, minutes, seconds = (part or 0.0 for part in parts)
+    total = degrees + minutes / 60 + seconds / 3600
+    if total > limit:
+        return None
+    return total if letter == letters[0] else -total
+
+
+def _altitude(gps: _Tags) -> float | None:
+    altitude = _number(gps.get(ExifTags.GPS.GPSAltitude))
+    if altitude is None:
+        return None
+    below = gps.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01")
+    return -altitude if below else altitude

@@ -1,0 +1,143 @@
+"""Values of a JSON file that know where they stand, so that every error can say it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+from visloc.errors import DatasetError
+
+LARGEST = 1e15  # of any number: what poses and points are made of must not overflow
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JsonValue:
+    """One value of a file.
+
+    Attributes:
+        value: what ``json`` made of it.
+        file: the file.
+        parent: the object or array that holds it; None at the top.
+        key: its key or index there.
+    """
+
+    value: Any
+    file: Path
+    parent: JsonValue | None = None
+    key: str | int = ""
+
+    @property
+    def where(self) -> str:
+        """Where it stands, such as ``sfm_data.json: views[3].value``."""
+        steps: list[str] = []
+        at = self
+        while at.parent is not None:
+            steps.append(f"[{at.key}]" if isinstance(at.key, int) else f".{at.key}")
+            at = at.parent
+        path = "".join(reversed(steps)).removeprefix(".")
+        return f"{self.file}: {path}" if path else str(self.file)
+
+    def error(self, message: str, expected: str | None = None) -> DatasetError:
+        """Make an error about this value."""
+        text = repr(self.value) if isinstance(self.value, bool | int | float | str) else None
+        kind = text or ("null" if self.value is None else type(self.value).__name__)
+        return DatasetError("import.json", message, field=self.where, expected=expected, got=kind)
+
+    def __getitem__(self, key: str) -> JsonValue:
+        """Return a field of this object.
+
+        Raises:
+            DatasetError: ``import.json`` if there is none.
+        """
+        found = self.get(key)
+        if found is None:
+            raise DatasetError("import.json", f"{key!r} is missing", field=self.where)
+        return found
+
+    def get(self, key: str) -> JsonValue | None:
+        """Return a field of this object, None without it."""
+        if not isinstance(self.value, dict):
+            raise self.error("not an object", expected="an object")
+        return JsonValue(self.value[key], self.file, self, key) if key in self.value else None
+
+    def fields(self) -> Iterator[tuple[str, JsonValue]]:
+        """Go through the fields of this object, in the file's order."""
+        if not isinstance(self.value, dict):
+            raise self.error("not an object", expected="an object")
+        return ((key, JsonValue(value, self.file, self, key)) for key, value in self.value.items())
+
+    def elements(self) -> list[JsonValue]:
+        """Return the elements of this array."""
+        if not isinstance(self.value, list):
+            raise self.error("not an array", expected="an array")
+        return [JsonValue(value, self.file, self, i) for i, value in enumerate(self.value)]
+
+    def number(self) -> float:
+        """Return this finite number."""
+        if type(self.value) in (int, float):
+            try:
+                number = float(self.value)
+            except OverflowError:
+                number = math.inf
+            if abs(number) <= LARGEST:  # NaN is not
+                return number
+        raise self.error("not a usable number", expected=f"a number within +-{LARGEST:g}")
+
+    def numbers(self, count: int) -> list[float]:
+        """Return this array of exactly ``count`` finite numbers."""
+        elements = self.elements()
+        if len(elements) != count:
+            raise self.error(f"has {len(elements)} elements", expected=f"{count} numbers")
+        return [element.number() for element in elements]
+
+    def integer(self, high: int) -> int:
+        """Return this whole number from 0 to ``high``."""
+        if type(self.value) is not int or not 0 <= self.value <= high:
+            raise self.error("not a usable number", expected=f"a whole number, 0 to {high}")
+        return self.value
+
+    def text(self) -> str:
+        """Return this text."""
+        if not isinstance(self.value, str):
+            raise self.error("not a text", expected="a text")
+        return self.value
+
+
+def read_json(path: Path) -> JsonValue:
+    """Read a JSON file. Keys that occur twice in an object and NaN are refused.
+
+    Raises:
+        DatasetError: ``import.missing``, ``import.unreadable`` or ``import.json``.
+    """
+    try:
+        value = json.loads(
+            path.read_bytes(), parse_constant=_not_finite, object_pairs_hook=_unique_keys
+        )
+    except FileNotFoundError:
+        raise DatasetError("import.missing", "this file does not exist", field=str(path)) from None
+    except OSError as error:
+        raise DatasetError(
+            "import.unreadable", "cannot be read", field=str(path), got=error.strerror
+        ) from error
+    except (ValueError, RecursionError) as error:  # of the syntax, of the text's coding, of depth
+        raise DatasetError(
+            "import.json", "not a usable JSON file", field=str(path), got=str(error)
+        ) from error
+    return JsonValue(value, path)
+
+
+def _not_finite(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} is not a number that JSON has")
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    made = dict(pairs)
+    if len(made) != len(pairs):
+        seen: set[str] = set()
+        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
+        raise ValueError(f"{twice!r} occurs twice in one object")
+    return made

@@ -1,0 +1,108 @@
+"""Names of photos in foreign files: absolute, climbing, with backslashes; and photos' sizes."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+from PIL import Image
+
+from visloc.errors import DatasetError
+from visloc.kapture.text import has_control_characters, is_field
+
+_WINDOWS_DRIVE = re.compile(r"[A-Za-z]:/")
+# What Pillow's parsers raise on malformed files beside OSError.
+_MALFORMED = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, OverflowError)
+
+
+def photo_names(
+    raw: Sequence[tuple[str, str]], base: Path, photos: Path
+) -> tuple[list[str], tuple[str, ...]]:
+    """Make the names of photos relative to their folder.
+
+    A relative name stays when there is such a photo. Else, what it means from ``base`` counts: if
+    that lies in ``photos``, the part below it is the name. An absolute name or one that climbs out
+    with ``..`` is shortened to its last part where that is not so; any other stays.
+
+    Args:
+        raw: each photo's name and where it stands.
+        base: the folder that relative names of the format count from.
+        photos: the folder of photos.
+
+    Returns:
+        The names, with forward slashes, and notes.
+
+    Raises:
+        DatasetError: ``import.photo_name`` for a name that is empty, holds a comma or control
+            characters, or is that of another photo.
+    """
+    folder = _absolute(photos)
+    names: list[str] = []
+    places: dict[str, str] = {}
+    shortened: list[str] = []
+    for text, where in raw:
+        slashed = text.replace("\\", "/")
+        is_absolute = slashed.startswith("/") or _WINDOWS_DRIVE.match(slashed) is not None
+        plain = os.path.normpath(slashed) if slashed else ""
+        leads_out = is_absolute or plain.split("/", 1)[0] == ".."
+        full = PurePosixPath(plain if is_absolute else _absolute(base, plain))
+        is_inside = full.is_relative_to(folder) and full != PurePosixPath(folder)
+        if is_inside and (leads_out or (not _is_file(photos / plain) and _is_file(Path(full)))):
+            name = full.relative_to(folder).as_posix()
+        elif leads_out:
+            name = full.name
+            shortened.append(text)
+        else:
+            name = plain
+        if name in ("", ".", "..") or not is_field(name) or has_control_characters(text):
+            raise DatasetError(
+                "import.photo_name",
+                "not a usable name of a photo",
+                field=where,
+                expected="a path of UTF-8 text without commas and control characters",
+                got=repr(text),
+            )
+        if name in places:
+            raise DatasetError(
+                "import.photo_name",
+                f"two photos have the name {name!r}; the other is at {places[name]}",
+                field=where,
+                expected="different names below the folder of photos",
+                got=text,
+            )
+        places[name] = where
+        names.append(name)
+    if not shortened:
+        return names, ()
+    return names, (
+        f"{len(shortened)} photo names lead out of the folder of photos; their last part was "
+        f"taken: {', '.join(shortened[:3])}" + (", ..." if len(shortened) > 3 else ""),
+    )
+
+
+def photo_size(path: Path) -> tuple[int, int] | None:
+    """Return (width, height) from a photo's header, None if there is no such file.
+
+    Raises:
+        DatasetError: ``import.photo`` if it is not a readable image.
+    """
+    if not _is_file(path):
+        return None
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except (*_MALFORMED, Image.DecompressionBombError) as error:
+        raise DatasetError(
+            "import.photo", "not a readable photo", field=str(path), got=str(error)
+        ) from error
+
+
+def _is_file(path: Path) -> bool:
+    return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises for names that cannot be
+
+
+def _absolute(folder: Path, name: str = "") -> str:
+    # Without following links, on which relative names in these files do not depend.
+    return os.path.abspath(folder / name)  # noqa: PTH100

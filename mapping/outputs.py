@@ -1,0 +1,53 @@
+"""Results that are complete or not there."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from visloc.errors import Conflict
+
+
+def refuse_existing(output: Path, code: str) -> None:
+    """Refuse to write where something is.
+
+    Raises:
+        Conflict: ``code``.
+    """
+    if output.exists() or output.is_symlink():
+        raise Conflict(
+            code,
+            "there is something already; name another place or remove it",
+            field=str(output),
+            expected="a path that does not exist",
+        )
+
+
+@contextmanager
+def complete_output(output: Path, code: str) -> Iterator[Path]:
+    """Give a path beside ``output``, for a file or folder that gets its name when all went well.
+
+    Raises:
+        Conflict: ``code`` if ``output`` exists, before or after the work.
+    """
+    refuse_existing(output, code)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    partial = output.with_name(f".{output.name}.{os.getpid()}.partial")
+    _remove(partial)  # of a process of the same id that was killed
+    try:
+        yield partial
+        refuse_existing(output, code)
+        partial.rename(output)
+    except BaseException:
+        _remove(partial)
+        raise
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,91 @@
+"""Worker processes: the same task for many items, in any order."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from typing import TypeVar
+
+import cv2
+import torch
+
+from visloc.errors import Unavailable
+
+T = TypeVar("T")
+
+# Each library would otherwise start as many threads as there are processors, in every worker.
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+class Workers:
+    """Does work in ``count`` processes; one means this process.
+
+    A task and its items travel to other processes: the task is a module's function or a
+    ``functools.partial`` of one, and leaves its result in the work folder.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+
+    def run(
+        self, task: Callable[[T], object], items: Sequence[T], progress: Callable[[int, int], None]
+    ) -> None:
+        """Do the task for every item; tell the progress after each.
+
+        Raises:
+            Unavailable: ``build.worker_died``.
+            Exception: what the task raised first; waiting items are dropped.
+        """
+        progress(0, len(items))
+        if self._count == 1 or len(items) <= 1:
+            for done, item in enumerate(items, 1):
+                task(item)
+                progress(done, len(items))
+            return
+        with _one_thread_each(), _pool(min(self._count, len(items))) as pool:
+            futures: list[Future[object]] = [pool.submit(task, item) for item in items]
+            try:
+                for done, future in enumerate(as_completed(futures), 1):
+                    future.result()
+                    progress(done, len(items))
+            except BrokenProcessPool as error:
+                raise Unavailable(
+                    "build.worker_died",
+                    "a worker process ended: it was killed, or there was not enough memory; "
+                    "finished work is kept, the same command resumes",
+                    field="--workers",
+                ) from error
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _pool(count: int) -> ProcessPoolExecutor:
+    # A forked child of a process that has used torch hangs.
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
+
+
+def _start_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Processes that start meanwhile use one thread in libraries that read the environment."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

@@ -1,0 +1,266 @@
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mapping.depth import DepthMatcher, photo_depth, read_depth
+from mapping.importers import import_dataset
+from mapping.importers.nerfstudio import read
+from visloc.errors import DatasetError, VislocError
+from visloc.geometry import Camera
+from visloc.kapture import read_dataset
+
+LOOKING_ALONG_MINUS_Z = np.eye(4).tolist()
+FRAME: dict[str, Any] = {"file_path": "images/0.jpg", "transform_matrix": LOOKING_ALONG_MINUS_Z}
+TOP: dict[str, Any] = {
+    **{"w": 64, "h": 48, "fl_x": 50.0, "fl_y": 51.0, "cx": 32.5, "cy": 24.0},
+    "frames": [FRAME],
+}
+
+
+def write(folder: Path, top: dict[str, Any]) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "transforms.json").write_text(json.dumps(top))
+    return folder
+
+
+def camera_of(folder: Path) -> Camera:
+    model = read(folder)
+    camera = model.sensors[model.images[0].sensor].camera
+    assert camera is not None
+    return camera
+
+
+@pytest.fixture(scope="module")
+def recorded(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The sample as a recorder of RGB-D writes it, depth maps of half size; only to be read."""
+    folder = tmp_path_factory.mktemp("recorded")
+    dataset = read_dataset(sample / "mapping")
+    matcher = DepthMatcher(dataset, None)
+    (folder / "depth").mkdir()
+    frames = []
+    for number, record in enumerate(dataset.images):
+        suffix = Path(record.path).suffix
+        target = folder / "images" / f"{number}{suffix}"
+        target.parent.mkdir(exist_ok=True)
+        target.write_bytes(dataset.path_of(record).read_bytes())
+        match = matcher.match(record)
+        assert match is not None
+        metres = read_depth(dataset.path_of(match.record), match.camera, 0.001)
+        units = np.nan_to_num(np.round(metres * 1000)).astype(np.uint16)
+        Image.fromarray(units).save(folder / "depth" / f"{number}.png")
+        pose, camera = dataset.pose(record), dataset.sensors[record.sensor_id].camera
+        assert pose is not None
+        assert camera is not None
+        world_from_cam = np.eye(4)
+        world_from_cam[:3, :3] = pose.rotation.T @ np.diag([1, -1, -1])
+        world_from_cam[:3, 3] = pose.center
+        scaled = camera.scaled(camera.width, camera.height)
+        names = {"PINHOLE": ("fl_x", "fl_y", "cx", "cy")}[scaled.model]
+        frames.append(
+            {
+                "file_path": f"./images/{number}{suffix}",
+                "depth_file_path": f"depth/{number}.png",
+                "transform_matrix": world_from_cam.tolist(),
+                **{"w": camera.width, "h": camera.height},
+                **dict(zip(names, camera.params, strict=True)),
+            }
+        )
+    write(folder, {"camera_model": "OPENCV", "frames": frames})
+    return folder
+
+
+def test_a_recording_becomes_a_dataset_with_the_true_cameras_poses_and_depth(
+    sample: Path, recorded: Path, tmp_path: Path
+) -> None:
+    summary = import_dataset("nerfstudio", recorded, tmp_path / "out")
+    assert (summary.images, summary.posed, summary.depth_maps) == (8, 8, 8)
+    assert summary.metric
+    assert summary.notes == ()
+    truth, dataset = read_dataset(sample / "mapping"), read_dataset(tmp_path / "out")
+    assert dataset.notes == ()
+    ours, theirs = DepthMatcher(dataset, None), DepthMatcher(truth, None)
+    for record, original in zip(dataset.images, truth.images, strict=True):
+        assert dataset.path_of(record).read_bytes() == truth.path_of(original).read_bytes()
+        pose, expected = dataset.pose(record), truth.pose(original)
+        camera = dataset.sensors[record.sensor_id].camera
+        assert pose is not None
+        assert expected is not None
+        assert camera is not None
+        assert camera == truth.sensors[original.sensor_id].camera
+        np.testing.assert_allclose(pose.rotation, expected.rotation, atol=1e-14)
+        np.testing.assert_allclose(pose.translation, expected.translation, atol=1e-13)
+        match, original_match = ours.match(record), theirs.match(original)
+        assert match is not None
+        assert original_match is not None
+        depth, _ = photo_depth(dataset, match, camera, 0.001)
+        expected_depth, _ = photo_depth(truth, original_match, camera, 0.001)
+        np.testing.assert_allclose(depth, expected_depth, atol=0.00051)
+
+
+def test_axes_turn_from_opengl_to_ours(tmp_path: Path) -> None:
+    # At (1, 2, 3), looking along -z with y up: our z is the world's -z, our y its -y.
+    matrix = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3]]
+    top = TOP | {"frames": [FRAME | {"transform_matrix": matrix}]}
+    (image,) = read(write(tmp_path, top)).images
+    pose = image.cam_from_world
+    assert pose is not None
+    assert pose.rotation.tolist() == [[1, 0, 0], [0, -1, 0], [0, 0, -1]]
+    assert pose.center.tolist() == [1, 2, 3]
+    assert pose.apply(np.array([1.0, 2.0, -4.0])).tolist() == [0, 0, 7]
+
+
+@pytest.mark.parametrize(
+    ("top", "model", "params"),
+    [
+        ({}, "PINHOLE", ()),
+        ({"camera_model": "PINHOLE"}, "PINHOLE", ()),
+        ({"camera_model": "SIMPLE_PINHOLE", "k1": 0, "p1": 0.0}, "PINHOLE", ()),
+        ({"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4}, "OPENCV", (0.1, 0.2, 0.3, 0.4)),
+        (
+            {"camera_model": "OPENCV", "k1": 0.1, "k3": 0.2, "k4": 0},
+            "FULL_OPENCV",
+            (0.1, 0, 0, 0, 0.2, 0, 0, 0),
+        ),
+        (
+            {"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4},
+            "OPENCV_FISHEYE",
+            (0.1, 0.2, 0.3, 0.4),
+        ),
+        ({"is_fisheye": True, "k1": 0.1}, "OPENCV_FISHEYE", (0.1, 0, 0, 0)),
+    ],
+)
+def test_intrinsics_become_the_camera_model_that_holds_them(
+    tmp_path: Path, top: dict[str, Any], model: str, params: tuple[float, ...]
+) -> None:
+    camera = camera_of(write(tmp_path, TOP | top))
+    assert camera == Camera(model, 64, 48, (50.0, 51.0, 32.5, 24.0, *params))
+
+
+def test_a_frame_s_own_intrinsics_win_and_equal_ones_share_a_sensor(tmp_path: Path) -> None:
+    frames = [
+        FRAME | {"file_path": f"{number}.jpg"} | own
+        for number, own in enumerate([{}, {"fl_x": 60.0}, {}, {"w": 64.0}])
+    ]
+    model = read(write(tmp_path, TOP | {"frames": frames}))
+    assert [image.sensor for image in model.images] == ["camera1", "camera2", "camera1", "camera1"]
+    assert [image.timestamp for image in model.images] == [0, 1, 2, 3]
+    camera = model.sensors["camera2"].camera
+    assert camera is not None
+    assert camera.params == (60, 51, 32.5, 24)
+
+
+def test_the_field_of_view_and_the_photo_s_size_are_enough(tmp_path: Path) -> None:
+    (tmp_path / "train").mkdir()
+    Image.new("RGB", (80, 60)).save(tmp_path / "train" / "r_0.png")
+    frame = FRAME | {"file_path": "./train/r_0"}
+    folder = write(tmp_path, {"camera_angle_x": math.radians(90), "frames": [frame]})
+    model = read(folder / "transforms.json")
+    assert model.images[0].name == "train/r_0.png"
+    camera = camera_of(folder)
+    assert camera.params == pytest.approx((40, 40, 40, 30))
+
+
+def test_photos_may_lie_elsewhere(tmp_path: Path) -> None:
+    Image.new("RGB", (80, 60)).save(tmp_path / "r_0.png")
+    top = {"fl_x": 40, "frames": [FRAME | {"file_path": "r_0.png"}]}
+    assert read(write(tmp_path / "json", top), tmp_path).photos == tmp_path
+
+
+def test_what_is_not_kept_is_noted(recorded: Path, tmp_path: Path) -> None:
+    top = json.loads((recorded / "transforms.json").read_text())
+    top |= {
+        "depth_unit_scale_factor": 0.0002,
+        "applied_transform": np.eye(4)[:3].tolist(),
+        "applied_scale": 0.5,
+        "ply_file_path": "points.ply",
+    }
+    top["frames"][1]["depth_file_path"] = "depth/1.npy"
+    top["frames"][2]["depth_file_path"] = "depth/gone.png"
+    model = read(write(tmp_path, top), recorded)
+    assert not model.metric
+    text = "\n".join(model.notes)
+    for part in (
+        "--depth-scale 0.0002",
+        "applied_transform",
+        "applied_scale is 0.5",
+        "ply_file_path",
+        "1 depth maps are not PNGs and left out: depth/1.npy",
+        "1 depth maps are missing: depth/gone.png",
+        "nothing says that a unit of the world is a metre",
+    ):
+        assert part in text
+    assert sum(image.depth is not None for image in model.images) == 6
+
+
+def frame_with(**changes: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
+    return lambda top: top | {"frames": [FRAME, FRAME | {"file_path": "1.jpg"} | changes]}
+
+
+def top_with(**changes: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
+    return lambda top: {k: v for k, v in (top | changes).items() if v is not None}
+
+
+SCALED = (2 * np.eye(4)).tolist()
+MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "named"),
+    [
+        (frame_with(transform_matrix=SCALED), "import.json", "frames[1].transform_matrix"),
+        (frame_with(transform_matrix=MIRRORED), "import.json", "frames[1].transform_matrix"),
+        (frame_with(transform_matrix=[]), "import.json", "frames[1].transform_matrix"),
+        (frame_with(transform_matrix=[[1, 2], [3, 4]]), "import.json", "frames[1]"),
+        (frame_with(transform_matrix=None), "import.json", "frames[1].transform_matrix"),
+        (frame_with(file_path="../1.jpg"), "import.name", "frames[1].file_path"),
+        (frame_with(file_path="/etc/passwd"), "import.name", "frames[1].file_path"),
+        (frame_with(file_path="a,b.jpg"), "import.name", "frames[1].file_path"),
+        (frame_with(file_path=7), "import.json", "frames[1].file_path"),
+        (frame_with(depth_file_path="../1.png"), "import.name", "frames[1].depth_file_path"),
+        (frame_with(fl_x=-5), "camera.param_value", "frames[1]"),
+        (frame_with(fl_x=True), "import.json", "frames[1].fl_x"),
+        (frame_with(w=0), "import.json", "frames[1].w"),
+        (frame_with(w=64.5), "import.json", "frames[1].w"),
+        (frame_with(k4=0.1), "import.json", "frames[1]"),
+        (frame_with(camera_model="EQUIRECTANGULAR"), "camera.model", "frames[1].camera_model"),
+        (frame_with(file_path="images/0.jpg"), "import.duplicate_image", "images/0.jpg"),
+        (top_with(fl_x=None), "import.json", "frames[0]"),
+        (top_with(w=None), "import.json", "frames[0]"),
+        (top_with(frames=None), "import.json", "'frames'"),
+        (top_with(frames=[]), "import.empty", ""),
+        (top_with(frames={"a": 1}), "import.json", "frames"),
+    ],
+)
+def test_what_cannot_be_used_is_named_with_its_frame(
+    tmp_path: Path,
+    change: Callable[[dict[str, Any]], dict[str, Any]],
+    code: str,
+    named: str,
+) -> None:
+    folder = write(tmp_path / "in", change(TOP))
+    with pytest.raises(VislocError) as caught:
+        import_dataset("nerfstudio", folder, tmp_path / "out")
+    assert caught.value.code == code
+    assert named in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1", '{"frames": [NaN]}', "[" * 100_000])
+def test_what_is_no_json_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "transforms.json").write_text(text)
+    with pytest.raises(DatasetError) as caught:
+        read(tmp_path)
+    assert caught.value.code == "import.json"
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"transforms\.json"):
+        read(tmp_path)

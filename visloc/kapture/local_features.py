@@ -1,0 +1,104 @@
+"""Ready-made keypoints with their descriptors, checked against each other and the image."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.errors import DatasetError
+from visloc.geometry import MAX_IMAGE_SIDE, PixelOrigin
+from visloc.kapture.feature_reader import FeatureSet
+
+
+def read_local(
+    keypoints: FeatureSet,
+    descriptors: FeatureSet,
+    image_path: str,
+    image_size: tuple[int, int] | None,
+    origin: PixelOrigin,
+) -> tuple[NDArray[np.float32], NDArray[Any]]:
+    """Read the keypoints and descriptors of one image.
+
+    Files do not say themselves what they hold, and published ones contradict their config file.
+    Numbers that cannot be pixels of the image are therefore refused.
+
+    Args:
+        keypoints: where keypoints are.
+        descriptors: where their descriptors are.
+        image_path: the image's identity, as in ``records_camera.txt``.
+        image_size: width and height; None checks only against the largest image there can be.
+        origin: what the keypoints count from.
+
+    Returns:
+        (N, 2) float32 x, y in pixels, top-left centre at (0.5, 0.5), and the descriptors (N, D)
+        in their own type. N may be 0.
+
+    Raises:
+        DatasetError: with the file: ``kapture.feature_count``, ``kapture.feature_values``,
+            ``kapture.feature_pixels``, and what ``FeatureSet.read`` raises.
+    """
+    rows, described = keypoints.read(image_path), descriptors.read(image_path)
+    if len(rows) != len(described):
+        raise DatasetError(
+            "kapture.feature_count",
+            f"{len(rows)} keypoints, but {len(described)} descriptors in "
+            f"{descriptors.label(image_path)}; one of the files is of another run, or its dtype "
+            "or dsize is not what the config file says",
+            field=keypoints.label(image_path),
+            expected="as many keypoints as descriptors",
+            got=f"{len(rows)} keypoints of {keypoints.dsize} {keypoints.dtype.name}, "
+            f"{len(described)} descriptors of {descriptors.dsize} {descriptors.dtype.name}",
+        )
+    for features, array in ((keypoints, rows), (descriptors, described)):
+        finite = np.isfinite(array).all(axis=1)
+        if not finite.all():
+            raise DatasetError(
+                "kapture.feature_values",
+                f"not finite in row {int(np.argmin(finite))}; the file is damaged, or its dtype is "
+                f"not what {features.kind}.txt says",
+                field=features.label(image_path),
+                expected=f"finite {features.dtype.name}",
+            )
+    pixels = rows[:, :2].astype(np.float64)
+    if len(pixels):
+        _check_pixels(pixels, keypoints, image_path, image_size)
+    return (pixels + origin.shift).astype(np.float32), described
+
+
+def _check_pixels(
+    pixels: NDArray[np.float64],
+    keypoints: FeatureSet,
+    image_path: str,
+    image_size: tuple[int, int] | None,
+) -> None:
+    size = np.array(image_size or (MAX_IMAGE_SIDE, MAX_IMAGE_SIDE))
+    inside = ((pixels >= -1) & (pixels <= size)).all(axis=1)
+    magnitude = np.abs(pixels)
+    # Half of a float64, or an integer, read as float32 is often far smaller than any detector
+    # places a keypoint, while single values such as 1e-8 do come from rounding.
+    tiny = ((magnitude > 0) & (magnitude < 1e-6)).any(axis=1)
+    example = int(np.argmin(inside))
+    if not inside.all():
+        what = (
+            f"keypoint {example} lies outside the image; the dtype is not what keypoints.txt "
+            "says, or the photo has another size, or these are not pixels"
+        )
+    elif 4 * np.count_nonzero(tiny) > len(pixels):
+        example = int(np.argmax(tiny))
+        what = (
+            f"keypoint {example}, like many, is next to 0; the dtype is not what keypoints.txt says"
+        )
+    elif (magnitude < 1).all():
+        what = "all keypoints are below 1: these are normalized units, not pixels"
+    else:
+        return
+    width, height = (f"{side}" for side in size)
+    raise DatasetError(
+        "kapture.feature_pixels",
+        what,
+        field=keypoints.label(image_path),
+        expected=f"pixels of a photo of {width} x {height}, as {keypoints.dtype.name}",
+        got=f"x {pixels[example, 0]:.6g}, y {pixels[example, 1]:.6g}",
+    )

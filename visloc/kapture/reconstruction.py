@@ -1,0 +1,312 @@
+"""3D points of a dataset and which keypoints see them: points3d.txt and observations.txt."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.errors import Conflict, DatasetError, InvalidInput
+from visloc.kapture.feature_reader import FeatureSet, feature_types, open_features
+from visloc.kapture.table import Table
+from visloc.kapture.text import is_field, relative_path
+from visloc.kapture.writer import VERSION_LINE, write_atomically
+
+_POINTS = "reconstruction/points3d.txt"
+_OBSERVATIONS = "reconstruction/observations.txt"
+_MAX_INDEX = 2**31
+_MAX_DIGITS = 18
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reconstruction:
+    """3D points and their observations by keypoints of one type.
+
+    Attributes:
+        points: (P, 3) float64 in the world.
+        colors: (P, 3) uint8 RGB; None without.
+        keypoints_type: folder TYPE of the keypoints; None when there are no observations.
+        images: paths of the images that observe, each once.
+        observations: (M, 3) int64 rows: row of ``points``, row of ``images``, row of that image's
+            keypoints. An image can see a point several times.
+    """
+
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8] | None
+    keypoints_type: str | None
+    images: tuple[str, ...]
+    observations: NDArray[np.int64]
+
+
+def read_reconstruction(
+    root: Path, keypoints_type: str | None = None, features_dir: Path | None = None
+) -> Reconstruction | None:
+    """Read the points of a dataset and the observations by one type of keypoints.
+
+    Args:
+        root: the dataset.
+        keypoints_type: folder TYPE of the keypoints; None takes the only one there is.
+        features_dir: where keypoints lie outside the dataset, as for ``open_features``.
+            Where they are found, rows are checked against their number.
+
+    Returns:
+        None if the dataset has no points.
+
+    Raises:
+        DatasetError: with file and line: ``kapture.index``, ``kapture.duplicate``,
+            ``kapture.number``, ``kapture.color``, ``kapture.path``, ``kapture.column_count``;
+            ``kapture.keypoints_type`` when the observations are by other or several types.
+    """
+    table = Table(root, _POINTS, None)
+    if not table.exists():
+        if Table(root, _OBSERVATIONS, None).exists():
+            raise table.error("kapture.unreadable", "observations of points that are missing")
+        return None
+    points, colors = _read_points(table)
+    table = Table(root, _OBSERVATIONS, None)
+    if not table.exists():
+        return Reconstruction(points, colors, None, (), np.empty((0, 3), dtype=np.int64))
+    known = feature_types(root, "keypoints", features_dir)
+
+    def open_keypoints(kind: str) -> FeatureSet | None:
+        return open_features(root, "keypoints", kind, features_dir) if kind in known else None
+
+    return Reconstruction(
+        points, colors, *_read_observations(table, len(points), keypoints_type, open_keypoints)
+    )
+
+
+def write_reconstruction(root: Path, reconstruction: Reconstruction) -> None:
+    """Write ``points3d.txt`` and, if anything is observed, ``observations.txt``.
+
+    Numbers come back as they were; observations come back sorted by point. Each file is complete
+    or not there, and the points come last: observations alone are not read.
+
+    Raises:
+        Conflict: ``kapture.exists`` if one of the files exists.
+        InvalidInput: ``kapture.reconstruction`` for arrays of another shape or type, or rows that
+            refer to nothing.
+        DatasetError: ``kapture.field`` for a name that kapture cannot hold.
+    """
+    _check(reconstruction)
+    for relative in (_OBSERVATIONS, _POINTS):
+        if (root / relative).exists():
+            raise Conflict(
+                "kapture.exists",
+                "there is a reconstruction already",
+                field=str(root / relative),
+                expected="a dataset without points",
+            )
+    (root / _POINTS).parent.mkdir(parents=True, exist_ok=True)
+    if len(reconstruction.observations):
+        write_atomically(root / _OBSERVATIONS, _observations_text(reconstruction).encode("utf-8"))
+    columns: list[list[float | int]] = reconstruction.points.T.tolist()
+    header = "# X, Y, Z"
+    if reconstruction.colors is not None:
+        columns += reconstruction.colors.T.tolist()
+        header += ", R, G, B"
+    rows = (", ".join(map(repr, row)) for row in zip(*columns, strict=True))
+    text = "\n".join(chain((VERSION_LINE, header), rows)) + "\n"
+    write_atomically(root / _POINTS, text.encode("utf-8"))
+
+
+def _read_points(table: Table) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
+    values = array("d")
+    num_columns = 0
+    for fields in table:
+        if not num_columns and len(fields) in (3, 6):
+            num_columns = len(fields)
+        if len(fields) != num_columns:
+            raise table.error(
+                "kapture.column_count",
+                "wrong number of columns",
+                expected=str(num_columns or "X, Y, Z or X, Y, Z, R, G, B"),
+                got=len(fields),
+            )
+        numbers = table.numbers(fields)
+        if num_columns == 6 and (min(numbers[3:]) < 0 or max(numbers[3:]) > 255):
+            raise table.error("kapture.color", "not a color", expected="0 to 255", got=fields[3:])
+        values.extend(numbers)
+    rows = np.frombuffer(values).reshape(-1, num_columns or 3)
+    colors = np.rint(rows[:, 3:]).astype(np.uint8) if num_columns == 6 else None
+    return rows[:, :3].copy(), colors
+
+
+class _Observers:
+    """The images of observations and, where it is known, how many keypoints each has."""
+
+    def __init__(self, keypoints: FeatureSet | None) -> None:
+        self.rows: dict[str, int] = {}  # by path
+        self.num_keypoints: list[int] = []
+        self._keypoints = keypoints
+        self._row_of_name: dict[str, int] = {}  # as written
+
+    def row(self, table: Table, name: str) -> int:
+        """Row of an image, a new one if need be."""
+        row = self._row_of_name.get(name)
+        if row is None:
+            path = _path(table, name)
+            if path not in self.rows:
+                self.rows[path] = len(self.rows)
+                keypoints = self._keypoints
+                known = keypoints.count(path) if keypoints and keypoints.has(path) else _MAX_INDEX
+                self.num_keypoints.append(known)
+            row = self._row_of_name[name] = self.rows[path]
+        return row
+
+
+def _read_observations(
+    table: Table,
+    num_points: int,
+    keypoints_type: str | None,
+    open_keypoints: Callable[[str], FeatureSet | None],
+) -> tuple[str | None, tuple[str, ...], NDArray[np.int64]]:
+    wanted, types = keypoints_type, dict[str, None]()
+    observers = _Observers(None if wanted is None else open_keypoints(wanted))
+    seen_points: set[int] = set()
+    points, lengths, images, keypoints = (array("q") for _ in range(4))
+    for fields in table:
+        if len(fields) < 2 or len(fields) % 2:
+            raise table.error(
+                "kapture.column_count",
+                "wrong number of columns (in kapture 1.0 the type of keypoints is missing)",
+                expected="point3d_id, keypoints_type, then image_path and feature_id in turn",
+                got=len(fields),
+            )
+        types[fields[1]] = None
+        if wanted is None:
+            wanted = fields[1]
+            observers = _Observers(open_keypoints(wanted))
+        if fields[1] != wanted:
+            if keypoints_type is None:
+                raise table.error(
+                    "kapture.keypoints_type",
+                    "keypoints of several types observe the points; name the one to use",
+                    expected=" or ".join(types),
+                )
+            continue
+        (point,) = _indices(table, fields[:1], num_points, "point in points3d.txt")
+        if point in seen_points:
+            raise table.error(
+                "kapture.duplicate", "a second line for the same point and type", got=fields[0]
+            )
+        seen_points.add(point)
+        track = _indices(table, fields[3::2], _MAX_INDEX, "keypoint")
+        for name, keypoint in zip(fields[2::2], track, strict=True):
+            row = observers.row(table, name)
+            if keypoint >= observers.num_keypoints[row]:
+                raise table.error(
+                    "kapture.index",
+                    f"{name} has no such keypoint",
+                    expected=f"less than {observers.num_keypoints[row]}",
+                    got=str(keypoint),
+                )
+            images.append(row)
+        keypoints.extend(track)
+        points.append(point)
+        lengths.append(len(track))
+    if keypoints_type is not None and types and keypoints_type not in types:
+        raise DatasetError(
+            "kapture.keypoints_type",
+            "no keypoints of this type observe the points",
+            field=table.relative,
+            expected=" or ".join(types),
+            got=keypoints_type,
+        )
+    point_of_row = np.repeat(np.frombuffer(points, np.int64), np.frombuffer(lengths, np.int64))
+    rest = (np.frombuffer(column, np.int64) for column in (images, keypoints))
+    return wanted, tuple(observers.rows), np.stack([point_of_row, *rest], axis=1)
+
+
+def _indices(table: Table, texts: list[str], limit: int, what: str) -> list[int]:
+    joined = "".join(texts)
+    # int() would also take signs, underscores, digits of other scripts, and texts of any length.
+    if all(texts) and joined.isascii() and (joined.isdigit() or not texts):
+        indices = [int(text) for text in texts if len(text) <= _MAX_DIGITS]
+        if len(indices) == len(texts) and max(indices, default=-1) < limit:
+            return indices
+    raise table.error(
+        "kapture.index",
+        f"no such {what}",
+        expected=f"integers from 0 to {limit - 1}" if limit else "no rows: there are none",
+        got=", ".join(texts),
+    )
+
+
+def _path(table: Table, text: str) -> str:
+    try:
+        return relative_path(text)
+    except ValueError:
+        raise table.error(
+            "kapture.path",
+            "not the path of an image",
+            expected="a relative path that stays inside the dataset",
+            got=text,
+        ) from None
+
+
+def _check(reconstruction: Reconstruction) -> None:
+    r = reconstruction
+    limits = (len(r.points), len(r.images), _MAX_INDEX)
+    fine = (
+        r.points.shape == (len(r.points), 3)
+        and r.points.dtype == np.float64
+        and bool(np.isfinite(r.points).all())
+        and (r.colors is None or (r.colors.shape == r.points.shape and r.colors.dtype == np.uint8))
+        and r.observations.shape == (len(r.observations), 3)
+        and np.issubdtype(r.observations.dtype, np.integer)
+        and bool(((r.observations >= 0) & (r.observations < limits)).all())
+        and (not len(r.observations) or r.keypoints_type is not None)
+        and len(set(r.images)) == len(r.images)
+    )
+    if not fine:
+        raise InvalidInput(
+            "kapture.reconstruction",
+            "not a reconstruction that can be written",
+            field="reconstruction",
+            expected="finite (P, 3) float64 points, (P, 3) uint8 colors, (M, 3) integer rows "
+            "of existing points and images, each image once, and the type of the keypoints",
+            got=f"points {r.points.shape} {r.points.dtype}, {len(r.images)} images, "
+            f"observations {r.observations.shape} {r.observations.dtype}",
+        )
+    for text in r.images:
+        if not is_field(text) or _normalized(text) != text:
+            raise _not_a_field(text)
+    if r.keypoints_type is not None and not (r.keypoints_type and is_field(r.keypoints_type)):
+        raise _not_a_field(r.keypoints_type)
+
+
+def _normalized(text: str) -> str | None:
+    try:
+        return relative_path(text)
+    except ValueError:
+        return None
+
+
+def _not_a_field(text: str) -> DatasetError:
+    return DatasetError(
+        "kapture.field",
+        "kapture has no way to write this name",
+        field=_OBSERVATIONS,
+        expected="a relative path, or a type, without commas or blanks around it",
+        got=text,
+    )
+
+
+def _observations_text(reconstruction: Reconstruction) -> str:
+    rows = reconstruction.observations
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    points, starts = np.unique(rows[:, 0], return_index=True)
+    bounds = [*starts.tolist(), len(rows)]
+    images, features = rows[:, 1].tolist(), rows[:, 2].tolist()
+    lines = [VERSION_LINE, "# point3d_id, keypoints_type, [image_path, feature_id]*"]
+    for row, point in enumerate(points.tolist()):
+        seen = range(bounds[row], bounds[row + 1])
+        track = ", ".join(f"{reconstruction.images[images[i]]}, {features[i]}" for i in seen)
+        lines.append(f"{point}, {reconstruction.keypoints_type}, {track}")
+    return "\n".join(lines) + "\n"
