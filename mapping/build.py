@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import JsonValue
 
 from mapping.features import (
     ExtractedFeatures,
@@ -28,7 +26,7 @@ from mapping.landmarks import MadeLandmarks
 from mapping.pairing import PAIRINGS, write_pairs
 from mapping.photos import MappingPhoto, collect_photos
 from mapping.rgbd import DepthSettings, landmarks_from_depth
-from mapping.sfm import SfmSettings, known_rigs, landmarks_from_matches, settings_record
+from mapping.sfm import SfmSettings, known_rigs, landmarks_from_matches
 from mapping.stages import WorkFolder, exclusive
 from mapping.triangulation import MAPPER_CONFIGS, REFINABLE
 from mapping.workers import Workers
@@ -312,15 +310,10 @@ def _content(
         for photo, kept in zip(placed, made.rows, strict=True):
             yield features.read(photo).descriptors[kept]
 
-    method_settings = {
-        "rgbd": lambda: asdict(settings.depth),
-        "sfm": lambda: settings_record(settings.sfm),
-        "model": dict,
-    }[settings.method]()
     return MapContent(
         metric=made.metric,
         method=settings.method,
-        settings=cast("dict[str, JsonValue]", method_settings),
+        settings=made.settings,
         notes=(*notes, *made.notes),
         cameras={
             photo.record.sensor_id: view.camera

@@ -13,7 +13,9 @@ from rich.console import Console
 from rich.table import Table
 
 from mapping.build import METHODS, BuildSettings, build_map
+from mapping.export import EXPORTERS, export_map
 from mapping.export_features import export_features
+from mapping.importers import IMPORTERS, ImportSummary, import_dataset, imported
 from mapping.pairing import PAIRINGS, PairSettings
 from mapping.progress import StageProgress
 from mapping.rgbd import DepthSettings
@@ -41,6 +43,7 @@ app = typer.Typer(
 )
 _out = Console()
 _err = Console(stderr=True)
+_GLOBAL_DEFAULT = ",".join(DEFAULT_GLOBAL_FEATURES)
 _RGBD, _SFM = "Method rgbd", "Method sfm"
 _DEPTH_DEFAULTS, _SFM_DEFAULTS, _PAIR_DEFAULTS = DepthSettings(), SfmSettings(), PairSettings()
 
@@ -96,7 +99,7 @@ def build(
         ),
     ] = METHODS[0],
     local_features: BuildLocalFeaturesOption = DEFAULT_LOCAL_FEATURES,
-    global_features: GlobalFeaturesOption = ",".join(DEFAULT_GLOBAL_FEATURES),
+    global_features: GlobalFeaturesOption = _GLOBAL_DEFAULT,
     features_dir: Annotated[
         Path | None,
         typer.Option(help="Where kapture:TYPE features lie, when not in the dataset."),
@@ -244,6 +247,101 @@ def _build(settings: BuildSettings) -> None:
         folder = build_map(settings, progress)
     _print_map(open_map(folder))
     _out.print(f"peak memory {_peak_memory_bytes() / 2**30:.2f} GiB")
+
+
+@app.command("import")
+def import_command(
+    format_name: Annotated[
+        str, typer.Argument(metavar="FORMAT", help=f"One of {', '.join(IMPORTERS)}.")
+    ],
+    path: Annotated[Path, typer.Argument(help="The file or folder that the format consists of.")],
+    map_id: Annotated[
+        str | None, typer.Option("--map", help="Make this map of it straight away.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", help="Or only make this dataset, for build.")
+    ] = None,
+    photos: Annotated[
+        Path | None,
+        typer.Option(help="Folder that names of photos are relative to, when not the usual one."),
+    ] = None,
+    metric: Annotated[
+        bool | None,
+        typer.Option(
+            "--metric/--not-metric",
+            help="Whether a unit of its world is a metre; left out: what the format says.",
+        ),
+    ] = None,
+    maps_dir: MapsDirOption = Path("maps"),
+    local_features: BuildLocalFeaturesOption = DEFAULT_LOCAL_FEATURES,
+    global_features: GlobalFeaturesOption = _GLOBAL_DEFAULT,
+    weights_dir: WeightsDirOption = None,
+    max_keypoints: MaxKeypointsOption = 5000,
+    workers: WorkersOption = 1,
+    force: Annotated[
+        bool, typer.Option("--force", help="Publish a new version of a map that exists.")
+    ] = False,
+) -> None:
+    """Bring a reconstruction or photos of another tool here, as a dataset or as a map.
+
+    A map is made of the points that came along (build --method model), else by matching: with the
+    poses that came along, or, without poses, with estimated ones. For other choices make a
+    dataset first, and build from it.
+    """
+    if (map_id is None) == (output is None):
+        raise InvalidInput(
+            "import.target", "say what to make", field="--map", expected="either --map or --output"
+        )
+    if output is not None:
+        _print_import(import_dataset(format_name, path, output, photos))
+        _out.print(f"dataset: {output}", soft_wrap=True)
+        return
+    assert map_id is not None
+    with imported(format_name, path, maps_dir, map_id, photos) as (dataset, summary):
+        _print_import(summary)
+        _build(
+            BuildSettings(
+                dataset=dataset,
+                map_id=map_id,
+                maps_dir=maps_dir,
+                method="model" if summary.observations else "sfm",
+                local_features=local_features,
+                global_features=_names(global_features),
+                weights_dir=weights_dir,
+                max_keypoints=max_keypoints,
+                metric=summary.metric if metric is None else metric,
+                sfm=SfmSettings(estimate_poses=summary.posed == 0),
+                workers=workers,
+                force=force,
+            )
+        )
+
+
+@app.command()
+def export(
+    map_ref: MapArgument,
+    output: Annotated[Path, typer.Option("--output", help="What to make; it must not exist.")],
+    format_name: Annotated[
+        str, typer.Option("--format", help=f"One of {', '.join(EXPORTERS)}.")
+    ] = "colmap",
+    maps_dir: MapsDirOption = Path("maps"),
+) -> None:
+    """Write a map for other tools: a COLMAP model, a kapture dataset, or a PLY point cloud."""
+    export_map(open_map(_folder(map_ref, maps_dir)), output, format_name)
+    _out.print(f"{format_name}: {output}", soft_wrap=True)
+
+
+def _print_import(summary: ImportSummary) -> None:
+    _out.print(
+        f"{summary.images} photos by {summary.cameras} cameras, {summary.posed} with a pose, "
+        f"{summary.depth_maps} with depth, {summary.gnss} GNSS fixes; {summary.points} points, "
+        f"{summary.observations} observations"
+        + (", metric" if summary.metric else ", not known to be metric"),
+        highlight=False,
+        soft_wrap=True,
+    )
+    for note in summary.notes:
+        _out.print(f"note: {note}", markup=False, soft_wrap=True)
 
 
 @app.command()

@@ -97,6 +97,7 @@ def landmarks_from_reconstruction(
         views=tuple(views),
         landmarks=landmarks,
         rows=tuple(rows),
+        settings={"max_distance_px": MAX_DISTANCE_PX},
         metric=metric,
         anchor=Anchor(kind="model", images=len(photos)),
         notes=notes if unseen or len(observations) < len(sightings) else (),

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import JsonValue
 
 from mapping.pairing import Pairs, Scene
 from visloc.archive import Anchor, Landmarks
@@ -66,6 +67,7 @@ class MadeLandmarks:
         views: of them.
         landmarks: with observations by these photos, in their order.
         rows: of each of these photos, the rows of its features that observe the landmarks.
+        settings: what the manifest says of how they were made.
         metric: whether a unit of the world is a metre.
         anchor: how the world was fixed.
         notes: what was left out, one sentence each.
@@ -76,6 +78,7 @@ class MadeLandmarks:
     views: tuple[View, ...]
     landmarks: Landmarks
     rows: tuple[NDArray[np.int64], ...]
+    settings: Mapping[str, JsonValue]
     metric: bool
     anchor: Anchor
     notes: tuple[str, ...] = ()

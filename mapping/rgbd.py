@@ -93,6 +93,7 @@ def landmarks_from_depth(
         views=tuple(View(photo.camera, photo.pose) for photo in photos),
         landmarks=landmarks,
         rows=tuple(rows),
+        settings=asdict(settings),
         metric=metric,
         anchor=Anchor(kind="dataset", images=len(photos)),
     )

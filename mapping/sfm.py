@@ -6,12 +6,13 @@ estimated poses also for photos without poses.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import JsonValue
 
 from mapping.anchor import Similarity, align_positions, known_positions
 from mapping.features import LocalFeaturesSource, Progress
@@ -126,6 +127,7 @@ def landmarks_from_matches(
         views=tuple(views),
         landmarks=landmarks,
         rows=tuple(rows),
+        settings=_settings_record(settings),
         metric=metric,
         anchor=anchor,
         notes=tuple(notes),
@@ -248,8 +250,12 @@ def _model_key(
         refine=sorted(settings.refine),
         estimate_poses=settings.estimate_poses,
         photos=[
-            [photo.record.sensor_id, photo.record.timestamp, *camera_values(photo.camera)]
-            + ([] if settings.estimate_poses else pose_values(photo.pose))
+            [
+                photo.record.sensor_id,
+                photo.record.timestamp,
+                *camera_values(photo.camera),
+                *(() if settings.estimate_poses else pose_values(photo.pose)),
+            ]
             for photo in photos
         ],
         rigs={
@@ -295,8 +301,7 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
 
 
-def settings_record(settings: SfmSettings) -> Mapping[str, object]:
-    """What the manifest says of the settings."""
+def _settings_record(settings: SfmSettings) -> dict[str, JsonValue]:
     pairing = asdict(settings.pairing)
     return {
         **(

@@ -396,10 +396,15 @@ def _refine(
     options.refine_focal_length = options.refine_extra_params = "intrinsics" in refine
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = _LOSS_SCALE_PX
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    if "poses" in refine:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # Not pycolmap.bundle_adjustment: that prints on stderr whatever it is told.
+    adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
     with _quiet():
-        _interruptible(
-            lambda token: pycolmap.bundle_adjustment(model, options, cancellation_token=token)
-        )
+        _interruptible(lambda token: adjuster.solve())  # noqa: ARG005  it cannot be cancelled
         if "poses" in refine:
             given = [photo.cam_from_world for photo in photos if photo.cam_from_world is not None]
             moved = [

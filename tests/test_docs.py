@@ -129,6 +129,7 @@ def desk(
         ("maps", built_maps),
         ("QUERIES", sample / "query"),
         (".demo/dataset", sample),
+        (".demo/maps", built_maps),
         ("examples", ROOT / "examples"),
     ):
         (folder / name).parent.mkdir(exist_ok=True)

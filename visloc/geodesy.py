@@ -1,4 +1,7 @@
-"""Positions on the Earth and in a local frame of metres. WGS84."""
+"""Positions on the Earth (WGS84) and in a local frame of metres east, north and up.
+
+Geodetic positions are latitude (deg), longitude (deg) and height above the ellipsoid (m).
+"""
 
 from __future__ import annotations
 
@@ -12,10 +15,10 @@ _ECCENTRICITY2 = _FLATTENING * (2 - _FLATTENING)
 
 
 def ecef_from_geodetic(positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert latitude (deg), longitude (deg), ellipsoidal height (m), (n, 3), to metres (n, 3)."""
+    """Convert geodetic positions (n, 3) to metres (n, 3) from the centre of the Earth."""
     latitude, longitude = np.radians(positions[:, 0]), np.radians(positions[:, 1])
     height = positions[:, 2]
-    normal = _SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(latitude) ** 2)
+    normal = _normal(latitude)
     return np.column_stack(
         [
             (normal + height) * np.cos(latitude) * np.cos(longitude),
@@ -25,22 +28,49 @@ def ecef_from_geodetic(positions: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
+def geodetic_from_ecef(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Convert metres (n, 3) from the centre of the Earth to geodetic positions (n, 3).
+
+    By fixed-point iteration on the latitude, of which each round gains two or three digits.
+    """
+    x, y, z = points.T
+    ring = np.hypot(x, y)
+    latitude = np.arctan2(z, ring * (1 - _ECCENTRICITY2))
+    for _ in range(8):
+        bulge = _ECCENTRICITY2 * _normal(latitude) * np.sin(latitude)
+        latitude = np.arctan2(z + bulge, ring)
+    # Along the normal; unlike ring / cos(latitude), it is good at the poles as well.
+    height = ring * np.cos(latitude) + z * np.sin(latitude) - _SEMI_MAJOR_M**2 / _normal(latitude)
+    return np.column_stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), height])
+
+
 def enu_from_geodetic(
     positions: NDArray[np.float64], origin: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Convert positions (n, 3) to metres east, north and up (n, 3) of an origin (3,).
+    """Convert geodetic positions (n, 3) to metres (n, 3) from a geodetic origin (3,)."""
+    offsets = ecef_from_geodetic(positions) - ecef_from_geodetic(origin[None])
+    return np.asarray(offsets @ _enu_from_ecef(origin).T)
 
-    Both are latitude (deg), longitude (deg), ellipsoidal height (m).
-    """
+
+def geodetic_from_enu(
+    points: NDArray[np.float64], origin: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Convert metres (n, 3) from a geodetic origin (3,) to geodetic positions (n, 3)."""
+    return geodetic_from_ecef(points @ _enu_from_ecef(origin) + ecef_from_geodetic(origin[None]))
+
+
+def _normal(latitude: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(_SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(latitude) ** 2))
+
+
+def _enu_from_ecef(origin: NDArray[np.float64]) -> NDArray[np.float64]:
     latitude, longitude = np.radians(origin[:2])
     sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
     sin_lon, cos_lon = np.sin(longitude), np.cos(longitude)
-    enu_from_ecef = np.array(
+    return np.array(
         [
             [-sin_lon, cos_lon, 0.0],
             [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
             [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
         ]
     )
-    offsets = ecef_from_geodetic(positions) - ecef_from_geodetic(origin[None])
-    return np.asarray(offsets @ enu_from_ecef.T)

@@ -5,7 +5,9 @@ A further format is one file with ``read(path, photos)`` and one line in the reg
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -14,6 +16,7 @@ from typing import cast
 from mapping.importers.dataset import write_imported
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.outputs import refuse_existing
+from mapping.stages import exclusive
 from visloc.errors import InvalidInput
 
 __all__ = [
@@ -22,6 +25,7 @@ __all__ = [
     "ImportedImage",
     "ImportedModel",
     "import_dataset",
+    "imported",
     "read_model",
     "write_imported",
 ]
@@ -67,6 +71,26 @@ class ImportSummary:
     with_descriptors: bool
     metric: bool
     notes: tuple[str, ...]
+
+
+@contextmanager
+def imported(
+    name: str, path: Path, maps_dir: Path, map_id: str, photos: Path | None
+) -> Iterator[tuple[Path, ImportSummary]]:
+    """Have a foreign reconstruction as a dataset while a map is made of it.
+
+    Raises:
+        InvalidInput, DatasetError: as ``import_dataset``.
+        Conflict: ``build.running``.
+    """
+    dataset = maps_dir / ".work" / f"{map_id}.imported"
+    with exclusive(dataset.with_name(f"{dataset.name}.lock")):
+        shutil.rmtree(dataset, ignore_errors=True)  # of an import that was killed
+        summary = import_dataset(name, path, dataset, photos)
+        try:
+            yield dataset, summary
+        finally:
+            shutil.rmtree(dataset, ignore_errors=True)
 
 
 def read_model(name: str, path: Path, photos: Path | None = None) -> ImportedModel:

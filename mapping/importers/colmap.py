@@ -135,8 +135,11 @@ def _model(
     rows = {image.image_id: row for row, image in enumerate(colmap_images)}
     keypoints = [_points2d(image) for image in colmap_images]
     names = [image.name for image in colmap_images]
-    from_database = database is not None and _belongs(database, names, keypoints, notes)
-    known = database.images if from_database and database is not None else {}
+    known: Mapping[str, _DatabaseImage] = {}
+    keypoints_type = "colmap"
+    if database is not None and _belongs(database, names, keypoints, notes):
+        known, keypoints_type = database.images, database.keypoints_type
+        notes += database.notes
     timestamps = _timestamps([(image.name, image.frame_id) for image in colmap_images])
     with_keypoints = any(map(len, keypoints))
     images = tuple(
@@ -156,8 +159,6 @@ def _model(
             f"{num_rigs} rigs of several cameras: every photo has its own pose, the rigs "
             "themselves are left out"
         )
-    if database is not None:
-        notes += database.notes
     points, colors, observations = _points(model, rows)
     users = {image.camera_id: image.name for image in colmap_images}
     sensors = {
@@ -172,7 +173,7 @@ def _model(
         points=points,
         colors=colors,
         observations=observations,
-        keypoints_type=database.keypoints_type if known and database is not None else "colmap",
+        keypoints_type=keypoints_type,
         gnss=gnss,
         notes=tuple(notes),
     )

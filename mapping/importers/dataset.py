@@ -16,10 +16,10 @@ from visloc.kapture import (
     FileRecord,
     Reconstruction,
     write_dataset,
+    write_keypoints,
     write_local_features,
     write_reconstruction,
 )
-from visloc.kapture.features import _write as write_feature_file
 from visloc.kapture.text import is_field, is_folder_name, relative_path
 
 _NAMED = 3  # how many names an error or note lists
@@ -103,7 +103,7 @@ def _write_features(model: ImportedModel, root: Path) -> None:
         if image.keypoints is None:
             continue
         if image.descriptors is None:
-            write_feature_file("keypoints", root, kind, image.name, image.keypoints, kind, ())
+            write_keypoints(root, kind, image.name, image.keypoints, name=kind)
         else:
             write_local_features(
                 root, kind, image.name, image.keypoints, image.descriptors, name=kind

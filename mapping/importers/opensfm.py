@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mapping.importers.enu import EastNorthUp
 from mapping.importers.json_fields import JsonValue, read_json
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.opensfm_features import Features, read_features
@@ -26,6 +25,7 @@ from mapping.importers.photo_names import photo_names
 from mapping.importers.text_lines import TextLines
 from mapping.importers.tracks import Measurements, keypoints_of
 from visloc.errors import DatasetError, InvalidInput
+from visloc.geodesy import geodetic_from_enu
 from visloc.geometry import MAX_IMAGE_SIDE, Camera, Pose
 from visloc.kapture import GnssRecord, Sensor
 from visloc.kapture.text import is_field
@@ -316,9 +316,9 @@ def _fixes(
     for angle, limit in ((latitude, 90), (longitude, 180)):
         if not -limit <= angle.number() <= limit:
             raise angle.error("not an angle on the globe", expected=f"-{limit} to {limit} degrees")
-    frame = EastNorthUp(latitude.number(), longitude.number(), reference["altitude"].number())
+    origin = [latitude.number(), longitude.number(), reference["altitude"].number()]
     positions = np.array([gps for _, gps, _ in located])
-    geodetic = frame.geodetic(positions)
+    geodetic = geodetic_from_enu(positions, np.array(origin))
     fixes = tuple(
         GnssRecord(rank, _GNSS, float(lon), float(lat), float(alt), 0.0, dop)
         for (rank, _, dop), (lat, lon, alt) in zip(located, geodetic, strict=True)

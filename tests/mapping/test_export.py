@@ -101,7 +101,8 @@ def opened(tmp_path: Path) -> Map:
 
 
 def points_of(opened: Map) -> NDArray[np.float64]:
-    return np.add(opened.landmarks, ORIGIN, dtype=np.float64)
+    points: NDArray[np.float64] = opened.landmarks.astype(np.float64) + ORIGIN
+    return points
 
 
 def test_pycolmap_reads_the_same_cameras_poses_and_points(opened: Map, tmp_path: Path) -> None:

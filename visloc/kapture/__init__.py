@@ -11,7 +11,7 @@ from visloc.kapture.feature_reader import (
     open_features,
     open_local_features,
 )
-from visloc.kapture.features import write_global_features, write_local_features
+from visloc.kapture.features import write_global_features, write_keypoints, write_local_features
 from visloc.kapture.local_features import read_local
 from visloc.kapture.reader import read_dataset
 from visloc.kapture.reconstruction import (
@@ -37,6 +37,7 @@ __all__ = [
     "read_reconstruction",
     "write_dataset",
     "write_global_features",
+    "write_keypoints",
     "write_local_features",
     "write_reconstruction",
 ]

@@ -50,8 +50,19 @@ def write_local_features(
             expected="(N, 2 or more) keypoints and as many descriptors",
             got=f"{keypoints.shape} and {descriptors.shape}",
         )
-    _write("keypoints", root, feature_type, image_path, keypoints, name, ())
+    write_keypoints(root, feature_type, image_path, keypoints, name=name)
     _write("descriptors", root, feature_type, image_path, descriptors, name, (feature_type, "L2"))
+
+
+def write_keypoints(
+    root: Path, feature_type: str, image_path: str, keypoints: NDArray[np.generic], *, name: str
+) -> None:
+    """Write the keypoints (N, K >= 2) of one image that has no descriptors.
+
+    Raises:
+        Conflict, InvalidInput, DatasetError: as ``write_local_features``.
+    """
+    _write("keypoints", root, feature_type, image_path, keypoints, name, ())
 
 
 def write_global_features(
