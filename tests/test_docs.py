@@ -317,6 +317,7 @@ ANSWERING = (
 NOT_MET = {
     "image.missing",  # reading a file, in process
     *("map.checksum", "map.manifest_hash", "map.range", "map.version_exists"),  # publishing
+    *("features.metric", "features.descriptor"),  # of files
 }
 
 

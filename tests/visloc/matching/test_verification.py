@@ -9,7 +9,7 @@ from visloc.geometry import Pose
 from visloc.matching.verification import epipolar_errors
 
 RANDOM = np.random.default_rng(0)
-POINTS = RANDOM.uniform(-1, 1, (200, 3)) + [0, 0, 5]
+POINTS = RANDOM.uniform([-1, -1, 4], [1, 1, 6], (200, 3))
 B_FROM_A = Pose(Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix(), np.array([0.3, 0.2, 0.1]))
 
 
