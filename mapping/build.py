@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,13 @@ from mapping.landmarks import MadeLandmarks
 from mapping.pairing import PAIRINGS, write_pairs
 from mapping.photos import MappingPhoto, collect_photos
 from mapping.rgbd import DepthSettings, landmarks_from_depth
-from mapping.sfm import SfmSettings, known_rigs, landmarks_from_matches
+from mapping.sfm import (
+    SfmSettings,
+    find_pairs,
+    known_rigs,
+    landmarks_from_matches,
+    make_scene,
+)
 from mapping.stages import WorkFolder, exclusive
 from mapping.triangulation import MAPPER_CONFIGS, REFINABLE
 from mapping.workers import Workers
@@ -138,6 +145,48 @@ def build_map(settings: BuildSettings, progress: Progress) -> Path:
     return folder
 
 
+def write_pairs_of(
+    root: Path,
+    output: Path,
+    settings: SfmSettings,
+    global_features: tuple[str, ...],
+    features_dir: Path | None,
+    pixel_origin: PixelOrigin,
+    progress: Progress,
+) -> int:
+    """Pair the photos of a posed dataset and write the pairs file; return how many pairs.
+
+    Args:
+        root: kapture folder; the photos themselves need not be there.
+        output: the file.
+        settings: pairings and their settings.
+        global_features: names ``kapture:TYPE``, for ``retrieval``.
+        features_dir: where they lie, when not in the dataset.
+        pixel_origin: what the dataset's principal points count from.
+        progress: told the stage, how much is done, and how much there is.
+
+    Raises:
+        InvalidInput, DatasetError: with the option or the file that is wrong.
+    """
+    _check_names("--pairs", settings.pairs, tuple(PAIRINGS))
+    dataset = read_dataset(root).with_pixels_from(pixel_origin)
+    photos, _ = collect_photos(dataset, with_files=False, progress=partial(progress, "photos"))
+    described = [_read_global(dataset, name, features_dir, photos) for name in global_features]
+    scene = make_scene(dataset, photos, described, settings)
+    progress("pairs", 0, 1)
+    found = find_pairs(scene, settings)
+    progress("pairs", 1, 1)
+    write_pairs(output, scene, found)
+    return len(found)
+
+
+def _read_global(
+    dataset: Dataset, name: str, features_dir: Path | None, photos: Sequence[MappingPhoto]
+) -> GlobalFeatures:
+    features = open_features(dataset.root, "global_features", ready_made_type(name), features_dir)
+    return read_global_features(features, photos)
+
+
 def _check(settings: BuildSettings) -> None:
     """Refuse what would otherwise fail after hours, or give a useless map."""
     if settings.method not in METHODS:
@@ -228,16 +277,11 @@ def _build(
         has_features=features.has if isinstance(features, ReadyMadeFeatures) else None,
         with_depth=settings.method == "rgbd",
         depth_sensor=settings.depth_sensor,
-        progress=lambda done, total: progress("photos", done, total),
+        progress=partial(progress, "photos"),
     )
     find_local_features(features, photos, workers, progress)
     global_features = [
-        read_global_features(
-            open_features(
-                dataset.root, "global_features", ready_made_type(name), settings.features_dir
-            ),
-            photos,
-        )
+        _read_global(dataset, name, settings.features_dir, photos)
         if is_ready_made(name)
         else describe_photos(work, photos, features, name, workers, progress)
         for name in settings.global_features

@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from mapping.build import METHODS, BuildSettings, build_map
+from mapping.build import METHODS, BuildSettings, build_map, write_pairs_of
 from mapping.export import EXPORTERS, export_map
 from mapping.export_features import export_features
 from mapping.importers import IMPORTERS, ImportSummary, import_dataset, imported
@@ -72,6 +72,17 @@ GlobalFeaturesOption = Annotated[
     str,
     typer.Option(help=f"Comma-separated, of {', '.join(sorted(GLOBAL_FEATURES))}, kapture:TYPE."),
 ]
+FeaturesDirOption = Annotated[
+    Path | None,
+    typer.Option(help="Where kapture:TYPE features lie, when not in the dataset."),
+]
+PixelOriginOption = Annotated[
+    PixelOrigin,
+    typer.Option(
+        help="The middle of the first pixel, in the dataset's principal points and in "
+        "kapture:TYPE keypoints, is (0.5, 0.5): corner, or (0, 0): center."
+    ),
+]
 MetricOption = Annotated[
     bool,
     typer.Option("--metric/--not-metric", help="Whether a unit of the dataset's poses is a metre."),
@@ -84,6 +95,42 @@ MaxKeypointsOption = Annotated[
 ]
 MapArgument = Annotated[str, typer.Argument(metavar="MAP", help="id, id@version, or a folder.")]
 DatasetArgument = Annotated[Path, typer.Argument(help="kapture folder (holds sensors/).")]
+# How photos are paired, for build and for pairs.
+PairsOption = Annotated[
+    str,
+    typer.Option(
+        help=f"Which photos to match: comma-separated, of {', '.join(PAIRINGS)}.",
+        rich_help_panel=_SFM,
+    ),
+]
+TopKOption = Annotated[
+    int,
+    typer.Option(
+        min=1, help="Best pairs of a photo that each pairing keeps.", rich_help_panel=_SFM
+    ),
+]
+MaxDistanceOption = Annotated[
+    float,
+    typer.Option(help="distance: most between camera centres, metres.", rich_help_panel=_SFM),
+]
+MaxAngleOption = Annotated[
+    float,
+    typer.Option(help="distance: most between orientations, degrees.", rich_help_panel=_SFM),
+]
+NearOption = Annotated[
+    float, typer.Option(help="frustum: where views begin, metres.", rich_help_panel=_SFM)
+]
+FarOption = Annotated[
+    float, typer.Option(help="frustum: where views end, metres.", rich_help_panel=_SFM)
+]
+CovisibleInOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="MAP",
+        help="covisibility: the map that tells; else the dataset's own points.",
+        rich_help_panel=_SFM,
+    ),
+]
 
 
 @app.command()
@@ -100,17 +147,8 @@ def build(
     ] = METHODS[0],
     local_features: BuildLocalFeaturesOption = DEFAULT_LOCAL_FEATURES,
     global_features: GlobalFeaturesOption = _GLOBAL_DEFAULT,
-    features_dir: Annotated[
-        Path | None,
-        typer.Option(help="Where kapture:TYPE features lie, when not in the dataset."),
-    ] = None,
-    pixel_origin: Annotated[
-        PixelOrigin,
-        typer.Option(
-            help="The middle of the first pixel, in the dataset's principal points and in "
-            "kapture:TYPE keypoints, is (0.5, 0.5): corner, or (0, 0): center."
-        ),
-    ] = PixelOrigin.CORNER,
+    features_dir: FeaturesDirOption = None,
+    pixel_origin: PixelOriginOption = PixelOrigin.CORNER,
     weights_dir: WeightsDirOption = None,
     max_keypoints: MaxKeypointsOption = 5000,
     metric: MetricOption = True,
@@ -134,41 +172,13 @@ def build(
         float,
         typer.Option(help="Metres per unit of 16-bit PNG depth.", rich_help_panel=_RGBD),
     ] = _DEPTH_DEFAULTS.depth_scale,
-    pairs: Annotated[
-        str,
-        typer.Option(
-            help=f"Which photos to match: comma-separated, of {', '.join(PAIRINGS)}.",
-            rich_help_panel=_SFM,
-        ),
-    ] = ",".join(_SFM_DEFAULTS.pairs),
-    top_k: Annotated[
-        int,
-        typer.Option(
-            min=1, help="Best pairs of a photo that each pairing keeps.", rich_help_panel=_SFM
-        ),
-    ] = _PAIR_DEFAULTS.top_k,
-    max_distance: Annotated[
-        float,
-        typer.Option(help="distance: most between camera centres, metres.", rich_help_panel=_SFM),
-    ] = _PAIR_DEFAULTS.max_distance,
-    max_angle: Annotated[
-        float,
-        typer.Option(help="distance: most between directions, degrees.", rich_help_panel=_SFM),
-    ] = _PAIR_DEFAULTS.max_angle_deg,
-    near: Annotated[
-        float, typer.Option(help="frustum: where views begin, metres.", rich_help_panel=_SFM)
-    ] = _PAIR_DEFAULTS.near,
-    far: Annotated[
-        float, typer.Option(help="frustum: where views end, metres.", rich_help_panel=_SFM)
-    ] = _PAIR_DEFAULTS.far,
-    covisible_in: Annotated[
-        str | None,
-        typer.Option(
-            metavar="MAP",
-            help="covisibility: the map that tells; else the dataset's own points.",
-            rich_help_panel=_SFM,
-        ),
-    ] = None,
+    pairs: PairsOption = _SFM_DEFAULTS.pairs[0],
+    top_k: TopKOption = _PAIR_DEFAULTS.top_k,
+    max_distance: MaxDistanceOption = _PAIR_DEFAULTS.max_distance,
+    max_angle: MaxAngleOption = _PAIR_DEFAULTS.max_angle_deg,
+    near: NearOption = _PAIR_DEFAULTS.near,
+    far: FarOption = _PAIR_DEFAULTS.far,
+    covisible_in: CovisibleInOption = None,
     pairs_file: Annotated[
         Path | None,
         typer.Option(
@@ -240,6 +250,46 @@ def build(
         force=force,
     )
     _build(settings)
+
+
+@app.command()
+def pairs(
+    dataset: DatasetArgument,
+    output: Annotated[Path, typer.Option("--output", help="The pairs file to write.")],
+    pairs: PairsOption = "distance",
+    top_k: TopKOption = _PAIR_DEFAULTS.top_k,
+    max_distance: MaxDistanceOption = _PAIR_DEFAULTS.max_distance,
+    max_angle: MaxAngleOption = _PAIR_DEFAULTS.max_angle_deg,
+    near: NearOption = _PAIR_DEFAULTS.near,
+    far: FarOption = _PAIR_DEFAULTS.far,
+    covisible_in: CovisibleInOption = None,
+    global_features: Annotated[
+        str, typer.Option(help="retrieval: comma-separated, kapture:TYPE of the dataset.")
+    ] = "",
+    features_dir: FeaturesDirOption = None,
+    pixel_origin: PixelOriginOption = PixelOrigin.CORNER,
+    maps_dir: MapsDirOption = Path("maps"),
+) -> None:
+    """Pair the photos of a posed dataset without building, for build --pairs-file or other tools.
+
+    Pairs by global features that are made of the photos come with a build: pairs.txt of its map.
+    """
+    pairing = PairSettings(
+        top_k=top_k, max_distance=max_distance, max_angle_deg=max_angle, near=near, far=far
+    )
+    known = None if covisible_in is None else open_map(_folder(covisible_in, maps_dir))
+    with StageProgress(_err, if_stopped="nothing was written") as progress:
+        count = write_pairs_of(
+            dataset,
+            output,
+            SfmSettings(pairs=_names(pairs), pairing=pairing, covisible_in=known),
+            _names(global_features),
+            features_dir,
+            pixel_origin,
+            progress,
+        )
+    _out.print(f"{count} pairs: {output}", highlight=False, soft_wrap=True)
+    _out.print(f"peak memory {_peak_memory_bytes() / 2**30:.2f} GiB")
 
 
 def _build(settings: BuildSettings) -> None:

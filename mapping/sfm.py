@@ -81,7 +81,7 @@ def landmarks_from_matches(
         DatasetError: with the file that is wrong.
     """
     config = MAPPER_CONFIGS[settings.mapper]
-    scene = _scene(dataset, photos, global_features, settings)
+    scene = make_scene(dataset, photos, global_features, settings)
     progress("pairs", 0, 1)
     pairs = find_pairs(scene, settings)
     progress("pairs", 1, 1)
@@ -151,12 +151,13 @@ def known_rigs(dataset: Dataset, cameras: set[str]) -> dict[str, dict[str, Pose]
     return {rig: members for rig, members in rigs.items() if members}
 
 
-def _scene(
+def make_scene(
     dataset: Dataset,
     photos: Sequence[MappingPhoto],
     global_features: Sequence[GlobalFeatures],
     settings: SfmSettings,
 ) -> Scene:
+    """Gather what pairings may look at."""
     names = tuple(photo.name for photo in photos)
     wanted = "covisibility" in settings.pairs and settings.pairs_file is None
     return Scene(

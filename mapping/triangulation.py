@@ -45,9 +45,10 @@ class MapperConfig:
         abs_pose_max_error: pixels, of an inlier of a photo that joins.
         filter_max_reproj_error: pixels; sightings further from their point are dropped, and
             matches further from their epipolar line.
-        min_track_length: photos that must see a landmark. Not in the paper: COLMAP drops tracks
-            of two photos, which the relaxed configuration keeps.
-        min_angle_deg: between two rays to a landmark. COLMAP's default in both.
+        min_track_length: photos that must see a landmark. Not in the paper. COLMAP drops tracks
+            of two photos; with known poses that have verified the match they are worth keeping
+            (docs/decisions/0008-two-photos-make-a-landmark.md).
+        min_angle_deg: between two rays to a landmark; COLMAP's default.
     """
 
     min_num_matches: int
@@ -62,7 +63,7 @@ class MapperConfig:
 
 
 MAPPER_CONFIGS: Mapping[str, MapperConfig] = {
-    "config1": MapperConfig(15, 100, 30, 0.25, 25, 12.0, 4.0, 3, 1.5),
+    "config1": MapperConfig(15, 100, 30, 0.25, 25, 12.0, 4.0, 2, 1.5),
     "config2": MapperConfig(4, 4, 4, 0.05, 50, 20.0, 12.0, 2, 1.5),
 }
 

@@ -196,8 +196,8 @@ def _overlap(
     length = np.linalg.norm(rays, axis=2)
     along = (tx * x + ty * y + tz * z) / length
     aside = np.sqrt(np.maximum(tx**2 + ty**2 + tz**2 - along**2, 0.0))
-    low = np.full(x.shape, settings.near)
-    high = np.full(x.shape, settings.far)
+    low = np.full(x.shape, settings.near, np.float64)  # whole numbers are given too
+    high = np.full(x.shape, settings.far, np.float64)
     for slope, offset in (
         (x - x_min * z, tx - x_min * tz),
         (x_max * z - x, x_max * tz - tx),

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 import mapping.build
 from mapping.build import BuildSettings, build_map
+from mapping.rgbd import DepthSettings
 from mapping.stages import exclusive
 from visloc.archive import Map, MapStore, verify_map, write_map
 from visloc.errors import (
@@ -185,9 +186,24 @@ def test_a_bad_dataset_is_refused_by_name_and_the_map_before_still_serves(
             "each once.*got localvlad,localvlad",
         ),
         ({"method": "nerf"}, InvalidInput, "build.method", "--method.*rgbd.*got nerf"),
-        ({"voxel_size": 0.0}, InvalidInput, "build.voxel_size", "--voxel-size"),
-        ({"voxel_size": float("nan")}, InvalidInput, "build.voxel_size", "--voxel-size"),
-        ({"depth_scale": float("inf")}, InvalidInput, "build.depth_scale", "--depth-scale"),
+        (
+            {"depth": DepthSettings(voxel_size=0.0)},
+            InvalidInput,
+            "build.voxel_size",
+            "--voxel-size",
+        ),
+        (
+            {"depth": DepthSettings(voxel_size=float("nan"))},
+            InvalidInput,
+            "build.voxel_size",
+            "--voxel-size",
+        ),
+        (
+            {"depth": DepthSettings(depth_scale=float("inf"))},
+            InvalidInput,
+            "build.depth_scale",
+            "--depth-scale",
+        ),
         ({"depth_sensor": "lidar"}, DatasetError, "depth.sensor", "left_depth.*got lidar"),
         ({"force": False}, Conflict, "map.exists", "'room' exists.*--force"),
     ],
@@ -320,7 +336,7 @@ def test_equal_builds_have_equal_content_hashes_and_versions_of_their_own(
 ) -> None:
     first, second = MapStore(built_maps).open("room"), build(sample / "mapping", tmp_path)
     assert first.manifest.content_hash == second.manifest.content_hash
-    third = build(sample / "mapping", tmp_path, voxel_size=0.02)
+    third = build(sample / "mapping", tmp_path, depth=DepthSettings(voxel_size=0.02))
     assert third.manifest.content_hash != second.manifest.content_hash
     published = {second.manifest.version, third.manifest.version}
     assert set(MapStore(tmp_path).versions("room")) == published
@@ -348,7 +364,9 @@ def test_a_changed_setting_finds_again_what_does_not_depend_on_it(
     assert {stage_of(item) for item in first} == {
         *("local_features", "words", "vocabulary", "pooled", "projection", "lifted"),
     }
-    assert work(voxel_size=0.02) == first  # it concerns nothing but the last step
+    assert (
+        work(depth=DepthSettings(voxel_size=0.02)) == first
+    )  # it concerns nothing but the last step
 
     data(dataset, FIRST_PHOTO).write_bytes(data(dataset, FIRST_PHOTO).read_bytes() + b"\0")
     changed = work()
@@ -463,7 +481,7 @@ def test_killed_in_any_stage_the_same_command_resumes_and_makes_the_same_map(
         "call:visloc.features.vlad:learn_whitening",
         "progress:localvlad:1",
         "progress:depth:4",
-        "call:mapping.build:merge_landmarks",
+        "call:mapping.rgbd:merge_landmarks",
         "call:visloc.archive.writer:manifest_hash",  # all arrays are written, no manifest
         "call:visloc.archive.store:_sync_folder",  # the version has its place, is not current
     ):
@@ -492,7 +510,9 @@ def test_a_first_build_killed_while_it_publishes_needs_no_force(
 ) -> None:
     built = build(sample / "mapping", tmp_path)
     (tmp_path / "room" / "current").unlink()
-    settings = settings_for(sample / "mapping", tmp_path, voxel_size=0.02, force=False)
+    settings = settings_for(
+        sample / "mapping", tmp_path, depth=DepthSettings(voxel_size=0.02), force=False
+    )
     assert build_map(settings, quiet).name == MapStore(tmp_path).current_version("room")
     assert built.manifest.version in MapStore(tmp_path).versions("room")
 

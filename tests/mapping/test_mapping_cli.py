@@ -98,7 +98,9 @@ def test_verify_names_the_file_in_which_one_bit_was_flipped(
 ) -> None:
     path = MapStore(maps_dir).folder("room") / name
     content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
+    # In the middle of a manifest may be the name of another file.
+    at = content.index(b'"created": "') + 14 if name == "manifest.json" else len(content) // 2
+    content[at] ^= 1
     path.write_bytes(content)
     error = error_of(run("verify", "room", "--maps-dir", maps_dir))
     assert error.startswith("error [map.")

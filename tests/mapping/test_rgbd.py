@@ -20,7 +20,9 @@ POSE = Pose.from_quaternion([0.9, 0.1, -0.3, 0.2], [0.3, -0.2, 0.5])
 def make_photo(name: str = "a.jpg", pose: Pose = POSE, depth: bool = True) -> MappingPhoto:
     record = FileRecord(timestamp=0, sensor_id="cam", path=name)
     match = DepthMatch(FileRecord(0, "depth", "a.depth"), CAMERA, Pose.identity())
-    return MappingPhoto(record, Path(name), "", CAMERA, pose, match if depth else None, None)
+    return MappingPhoto(
+        record, Path(name), "", CAMERA, True, pose, match if depth else None, "" if depth else None
+    )
 
 
 def dataset_with_depth(root: Path, depth: NDArray[np.float32]) -> Dataset:
@@ -55,7 +57,7 @@ def test_a_photo_without_depth_gives_nothing(tmp_path: Path) -> None:
 
 def lifted_at(photo: MappingPhoto, *points: tuple[float, float, float]) -> LiftedKeypoints:
     world = np.array(points).reshape(-1, 3)
-    seen = photo.cam_from_world.apply(world)
+    seen = photo.pose.apply(world)
     u = 60.0 * seen[:, 0] / seen[:, 2] + 31.0
     v = 62.0 * seen[:, 1] / seen[:, 2] + 25.0
     pixels = np.column_stack([u, v]).astype(np.float32)
