@@ -133,7 +133,8 @@ def build_map(settings: BuildSettings, progress: Progress) -> Path:
     work_root = settings.maps_dir / ".work" / settings.map_id
     try:
         with exclusive(work_root.with_name(f"{work_root.name}.lock")):
-            folder = _build(settings, dataset, store, work_root, progress)
+            with Workers(settings.workers) as workers:
+                folder = _build(settings, dataset, store, work_root, workers, progress)
             shutil.rmtree(work_root, ignore_errors=True)
     except OSError as error:
         raise Unavailable(
@@ -239,12 +240,12 @@ def _check(settings: BuildSettings) -> None:
             expected="given, or --method sfm",
             got=f"estimate with --method {settings.method}",
         )
-    if sfm.estimate_poses and sfm.refine:
+    if sfm.estimate_poses and not set(sfm.refine) <= {"intrinsics"}:
         raise InvalidInput(
             "build.refine",
-            "with --poses estimate everything that is not known is refined anyway",
+            "estimated poses and points are refined anyway",
             field="--refine",
-            expected="none",
+            expected="nothing, or intrinsics, with --poses estimate",
             got=",".join(sfm.refine),
         )
 
@@ -266,9 +267,10 @@ def _build(
     dataset: Dataset,
     store: MapStore,
     work_root: Path,
+    workers: Workers,
     progress: Progress,
 ) -> Path:
-    work, workers = WorkFolder(work_root), Workers(settings.workers)
+    work = WorkFolder(work_root)
     features = _local_features(work, settings)
     photos, notes = collect_photos(
         dataset,

@@ -31,6 +31,7 @@ from visloc.features import (
     LOCAL_FEATURES,
     make_local_features,
 )
+from visloc.features.readymade import is_ready_made
 from visloc.geometry import PixelOrigin
 from visloc.localizer import Localizer
 
@@ -360,7 +361,10 @@ def import_command(
                 weights_dir=weights_dir,
                 max_keypoints=max_keypoints,
                 metric=summary.metric if metric is None else metric,
-                sfm=SfmSettings(estimate_poses=summary.posed == 0),
+                sfm=_SFM_DEFAULTS
+                if summary.posed
+                # What EXIF says of a focal length is a start, not a calibration.
+                else SfmSettings(estimate_poses=True, refine=("intrinsics",)),
                 workers=workers,
                 force=force,
             )
@@ -419,7 +423,8 @@ def verify(
     num_files = len(opened.manifest.files)
     _out.print(f"{opened.ref}: {num_files} files, every byte as published", soft_wrap=True)
     name = opened.manifest.local_features.fingerprint.name
-    Localizer(opened, make_local_features(name, weights_dir))  # raises when they differ
+    extractor = None if is_ready_made(name) else make_local_features(name, weights_dir)
+    Localizer(opened, extractor)  # raises when they differ
     names = (name, *(record.fingerprint.name for record in opened.manifest.global_features))
     _out.print(f"{', '.join(names)}: the same features as here", soft_wrap=True)
 
@@ -538,6 +543,7 @@ def _print_map(opened: Map) -> None:
         ),
         "extent": " x ".join(f"{side:.2f}" for side in sides)
         + (" m" if summary["world"]["metric"] else " (not metric)"),
+        "world": _world(opened),
         "method": summary["method"]["name"],
         "size": f"{summary['size_bytes'] / 2**20:.1f} MiB, "
         f"{summary['bytes_per_observation']:.0f} bytes per observation",
@@ -549,6 +555,24 @@ def _print_map(opened: Map) -> None:
     _out.print(table)
     for note in summary["notes"]:
         _out.print(f"note: {note}", markup=False, soft_wrap=True)
+
+
+def _world(opened: Map) -> str:
+    """Whether a unit is a metre, and what fixed the frame."""
+    world = opened.manifest.world
+    unit = "metric" if world.metric else "not metric"
+    if world.anchor is None:
+        return unit
+    anchor = world.anchor
+    fixed_by = {
+        "dataset": "the poses of the dataset",
+        "model": "the imported reconstruction",
+        "gnss": f"GNSS fixes of {anchor.images} photos",
+        "positions": f"known positions of {anchor.images} photos",
+        "none": "nothing: the frame is arbitrary",
+    }[anchor.kind]
+    off = "" if anchor.rms is None else f", which agree within {anchor.rms:.2g} (RMS)"
+    return f"{unit}, fixed by {fixed_by}{off}"
 
 
 def _peak_memory_bytes() -> int:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import cache, partial
 from pathlib import Path
@@ -16,7 +17,7 @@ from mapping.photos import MappingPhoto
 from mapping.stages import Item, WorkFolder, key_of
 from mapping.workers import Workers
 from visloc.archive import FingerprintRecord, GlobalFeatures
-from visloc.errors import DatasetError
+from visloc.errors import DatasetError, InvalidInput
 from visloc.features import (
     GlobalDescriptor,
     LocalFeatureExtractor,
@@ -187,9 +188,9 @@ class ReadyMadeFeatures:
             DatasetError: with the file that is wrong.
         """
         size = (photo.camera.width, photo.camera.height)
-        return to_local_features(
-            *read_local(self.keypoints, self.descriptors, photo.name, size, self.origin)
-        )
+        rows = read_local(self.keypoints, self.descriptors, photo.name, size, self.origin)
+        with _errors_in(self.descriptors, photo):
+            return to_local_features(*rows)
 
 
 def find_local_features(
@@ -245,9 +246,27 @@ def read_global_features(features: FeatureSet, photos: Sequence[MappingPhoto]) -
     Raises:
         DatasetError: with the file that is wrong or missing.
     """
-    rows = [to_global_descriptor(features.read(photo.name)[0]) for photo in photos]
+    rows = []
+    for photo in photos:
+        with _errors_in(features, photo):
+            rows.append(to_global_descriptor(features.read(photo.name)[0]))
     fingerprint = FingerprintRecord.of(ready_made_fingerprint(features))
     return GlobalFeatures(fingerprint, np.stack(rows), {})
+
+
+@contextmanager
+def _errors_in(features: FeatureSet, photo: MappingPhoto) -> Iterator[None]:
+    """Name the file in what is wrong with rows that do not know where they are from."""
+    try:
+        yield
+    except InvalidInput as error:
+        raise DatasetError(
+            error.code,
+            error.message,
+            field=features.label(photo.name),
+            expected=error.expected,
+            got=error.got,
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)

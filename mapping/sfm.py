@@ -50,7 +50,7 @@ class SfmSettings:
         covisible_in: a map whose observations tell which photos see the same, for
             ``covisibility``; without it, the dataset's own reconstruction.
         mapper: a name of ``MAPPER_CONFIGS``.
-        refine: names of ``REFINABLE``.
+        refine: names of ``REFINABLE``; of them only ``intrinsics`` with ``estimate_poses``.
         estimate_poses: find poses too; known ones only anchor the result.
     """
 
@@ -98,7 +98,7 @@ def landmarks_from_matches(
         rigs = known_rigs(dataset, {photo.record.sensor_id for photo in photos})
         given = [_sfm_photo(photo, features, settings) for photo in photos]
         if settings.estimate_poses:
-            return _to_item(reconstruct(given, rigs, matches, config, work.root))
+            return _to_item(reconstruct(given, rigs, matches, config, settings.refine, work.root))
         return _to_item(triangulate(given, rigs, matches, config, settings.refine, work.root))
 
     progress("triangulation", 0, 1)

@@ -155,11 +155,13 @@ def reconstruct(
     rigs: Mapping[str, Mapping[str, Pose]],
     matches: Sequence[Matches],
     config: MapperConfig,
+    refine: Sequence[str],
     work: Path,
 ) -> SparseModel:
     """Find poses and points by incremental mapping; the frame and the unit of it are arbitrary.
 
-    Known intrinsics stay as they are. Of several models that do not connect the largest is taken.
+    Known intrinsics stay as they are unless ``refine`` names them. Of several models that do not
+    connect the largest is taken.
 
     Raises:
         InvalidInput: ``sfm.no_model``, ``sfm.no_points``.
@@ -167,7 +169,9 @@ def reconstruct(
     with _database(photos, rigs, matches, work) as (path, scene):
         options = _pipeline_options(config)
         options.constant_cameras = {
-            scene.camera_ids[photo.sensor] for photo in photos if photo.camera_known
+            scene.camera_ids[photo.sensor]
+            for photo in photos
+            if photo.camera_known and "intrinsics" not in refine
         }
 
         def run(token: pycolmap.CancellationToken) -> dict[int, pycolmap.Reconstruction]:

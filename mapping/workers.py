@@ -5,10 +5,12 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from types import TracebackType
 from typing import TypeVar
 
 import cv2
@@ -23,14 +25,32 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class Workers:
-    """Does work in ``count`` processes; one means this process.
+    """Does work in ``count`` processes, which end with the ``with`` block; one means this process.
 
-    A task and its items travel to other processes: the task is a module's function or a
-    ``functools.partial`` of one, and leaves its result in the work folder.
+    A task and its items travel to other processes: the task is a module's function, a method of a
+    dataclass or a ``functools.partial`` of one, and leaves its result in the work folder.
     """
 
     def __init__(self, count: int) -> None:
-        self._count = count
+        # A forked child of a process that has used torch hangs.
+        spawn = multiprocessing.get_context("spawn")
+        self._pool = (
+            ProcessPoolExecutor(count, mp_context=spawn, initializer=_start_worker)
+            if count > 1
+            else None
+        )
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
 
     def run(
         self, task: Callable[[T], object], items: Sequence[T], progress: Callable[[int, int], None]
@@ -42,38 +62,39 @@ class Workers:
             Exception: what the task raised first; waiting items are dropped.
         """
         progress(0, len(items))
-        if self._count == 1 or len(items) <= 1:
+        if self._pool is None:
             for done, item in enumerate(items, 1):
                 task(item)
                 progress(done, len(items))
             return
-        with _one_thread_each(), _pool(min(self._count, len(items))) as pool:
-            futures: list[Future[object]] = [pool.submit(task, item) for item in items]
-            try:
-                for done, future in enumerate(as_completed(futures), 1):
-                    future.result()
-                    progress(done, len(items))
-            except BrokenProcessPool as error:
-                raise Unavailable(
-                    "build.worker_died",
-                    "a worker process ended: it was killed, or there was not enough memory; "
-                    "finished work is kept, the same command resumes",
-                    field="--workers",
-                ) from error
-            finally:
-                pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _pool(count: int) -> ProcessPoolExecutor:
-    # A forked child of a process that has used torch hangs.
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
+        try:
+            with _one_thread_each():
+                futures: list[Future[object]] = [self._pool.submit(task, item) for item in items]
+            for done, future in enumerate(as_completed(futures), 1):
+                future.result()
+                progress(done, len(items))
+        except BrokenProcessPool as error:
+            raise Unavailable(
+                "build.worker_died",
+                "a worker process ended: it was killed, or there was not enough memory; "
+                "finished work is kept, the same command resumes",
+                field="--workers",
+            ) from error
 
 
 def _start_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
+
+
+def _end_with_parent() -> None:
+    """A worker of a build that was killed would wait for work forever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 @contextmanager

@@ -121,3 +121,99 @@ def test_what_is_refined_changes_and_nothing_else_and_the_frame_stays(
     ]
     assert np.max(moved, axis=0) == pytest.approx([0.0, 0.0], abs=0.3)
     assert localization_errors(built, walk / "query")[:, 0].max() < 0.02
+
+
+ANCHOR = np.array([ANCHOR_LATITUDE_DEG, ANCHOR_LONGITUDE_DEG, ANCHOR_ALTITUDE_M])
+ESTIMATE = SfmSettings(pairing=PairSettings(top_k=4), estimate_poses=True)
+
+
+def centers_of(dataset: Path) -> dict[str, NDArray[np.float64]]:
+    read = read_dataset(dataset)
+    return {r.path: pose.center for r in read.images if (pose := read.pose(r)) is not None}
+
+
+def test_without_any_position_the_world_is_said_to_be_arbitrary(
+    walk_copy: Path, tmp_path: Path, build_walk: Build, rewrite: Rewrite
+) -> None:
+    known = read_dataset(walk_copy)
+    unknown = {
+        name: Sensor(name, "", "camera", ("UNKNOWN_CAMERA", "256", "192"), None)
+        for name in ("left", "right")
+    }
+    rewrite(walk_copy, sensors=unknown, rigs={}, trajectories={}, gnss=(), depth_maps=())
+    built = build_walk(walk_copy, tmp_path / "maps", sfm=ESTIMATE)
+    world = built.manifest.world
+    assert not world.metric
+    assert world.anchor is not None
+    assert (world.anchor.kind, world.anchor.images, world.anchor.rms) == ("none", 0, None)
+    assert any("the frame and unit are arbitrary" in note for note in built.manifest.notes)
+    # What the lenses are was found too: a guess of 307 px became what it is.
+    for name, camera in built.cameras.items():
+        truth = known.sensors[name].camera
+        assert truth is not None
+        assert camera.model == "SIMPLE_RADIAL"
+        assert camera.focal_length == pytest.approx(truth.focal_length, rel=0.1)
+
+
+def test_gnss_says_where_the_map_lies_and_one_wrong_fix_does_no_harm(
+    walk: Path, walk_copy: Path, tmp_path: Path, build_walk: Build, rewrite: Rewrite
+) -> None:
+    dataset, random = read_dataset(walk_copy), np.random.default_rng(0)
+    fixes = []
+    for number, stamp in enumerate(sorted({record.timestamp for record in dataset.images})):
+        at = dataset.trajectories[stamp, "rig"].center + random.normal(0, 0.02, 3)
+        if number == 3:
+            at += [60.0, 0.0, 0.0]
+        latitude, longitude, altitude = geodetic_from_enu(at[None], ANCHOR)[0]
+        fixes.append(GnssRecord(stamp, "gnss", longitude, latitude, altitude, 0.0, 0.0))
+    rewrite(walk_copy, rigs={}, trajectories={}, gnss=tuple(fixes), depth_maps=())
+
+    built = build_walk(walk_copy, tmp_path / "maps", sfm=ESTIMATE, metric=False)
+
+    world = built.manifest.world
+    assert world.metric
+    assert world.anchor is not None
+    assert (world.anchor.kind, world.anchor.images) == ("gnss", 14)  # all but two of one instant
+    assert world.anchor.rms is not None
+    assert world.anchor.rms < 0.2
+    geodetic = world.anchor.geodetic
+    assert geodetic is not None
+    origin = np.array([geodetic.latitude_deg, geodetic.longitude_deg, geodetic.altitude_m])
+    # The world's axes point east, north and up of that origin; the rig is 12 cm wide.
+    truth = centers_of(walk / "mapping")
+    expected = enu_from_geodetic(geodetic_from_enu(np.array(list(truth.values())), ANCHOR), origin)
+    poses = poses_of(built)
+    found = [Pose.from_quaternion(poses[name][:4], poses[name][4:]).center for name in truth]
+    assert np.linalg.norm(found - expected, axis=1).max() < 0.15
+
+
+def test_poses_of_some_photos_anchor_all_of_them(
+    walk: Path,
+    walk_copy: Path,
+    tmp_path: Path,
+    build_walk: Build,
+    rewrite: Rewrite,
+    localization_errors: Errors,
+) -> None:
+    stamps = sorted({record.timestamp for record in read_dataset(walk_copy).images})
+    kept = set(stamps[::3])
+    dataset = read_dataset(walk_copy)
+    poses = {
+        (record.timestamp, record.sensor_id): pose
+        for record in dataset.images
+        if record.timestamp in kept and (pose := dataset.pose(record)) is not None
+    }
+    rewrite(walk_copy, rigs={}, trajectories=poses, gnss=(), depth_maps=())
+
+    built = build_walk(walk_copy, tmp_path / "maps", sfm=ESTIMATE)
+
+    anchor = built.manifest.world.anchor
+    assert built.manifest.world.metric
+    assert anchor is not None
+    assert (anchor.kind, anchor.images) == ("positions", len(poses))
+    assert anchor.rms is not None
+    assert anchor.rms < 0.05
+    errors = localization_errors(built, walk / "query")
+    assert np.median(errors[:, 0]) < 0.03
+    assert errors[:, 0].max() < 0.1
+    assert errors[:, 1].max() < 1.5

@@ -104,17 +104,20 @@ def test_wrong_matches_make_no_points(tmp_path: Path) -> None:
         )
         for pair in world.matches
     ]
-    model = triangulate(world.photos, {}, wrong, CONFIG, (), tmp_path)
+    strict = replace(CONFIG, min_track_length=3)  # no verification has dropped anything
+    model = triangulate(world.photos, {}, wrong, strict, (), tmp_path)
     errors = np.linalg.norm(model.points - world.truth(model), axis=1)
     assert len(model.points) <= 260
     assert (errors < 1e-3).sum() >= 225
 
 
-def test_tracks_of_two_photos_are_points_only_in_the_relaxed_configuration(tmp_path: Path) -> None:
+def test_tracks_of_two_photos_are_points_unless_more_are_asked_for(tmp_path: Path) -> None:
     world = make_world(num_photos=2)
     with pytest.raises(InvalidInput, match="too few matches to triangulate"):
-        triangulate(world.photos, {}, world.matches, CONFIG, (), tmp_path)
-    model = triangulate(world.photos, {}, world.matches, MAPPER_CONFIGS["config2"], (), tmp_path)
+        triangulate(
+            world.photos, {}, world.matches, replace(CONFIG, min_track_length=3), (), tmp_path
+        )
+    model = triangulate(world.photos, {}, world.matches, CONFIG, (), tmp_path)
     np.testing.assert_allclose(model.points, world.truth(model), atol=1e-4)
     np.testing.assert_allclose(model.angles_deg, 12, atol=5)
 
@@ -201,7 +204,7 @@ def test_refined_intrinsics_come_nearer_to_the_truth(tmp_path: Path) -> None:
 def test_without_poses_the_same_world_comes_back_up_to_a_similarity(tmp_path: Path) -> None:
     world = make_world()
     photos = [replace(photo, cam_from_world=None) for photo in world.photos]
-    model = reconstruct(photos, {}, world.matches, CONFIG, tmp_path)
+    model = reconstruct(photos, {}, world.matches, CONFIG, (), tmp_path)
     assert all(view is not None for view in model.views)
     centers = np.array([view.cam_from_world.center for view in model.views if view])
     known = np.array([p.cam_from_world.center for p in world.photos if p.cam_from_world])
@@ -224,5 +227,5 @@ def test_photos_that_share_nothing_cannot_be_placed(tmp_path: Path) -> None:
     world = make_world(num_photos=3)
     photos = [replace(photo, cam_from_world=None) for photo in world.photos]
     with pytest.raises(InvalidInput) as caught:
-        reconstruct(photos, {}, [], CONFIG, tmp_path)
+        reconstruct(photos, {}, [], CONFIG, (), tmp_path)
     assert caught.value.code == "sfm.no_model"

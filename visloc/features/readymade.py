@@ -133,7 +133,7 @@ def _unit_rows(rows: NDArray[Any], field: str) -> NDArray[np.float32]:
             f"row {row} has no direction",
             field=field,
             expected="finite numbers, not all zero",
-            got=rows[row, :4],
+            got=rows[row, :4].tolist(),
         )
     wide /= largest
     wide /= np.linalg.norm(wide, axis=1, keepdims=True)

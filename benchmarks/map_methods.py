@@ -1,0 +1,112 @@
+"""Maps of one dataset made in several ways, side by side: landmarks, time, accuracy.
+
+    python benchmarks/map_methods.py DATASET rgbd sfm:retrieval sfm:distance sfm:frustum
+
+DATASET holds ``mapping`` and ``query``, kapture datasets. Each way is a method, for sfm with its
+pairing. Maps are built in order and kept in --maps-dir; ``sfm:covisibility`` asks the first of
+them who sees what. Queries are localized in this process, one after the other, with the default
+options. Prints a table in Markdown.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from mapping.build import BuildSettings, build_map
+from mapping.sfm import SfmSettings
+from visloc.archive import Map, open_map
+from visloc.evaluation import pose_error
+from visloc.features import DEFAULT_LOCAL_FEATURES, make_local_features
+from visloc.images import read_photo_file
+from visloc.kapture import read_dataset
+from visloc.localizer import Localizer
+from visloc.types import Localized, LocalizeOptions
+
+# Stages that depend on the way; features and global descriptors do not.
+STAGES = ("depth", "landmarks", "pairs", "matches", "verified", "triangulation")
+BINS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0))
+
+
+@dataclass
+class Stopwatch:
+    """Seconds by stage, from what a build tells of its progress."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    _since: float = field(default_factory=time.perf_counter)
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Note the time since the last call under the stage."""
+        del done, total
+        now = time.perf_counter()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._since
+        self._since = now
+
+
+def measure(opened: Map, query: Path, weights_dir: Path | None) -> tuple[int, np.ndarray]:
+    """Localize the queries; return how many there are, and the errors (n, 2) in m and degrees."""
+    name = opened.manifest.local_features.fingerprint.name
+    localizer = Localizer(opened, make_local_features(name, weights_dir))
+    dataset = read_dataset(query)
+    errors = []
+    for record in dataset.images:
+        photo = read_photo_file(dataset.path_of(record))
+        camera, truth = dataset.sensors[record.sensor_id].camera, dataset.pose(record)
+        answer = localizer.localize(photo, camera, LocalizeOptions())
+        if isinstance(answer, Localized) and truth is not None:
+            errors.append(pose_error(answer.cam_from_world, truth))
+    return len(dataset.images), np.array(errors).reshape(-1, 2)
+
+
+def main(
+    dataset: Annotated[Path, typer.Argument(help="Holds mapping/ and query/.")],
+    ways: Annotated[list[str], typer.Argument(help="rgbd, or sfm:PAIRING[,PAIRING].")],
+    maps_dir: Path = Path("maps"),
+    local_features: str = DEFAULT_LOCAL_FEATURES,
+    weights_dir: Path | None = None,
+    mapper: str = "config1",
+    workers: int = 2,
+) -> None:
+    """Build, localize, print."""
+    typer.echo(
+        "| way | landmarks | observations | s to make them | localized | "
+        "5 cm, 5 deg | 25 cm, 2 deg | 50 cm, 5 deg | median |"
+    )
+    typer.echo("|---|---|---|---|---|---|---|---|---|")
+    first: Map | None = None
+    for way in ways:
+        method, _, pairs = way.partition(":")
+        sfm = SfmSettings(mapper=mapper, covisible_in=first)
+        settings = BuildSettings(
+            dataset=dataset / "mapping",
+            map_id="-".join([dataset.name, local_features, method, *pairs.split(",")]).strip("-"),
+            maps_dir=maps_dir,
+            method=method,
+            local_features=local_features,
+            weights_dir=weights_dir,
+            sfm=replace(sfm, pairs=tuple(pairs.split(","))) if pairs else sfm,
+            workers=workers,
+            force=True,
+        )
+        watch = Stopwatch()
+        opened = open_map(build_map(settings, watch))
+        first = first or opened
+        total, errors = measure(opened, dataset / "query", weights_dir)
+        counts = opened.manifest.counts
+        within = [int(((errors[:, 0] <= m) & (errors[:, 1] <= deg)).sum()) for m, deg in BINS]
+        median = np.median(errors, axis=0) if len(errors) else np.full(2, np.nan)
+        seconds = sum(watch.seconds.get(stage, 0.0) for stage in STAGES)
+        typer.echo(
+            f"| `{way}` | {counts.landmarks} | {counts.observations} | {seconds:.1f} | "
+            f"{len(errors)} of {total} | {' | '.join(map(str, within))} | "
+            f"{median[0] * 100:.2f} cm, {median[1]:.3f} deg |"
+        )
+
+
+if __name__ == "__main__":
+    typer.run(main)
