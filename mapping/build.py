@@ -326,7 +326,15 @@ def _make_landmarks(
         )
     if settings.method == "model":
         return landmarks_from_reconstruction(
-            dataset, photos, features, settings.pixel_origin, settings.metric, progress
+            work,
+            dataset,
+            photos,
+            features,
+            settings.pixel_origin,
+            settings.sfm,
+            settings.metric,
+            workers,
+            progress,
         )
     return landmarks_from_matches(
         work,
@@ -400,6 +408,8 @@ def _publish(
     try:
         if made.pairs is not None:
             write_pairs(incoming / "pairs.txt", *made.pairs)
+        if made.imported is not None:
+            made.imported.write(incoming)
         version = write_map(
             incoming,
             content,

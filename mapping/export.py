@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import PIL.Image  # noqa: F401  Pillow saves PNGs only when it was imported befo
 import pycolmap
 from numpy.typing import NDArray
 
+from mapping.imported_points import read_imported_points
 from mapping.outputs import complete_output
 from visloc.archive import Map
 from visloc.errors import InvalidInput
@@ -21,13 +23,14 @@ from visloc.kapture import (
     Sensor,
     write_dataset,
     write_global_features,
+    write_keypoints,
     write_local_features,
     write_reconstruction,
 )
 from visloc.pose.colmap import colmap_camera
 
 _READY_MADE = "kapture:"  # begins the names of features that came with a dataset
-_NO_ERROR = -1.0  # COLMAP's word for a point whose error is not known
+_IMPORTED = "imported"  # type of the keypoints of the reconstruction that a map came from
 
 
 def export_map(opened: Map, output: Path, format_name: str) -> None:
@@ -35,6 +38,9 @@ def export_map(opened: Map, output: Path, format_name: str) -> None:
 
     Coordinates are those of the world, with the map's origin added, and names of photos are those
     of the map. Points keep their order, also those that no photo sees. Photos are not in a map.
+
+    A map of an imported reconstruction whose photos were matched anew gives the reconstruction
+    back: its points and who sees them, not the landmarks made since.
 
     Args:
         opened: the map.
@@ -61,40 +67,75 @@ def export_map(opened: Map, output: Path, format_name: str) -> None:
         export(opened, partial)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Model:
+    """What is exported: the map's landmarks, or the reconstruction that it was imported from.
+
+    Attributes:
+        points: (P, 3) float64 in the world.
+        colors: (P, 3) uint8; None without.
+        keypoints: of each photo, (k, 2) float32 pixels.
+        observations: (M, 3) rows: point, photo, keypoint of that photo.
+        described: whether the keypoints are those that the map has descriptors of.
+    """
+
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8] | None
+    keypoints: list[NDArray[np.float32]]
+    observations: NDArray[np.int64]
+    described: bool
+
+
+def _model(opened: Map) -> _Model:
+    imported = read_imported_points(opened)
+    if imported is not None:
+        keypoints = np.split(imported.keypoints, imported.keypoint_offsets[1:-1])
+        return _Model(imported.points, imported.colors, keypoints, imported.observations, False)
+    offsets = opened.observation_offsets
+    photo = np.repeat(np.arange(len(opened.images)), np.diff(offsets))
+    landmark = opened.observation_landmarks.astype(np.int64)
+    origin = np.array(opened.manifest.world.origin, np.float64)
+    return _Model(
+        points=opened.landmarks.astype(np.float64) + origin,
+        colors=None if opened.colors is None else np.asarray(opened.colors),
+        keypoints=np.split(np.asarray(opened.observation_keypoints), offsets[1:-1]),
+        observations=np.column_stack([landmark, photo, np.arange(len(photo)) - offsets[photo]]),
+        described=True,
+    )
+
+
 def _export_colmap(opened: Map, output: Path) -> None:
+    exported = _model(opened)
     model = pycolmap.Reconstruction()
     camera_ids = {name: number for number, name in enumerate(opened.cameras, 1)}
     for name, camera in opened.cameras.items():
         made = colmap_camera(camera)
         made.camera_id = camera_ids[name]
         model.add_camera_with_trivial_rig(made)
-    tracks = [pycolmap.Track() for _ in range(len(opened.landmarks))]
     for row, record in enumerate(opened.images):
-        image_id = row + 1
-        start, stop = opened.observation_offsets[row : row + 2]
-        keypoints = opened.observation_keypoints[start:stop].astype(np.float64)
         image = pycolmap.Image(
             name=record.name,
-            keypoints=keypoints,
+            keypoints=exported.keypoints[row].astype(np.float64),
             camera_id=camera_ids[record.camera],
-            image_id=image_id,
+            image_id=row + 1,
         )
         pose = opened.image_poses[row]
         rotation = pycolmap.Rotation3d(pose[[1, 2, 3, 0]])  # pycolmap has w last
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(rotation, pose[4:]))
-        for index, landmark in enumerate(opened.observation_landmarks[start:stop].tolist()):
-            tracks[landmark].add_element(image_id, index)
-    points, colors = _points(opened), _colors(opened)
-    errors = np.where(np.isfinite(opened.errors_px), opened.errors_px, _NO_ERROR)
+    tracks = [pycolmap.Track() for _ in range(len(exported.points))]
+    for point, photo, keypoint in exported.observations.tolist():
+        tracks[point].add_element(photo + 1, keypoint)
+    black = np.zeros((len(tracks), 3), np.uint8)
+    colors = black if exported.colors is None else exported.colors
     for index, track in enumerate(tracks):
-        point_id = model.add_point3D(points[index], track, colors[index])
-        model.points3D[point_id].error = float(errors[index])
+        model.add_point3D(exported.points[index], track, colors[index])
+    model.update_point_3d_errors()
     output.mkdir()
     model.write_binary(output)
 
 
 def _export_kapture(opened: Map, output: Path) -> None:
-    local = opened.manifest.local_features.fingerprint.name.removeprefix(_READY_MADE)
+    exported = _model(opened)
     poses = [Pose.from_quaternion(row[:4], row[4:]) for row in opened.image_poses]
     records = [FileRecord(i.timestamp, i.camera, i.name) for i in opened.images]
     write_dataset(
@@ -113,47 +154,44 @@ def _export_kapture(opened: Map, output: Path) -> None:
             gnss=(),
         )
     )
-    offsets = opened.observation_offsets
+    local = opened.manifest.local_features.fingerprint.name.removeprefix(_READY_MADE)
+    keypoints_type = local if exported.described else _IMPORTED
     for row, record in enumerate(opened.images):
-        keypoints = np.asarray(opened.observation_keypoints[offsets[row] : offsets[row + 1]])
-        _, descriptors = opened.observations(row)
-        write_local_features(output, local, record.name, keypoints, descriptors, name=local)
+        keypoints = exported.keypoints[row]
+        if exported.described:
+            _, descriptors = opened.observations(row)
+            write_local_features(output, local, record.name, keypoints, descriptors, name=local)
+        else:
+            write_keypoints(output, _IMPORTED, record.name, keypoints, name=_IMPORTED)
         for name, vectors in opened.global_descriptors.items():
             kind = name.removeprefix(_READY_MADE)
             write_global_features(output, kind, record.name, vectors[row], name=kind)
-    image = np.repeat(np.arange(len(records)), np.diff(offsets))
     write_reconstruction(
         output,
         Reconstruction(
-            points=_points(opened),
-            colors=None if opened.colors is None else np.asarray(opened.colors),
-            keypoints_type=local,
+            points=exported.points,
+            colors=exported.colors,
+            keypoints_type=keypoints_type,
             images=tuple(record.name for record in opened.images),
-            observations=np.column_stack(
-                [
-                    opened.observation_landmarks.astype(np.int64),
-                    image,
-                    np.arange(len(image)) - offsets[image],
-                ]
-            ).astype(np.int64),
+            observations=exported.observations,
         ),
     )
 
 
 def _export_ply(opened: Map, output: Path) -> None:
+    exported = _model(opened)
     # pycolmap writes single precision, which is half a metre at the coordinates of a city.
     columns = [(axis, "<f8") for axis in "xyz"]
     names = ["double x", "double y", "double z"]
-    if opened.colors is not None:
+    if exported.colors is not None:
         columns += [(channel, "u1") for channel in ("red", "green", "blue")]
         names += ["uchar red", "uchar green", "uchar blue"]
-    vertices = np.empty(len(opened.landmarks), dtype=columns)
-    points = _points(opened)
+    vertices = np.empty(len(exported.points), dtype=columns)
     for index, axis in enumerate("xyz"):
-        vertices[axis] = points[:, index]
-    if opened.colors is not None:
+        vertices[axis] = exported.points[:, index]
+    if exported.colors is not None:
         for index, channel in enumerate(("red", "green", "blue")):
-            vertices[channel] = opened.colors[:, index]
+            vertices[channel] = exported.colors[:, index]
     header = [
         "ply",
         "format binary_little_endian 1.0",
@@ -163,18 +201,6 @@ def _export_ply(opened: Map, output: Path) -> None:
         "end_header\n",
     ]
     output.write_bytes("\n".join(header).encode("ascii") + vertices.tobytes())
-
-
-def _points(opened: Map) -> NDArray[np.float64]:
-    origin = np.array(opened.manifest.world.origin, np.float64)
-    points: NDArray[np.float64] = opened.landmarks.astype(np.float64) + origin
-    return points
-
-
-def _colors(opened: Map) -> NDArray[np.uint8]:
-    if opened.colors is None:
-        return np.zeros((len(opened.landmarks), 3), np.uint8)
-    return np.asarray(opened.colors)
 
 
 EXPORTERS: Mapping[str, Callable[[Map, Path], None]] = {

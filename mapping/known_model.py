@@ -1,14 +1,21 @@
-"""Landmarks from the points that the dataset brings along: an imported reconstruction."""
+"""Landmarks from a reconstruction that the dataset brings along: an imported one.
+
+With the features that the reconstruction was made of, its points are the landmarks. Other features
+do not see its points: its photos are matched anew, with its poses, between the photos that it says
+see the same. Its points then stay in the map beside the landmarks, so that the map can be exported
+as the reconstruction that it was.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mapping.features import LocalFeaturesSource, Progress, ReadyMadeFeatures
+from mapping.imported_points import ImportedPoints
 from mapping.landmarks import (
     MadeLandmarks,
     Observations,
@@ -17,33 +24,77 @@ from mapping.landmarks import (
     triangulation_angles,
 )
 from mapping.photos import MappingPhoto
+from mapping.sfm import SfmSettings, landmarks_from_matches
+from mapping.stages import WorkFolder
+from mapping.workers import Workers
 from visloc.archive import Anchor
 from visloc.errors import DatasetError
 from visloc.geometry import PixelOrigin
 from visloc.kapture import Dataset, FeatureSet, Reconstruction, open_features, read_reconstruction
 
-# A keypoint of ours this close to where the reconstruction saw a point is taken for that point.
-MAX_DISTANCE_PX = 2.0
-
 
 def landmarks_from_reconstruction(
+    work: WorkFolder,
     dataset: Dataset,
     photos: Sequence[MappingPhoto],
     features: LocalFeaturesSource,
     origin: PixelOrigin,
+    settings: SfmSettings,
     metric: bool,
+    workers: Workers,
     progress: Progress,
 ) -> MadeLandmarks:
-    """Take the dataset's points as landmarks, and give them descriptors.
+    """Take the dataset's points as landmarks, or match its photos anew.
 
-    With the ready-made features that the points were made of, every sighting has its descriptor.
-    With other features, a sighting gets that of the nearest keypoint within ``MAX_DISTANCE_PX``,
-    and is left out without one. All points stay, in their order, also those that no feature of
-    ours sees: so the map can be exported as the reconstruction that it was.
+    Args:
+        work: where finished work is kept.
+        dataset: it has points, observations and the keypoints that observe.
+        photos: with poses.
+        features: of the photos.
+        origin: what the dataset's keypoints count from.
+        settings: how photos are matched anew; the pairs are those that see the same points.
+        metric: whether a unit of the dataset's poses is a metre.
+        workers: who works.
+        progress: told how far it is.
 
     Raises:
-        DatasetError: ``model.no_points``, ``model.no_sightings``, and what reading raises.
+        DatasetError: ``model.no_points``, and what reading raises.
+        InvalidInput: what matching raises.
     """
+    known, keypoints = _read(dataset, features)
+    imported = _imported_points(known, keypoints, photos, origin)
+    anchor = Anchor(kind="model", images=len(photos))
+    if not (
+        isinstance(features, ReadyMadeFeatures)
+        and features.keypoints.type_name == known.keypoints_type
+    ):
+        anew = replace(settings, pairs=("covisibility",), covisible_in=None, pairs_file=None)
+        made = landmarks_from_matches(
+            work, dataset, photos, features, (), anew, metric, workers, progress
+        )
+        return replace(made, anchor=anchor, imported=imported)
+    views = [View(photo.camera, photo.pose) for photo in photos]
+    observations = _observations(imported)
+    landmarks, rows = assemble_landmarks(
+        views,
+        imported.points,
+        observations,
+        angles_deg=triangulation_angles(views, imported.points, observations),
+        colors=imported.colors,
+    )
+    return MadeLandmarks(
+        photos=np.arange(len(photos)),
+        views=tuple(views),
+        landmarks=landmarks,
+        rows=tuple(rows),
+        settings={},
+        metric=metric,
+        anchor=anchor,
+    )
+
+
+def _read(dataset: Dataset, features: LocalFeaturesSource) -> tuple[Reconstruction, FeatureSet]:
+    """The reconstruction, and the keypoints that see its points."""
     known = read_reconstruction(dataset.root)
     if known is None or known.keypoints_type is None or len(known.observations) == 0:
         raise DatasetError(
@@ -53,99 +104,48 @@ def landmarks_from_reconstruction(
             expected="points3d.txt and observations.txt, as mapping import writes them; "
             "without, use --method sfm",
         )
-    keypoints = open_features(dataset.root, "keypoints", known.keypoints_type)
-    sightings = _sightings(keypoints, photos, known, origin)
-    same = (
+    if (
         isinstance(features, ReadyMadeFeatures)
         and features.keypoints.type_name == known.keypoints_type
-    )
-    found = []
-    for row, photo in enumerate(photos):
-        own = sightings.take(sightings.views == row)
-        found.append(own if same else _nearest(own, features.read(photo).keypoints))
-        progress("landmarks", row + 1, len(photos))
-    observations = Observations(
-        *(
-            np.concatenate([getattr(one, name) for one in found])
-            for name in ("points", "views", "rows", "pixels")
-        )
-    )
-    if len(observations) == 0:
-        raise DatasetError(
-            "model.no_sightings",
-            "no point of the reconstruction is where the features see anything",
-            field=str(dataset.root / "reconstruction" / "observations.txt"),
-            expected=f"sightings within {MAX_DISTANCE_PX} px of keypoints of "
-            f"{features.fingerprint.name}; check --pixel-origin, or use --method sfm",
-        )
-    views = [View(photo.camera, photo.pose) for photo in photos]
-    landmarks, rows = assemble_landmarks(
-        views,
-        known.points,
-        observations,
-        track_lengths=np.bincount(sightings.points, minlength=len(known.points)),
-        angles_deg=triangulation_angles(views, known.points, sightings),
-        colors=known.colors,
-    )
-    unseen = len(known.points) - len(np.unique(observations.points))
-    notes = (
-        f"{unseen} of {len(known.points)} points are kept, but no feature sees them",
-        f"{len(observations)} of {len(sightings)} sightings have a descriptor",
-    )
-    return MadeLandmarks(
-        photos=np.arange(len(photos)),
-        views=tuple(views),
-        landmarks=landmarks,
-        rows=tuple(rows),
-        settings={"max_distance_px": MAX_DISTANCE_PX},
-        metric=metric,
-        anchor=Anchor(kind="model", images=len(photos)),
-        notes=notes if unseen or len(observations) < len(sightings) else (),
-    )
+    ):
+        return known, features.keypoints
+    return known, open_features(dataset.root, "keypoints", known.keypoints_type)
 
 
-def _sightings(
+def _imported_points(
+    known: Reconstruction,
     keypoints: FeatureSet,
     photos: Sequence[MappingPhoto],
-    known: Reconstruction,
     origin: PixelOrigin,
-) -> Observations:
-    """The reconstruction's own observations by these photos, at its own keypoints."""
+) -> ImportedPoints:
+    """The reconstruction as far as these photos see it, in their order."""
     row_of_name = {photo.name: row for row, photo in enumerate(photos)}
-    views = np.array([row_of_name.get(name, -1) for name in known.images], dtype=np.int64)
-    found = []
-    for image in np.unique(known.observations[:, 1]).tolist():
-        if views[image] < 0:
-            continue
-        own = known.observations[known.observations[:, 1] == image]
-        pixels = keypoints.read(known.images[image])[:, :2]
-        # A photo may see a point twice; the first time counts.
-        _, first = np.unique(own[:, 0], return_index=True)
-        own = own[np.sort(first)]
-        seen_at = (pixels[own[:, 2]] + origin.shift).astype(np.float32)
-        row = np.full(len(own), views[image], dtype=np.int64)
-        found.append(Observations(own[:, 0], row, own[:, 2], seen_at))
-    if not found:
-        empty = np.empty(0, dtype=np.int64)
-        return Observations(empty, empty, empty, np.empty((0, 2), dtype=np.float32))
-    return Observations(
-        *(
-            np.concatenate([getattr(one, name) for one in found])
-            for name in ("points", "views", "rows", "pixels")
-        )
+    photo_of_image = np.array([row_of_name.get(name, -1) for name in known.images], dtype=np.int64)
+    pixels = [
+        (keypoints.read(photo.name)[:, :2] + origin.shift).astype(np.float32)
+        if keypoints.has(photo.name)
+        else np.empty((0, 2), dtype=np.float32)
+        for photo in photos
+    ]
+    observations = known.observations.copy()
+    observations[:, 1] = photo_of_image[known.observations[:, 1]]
+    return ImportedPoints(
+        points=known.points,
+        colors=known.colors,
+        keypoint_offsets=np.cumsum([0, *(len(one) for one in pixels)], dtype=np.int64),
+        keypoints=np.concatenate(pixels),
+        observations=observations[observations[:, 1] >= 0],
     )
 
 
-def _nearest(sightings: Observations, keypoints: NDArray[np.float32]) -> Observations:
-    """Sightings moved to the nearest keypoint, each keypoint used once, by the nearest sighting."""
-    if len(sightings) == 0 or len(keypoints) == 0:
-        return sightings.take(np.zeros(len(sightings), dtype=bool))
-    nearest = cKDTree(keypoints).query(sightings.pixels, distance_upper_bound=MAX_DISTANCE_PX)
-    distance, row = np.asarray(nearest[0]), np.asarray(nearest[1], dtype=np.int64)
-    order = np.lexsort((sightings.points, distance))
-    order = order[np.isfinite(distance[order])]
-    _, first = np.unique(row[order], return_index=True)
-    kept = np.sort(order[first])
+def _observations(imported: ImportedPoints) -> Observations:
+    """Every point once per photo: of several sightings in a photo the first counts."""
+    table: NDArray[np.int64] = imported.observations
+    order = np.lexsort((table[:, 2], table[:, 0], table[:, 1]))
+    table = table[order]
+    repeated = np.zeros(len(table), dtype=bool)
+    repeated[1:] = (np.diff(table[:, :2], axis=0) == 0).all(axis=1)
+    points, views, rows = table[~repeated].T
     return Observations(
-        sightings.points[kept], sightings.views[kept], row[kept], keypoints[row[kept]]
+        points, views, rows, imported.keypoints[imported.keypoint_offsets[views] + rows]
     )

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import JsonValue
 
+from mapping.imported_points import ImportedPoints
 from mapping.pairing import Pairs, Scene
 from visloc.archive import Anchor, Landmarks
 from visloc.geometry import Camera, Pose
@@ -71,6 +72,7 @@ class MadeLandmarks:
         metric: whether a unit of the world is a metre.
         anchor: how the world was fixed.
         notes: what was left out, one sentence each.
+        imported: points of the reconstruction that was matched anew, if one was.
         pairs: the pairs that were matched, with the scene they belong to, if any were.
     """
 
@@ -82,6 +84,7 @@ class MadeLandmarks:
     metric: bool
     anchor: Anchor
     notes: tuple[str, ...] = ()
+    imported: ImportedPoints | None = None
     pairs: tuple[Scene, Pairs] | None = None
 
 
@@ -90,7 +93,6 @@ def assemble_landmarks(
     points: NDArray[np.float64],
     observations: Observations,
     *,
-    track_lengths: NDArray[np.int64] | None = None,
     angles_deg: NDArray[np.float32] | None = None,
     colors: NDArray[np.uint8] | None = None,
 ) -> tuple[Landmarks, list[NDArray[np.int64]]]:
@@ -100,7 +102,6 @@ def assemble_landmarks(
         views: n photos.
         points: (P, 3) in the world.
         observations: of the points; sorted by photo here.
-        track_lengths: (P,) when they are not those of the observations.
         angles_deg: (P,); NaN without.
         colors: (P, 3).
 
@@ -118,9 +119,7 @@ def assemble_landmarks(
     landmarks = Landmarks(
         origin=origin,
         points=(points - origin).astype(np.float32),
-        track_lengths=np.minimum(seen if track_lengths is None else track_lengths, 65535).astype(
-            np.uint16
-        ),
+        track_lengths=np.minimum(seen, 65535).astype(np.uint16),
         errors_px=mean_errors.astype(np.float32),
         angles_deg=np.full(num_points, np.nan, np.float32) if angles_deg is None else angles_deg,
         offsets=bounds.astype(np.int64),

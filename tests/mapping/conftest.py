@@ -19,7 +19,7 @@ from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
-from visloc.kapture import Dataset, read_dataset, write_dataset
+from visloc.kapture import read_dataset, write_dataset
 from visloc.localizer import Localizer
 from visloc.types import Localized, LocalizeOptions
 
@@ -112,6 +112,3 @@ def rgbd_walk(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Map:
 def sfm_walk(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Map:
     """The walk as a map by matches with default settings; only to be read."""
     return _build_walk(walk / "mapping", tmp_path_factory.mktemp("sfm"))
-
-
-__all__ = ["Dataset"]

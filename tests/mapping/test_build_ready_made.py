@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from mapping.sfm import SfmSettings
 from visloc.archive import Map, MapStore
@@ -25,7 +24,7 @@ from visloc.kapture import (
     write_local_features,
 )
 from visloc.localizer import Localizer
-from visloc.types import LocalFeatures, Localized, LocalizeOptions, NotLocalized, QueryFeatures
+from visloc.types import LocalFeatures, Localized, LocalizeOptions, QueryFeatures
 
 Build = Callable[..., Map]
 Rewrite = Callable[..., None]
@@ -111,7 +110,11 @@ def query_of(
 
 
 def test_features_are_localized_in_a_map_of_features(
-    walk: Path, described: Path, tmp_path: Path, found: Mapping[str, LocalFeatures], build_walk: Build
+    walk: Path,
+    described: Path,
+    tmp_path: Path,
+    found: Mapping[str, LocalFeatures],
+    build_walk: Build,
 ) -> None:
     built = build_walk(described, tmp_path, **KINDS | {"global_features": ("localvlad",)})
     localizer = Localizer(built, None)
@@ -170,14 +173,12 @@ def test_pixels_that_count_from_the_centre_make_the_same_map(
         if camera is not None:
             fx, fy, cx, cy = camera.params
             camera = replace(camera, params=(fx, fy, cx - 0.5, cy - 0.5))
-            sensor = type(sensor).with_camera(name, camera, sensor.kind)  # noqa: PLW2901
+            sensor = type(sensor).with_camera(name, camera, sensor.kind)
         sensors[name] = sensor
     rewrite(described_copy, sensors=sensors)
     for path in file_of(described_copy, "keypoints", "x").parent.rglob("*.kpt"):
         (np.fromfile(path, "<f4") - np.float32(0.5)).tofile(path)
-    center = build_walk(
-        described_copy, tmp_path / "maps", pixel_origin=PixelOrigin.CENTER, **KINDS
-    )
+    center = build_walk(described_copy, tmp_path / "maps", pixel_origin=PixelOrigin.CENTER, **KINDS)
     # float32 loses a bit of a keypoint near the edge when half a pixel is taken away
     np.testing.assert_allclose(
         center.observation_keypoints, corner.observation_keypoints, atol=2e-5
@@ -321,13 +322,11 @@ def test_a_published_dataset_is_mapped_and_queried_by_its_own_features(
             keypoints, descriptors, record.path, (camera.width, camera.height), PixelOrigin.CENTER
         )
         vector = vectors.read(record.path)[0]
-        features = QueryFeatures(
-            "kapture:r2d2_500", pixels, rows, {"kapture:AP-GeM-LM18": vector}
-        )
+        features = QueryFeatures("kapture:r2d2_500", pixels, rows, {"kapture:AP-GeM-LM18": vector})
         answer = localizer.localize_features(features, camera, LocalizeOptions())
         assert isinstance(answer, Localized)
         errors.append(pose_error(answer.cam_from_world, truth))
     assert len(errors) == 4
-    assert np.median(errors, axis=0) == pytest.approx([0.0, 0.0], abs=0.2)
-    assert np.max(errors, axis=0)[0] < 0.3
-    print(errors)
+    # 4 to 9 mm and 0.04 to 0.18 degrees, in a hall of 500 keypoints per photo
+    assert np.max(errors, axis=0)[0] < 0.03
+    assert np.max(errors, axis=0)[1] < 0.4

@@ -1,8 +1,8 @@
 from __future__ import annotations
 
-import os
 import re
-from collections.abc import Callable, Sequence
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -29,9 +29,7 @@ def sfm(**settings: object) -> SfmSettings:
 
 
 def poses_of(opened: Map) -> dict[str, NDArray[np.float64]]:
-    return {
-        image.name: pose for image, pose in zip(opened.images, opened.image_poses, strict=True)
-    }
+    return {image.name: pose for image, pose in zip(opened.images, opened.image_poses, strict=True)}
 
 
 def test_queries_are_localized_to_millimetres_in_a_map_by_matches(
@@ -81,8 +79,6 @@ def test_every_pairing_makes_a_map_that_localizes(
     assert localization_errors(built, walk / "query")[:, 0].max() < 0.03
     num_pairs = len((built.path / "pairs.txt").read_text().splitlines()) - 1
     assert (num_pairs == 16 * 15 / 2) == (names == ("exhaustive",))
-    text = (built.path / "pairs.txt").read_text()
-    assert ("left" in text) and ("right" in text)
 
 
 def test_the_pairs_in_a_map_make_the_same_map_again(
@@ -217,3 +213,125 @@ def test_poses_of_some_photos_anchor_all_of_them(
     assert np.median(errors[:, 0]) < 0.03
     assert errors[:, 0].max() < 0.1
     assert errors[:, 1].max() < 1.5
+
+
+def append(name: str, *lines: str) -> Callable[[Path], None]:
+    def change(dataset: Path) -> None:
+        path = dataset / "sensors" / name
+        path.write_text(path.read_text() + "".join(f"{line}\n" for line in lines))
+
+    return change
+
+
+def replace_in(name: str, before: str, after: str) -> Callable[[Path], None]:
+    def change(dataset: Path) -> None:
+        path = dataset / "sensors" / name
+        text = path.read_text()
+        assert re.search(before, text)
+        path.write_text(re.sub(before, after, text))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("damage", "code", "named"),
+    [
+        (
+            append("records_camera.txt", "9, left, mapping/left/0001.jpg"),
+            "kapture.duplicate",
+            r"sensors/records_camera.txt:19.*mapping/left/0001.jpg",
+        ),
+        (
+            append("records_camera.txt", "1700000000000, left, mapping/left/0009.jpg"),
+            "kapture.duplicate",
+            r"sensors/records_camera.txt:19.*1700000000000, left",
+        ),
+        (
+            append("trajectories.txt", "1700000000000, rig, 1, 0, 0, 0, 0, 0, 0"),
+            "kapture.duplicate",
+            r"sensors/trajectories.txt:\d+.*1700000000000, rig",
+        ),
+        (
+            replace_in("sensors.txt", "camera, PINHOLE", "camera, FISHY"),
+            "camera.model",
+            r"sensors/sensors.txt:\d+.*FISHY",
+        ),
+        (
+            replace_in(
+                "sensors.txt", "camera, PINHOLE, 256, 192.*", "camera, UNKNOWN_CAMERA, 256, 192"
+            ),
+            "dataset.no_photos",
+            r"16 of 16 photos have a camera of unknown model: mapping/left/0001.jpg",
+        ),
+        (
+            lambda dataset: (dataset / "sensors" / "records_data").unlink(),
+            "dataset.no_photos",
+            r"16 of 16 photos are listed, but the file is absent: mapping/left/0001.jpg",
+        ),
+    ],
+)
+def test_a_bad_dataset_is_refused_by_name_and_nothing_is_published(
+    walk_copy: Path,
+    tmp_path: Path,
+    build_walk: Build,
+    damage: Callable[[Path], None],
+    code: str,
+    named: str,
+) -> None:
+    damage(walk_copy)
+    with pytest.raises(DatasetError, match=named) as caught:
+        build_walk(walk_copy, tmp_path / "maps")
+    assert caught.value.code == code
+    assert not (tmp_path / "maps" / "walk").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "named"),
+    [
+        ("mapping/left/0001.jpg, elsewhere.jpg\n", "pairs.unknown_photo", r"my.txt:1.*elsewhere"),
+        ("# nothing\n", "sfm.no_points", "too few matches to triangulate"),
+        (
+            "mapping/left/0001.jpg, mapping/right/0008.jpg\n",
+            "sfm.no_points",
+            "too few matches to triangulate",
+        ),
+    ],
+)
+def test_pairs_that_make_no_map_leave_the_one_before(
+    walk: Path,
+    tmp_path: Path,
+    rgbd_walk: Map,
+    build_walk: Build,
+    text: str,
+    code: str,
+    named: str,
+) -> None:
+    shutil.copytree(rgbd_walk.path.parent, tmp_path / "walk")
+    pairs = tmp_path / "my.txt"
+    pairs.write_text(text)
+    with pytest.raises(VislocError, match=named) as caught:
+        build_walk(walk / "mapping", tmp_path, sfm=sfm(pairs_file=pairs))
+    assert caught.value.code == code
+    assert sorted(path.name for path in (tmp_path / "walk").iterdir()) == sorted(
+        ["current", rgbd_walk.path.name]
+    )
+    assert MapStore(tmp_path).open("walk").manifest == rgbd_walk.manifest
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"sfm": SfmSettings(pairs=("nearest",))}, "--pairs.*retrieval.*got nearest"),
+        ({"sfm": SfmSettings(pairs=("distance", "distance"))}, "--pairs: a name is given twice"),
+        ({"sfm": SfmSettings(refine=("rigs",))}, "--refine.*poses, points, intrinsics.*got rigs"),
+        ({"sfm": SfmSettings(mapper="config3")}, "--mapper.*config1, config2.*got config3"),
+        ({"sfm": SfmSettings(estimate_poses=True, refine=("poses",))}, "--refine"),
+        ({"sfm": SfmSettings(estimate_poses=True), "method": "rgbd"}, "--poses.*--method sfm"),
+    ],
+)
+def test_a_wrong_setting_names_its_option(
+    walk: Path, tmp_path: Path, build_walk: Build, changes: dict[str, object], named: str
+) -> None:
+    with pytest.raises(InvalidInput, match=named):
+        build_walk(walk / "mapping", tmp_path, **changes)
+    assert not list(tmp_path.iterdir())

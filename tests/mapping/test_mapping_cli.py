@@ -9,10 +9,16 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+import PIL.Image  # noqa: F401  before pycolmap
+import pycolmap
 import pytest
+from rich.console import ConsoleDimensions
 
 from mapping import cli
+from mapping.pairing import PAIRINGS
 from visloc.archive import MapStore, open_map
+from visloc.kapture import read_dataset
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -142,6 +148,19 @@ def test_verify_tells_that_the_features_of_a_map_are_others(
             "download r2d2_WASF_N16.pt",
         ),
         (("export-features", "nowhere", "--output", "out"), "[kapture.no_dataset]"),
+        (("build", "x", "--map", "new", "--method", "nerf"), "[build.method] --method"),
+        (("build", "x", "--map", "new", "--pairs", "near"), "[build.pairs] --pairs"),
+        (("build", "x", "--map", "new", "--poses", "guess"), "[build.poses] --poses"),
+        (("build", "x", "--map", "new", "--mapper", "c3"), "[build.mapper] --mapper"),
+        (("build", "x", "--map", "new", "--refine", "all"), "[build.refine] --refine"),
+        (("build", "x", "--map", "new", "--max-angle", "270"), "[pairs.max_angle] --max-angle"),
+        (("build", "x", "--map", "new", "--near", "9", "--far", "2"), "[pairs.far] --far"),
+        (("build", "x", "--map", "new", "--covisible-in", "y"), "[map.unknown]"),
+        (("import", "colmap", "x"), "[import.target] --map: say what to make"),
+        (("import", "colmap", "x", "--map", "m", "--output", "o"), "[import.target] --map"),
+        (("import", "meshroom", "x", "--output", "o"), "[import.unknown_format] FORMAT"),
+        (("export", "room", "--output", "o", "--format", "e57"), "[export.unknown_format] --f"),
+        (("export", "attic", "--output", "o"), "[map.unknown] map: no such map"),
     ],
 )
 def test_an_error_is_one_line_with_its_code(
@@ -189,11 +208,30 @@ def test_what_the_system_refuses_is_one_line_too(run: Run, tmp_path: Path) -> No
     assert "Not a directory" in error
 
 
-@pytest.mark.parametrize("command", ["", "build", "inspect", "verify", "export-features", "sample"])
+@pytest.mark.parametrize(
+    "command",
+    ["", "build", "import", "export", "inspect", "verify", "export-features", "sample"],
+)
 def test_every_command_has_help(run: Run, command: str) -> None:
     status, out, err = run(*command.split(), "--help")
     assert (status, err) == (0, "")
     assert f"mapping {command}".strip() in out  # whatever started the tests comes before it
+
+
+def test_build_explains_all_its_options(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.setattr("rich.console.Console.size", ConsoleDimensions(120, 200))
+    _, out, _ = run("build", "--help")
+    for option in (
+        *("--map", "--maps-dir", "--method", "--local-features", "--global-features"),
+        *("--features-dir", "--pixel-origin", "--weights-dir", "--max-keypoints", "--metric"),
+        *("--workers", "--force", "--voxel-size", "--depth-sensor", "--depth-scale", "--pairs"),
+        *("--top-k", "--max-distance", "--max-angle", "--near", "--far", "--covisible-in"),
+        *("--pairs-file", "--mapper", "--refine", "--poses"),
+    ):
+        assert re.search(rf"{option}\b", out), option
+    for name in PAIRINGS:
+        assert name in out
 
 
 @pytest.mark.parametrize(
@@ -211,6 +249,9 @@ def test_every_command_has_help(run: Run, command: str) -> None:
             ("build", "dataset", "--map", "m", "--max-keypoints", "0"),
             "'--max-keypoints'",
         ),
+        (("build", "dataset", "--map", "m", "--workers", "0"), "'--workers'"),
+        (("build", "dataset", "--map", "m", "--top-k", "0"), "'--top-k'"),
+        (("build", "dataset", "--map", "m", "--pixel-origin", "left"), "'--pixel-origin'"),
     ],
 )
 def test_wrong_usage_exits_with_2(run: Run, arguments: tuple[str, ...], said: str) -> None:
@@ -234,6 +275,65 @@ def test_build_shows_each_stage_and_what_was_made(run: Run, sample: Path, tmp_pa
     assert opened.ref in out
     assert "peak memory" in out
     assert list(opened.global_descriptors) == ["localvlad"]
+
+
+@pytest.mark.parametrize(("format_name", "made"), [("colmap", 3), ("kapture", 2), ("ply", 0)])
+def test_a_map_is_exported_once(
+    run: Run, built_maps: Path, tmp_path: Path, format_name: str, made: int
+) -> None:
+    command = ("export", "room", "--maps-dir", built_maps, "--format", format_name, "--output")
+    status, out, err = run(*command, tmp_path / "out")
+    assert (status, err) == (0, "")
+    assert out == f"{format_name}: {tmp_path / 'out'}\n"
+    if format_name == "ply":
+        assert (tmp_path / "out").read_bytes().startswith(b"ply\n")
+    else:
+        assert len(list((tmp_path / "out").iterdir())) >= made
+    assert "error [export.exists]" in error_of(run(*command, tmp_path / "out"))
+
+
+def test_a_real_model_goes_through_a_map_and_comes_out_as_it_was(
+    run: Run, shared_data: Path, tmp_path: Path
+) -> None:
+    door = shared_data / "import_samples" / "lund_door" / "colmap"
+    maps = ("--maps-dir", tmp_path / "maps")
+    few = ("--local-features", "sift", "--global-features", "localvlad", "--max-keypoints", "500")
+    status, out, _ = run("import", "colmap", door, "--map", "door", *maps, *few)
+    assert status == 0
+    assert "12 photos by 1 cameras, 12 with a pose" in out
+    assert "11384 points, 73327 observations, not known to be metric" in out
+    assert not list((tmp_path / "maps" / ".work").glob("door*/*"))
+    opened = MapStore(tmp_path / "maps").open("door")
+    assert opened.manifest.method.name == "model"
+    assert not opened.manifest.world.metric
+
+    assert run("export", "door", *maps, "--output", tmp_path / "model")[0] == 0
+    before, after = pycolmap.Reconstruction(door), pycolmap.Reconstruction(tmp_path / "model")
+    (old,), (new,) = before.cameras.values(), after.cameras.values()
+    assert (new.model, new.width, new.height) == (old.model, old.width, old.height)
+    assert np.array_equal(new.params, old.params)
+    images = {image.name: image for image in before.images.values()}
+    assert len(after.images) == len(images) == 12
+    for image in after.images.values():
+        pose, known = image.cam_from_world(), images[image.name].cam_from_world()
+        # Quaternions of six digits there have the length 1 only after scaling.
+        np.testing.assert_allclose(pose.matrix(), known.matrix(), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(  # single precision in the map
+        [after.points3D[key].xyz for key in sorted(after.points3D)],
+        [before.points3D[key].xyz for key in sorted(before.points3D)],
+        rtol=0,
+        atol=2e-6,
+    )
+
+
+def test_an_imported_dataset_is_written_once(run: Run, shared_data: Path, tmp_path: Path) -> None:
+    door = shared_data / "import_samples" / "lund_door" / "colmap"
+    status, out, err = run("import", "colmap", door, "--output", tmp_path / "door")
+    assert (status, err) == (0, "")
+    assert out.splitlines()[-1] == f"dataset: {tmp_path / 'door'}"
+    assert len(read_dataset(tmp_path / "door").images) == 12
+    error = error_of(run("import", "colmap", door, "--output", tmp_path / "door"))
+    assert f"error [import.exists] {tmp_path / 'door'}" in error
 
 
 def test_ctrl_c_ends_a_build_with_130_and_says_that_it_resumes(
