@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import resource
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -480,6 +481,8 @@ def sample(
 
 def main() -> None:
     """Run the command; an error is one line, not a traceback."""
+    # pycolmap would answer it with a stack trace.
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
         app()
     except VislocError as error:

@@ -11,7 +11,8 @@ import PIL.Image  # noqa: F401  Pillow saves PNGs only when it was imported befo
 import pycolmap
 from numpy.typing import NDArray
 
-from mapping.imported_points import read_imported_points
+from mapping.imported_points import ImportedPoints, read_imported_points
+from mapping.landmarks import Observations, View, reprojection_errors
 from mapping.outputs import complete_output
 from visloc.archive import Map
 from visloc.errors import InvalidInput
@@ -30,6 +31,7 @@ from visloc.kapture import (
 from visloc.pose.colmap import colmap_camera
 
 _READY_MADE = "kapture:"  # begins the names of features that came with a dataset
+_NO_ERROR = -1.0  # COLMAP's word for a point whose error is not known
 _IMPORTED = "imported"  # type of the keypoints of the reconstruction that a map came from
 
 
@@ -76,6 +78,7 @@ class _Model:
         colors: (P, 3) uint8; None without.
         keypoints: of each photo, (k, 2) float32 pixels.
         observations: (M, 3) rows: point, photo, keypoint of that photo.
+        errors_px: (P,) mean reprojection error; NaN where no photo sees the point.
         described: whether the keypoints are those that the map has descriptors of.
     """
 
@@ -83,14 +86,21 @@ class _Model:
     colors: NDArray[np.uint8] | None
     keypoints: list[NDArray[np.float32]]
     observations: NDArray[np.int64]
+    errors_px: NDArray[np.float32]
     described: bool
 
 
 def _model(opened: Map) -> _Model:
     imported = read_imported_points(opened)
     if imported is not None:
-        keypoints = np.split(imported.keypoints, imported.keypoint_offsets[1:-1])
-        return _Model(imported.points, imported.colors, keypoints, imported.observations, False)
+        return _Model(
+            points=imported.points,
+            colors=imported.colors,
+            keypoints=np.split(imported.keypoints, imported.keypoint_offsets[1:-1]),
+            observations=imported.observations,
+            errors_px=_mean_errors(opened, imported),
+            described=False,
+        )
     offsets = opened.observation_offsets
     photo = np.repeat(np.arange(len(opened.images)), np.diff(offsets))
     landmark = opened.observation_landmarks.astype(np.int64)
@@ -100,8 +110,23 @@ def _model(opened: Map) -> _Model:
         colors=None if opened.colors is None else np.asarray(opened.colors),
         keypoints=np.split(np.asarray(opened.observation_keypoints), offsets[1:-1]),
         observations=np.column_stack([landmark, photo, np.arange(len(photo)) - offsets[photo]]),
+        errors_px=np.asarray(opened.errors_px),
         described=True,
     )
+
+
+def _mean_errors(opened: Map, imported: ImportedPoints) -> NDArray[np.float32]:
+    views = [
+        View(opened.cameras[image.camera], Pose.from_quaternion(pose[:4], pose[4:]))
+        for image, pose in zip(opened.images, opened.image_poses, strict=True)
+    ]
+    points, photos, rows = imported.observations.T
+    pixels = imported.keypoints[imported.keypoint_offsets[photos] + rows]
+    errors = reprojection_errors(views, imported.points, Observations(points, photos, rows, pixels))
+    count = np.bincount(points, minlength=len(imported.points))
+    with np.errstate(invalid="ignore"):
+        mean = np.bincount(points, errors, len(imported.points)) / count
+    return mean.astype(np.float32)
 
 
 def _export_colmap(opened: Map, output: Path) -> None:
@@ -127,9 +152,10 @@ def _export_colmap(opened: Map, output: Path) -> None:
         tracks[point].add_element(photo + 1, keypoint)
     black = np.zeros((len(tracks), 3), np.uint8)
     colors = black if exported.colors is None else exported.colors
+    errors = np.where(np.isfinite(exported.errors_px), exported.errors_px, _NO_ERROR)
     for index, track in enumerate(tracks):
-        model.add_point3D(exported.points[index], track, colors[index])
-    model.update_point_3d_errors()
+        point_id = model.add_point3D(exported.points[index], track, colors[index])
+        model.points3D[point_id].error = float(errors[index])
     output.mkdir()
     model.write_binary(output)
 

@@ -427,7 +427,7 @@ def _checked(model: SparseModel, config: MapperConfig) -> SparseModel:
     views = [view or _NOWHERE for view in model.views]
     observations = model.observations
     errors = reprojection_errors(views, model.points, observations)
-    observations = observations.take(errors <= config.filter_max_reproj_error)
+    observations = _once_per_view(observations, errors, config.filter_max_reproj_error)
     angles = triangulation_angles(views, model.points, observations)
     lengths = np.bincount(observations.points, minlength=len(model.points))
     good = (lengths >= config.min_track_length) & (angles >= config.min_angle_deg)
@@ -453,6 +453,19 @@ def _checked(model: SparseModel, config: MapperConfig) -> SparseModel:
         ),
         angles[good],
     )
+
+
+def _once_per_view(
+    observations: Observations, errors: NDArray[np.float64], max_error: float
+) -> Observations:
+    """Sightings within the error; of several of one point in one photo the best."""
+    order = np.lexsort((errors, observations.views, observations.points))
+    order = order[errors[order] <= max_error]
+    best = np.ones(len(order), dtype=bool)
+    best[1:] = (np.diff(observations.points[order]) != 0) | (
+        np.diff(observations.views[order]) != 0
+    )
+    return observations.take(order[best])
 
 
 # Stands in for a photo without a place, which observes nothing.

@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from types import TracebackType
@@ -22,6 +22,10 @@ T = TypeVar("T")
 
 # Each library would otherwise start as many threads as there are processors, in every worker.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+# Items that travel together: few, so that progress is seen, and all workers have work to the end.
+_MAX_BATCH, _MIN_BATCHES = 16, 200
 
 
 class Workers:
@@ -68,10 +72,14 @@ class Workers:
                 progress(done, len(items))
             return
         try:
+            # A task can hold a whole dataset: many items share one journey of it.
+            size = max(1, min(_MAX_BATCH, len(items) // _MIN_BATCHES))
+            batches = [items[start : start + size] for start in range(0, len(items), size)]
             with _one_thread_each():
-                futures: list[Future[object]] = [self._pool.submit(task, item) for item in items]
-            for done, future in enumerate(as_completed(futures), 1):
-                future.result()
+                futures = [self._pool.submit(_do_all, task, batch) for batch in batches]
+            done = 0
+            for future in as_completed(futures):
+                done += future.result()
                 progress(done, len(items))
         except BrokenProcessPool as error:
             raise Unavailable(
@@ -80,6 +88,12 @@ class Workers:
                 "finished work is kept, the same command resumes",
                 field="--workers",
             ) from error
+
+
+def _do_all(task: Callable[[T], object], items: Sequence[T]) -> int:
+    for item in items:
+        task(item)
+    return len(items)
 
 
 def _start_worker() -> None:

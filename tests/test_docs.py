@@ -23,9 +23,11 @@ from pydantic import BaseModel
 
 import clients.cli
 import mapping.cli
+from mapping.export import export_map
 from service.schemas import LocalizeRequest, LocalizeResponse, MapInfo, PoseEstimate, Problem
 from service.settings import CONFIG_VARIABLE, PREFIX, ServiceSettings, read_settings
 from service.wire import STATUSES
+from visloc.archive import MapStore
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.pose.covariance import position_covariance
@@ -128,15 +130,24 @@ def desk(
     for name, target in (
         ("maps", built_maps),
         ("QUERIES", sample / "query"),
+        ("DATASET", sample / "mapping"),
+        ("PHOTOS", sample / "mapping" / "sensors" / "records_data"),
+        ("lund_door/images", sample / "mapping" / "sensors" / "records_data"),
         (".demo/dataset", sample),
         (".demo/maps", built_maps),
         ("examples", ROOT / "examples"),
     ):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).symlink_to(target)
+    export_map(MapStore(built_maps).open("room"), folder / "lund_door" / "colmap", "colmap")
     (line,) = (line for line in shell_lines(API) if line.startswith("cp "))
     subprocess.run(line.split(), cwd=folder, check=True)
     assert (folder / "photo.jpg").read_bytes() == query.image
+    frame = {"file_path": "photo.jpg", "transform_matrix": np.eye(4).tolist()}
+    recording = {"camera_angle_x": 1.0, "frames": [frame]}
+    (folder / "RECORDING").mkdir()
+    (folder / "RECORDING" / "photo.jpg").write_bytes(query.image)
+    (folder / "RECORDING" / "transforms.json").write_text(json.dumps(recording))
     (line,) = (line for line in shell_lines(README) if "visloc-service" in line)
     arguments = line.replace("8000", "0").replace("50051", "0").split()
     arguments[0] = f"{COMMANDS}/visloc-service"
@@ -180,8 +191,12 @@ def test_python_examples_say_where_the_photo_was_taken(code: str, desk: Desk) ->
         for page in PAGES
         for line in shell_lines(page)
         # cp and the service are run above, for the targets of make see below; building takes long
-        # and has tests of its own.
-        if not re.match(r"make|cp|\.venv/bin/(visloc-service|mapping build)", line)
+        # and has tests of its own, as has a map of ready-made features.
+        if not re.match(
+            r"make|cp|\.venv/bin/(visloc-service|mapping build|mapping import .* --map)"
+            r"|.* --features-dir",
+            line,
+        )
     ],
 )
 def test_shell_examples_run(line: str, desk: Desk) -> None:
@@ -260,7 +275,11 @@ def options_of(app: typer.Typer) -> dict[str, set[str]]:
     """The flags of each of a program's commands."""
     commands: Any = typer.main.get_command(app)
     return {
-        name: {flag for parameter in command.params for flag in parameter.opts}
+        name: {
+            flag
+            for parameter in command.params
+            for flag in (*parameter.opts, *parameter.secondary_opts)
+        }
         for name, command in commands.commands.items()
     }
 
