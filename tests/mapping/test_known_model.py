@@ -5,14 +5,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
+import pycolmap
 import pytest
 from numpy.typing import NDArray
 
 from mapping.export import export_map
 from visloc.archive import Map
-from visloc.errors import DatasetError
-from visloc.kapture import read_reconstruction, write_keypoints, write_reconstruction
-from visloc.kapture.reconstruction import Reconstruction
+from visloc.errors import DatasetError, MapCorrupt
+from visloc.kapture import read_reconstruction
 
 Build = Callable[..., Map]
 Errors = Callable[[Map, Path], NDArray[np.float64]]
@@ -67,7 +68,7 @@ def test_ready_made_rows_are_the_descriptors_of_their_points(
     assert (anchor.kind, anchor.images) == ("model", 16)
 
 
-def test_other_features_take_the_points_that_they_see_and_all_points_stay_in_order(
+def test_other_features_are_matched_anew_and_the_points_come_back_out(
     walk: Path,
     with_points: Path,
     tmp_path: Path,
@@ -76,56 +77,43 @@ def test_other_features_take_the_points_that_they_see_and_all_points_stay_in_ord
 ) -> None:
     known = read_reconstruction(with_points)
     assert known is not None
-    built = build_walk(with_points, tmp_path / "maps", **MODEL, max_keypoints=150)
-    np.testing.assert_allclose(built.landmarks, known.points, atol=1e-6)
-    seen = np.zeros(len(known.points), dtype=bool)
-    seen[built.observation_landmarks] = True
-    assert 0.1 < seen.mean() < 0.9
-    assert np.isnan(built.errors_px[~seen]).all()
-    assert (built.errors_px[seen] < 6).all()
-    notes = "\n".join(built.manifest.notes)
-    assert f"{(~seen).sum()} of {len(seen)} points are kept, but no feature sees them" in notes
-    num = len(built.observation_landmarks)
-    num_known = len(np.unique(known.observations[:, :2], axis=0))
-    assert f"{num} of {num_known} sightings have a descriptor" in notes
-    assert (
-        localization_errors(build_walk(with_points, tmp_path / "maps", **MODEL), walk / "query")[
-            :, 0
-        ].max()
-        < 0.03
-    )
-
-
-@pytest.mark.parametrize(("offset", "found"), [(1.9, True), (2.1, False)])
-def test_the_nearest_keypoint_within_two_pixels_is_taken(
-    with_points: Path, tmp_path: Path, build_walk: Build, offset: float, found: bool
-) -> None:
-    known = read_reconstruction(with_points)
-    assert known is not None
-    # One point, seen a little off the strongest keypoint of one photo, far from all others.
-    name = known.images[0]
-    folder = with_points / "reconstruction"
-    xy = np.fromfile(folder / "keypoints" / "sift" / f"{name}.kpt", "<f4").reshape(-1, 2)
-    gaps = np.linalg.norm(xy[:, None] - xy, axis=2)
-    np.fill_diagonal(gaps, np.inf)
-    lonely = int(gaps.min(axis=1).argmax())
-    shutil.rmtree(folder)
-    write_keypoints(
-        with_points, "mine", name, xy[[lonely]] + np.array([offset, 0], np.float32), name="mine"
-    )
-    observations = np.zeros((1, 3), dtype=np.int64)
-    write_reconstruction(
-        with_points, Reconstruction(known.points[:1], None, "mine", (name,), observations)
-    )
-    if not found:
-        with pytest.raises(DatasetError, match=r"within 2\.0 px") as caught:
-            build_walk(with_points, tmp_path / "maps", **MODEL)
-        assert caught.value.code == "model.no_sightings"
-        assert not (tmp_path / "maps" / "walk").exists()
-        return
     built = build_walk(with_points, tmp_path / "maps", **MODEL)
-    (seen_at,) = built.observation_keypoints
-    assert np.linalg.norm(seen_at - xy[lonely]) < 2.0
+    assert localization_errors(built, walk / "query")[:, 0].max() < 0.03
+    anchor = built.manifest.world.anchor
+    assert anchor is not None
+    assert (anchor.kind, anchor.images) == ("model", 16)
+
+    for format_name in ("kapture", "colmap", "ply"):
+        export_map(built, tmp_path / format_name, format_name)
+    back = read_reconstruction(tmp_path / "kapture")
+    assert back is not None
+    np.testing.assert_array_equal(back.points, known.points)
+    assert {
+        (point, back.images[image], keypoint)
+        for point, image, keypoint in back.observations.tolist()
+    } == {
+        (point, known.images[image], keypoint)
+        for point, image, keypoint in known.observations.tolist()
+    }
+    model = pycolmap.Reconstruction(tmp_path / "colmap")
+    assert model.num_points3D() == len(known.points)
+    assert model.compute_num_observations() == len(known.observations)
+    np.testing.assert_array_equal(
+        [point.xyz for _, point in sorted(model.points3D.items())], known.points
+    )
+
+
+def test_damaged_imported_points_are_refused(
+    with_points: Path, tmp_path: Path, build_walk: Build
+) -> None:
+    built = build_walk(with_points, tmp_path / "maps", **MODEL)
+    path = built.path / "imported_points.npz"
+    size = path.stat().st_size
+    whole = path.read_bytes()
+    path.write_bytes(whole[: size // 2] + b"\0" * (size - size // 2))
+    with pytest.raises(MapCorrupt, match=r"imported_points\.npz"):
+        export_map(built, tmp_path / "out", "ply")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
