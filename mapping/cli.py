@@ -336,36 +336,42 @@ def import_command(
 ) -> None:
     """Bring a reconstruction or photos of another tool here, as a dataset or as a map.
 
-    A map is made of the points that came along (build --method model), else by matching: with the
-    poses that came along, or, without poses, with estimated ones. For other choices make a
-    dataset first, and build from it.
+    A map is made of the points that came along (build --method model), else of depth (rgbd), else
+    by matching (sfm): with the poses that came along or, without, with estimated ones. For other
+    choices make a dataset first, and build from it.
     """
     if (map_id is None) == (output is None):
         raise InvalidInput(
             "import.target", "say what to make", field="--map", expected="either --map or --output"
         )
     if output is not None:
-        _print_import(import_dataset(format_name, path, output, photos))
+        summary = import_dataset(format_name, path, output, photos)
+        _print_import(summary)
+        method, sfm = _method_for(summary)
+        options = ["--method", method]
+        if sfm.estimate_poses:
+            options += ["--poses", "estimate", "--refine", ",".join(sfm.refine)]
+        elif not (summary.metric if metric is None else metric):
+            options.append("--not-metric")  # a dataset cannot say so itself
         _out.print(f"dataset: {output}", soft_wrap=True)
+        _out.print(f"next: mapping build {output} --map ID {' '.join(options)}", soft_wrap=True)
         return
     assert map_id is not None
     with imported(format_name, path, maps_dir, map_id, photos) as (dataset, summary):
         _print_import(summary)
+        method, sfm = _method_for(summary)
         _build(
             BuildSettings(
                 dataset=dataset,
                 map_id=map_id,
                 maps_dir=maps_dir,
-                method="model" if summary.observations else "sfm",
+                method=method,
                 local_features=local_features,
                 global_features=_names(global_features),
                 weights_dir=weights_dir,
                 max_keypoints=max_keypoints,
                 metric=summary.metric if metric is None else metric,
-                sfm=_SFM_DEFAULTS
-                if summary.posed
-                # What EXIF says of a focal length is a start, not a calibration.
-                else SfmSettings(estimate_poses=True, refine=("intrinsics",)),
+                sfm=sfm,
                 workers=workers,
                 force=force,
             )
@@ -384,6 +390,18 @@ def export(
     """Write a map for other tools: a COLMAP model, a kapture dataset, or a PLY point cloud."""
     export_map(open_map(_folder(map_ref, maps_dir)), output, format_name)
     _out.print(f"{format_name}: {output}", soft_wrap=True)
+
+
+def _method_for(summary: ImportSummary) -> tuple[str, SfmSettings]:
+    """How a map is best made of what an import brought."""
+    if summary.observations:
+        return "model", _SFM_DEFAULTS
+    if summary.depth_maps:
+        return "rgbd", _SFM_DEFAULTS
+    if summary.posed:
+        return "sfm", _SFM_DEFAULTS
+    # What EXIF says of a focal length is a start, not a calibration.
+    return "sfm", SfmSettings(estimate_poses=True, refine=("intrinsics",))
 
 
 def _print_import(summary: ImportSummary) -> None:

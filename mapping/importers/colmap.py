@@ -55,8 +55,9 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     """Read a model, a database, or a model with the database that it was made of.
 
     Args:
-        path: a folder with a model, a folder with ``sparse/0`` or ``sparse``, or a database; a
-            folder with nothing but a ``database.db`` (or a single ``*.db``) is taken for that.
+        path: a folder with a model, or with one in ``sparse/0``, ``sparse`` or in just one of its
+            subfolders; or a database; a folder with nothing but a ``database.db`` (or a single
+            ``*.db``) is taken for that.
         photos: folder that names are relative to; None takes ``images`` in or beside ``path``.
 
     Raises:
@@ -72,7 +73,7 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
             "import.missing",
             "there is neither a COLMAP model nor a database",
             field=str(path),
-            expected="cameras, images and points3D (.bin or .txt), there, in sparse/0 or sparse; "
+            expected="cameras, images and points3D (.bin or .txt), there, in sparse/0, sparse or one subfolder; "
             "or a database.db",
         )
     if photos is None:
@@ -86,7 +87,11 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
 
 def _model_folder(path: Path) -> Path | None:
     candidates = (path, path / "sparse" / "0", path / "sparse")
-    return next((folder for folder in candidates if has_model(folder)), None)
+    found = next((folder for folder in candidates if has_model(folder)), None)
+    if found is None and path.is_dir():
+        below = [folder for folder in sorted(path.iterdir()) if has_model(folder)]
+        return below[0] if len(below) == 1 else None
+    return found
 
 
 def _places(path: Path, folder: Path | None) -> list[Path]:
