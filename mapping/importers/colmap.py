@@ -73,8 +73,8 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
             "import.missing",
             "there is neither a COLMAP model nor a database",
             field=str(path),
-            expected="cameras, images and points3D (.bin or .txt), there, in sparse/0, sparse or one subfolder; "
-            "or a database.db",
+            expected="cameras, images and points3D (.bin or .txt), there, in sparse/0, sparse or "
+            "one subfolder; or a database.db",
         )
     if photos is None:
         photos = next((p / "images" for p in places if (p / "images").is_dir()), None)
