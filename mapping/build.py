@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -24,9 +24,10 @@ from mapping.features import (
 )
 from mapping.known_model import landmarks_from_reconstruction
 from mapping.landmarks import MadeLandmarks
+from mapping.outputs import refuse_existing
 from mapping.pairing import PAIRINGS, write_pairs
 from mapping.photos import MappingPhoto, collect_photos
-from mapping.rgbd import DepthSettings, landmarks_from_depth
+from mapping.rgbd import DepthSettings, landmarks_from_depth, refuse_without_depth
 from mapping.sfm import (
     SfmSettings,
     find_pairs,
@@ -53,7 +54,7 @@ from visloc.features import (
     make_local_features,
 )
 from visloc.features.readymade import is_ready_made, ready_made_type
-from visloc.geometry import PixelOrigin
+from visloc.geometry import PixelOrigin, Pose
 from visloc.kapture import Dataset, open_features, open_local_features, read_dataset
 
 # How landmarks are made: from depth, from matches, or from points that the dataset brings along.
@@ -76,7 +77,8 @@ class BuildSettings:
         pixel_origin: what the dataset's principal points and ready-made keypoints count from.
         weights_dir: folder with network weights.
         max_keypoints: strongest keypoints kept per photo, in the map and in queries.
-        metric: whether a unit of the dataset's poses is a metre.
+        metric: whether a unit of the dataset's poses is a metre; None: yes, as kapture has it, but
+            not for ``model``, since a reconstruction has the unit that its tool chose.
         depth: settings of ``rgbd``.
         depth_sensor: the depth sensor to use, when several go with a photo.
         sfm: settings of ``sfm``.
@@ -94,7 +96,7 @@ class BuildSettings:
     pixel_origin: PixelOrigin = PixelOrigin.CORNER
     weights_dir: Path | None = None
     max_keypoints: int = 5000
-    metric: bool = True
+    metric: bool | None = None
     depth: DepthSettings = field(default_factory=DepthSettings)
     depth_sensor: str | None = None
     sfm: SfmSettings = field(default_factory=SfmSettings)
@@ -159,7 +161,7 @@ def write_pairs_of(
 
     Args:
         root: kapture folder; the photos themselves need not be there.
-        output: the file.
+        output: the file; it must not exist.
         settings: pairings and their settings.
         global_features: names ``kapture:TYPE``, for ``retrieval``.
         features_dir: where they lie, when not in the dataset.
@@ -167,8 +169,10 @@ def write_pairs_of(
         progress: told the stage, how much is done, and how much there is.
 
     Raises:
+        Conflict: ``pairs.exists``.
         InvalidInput, DatasetError: with the option or the file that is wrong.
     """
+    refuse_existing(output, "pairs.exists")
     _check_names("--pairs", settings.pairs, tuple(PAIRINGS))
     dataset = read_dataset(root).with_pixels_from(pixel_origin)
     photos, _ = collect_photos(dataset, with_files=False, progress=partial(progress, "photos"))
@@ -281,6 +285,7 @@ def _build(
         depth_sensor=settings.depth_sensor,
         progress=partial(progress, "photos"),
     )
+    _refuse_early(settings, dataset, photos)
     find_local_features(features, photos, workers, progress)
     global_features = [
         _read_global(dataset, name, settings.features_dir, photos)
@@ -298,6 +303,22 @@ def _build(
     folder = _publish(settings, content, made, store, work_root)
     progress("archive", 1, 1)
     return folder
+
+
+def _refuse_early(
+    settings: BuildSettings, dataset: Dataset, photos: Sequence[MappingPhoto]
+) -> None:
+    """Refuse what cannot end well before the long work begins."""
+    for name in settings.global_features:
+        if is_ready_made(name):
+            _read_global(dataset, name, settings.features_dir, photos)
+    if settings.method == "rgbd":
+        refuse_without_depth(dataset, photos)
+    if settings.method == "sfm":
+        others = tuple(name for name in settings.sfm.pairs if name != "retrieval")
+        if others or settings.sfm.pairs_file is not None:
+            known = replace(settings.sfm, pairs=others)
+            find_pairs(make_scene(dataset, photos, (), known), known)
 
 
 def _local_features(work: WorkFolder, settings: BuildSettings) -> LocalFeaturesSource:
@@ -320,9 +341,10 @@ def _make_landmarks(
     workers: Workers,
     progress: Progress,
 ) -> MadeLandmarks:
+    metric = settings.method != "model" if settings.metric is None else settings.metric
     if settings.method == "rgbd":
         return landmarks_from_depth(
-            work, dataset, photos, features, settings.depth, settings.metric, workers, progress
+            work, dataset, photos, features, settings.depth, metric, workers, progress
         )
     if settings.method == "model":
         return landmarks_from_reconstruction(
@@ -332,7 +354,7 @@ def _make_landmarks(
             features,
             settings.pixel_origin,
             settings.sfm,
-            settings.metric,
+            metric,
             workers,
             progress,
         )
@@ -343,7 +365,7 @@ def _make_landmarks(
         features,
         global_features,
         settings.sfm,
-        settings.metric,
+        metric,
         workers,
         progress,
     )
@@ -373,7 +395,17 @@ def _content(
             photo.record.sensor_id: view.camera
             for photo, view in zip(placed, made.views, strict=True)
         },
-        rigs=known_rigs(dataset, {photo.record.sensor_id for photo in placed}),
+        rigs={
+            rig: {
+                sensor: Pose(pose.rotation, pose.translation * made.rig_scale)
+                for sensor, pose in members.items()
+            }
+            for rig, members in known_rigs(
+                dataset, {photo.record.sensor_id for photo in placed}
+            ).items()
+        }
+        if made.rig_scale is not None
+        else {},
         images=tuple(
             ImageRecord(
                 name=photo.name, camera=photo.record.sensor_id, timestamp=photo.record.timestamp

@@ -16,6 +16,7 @@ from rich.table import Table
 from mapping.build import METHODS, BuildSettings, build_map, write_pairs_of
 from mapping.export import EXPORTERS, export_map
 from mapping.export_features import export_features
+from mapping.imported_points import read_imported_points
 from mapping.importers import IMPORTERS, ImportSummary, import_dataset, imported
 from mapping.pairing import PAIRINGS, PairSettings
 from mapping.progress import StageProgress
@@ -23,6 +24,7 @@ from mapping.rgbd import DepthSettings
 from mapping.sample import write_sample
 from mapping.sfm import SfmSettings
 from mapping.triangulation import MAPPER_CONFIGS, REFINABLE
+from mapping.workers import DEFAULT_WORKERS
 from visloc.archive import Map, MapStore, open_map, verify_map
 from visloc.errors import InvalidInput, VislocError
 from visloc.features import (
@@ -86,11 +88,17 @@ PixelOriginOption = Annotated[
     ),
 ]
 MetricOption = Annotated[
-    bool,
-    typer.Option("--metric/--not-metric", help="Whether a unit of the dataset's poses is a metre."),
+    bool | None,
+    typer.Option(
+        "--metric/--not-metric",
+        help="Whether a unit of the dataset's poses is a metre; left out: yes, but no for model.",
+    ),
 ]
 WorkersOption = Annotated[
-    int, typer.Option(min=1, max=256, help="Processes that work on photos and pairs.")
+    int,
+    typer.Option(
+        min=1, max=256, help="Processes that work on photos and pairs; they do not change the map."
+    ),
 ]
 MaxKeypointsOption = Annotated[
     int, typer.Option(min=100, max=100_000, help="Strongest keypoints kept per photo.")
@@ -153,8 +161,8 @@ def build(
     pixel_origin: PixelOriginOption = PixelOrigin.CORNER,
     weights_dir: WeightsDirOption = None,
     max_keypoints: MaxKeypointsOption = 5000,
-    metric: MetricOption = True,
-    workers: WorkersOption = 1,
+    metric: MetricOption = None,
+    workers: WorkersOption = DEFAULT_WORKERS,
     force: Annotated[
         bool, typer.Option("--force", help="Publish a new version of a map that exists.")
     ] = False,
@@ -329,7 +337,7 @@ def import_command(
     global_features: GlobalFeaturesOption = _GLOBAL_DEFAULT,
     weights_dir: WeightsDirOption = None,
     max_keypoints: MaxKeypointsOption = 5000,
-    workers: WorkersOption = 1,
+    workers: WorkersOption = DEFAULT_WORKERS,
     force: Annotated[
         bool, typer.Option("--force", help="Publish a new version of a map that exists.")
     ] = False,
@@ -351,8 +359,9 @@ def import_command(
         options = ["--method", method]
         if sfm.estimate_poses:
             options += ["--poses", "estimate", "--refine", ",".join(sfm.refine)]
-        elif not (summary.metric if metric is None else metric):
-            options.append("--not-metric")  # a dataset cannot say so itself
+        else:  # a dataset cannot say so itself
+            known = summary.metric if metric is None else metric
+            options.append("--metric" if known else "--not-metric")
         _out.print(f"dataset: {output}", soft_wrap=True)
         _out.print(f"next: mapping build {output} --map ID {' '.join(options)}", soft_wrap=True)
         return
@@ -440,6 +449,7 @@ def verify(
     """Read every byte of a map: checksums and ranges; then compare its features with ours."""
     opened = verify_map(_folder(map_ref, maps_dir))
     num_files = len(opened.manifest.files)
+    read_imported_points(opened)  # raises when they are damaged
     _out.print(f"{opened.ref}: {num_files} files, every byte as published", soft_wrap=True)
     name = opened.manifest.local_features.fingerprint.name
     extractor = None if is_ready_made(name) else make_local_features(name, weights_dir)

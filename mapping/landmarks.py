@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -71,6 +71,8 @@ class MadeLandmarks:
         settings: what the manifest says of how they were made.
         metric: whether a unit of the world is a metre.
         anchor: how the world was fixed.
+        rig_scale: what distances on the dataset's rigs are multiplied by to be in the world's
+            unit; None when that is not known.
         notes: what was left out, one sentence each.
         imported: points of the reconstruction that was matched anew, if one was.
         pairs: the pairs that were matched, with the scene they belong to, if any were.
@@ -84,6 +86,7 @@ class MadeLandmarks:
     metric: bool
     anchor: Anchor
     notes: tuple[str, ...] = ()
+    rig_scale: float | None = 1.0
     imported: ImportedPoints | None = None
     pairs: tuple[Scene, Pairs] | None = None
 
@@ -135,12 +138,20 @@ def reprojection_errors(
 ) -> NDArray[np.float64]:
     """Return the distance in pixels (M,) between sightings and projections; NaN behind a camera."""
     errors = np.empty(len(observations))
-    for row in np.unique(observations.views).tolist():
-        own = np.flatnonzero(observations.views == row)
+    for row, own in rows_by_value(observations.views):
         view = views[row]
         seen_at = project(view.camera, view.cam_from_world.apply(points[observations.points[own]]))
         errors[own] = np.linalg.norm(seen_at - observations.pixels[own], axis=1)
     return errors
+
+
+def rows_by_value(values: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
+    """Yield each value that occurs, with the rows where it does."""
+    if len(values) == 0:
+        return
+    order = np.argsort(values, kind="stable")
+    distinct, starts = np.unique(values[order], return_index=True)
+    yield from zip(distinct.tolist(), np.split(order, starts[1:]), strict=True)
 
 
 def triangulation_angles(

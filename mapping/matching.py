@@ -100,7 +100,7 @@ def match_pairs(
             if len(rows):
                 found.append(Matches(first, second, rows))
     keys = [task.verified_key(partners) for partners in tasks]
-    return found, key_of("all_matches", 1, keys=keys, photos=[photo.name for photo in photos])
+    return found, key_of("all_matches", 1, keys=keys, groups=groups)
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,11 +173,10 @@ class _MatchTask:
         pixels_a: NDArray[np.float32],
         pixels_b: NDArray[np.float32],
     ) -> NDArray[np.bool_]:
-        limit = self.verification.max_error_px
         if self.verification.poses_known:
             views = View(a.camera, a.pose), View(b.camera, b.pose)
-            return fits_poses(views, pixels_a, pixels_b, limit)
-        return _fits_two_views(a, b, pixels_a, pixels_b, limit)
+            return fits_poses(views, pixels_a, pixels_b, self.verification.max_error_px)
+        return _fits_two_views(a, b, pixels_a, pixels_b, self.verification)
 
 
 def fits_poses(
@@ -202,14 +201,15 @@ def _fits_two_views(
     b: MappingPhoto,
     pixels_a: NDArray[np.float32],
     pixels_b: NDArray[np.float32],
-    max_error_px: float,
+    verification: Verification,
 ) -> NDArray[np.bool_]:
     count = len(pixels_a)
     fits = np.zeros(count, dtype=bool)
     if count == 0:
         return fits
     options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.max_error, options.ransac.random_seed = max_error_px, 0
+    options.ransac.max_error, options.ransac.random_seed = verification.max_error_px, 0
+    options.min_num_inliers = verification.min_matches
     every = np.repeat(np.arange(count, dtype=np.uint32)[:, None], 2, axis=1)
     geometry = pycolmap.estimate_two_view_geometry(
         _with_prior(a),

@@ -71,17 +71,9 @@ def landmarks_from_depth(
     """Lift the keypoints of all photos and merge them.
 
     Raises:
-        DatasetError: ``dataset.no_depth``, and what ``lift_keypoints`` raises.
+        DatasetError: what ``lift_keypoints`` raises.
         InvalidInput: what ``merge_landmarks`` raises.
     """
-    if all(photo.depth is None for photo in photos):
-        raise DatasetError(
-            "dataset.no_depth",
-            "no photo has a depth map",
-            field=str(dataset.root / "sensors" / "records_depth.txt"),
-            expected="depth maps with the timestamps of the photos, of a sensor in their rig or "
-            "with poses of its own; see --depth-sensor. Without depth: --method sfm",
-        )
     task = _LiftTask(work, dataset, features, settings.depth_scale)
     workers.run(task.lift, photos, partial(progress, "depth"))
     lifted = [LiftedKeypoints(**work.read(task.key(photo))) for photo in photos]
@@ -97,6 +89,22 @@ def landmarks_from_depth(
         metric=metric,
         anchor=Anchor(kind="dataset", images=len(photos)),
     )
+
+
+def refuse_without_depth(dataset: Dataset, photos: Sequence[MappingPhoto]) -> None:
+    """Refuse photos of which none has a depth map.
+
+    Raises:
+        DatasetError: ``dataset.no_depth``.
+    """
+    if all(photo.depth is None for photo in photos):
+        raise DatasetError(
+            "dataset.no_depth",
+            "no photo has a depth map",
+            field=str(dataset.root / "sensors" / "records_depth.txt"),
+            expected="depth maps with the timestamps of the photos, of a sensor in their rig or "
+            "with poses of its own; see --depth-sensor. Without depth: --method sfm",
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,8 +30,8 @@ from mapping.triangulation import (
     triangulate,
 )
 from mapping.workers import Workers
-from visloc.archive import Anchor, GlobalFeatures, Map
-from visloc.errors import DatasetError
+from visloc.archive import Anchor, GlobalFeatures, Map, sha256_of
+from visloc.errors import DatasetError, InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, read_reconstruction
 
@@ -111,11 +111,14 @@ def landmarks_from_matches(
     absent = [photo.name for photo, v in zip(photos, model.views, strict=True) if v is None]
     if absent:
         notes.append(f"{len(absent)} of {len(photos)} photos found no place: {_some(absent)}")
+    rig_scale: float | None = 1.0
     anchor = Anchor(kind="dataset", images=len(photos))
     if settings.estimate_poses:
         similarity, anchor, note = _anchored(dataset, photos, model)
         views = [View(v.camera, similarity.move(v.cam_from_world)) for v in views]
         points = similarity.apply(points)
+        # Without rigs in it, the reconstruction had a unit of its own.
+        rig_scale = similarity.scale if model.on_rigs else None
         metric = anchor.kind == "gnss" or (anchor.kind == "positions" and metric)
         notes += [note] if note else []
     number = np.full(len(photos), -1)
@@ -130,16 +133,32 @@ def landmarks_from_matches(
         settings=_settings_record(settings),
         metric=metric,
         anchor=anchor,
+        rig_scale=rig_scale,
         notes=tuple(notes),
         pairs=(scene, pairs),
     )
 
 
 def find_pairs(scene: Scene, settings: SfmSettings) -> Pairs:
-    """Return the pairs of the settings' file, or of their pairings."""
+    """Return the pairs of the settings' file, or of their pairings.
+
+    Raises:
+        InvalidInput: ``pairs.none``, and what the pairings raise.
+        DatasetError: what ``read_pairs`` raises.
+    """
     if settings.pairs_file is not None:
-        return read_pairs(settings.pairs_file, scene)
-    return pair_photos(scene, settings.pairs, settings.pairing)
+        pairs = read_pairs(settings.pairs_file, scene)
+    else:
+        pairs = pair_photos(scene, settings.pairs, settings.pairing)
+    if len(pairs) == 0:
+        raise InvalidInput(
+            "pairs.none",
+            "no two photos are paired",
+            field="--pairs" if settings.pairs_file is None else str(settings.pairs_file),
+            expected="photos that may show the same",
+            got=f"{len(scene.names)} photos, no pair",
+        )
+    return pairs
 
 
 def known_rigs(dataset: Dataset, cameras: set[str]) -> dict[str, dict[str, Pose]]:
@@ -279,6 +298,7 @@ def _to_item(model: SparseModel) -> Item:
         "params": np.array([value for view in views for value in view.camera.params]),
         "points": model.points,
         "angles_deg": model.angles_deg,
+        "on_rigs": np.array(model.on_rigs),
         **{f"observed_{name}": array for name, array in asdict(model.observations).items()},
     }
 
@@ -295,7 +315,9 @@ def _from_item(item: Item, photos: Sequence[MappingPhoto]) -> SparseModel:
     observations = Observations(
         *(item[f"observed_{name}"] for name in ("points", "views", "rows", "pixels"))
     )
-    return SparseModel(tuple(views), item["points"], observations, item["angles_deg"])
+    return SparseModel(
+        tuple(views), item["points"], observations, item["angles_deg"], bool(item["on_rigs"])
+    )
 
 
 def _some(names: Sequence[str]) -> str:
@@ -303,14 +325,19 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _settings_record(settings: SfmSettings) -> dict[str, JsonValue]:
-    pairing = asdict(settings.pairing)
-    return {
-        **(
-            {"pairs": "file"}
-            if settings.pairs_file is not None
-            else {"pairs": list(settings.pairs), **pairing}
-        ),
+    """What the manifest says of the settings: those that were used."""
+    pairing = settings.pairing
+    used: dict[str, JsonValue] = {
         "mapper": {"name": settings.mapper, **asdict(MAPPER_CONFIGS[settings.mapper])},
         "refine": list(settings.refine),
         "poses": "estimate" if settings.estimate_poses else "given",
     }
+    if settings.pairs_file is not None:
+        return {"pairs_file_sha256": sha256_of(settings.pairs_file), **used}
+    if "distance" in settings.pairs:
+        used |= {"max_distance": pairing.max_distance, "max_angle_deg": pairing.max_angle_deg}
+    if "frustum" in settings.pairs:
+        used |= {"near": pairing.near, "far": pairing.far}
+    if "covisibility" in settings.pairs and settings.covisible_in is not None:
+        used |= {"covisible_in": settings.covisible_in.ref}
+    return {"pairs": list(settings.pairs), "top_k": pairing.top_k, **used}

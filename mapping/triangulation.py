@@ -9,7 +9,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,7 +19,13 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mapping.anchor import align_poses
-from mapping.landmarks import Observations, View, reprojection_errors, triangulation_angles
+from mapping.landmarks import (
+    Observations,
+    View,
+    reprojection_errors,
+    rows_by_value,
+    triangulation_angles,
+)
 from mapping.matching import Matches
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
@@ -100,12 +106,14 @@ class SparseModel:
         points: (P, 3) float64.
         observations: of the points; ``views`` are rows of the photos.
         angles_deg: (P,) largest angle between two rays.
+        on_rigs: whether known rigs held cameras together; the model then has their unit.
     """
 
     views: tuple[View | None, ...]
     points: NDArray[np.float64]
     observations: Observations
     angles_deg: NDArray[np.float32]
+    on_rigs: bool
 
 
 def triangulate(
@@ -247,6 +255,11 @@ class _Scene:
             rig_of_sensor.update(dict.fromkeys(members, rig))
         return rig_of_sensor
 
+    @property
+    def on_rigs(self) -> bool:
+        """Whether a rig holds several cameras together."""
+        return len(self.rigs) < len(self.cameras)
+
     def with_poses(self, photos: Sequence[SfmPhoto]) -> pycolmap.Reconstruction:
         """The photos at their given poses, without points."""
         model = pycolmap.Reconstruction()
@@ -298,12 +311,12 @@ class _Scene:
             ]
         table = np.array(tracks, dtype=np.int64).reshape(-1, 3)
         pixels = np.empty((len(table), 2), dtype=np.float32)
-        for row in np.unique(table[:, 1]).tolist():
-            own = table[:, 1] == row
+        for row, own in rows_by_value(table[:, 1]):
             pixels[own] = photos[row].keypoints[table[own, 2]]
         observations = Observations(table[:, 0], table[:, 1], table[:, 2], pixels)
         xyz = np.array(points, dtype=np.float64).reshape(-1, 3)
-        return SparseModel(tuple(views), xyz, observations, np.zeros(len(xyz), np.float32))
+        angles = np.zeros(len(xyz), np.float32)
+        return SparseModel(tuple(views), xyz, observations, angles, self.on_rigs)
 
 
 _Rigs = Mapping[str, Mapping[str, Pose]]
@@ -321,6 +334,15 @@ def _database(
     photos: Sequence[SfmPhoto], rigs: _Rigs, matches: Sequence[Matches], work: Path
 ) -> Iterator[tuple[Path, _Scene]]:
     """A temporary COLMAP database with everything in it."""
+    if not matches:
+        raise InvalidInput(
+            "sfm.no_matches",
+            "no two photos match",
+            field="dataset",
+            expected="pairs of photos that show the same; see --pairs and --mapper",
+            got=f"{len(photos)} photos, none of their pairs with enough verified matches",
+        )
+    work.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=work) as folder, _quiet():
         path = Path(folder) / "database.db"
         with pycolmap.Database.open(path) as database:
@@ -417,6 +439,8 @@ def _refine(
                 for image in scene.images
             ]
             back = align_poses(moved, given)
+            if scene.on_rigs:  # they fix the scale
+                back = replace(back, scale=1.0)
             model.transform(
                 pycolmap.Sim3d(back.scale, pycolmap.Rotation3d(back.rotation), back.translation)
             )
@@ -452,6 +476,7 @@ def _checked(model: SparseModel, config: MapperConfig) -> SparseModel:
             observations.pixels,
         ),
         angles[good],
+        model.on_rigs,
     )
 
 

@@ -20,6 +20,9 @@ from visloc.errors import Unavailable
 
 T = TypeVar("T")
 
+# Processes of a build unless told otherwise: more than this few machines have memory for.
+DEFAULT_WORKERS = min(os.cpu_count() or 1, 8)
+
 # Each library would otherwise start as many threads as there are processors, in every worker.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -30,6 +33,8 @@ _MAX_BATCH, _MIN_BATCHES = 16, 200
 
 class Workers:
     """Does work in ``count`` processes, which end with the ``with`` block; one means this process.
+
+    Every process uses one thread, so that their number does not change what comes out.
 
     A task and its items travel to other processes: the task is a module's function, a method of a
     dataclass or a ``functools.partial`` of one, and leaves its result in the work folder.
@@ -67,9 +72,10 @@ class Workers:
         """
         progress(0, len(items))
         if self._pool is None:
-            for done, item in enumerate(items, 1):
-                task(item)
-                progress(done, len(items))
+            with _one_thread_here():
+                for done, item in enumerate(items, 1):
+                    task(item)
+                    progress(done, len(items))
             return
         try:
             # A task can hold a whole dataset: many items share one journey of it.
@@ -109,6 +115,19 @@ def _end_with_parent() -> None:
     assert parent is not None
     parent.join()
     os._exit(1)
+
+
+@contextmanager
+def _one_thread_here() -> Iterator[None]:
+    """Compute as a worker does: networks differ in the last bits with the number of threads."""
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        cv2.setNumThreads(before[1])
 
 
 @contextmanager

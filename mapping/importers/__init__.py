@@ -17,6 +17,7 @@ from mapping.importers.dataset import write_imported
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.outputs import refuse_existing
 from mapping.stages import exclusive
+from visloc.archive import MapStore
 from visloc.errors import InvalidInput
 
 __all__ = [
@@ -80,10 +81,13 @@ def imported(
     """Have a foreign reconstruction as a dataset while a map is made of it.
 
     Raises:
+        InvalidInput: ``map.id``.
         InvalidInput, DatasetError: as ``import_dataset``.
         Conflict: ``build.running``.
     """
-    dataset = maps_dir / ".work" / f"{map_id}.imported"
+    MapStore(maps_dir).versions(map_id)  # refuses what is not an id
+    # Ids begin with a letter or digit: no work folder of a build has this name.
+    dataset = maps_dir / ".work" / f".imported-{map_id}"
     with exclusive(dataset.with_name(f"{dataset.name}.lock")):
         shutil.rmtree(dataset, ignore_errors=True)  # of an import that was killed
         summary = import_dataset(name, path, dataset, photos)
