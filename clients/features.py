@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from visloc.errors import InvalidInput
 
 # As the server reads them: little-endian where they have more than one byte.
-_DTYPES: Mapping[str, np.dtype[Any]] = {
+ARRAY_DTYPES: Mapping[str, np.dtype[Any]] = {
     "float32": np.dtype("<f4"),
     "float16": np.dtype("<f2"),
     "uint8": np.dtype("u1"),
@@ -79,15 +79,15 @@ def _array(part: str, values: ArrayLike, name: str | None = None) -> NDArray[Any
     """Return an array that can be sent as it lies in memory."""
     array = np.asarray(values)
     dtype = "float32" if array.dtype == np.float64 else array.dtype.name
-    if dtype not in _DTYPES:
+    if dtype not in ARRAY_DTYPES:
         raise InvalidInput(
             "features.dtype",
             "an array of these cannot be sent",
             field=_field(part, name),
-            expected=f"one of {', '.join(_DTYPES)}, float64",
+            expected=f"one of {', '.join(ARRAY_DTYPES)}, float64",
             got=array.dtype.name,
         )
-    return np.ascontiguousarray(array, dtype=_DTYPES[dtype])
+    return np.ascontiguousarray(array, dtype=ARRAY_DTYPES[dtype])
 
 
 def _array_as_json(array: NDArray[Any]) -> dict[str, Any]:

@@ -14,10 +14,13 @@ from clients.requests import read_image
 from clients.types import MapInfo
 from visloc.errors import InvalidInput
 from visloc.geometry import PixelOrigin
-from visloc.kapture import FeatureSet, open_features, open_local_features, read_local
-
-# What a map calls the features of type TYPE that a kapture dataset brought along.
-_READY_MADE = "kapture:"
+from visloc.kapture import (
+    READY_MADE_PREFIX,
+    FeatureSet,
+    open_features,
+    open_local_features,
+    read_local,
+)
 
 Reader = Callable[[Query], bytes | Features]
 
@@ -76,39 +79,42 @@ def choose_reader(
 ) -> Reader:
     """Return what reads of a query that which this map takes.
 
-    A map of ready-made features takes those of the same types, from the dataset or from
-    ``features_dir``; any other takes photos.
+    A map with ready-made features, local or global, takes features of the same types, from the
+    dataset or from ``features_dir``; any other takes photos. Local features that the server could
+    find itself are then read from the folder of their name, as ``mapping export-features``
+    writes them: photos and features do not go together in one request.
 
     Raises:
         InvalidInput: ``queries.no_features`` for a list of photos and a map that takes features;
             ``queries.features_dir`` for a map that takes photos.
         DatasetError: ``kapture.*`` when the dataset has no such features.
     """
-    if not info.local_features.startswith(_READY_MADE):
+    ready_made = [name for name in info.global_features if name.startswith(READY_MADE_PREFIX)]
+    if not ready_made and not info.local_features.startswith(READY_MADE_PREFIX):
         if features_dir is not None:
             raise InvalidInput(
                 "queries.features_dir",
                 f"map {info.ref} takes photos; ready-made features are of no use to it",
                 field="features_dir",
-                expected=f"a map with local features {_READY_MADE}TYPE",
-                got=info.local_features,
+                expected=f"a map with features {READY_MADE_PREFIX}TYPE",
+                got=", ".join((info.local_features, *info.global_features)),
             )
         return lambda query: read_image(query.path)
     if not source.is_dir():
         raise InvalidInput(
             "queries.no_features",
-            f"map {info.ref} takes features of kind {info.local_features}, and a list of photos "
-            "has none",
+            f"map {info.ref} takes features, and a list of photos has none",
             field=str(source),
-            expected="a kapture folder",
+            expected=f"a kapture folder with {', '.join((info.local_features, *ready_made))}",
         )
     kind = info.local_features
     keypoints, descriptors = open_local_features(
-        source, kind.removeprefix(_READY_MADE), features_dir
+        source, kind.removeprefix(READY_MADE_PREFIX), features_dir
     )
     global_features = {
-        name: open_features(source, "global_features", name.removeprefix(_READY_MADE), features_dir)
-        for name in info.global_features
-        if name.startswith(_READY_MADE)
+        name: open_features(
+            source, "global_features", name.removeprefix(READY_MADE_PREFIX), features_dir
+        )
+        for name in ready_made
     }
     return FeatureReader(kind, keypoints, descriptors, global_features, origin)

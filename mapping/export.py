@@ -18,6 +18,7 @@ from visloc.archive import Map
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose
 from visloc.kapture import (
+    READY_MADE_PREFIX,
     Dataset,
     FileRecord,
     Reconstruction,
@@ -30,7 +31,6 @@ from visloc.kapture import (
 )
 from visloc.pose.colmap import colmap_camera
 
-_READY_MADE = "kapture:"  # begins the names of features that came with a dataset
 _NO_ERROR = -1.0  # COLMAP's word for a point whose error is not known
 _IMPORTED = "imported"  # type of the keypoints of the reconstruction that a map came from
 
@@ -180,7 +180,7 @@ def _export_kapture(opened: Map, output: Path) -> None:
             gnss=(),
         )
     )
-    local = opened.manifest.local_features.fingerprint.name.removeprefix(_READY_MADE)
+    local = opened.manifest.local_features.fingerprint.name.removeprefix(READY_MADE_PREFIX)
     keypoints_type = local if exported.described else _IMPORTED
     for row, record in enumerate(opened.images):
         keypoints = exported.keypoints[row]
@@ -190,7 +190,7 @@ def _export_kapture(opened: Map, output: Path) -> None:
         else:
             write_keypoints(output, _IMPORTED, record.name, keypoints, name=_IMPORTED)
         for name, vectors in opened.global_descriptors.items():
-            kind = name.removeprefix(_READY_MADE)
+            kind = name.removeprefix(READY_MADE_PREFIX)
             write_global_features(output, kind, record.name, vectors[row], name=kind)
     write_reconstruction(
         output,

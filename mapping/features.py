@@ -25,6 +25,7 @@ from visloc.features import (
     make_local_features,
 )
 from visloc.features.readymade import (
+    MAX_READY_MADE_KEYPOINTS,
     ready_made_fingerprint,
     to_global_descriptor,
     to_local_features,
@@ -37,8 +38,6 @@ from visloc.types import Fingerprint, LocalFeatures
 Progress = Callable[[str, int, int], None]
 """Told the stage, how much of it is done, and how much there is."""
 
-# Most keypoints of a photo with ready-made features, in the dataset and in queries.
-MAX_READY_MADE_KEYPOINTS = 100_000
 # The vocabulary of a global descriptor is learned from at most this many photos, evenly chosen.
 _VOCABULARY_PHOTOS = 200
 # Raised when the code of a stage here changes what comes out.
@@ -161,7 +160,7 @@ class ReadyMadeFeatures:
 
     @property
     def max_keypoints(self) -> int:
-        """Most keypoints of a photo: all that there are are taken."""
+        """Most keypoints that a photo may have; all of them are taken."""
         return MAX_READY_MADE_KEYPOINTS
 
     def has(self, image_path: str) -> bool:
@@ -187,6 +186,15 @@ class ReadyMadeFeatures:
         Raises:
             DatasetError: with the file that is wrong.
         """
+        count = self.descriptors.count(photo.name)
+        if count > MAX_READY_MADE_KEYPOINTS:
+            raise DatasetError(
+                "features.too_many",
+                "the photo has too many keypoints",
+                field=self.descriptors.label(photo.name),
+                expected=f"at most {MAX_READY_MADE_KEYPOINTS}",
+                got=count,
+            )
         size = (photo.camera.width, photo.camera.height)
         rows = read_local(self.keypoints, self.descriptors, photo.name, size, self.origin)
         with _errors_in(self.descriptors, photo):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import Map
+from visloc.archive.npz import read_npz
 from visloc.errors import MapCorrupt
 
 FILE_NAME = "imported_points.npz"
@@ -60,6 +59,8 @@ class ImportedPoints:
 def read_imported_points(opened: Map) -> ImportedPoints | None:
     """Read what a map keeps of the reconstruction that it was imported from, if it was.
 
+    Everything is checked: whoever verifies a map calls this for its errors.
+
     Raises:
         MapCorrupt: ``map.imported_points``.
     """
@@ -67,14 +68,16 @@ def read_imported_points(opened: Map) -> ImportedPoints | None:
         return None
     path = opened.path / FILE_NAME
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            found = {name: np.asarray(arrays[name]) for name in _ARRAYS}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        found = read_npz(path)
+    except (OSError, ValueError) as error:
         raise _corrupt(path, str(error)) from error
+    if found.keys() != _ARRAYS.keys():
+        raise _corrupt(path, ", ".join(sorted(found)))
     for name, (dtype, columns) in _ARRAYS.items():
-        shape = found[name].shape[1:]
-        if found[name].dtype != np.dtype(dtype) or shape != (() if columns is None else (columns,)):
-            raise _corrupt(path, f"{name} {found[name].dtype} {found[name].shape}")
+        array = found[name]
+        row = () if columns is None else (columns,)
+        if array.dtype != np.dtype(dtype) or array.ndim != 1 + len(row) or array.shape[1:] != row:
+            raise _corrupt(path, f"{name} {array.dtype} {array.shape}")
     points, colors, offsets, observations = (
         found[name] for name in ("points", "colors", "keypoint_offsets", "observations")
     )
@@ -84,6 +87,7 @@ def read_imported_points(opened: Map) -> ImportedPoints | None:
         and offsets[0] == 0
         and offsets[-1] == len(found["keypoints"])
         and bool((counts >= 0).all())
+        and bool(np.isfinite(points).all())
         and len(colors) in (0, len(points))
         and bool((observations >= 0).all())
         and bool((observations[:, 0] < len(points)).all())

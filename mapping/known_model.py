@@ -46,6 +46,9 @@ def landmarks_from_reconstruction(
 ) -> MadeLandmarks:
     """Take the dataset's points as landmarks, or match its photos anew.
 
+    As landmarks the points are taken as they are: no threshold of reprojection error, angle or
+    number of observations is applied, since what made them had its own.
+
     Args:
         work: where finished work is kept.
         dataset: it has points, observations and the keypoints that observe.
@@ -58,11 +61,12 @@ def landmarks_from_reconstruction(
         progress: told how far it is.
 
     Raises:
-        DatasetError: ``model.no_points``, and what reading raises.
+        DatasetError: ``model.no_points``, ``kapture.index`` for an observation by a keypoint that
+            does not exist, and what reading raises.
         InvalidInput: what matching raises.
     """
     known, keypoints = _read(dataset, features)
-    imported = _imported_points(known, keypoints, photos, origin)
+    imported, notes = _imported_points(known, keypoints, photos, origin)
     anchor = Anchor(kind="model", images=len(photos))
     if not (
         isinstance(features, ReadyMadeFeatures)
@@ -72,7 +76,7 @@ def landmarks_from_reconstruction(
         made = landmarks_from_matches(
             work, dataset, photos, features, (), anew, metric, workers, progress
         )
-        return replace(made, anchor=anchor, imported=imported)
+        return replace(made, anchor=anchor, imported=imported, notes=(*made.notes, *notes))
     views = [View(photo.camera, photo.pose) for photo in photos]
     observations = _observations(imported)
     landmarks, rows = assemble_landmarks(
@@ -90,6 +94,7 @@ def landmarks_from_reconstruction(
         settings={},
         metric=metric,
         anchor=anchor,
+        notes=notes,
     )
 
 
@@ -117,8 +122,8 @@ def _imported_points(
     keypoints: FeatureSet,
     photos: Sequence[MappingPhoto],
     origin: PixelOrigin,
-) -> ImportedPoints:
-    """The reconstruction as far as these photos see it, in their order."""
+) -> tuple[ImportedPoints, tuple[str, ...]]:
+    """The reconstruction as far as these photos see it, in their order, and what was left out."""
     row_of_name = {photo.name: row for row, photo in enumerate(photos)}
     photo_of_image = np.array([row_of_name.get(name, -1) for name in known.images], dtype=np.int64)
     pixels = [
@@ -129,13 +134,44 @@ def _imported_points(
     ]
     observations = known.observations.copy()
     observations[:, 1] = photo_of_image[known.observations[:, 1]]
-    return ImportedPoints(
+    observations = observations[observations[:, 1] >= 0]
+    readable = np.array([keypoints.has(photo.name) for photo in photos])[observations[:, 1]]
+    lost, observations = observations[~readable], observations[readable]
+    _check_rows(observations, np.array([len(one) for one in pixels]), keypoints, photos)
+    notes: tuple[str, ...] = ()
+    if len(lost):
+        blind = np.unique(lost[:, 1])
+        notes = (
+            f"{len(lost)} observations by {len(blind)} photos without a file of keypoints were "
+            f"left out (first {keypoints.label(photos[blind[0]].name)})",
+        )
+    imported = ImportedPoints(
         points=known.points,
         colors=known.colors,
         keypoint_offsets=np.cumsum([0, *(len(one) for one in pixels)], dtype=np.int64),
         keypoints=np.concatenate(pixels),
-        observations=observations[observations[:, 1] >= 0],
+        observations=observations,
     )
+    return imported, notes
+
+
+def _check_rows(
+    observations: NDArray[np.int64],
+    counts: NDArray[np.int64],
+    keypoints: FeatureSet,
+    photos: Sequence[MappingPhoto],
+) -> None:
+    beyond = np.flatnonzero(observations[:, 2] >= counts[observations[:, 1]])
+    if len(beyond):
+        _, photo, row = observations[beyond[0]].tolist()
+        raise DatasetError(
+            "kapture.index",
+            f"reconstruction/observations.txt has a keypoint of {photos[photo].name} that is not "
+            "in this file",
+            field=keypoints.label(photos[photo].name),
+            expected=f"less than {counts[photo]}",
+            got=str(row),
+        )
 
 
 def _observations(imported: ImportedPoints) -> Observations:

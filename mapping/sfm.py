@@ -242,10 +242,10 @@ def _anchored(
     centers = np.array([view.cam_from_world.center for view in views]).reshape(-1, 3)
     positions = known.positions[placed]
     found = align_positions(centers, positions, known.max_error)
-    if found is None:
+    if isinstance(found, str):
         return *free, (
-            f"{len(known.photos)} photos have a known position ({known.anchor.kind}), too few "
-            "agree with the reconstruction or all lie in a line: the frame and unit are arbitrary"
+            f"{len(known.photos)} photos have a known position ({known.anchor.kind}), but {found}: "
+            "the frame and unit are arbitrary"
         )
     similarity, agrees = found
     errors = np.linalg.norm(similarity.apply(centers) - positions, axis=1)[agrees]

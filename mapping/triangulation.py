@@ -337,7 +337,7 @@ def _database(
     if not matches:
         raise InvalidInput(
             "sfm.no_matches",
-            "no two photos match",
+            "too few matches to triangulate anything",
             field="dataset",
             expected="pairs of photos that show the same; see --pairs and --mapper",
             got=f"{len(photos)} photos, none of their pairs with enough verified matches",

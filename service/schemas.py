@@ -161,8 +161,6 @@ def _array_bytes_from_base64(value: object) -> object:
 class Array(IncomingMessage):
     """Numbers in little-endian order, the last index running fastest."""
 
-    path: ClassVar[str] = "features.*."
-
     dtype: Annotated[str, Field(description=f"one of {', '.join(ARRAY_DTYPES)}")]
     shape: Annotated[list[int], Field(description="rows and columns; of a single row its length")]
     data: Annotated[

@@ -19,7 +19,11 @@ from visloc.images import Photo, stored_from_upright, upright
 from visloc.matching.correspondences import match_landmarks
 from visloc.pose.absolute import estimate_absolute_pose
 from visloc.pose.covariance import position_covariance, with_origin
-from visloc.query_features import checked_global_descriptors, checked_local_features
+from visloc.query_features import (
+    checked_global_descriptors,
+    checked_local_features,
+    max_sent_keypoints,
+)
 from visloc.retrieval.index import Retrieved, retrieve
 from visloc.types import (
     DEFAULT_PRESET,
@@ -89,10 +93,11 @@ class Localizer:
             self.localize(Photo(noise), None, LocalizeOptions())
             return
         manifest = self.map.manifest
+        num_keypoints = min(1000, max_sent_keypoints(manifest))
         features = QueryFeatures(
             manifest.local_features.fingerprint.name,
-            random.uniform(0, 480, (1000, 2)),
-            random.normal(size=(1000, manifest.local_features.descriptor_dim)),
+            random.uniform(0, 480, (num_keypoints, 2)),
+            random.normal(size=(num_keypoints, manifest.local_features.descriptor_dim)),
             {g.fingerprint.name: random.normal(size=g.dim) for g in manifest.global_features},
         )
         camera = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))

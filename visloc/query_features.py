@@ -9,14 +9,26 @@ from numpy.typing import NDArray
 
 from visloc.archive import Manifest
 from visloc.errors import InvalidInput, TooLarge
-from visloc.features.readymade import to_global_descriptor, to_local_features
+from visloc.features.readymade import (
+    MAX_READY_MADE_KEYPOINTS,
+    is_ready_made,
+    to_global_descriptor,
+    to_local_features,
+)
 from visloc.geometry import Camera
 from visloc.types import LocalFeatures, QueryFeatures
 
-# Twenty times what our extractors keep; the time that a request takes grows with them.
-MAX_KEYPOINTS = 100_000
 # Extractors that work on a shrunk or padded photo may place a keypoint a little beyond its edge.
 EDGE_TOLERANCE_PX = 1.0
+
+
+def max_sent_keypoints(manifest: Manifest) -> int:
+    """Return how many keypoints may be sent: as many as a photo of the map may have."""
+    local = manifest.local_features
+    # A map of ready-made features took all that there were; its own number says nothing.
+    return (
+        MAX_READY_MADE_KEYPOINTS if is_ready_made(local.fingerprint.name) else local.max_keypoints
+    )
 
 
 def checked_local_features(
@@ -32,12 +44,13 @@ def checked_local_features(
     keypoints, descriptors = features.keypoints, features.descriptors
     if keypoints.ndim != 2 or keypoints.shape[1] != 2:
         raise _unusable("keypoints", "not keypoints", "(N, 2): x, y", keypoints.shape)
-    if len(keypoints) > MAX_KEYPOINTS:
+    most = max_sent_keypoints(manifest)
+    if len(keypoints) > most:
         raise TooLarge(
             "features.too_many",
             "too many keypoints; send the strongest",
             field="features.keypoints",
-            expected=f"at most {MAX_KEYPOINTS}",
+            expected=f"at most {most}",
             got=len(keypoints),
         )
     dim = manifest.local_features.descriptor_dim

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from mapping.anchor import scale_doubt
 from mapping.importers.json_fields import JsonValue, read_json
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.opensfm_features import Features, read_features
@@ -53,7 +54,7 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
 
     Features are taken from ``features/NAME.features.npz`` if all photos have them; else the
     observations in ``tracks.csv`` become the keypoints. Photos' GPS positions become GNSS fixes,
-    and with two or more different ones the world counts as metric.
+    and the world counts as metric when they tell its scale (``mapping.anchor.scale_doubt``).
 
     Args:
         path: the dataset's folder, or its ``reconstruction.json``.
@@ -305,7 +306,7 @@ def _checked_rows(
 def _fixes(
     folder: Path, reconstruction: JsonValue, shots: Sequence[_Shot]
 ) -> tuple[tuple[GnssRecord, ...], bool, list[str]]:
-    """Return the photos' GPS positions, whether they fix the scale, and notes."""
+    """Return the photos' GPS positions, whether they tell the scale, and notes."""
     located = [(rank, shot.gps, shot.dop) for rank, shot in enumerate(shots) if shot.gps]
     reference = reconstruction.get("reference_lla")
     if reference is None and os.path.isfile(folder / "reference_lla.json"):  # noqa: PTH113
@@ -331,7 +332,8 @@ def _fixes(
     ]
     if np.abs(geodetic[:, 2] - _UNUSED_ALTITUDE).max() < 0.01:
         notes.append("the altitudes of the GPS positions are OpenSfM's placeholder, not measured")
-    metric = bool(np.ptp(positions[:, :2], axis=0).max() > 0)
-    if not metric:
-        notes.append("the GPS positions are all the same: the scale is unknown")
-    return fixes, metric, notes
+    # Horizontally: altitudes are worse, or not measured.
+    doubt = scale_doubt(centers[:, :2], positions[:, :2])
+    if doubt is not None:
+        notes.append(f"the world does not count as metric: {doubt}")
+    return fixes, doubt is None, notes

@@ -40,8 +40,8 @@ def pair_by_distance(scene: Scene, settings: PairSettings) -> Pairs:
     """Pair every photo with the ``top_k`` nearest in position and rotation.
 
     Photos without a pose get no pair. Two photos from the very same place, which differ by a
-    rotation only, are a legal pair with a high score, although no point can be triangulated from
-    the two alone: they still link the tracks of others.
+    rotation only, pair with a high score all the same; their matches are lost, since without a
+    baseline given poses confirm none (``visloc.matching.verification.epipolar_errors``).
 
     Raises:
         InvalidInput: ``pairs.no_poses``.

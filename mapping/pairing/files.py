@@ -42,7 +42,7 @@ def read_pairs(path: Path, scene: Scene) -> Pairs:
             ``kapture.number`` for a score that is not a finite number.
     """
     row_of = {name: row for row, name in enumerate(scene.names)}
-    table = Table(path.parent, path.name, None)
+    table = Table(Path(), str(path), None)  # so that errors name the whole path
     first, second, scores = array("q"), array("q"), array("d")
     for fields in table:
         if len(fields) not in (2, 3):
@@ -76,7 +76,8 @@ def _row(row_of: dict[str, int], name: str, table: Table) -> int:
     if row is None:
         raise table.error(
             "pairs.unknown_photo",
-            "no photo of the dataset has this name; remove the line or add the photo",
+            "no photo that can be used has this name: it is not in the dataset, or was left out, "
+            "see the notes; remove the line or add the photo",
             expected="the name of a photo that can be mapped",
             got=name,
         )

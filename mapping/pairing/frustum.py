@@ -78,9 +78,9 @@ class _Views:
 def pair_by_frustum(scene: Scene, settings: PairSettings) -> Pairs:
     """Pair every photo with the ``top_k`` that overlap most with it.
 
-    Photos without a pose or without intrinsics get no pair. Photos from the very same place are
-    legal pairs although no point can be triangulated from the two alone, and so are photos along
-    the same axis.
+    Photos without a pose or without intrinsics get no pair. Photos from the very same place pair
+    all the same; their matches are lost, since without a baseline given poses confirm none
+    (``visloc.matching.verification.epipolar_errors``).
 
     Raises:
         InvalidInput: ``pairs.no_poses``, ``pairs.no_cameras``, or ``pairs.camera`` for a camera

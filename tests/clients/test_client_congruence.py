@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from clients import AsyncClient, Client, Features, LocalizeOptions
+from clients.features import ARRAY_DTYPES
+from service import schemas
 from visloc.errors import InvalidInput, NotFound, Overloaded, TooLarge, Unavailable, VislocError
 from visloc.geometry import Camera
 
@@ -121,6 +123,11 @@ def test_all_clients_send_the_same_features(http_url: str, grpc_url: str, servic
     assert all(answer.localized for answer in answers)
     assert [seen["features"] for seen in service.seen] == [features.as_json()] * 4
     assert service.seen[0]["features"]["keypoints"]["shape"] == [3, 2]
+
+
+def test_clients_send_the_arrays_that_the_service_reads() -> None:
+    assert list(ARRAY_DTYPES.items()) == list(schemas.ARRAY_DTYPES.items())
+    assert {dtype.str[0] for dtype in ARRAY_DTYPES.values()} == {"<", "|"}
 
 
 def test_what_is_not_given_is_not_sent(http_url: str, grpc_url: str, service: Any) -> None:

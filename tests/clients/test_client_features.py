@@ -162,6 +162,28 @@ def test_a_benchmark_measures_features(
     assert "features" in ready_made.seen[0]
 
 
+@pytest.mark.parametrize("command", ["batch", "benchmark"])
+@pytest.mark.parametrize("features_dir", [False, True])
+def test_a_map_with_only_global_features_ready_made_takes_features(
+    command: str,
+    features_dir: bool,
+    http_url: str,
+    ready_made: Any,
+    make_dataset: Dataset,
+    tmp_path: Path,
+) -> None:
+    ready_made.local_features = "r2d2"
+    dataset = make_dataset({"a.jpg": b"photo"})
+    elsewhere = tmp_path / "features"
+    write_features(elsewhere if features_dir else dataset, "a.jpg")
+    target = ("--output" if command == "batch" else "--report", tmp_path / "out")
+    more = ("--features-dir", elsewhere) if features_dir else ()
+    assert run(command, dataset, "--map", "room", *target, "--server", http_url, *more) == 0
+    (seen,) = ready_made.seen
+    assert seen["features"]["kind"] == "r2d2"
+    assert seen["features"]["global_descriptors"].keys() == {"kapture:gem"}
+
+
 def test_descriptors_of_other_numbers_are_sent_as_float32_and_bytes_as_they_are(
     http_url: str, ready_made: Any, make_dataset: Dataset, tmp_path: Path
 ) -> None:
@@ -202,6 +224,8 @@ def test_the_pixel_origin_counts_for_photos_and_lists_too(
     ("case", "code"),
     [
         ("list", "queries.no_features"),
+        ("list, mixed map", "queries.no_features"),
+        ("no features, mixed map", "kapture.no_features"),
         ("photo map", "queries.features_dir"),
         ("no features", "kapture.no_features"),
         ("no global features", "kapture.no_features"),
@@ -219,11 +243,13 @@ def test_what_cannot_be_asked_is_said_before_anything_is_sent(
 ) -> None:
     source = make_dataset({"a.jpg": b"photo"})
     more: tuple[object, ...] = ()
-    if case == "list":
+    if case.endswith("mixed map"):
+        ready_made.local_features = "xfeat"
+    if case.startswith("list"):
         source = tmp_path / "list.txt"
         source.write_text("dataset/sensors/records_data/a.jpg\n")
     elif case == "photo map":
-        ready_made.local_features = "xfeat"
+        ready_made.local_features, ready_made.global_features = "xfeat", ("densevlad",)
         more = ("--features-dir", tmp_path)
     elif case == "no global features":
         write_local_features(source, "r2d2", "a.jpg", KEYPOINTS, DESCRIPTORS, name="x")

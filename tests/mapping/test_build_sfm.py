@@ -3,6 +3,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -155,27 +156,29 @@ def test_gnss_says_where_the_map_lies_and_one_wrong_fix_does_no_harm(
     walk: Path, walk_copy: Path, tmp_path: Path, build_walk: Build, rewrite: Rewrite
 ) -> None:
     dataset, random = read_dataset(walk_copy), np.random.default_rng(0)
-    fixes = []
-    for number, stamp in enumerate(sorted({record.timestamp for record in dataset.images})):
-        at = dataset.trajectories[stamp, "rig"].center + random.normal(0, 0.02, 3)
-        if number == 3:
-            at += [60.0, 0.0, 0.0]
+    fixes, images = [], []
+    for stamp, record in enumerate(dataset.images):
+        pose = dataset.pose(record)
+        assert pose is not None
+        at = pose.center + random.normal(0, 0.01, 3) + [60.0 if stamp == 3 else 0.0, 0.0, 0.0]
         latitude, longitude, altitude = geodetic_from_enu(at[None], ANCHOR)[0]
         fixes.append(GnssRecord(stamp, "gnss", longitude, latitude, altitude, 0.0, 0.0))
-    rewrite(walk_copy, rigs={}, trajectories={}, gnss=tuple(fixes), depth_maps=())
+        images.append(replace(record, timestamp=stamp))
+    changes = {"images": tuple(images), "gnss": tuple(fixes)}
+    rewrite(walk_copy, rigs={}, trajectories={}, depth_maps=(), **changes)
 
     built = build_walk(walk_copy, tmp_path / "maps", sfm=ESTIMATE, metric=False)
 
     world = built.manifest.world
     assert world.metric
     assert world.anchor is not None
-    assert (world.anchor.kind, world.anchor.images) == ("gnss", 14)  # all but two of one instant
+    assert (world.anchor.kind, world.anchor.images) == ("gnss", 15)
     assert world.anchor.rms is not None
     assert world.anchor.rms < 0.2
     geodetic = world.anchor.geodetic
     assert geodetic is not None
     origin = np.array([geodetic.latitude_deg, geodetic.longitude_deg, geodetic.altitude_m])
-    # The world's axes point east, north and up of that origin; the rig is 12 cm wide.
+    # The world's axes point east, north and up of that origin.
     truth = centers_of(walk / "mapping")
     expected = enu_from_geodetic(geodetic_from_enu(np.array(list(truth.values())), ANCHOR), origin)
     poses = poses_of(built)
@@ -289,10 +292,10 @@ def test_a_bad_dataset_is_refused_by_name_and_nothing_is_published(
     ("text", "code", "named"),
     [
         ("mapping/left/0001.jpg, elsewhere.jpg\n", "pairs.unknown_photo", r"my.txt:1.*elsewhere"),
-        ("# nothing\n", "sfm.no_points", "too few matches to triangulate"),
+        ("# nothing\n", "pairs.none", r"my.txt: no two photos are paired"),
         (
             "mapping/left/0001.jpg, mapping/right/0008.jpg\n",
-            "sfm.no_points",
+            "sfm.no_matches",
             "too few matches to triangulate",
         ),
     ],

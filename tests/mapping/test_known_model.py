@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mapping.export import export_map
+from mapping.imported_points import read_imported_points
 from visloc.archive import Map
 from visloc.errors import DatasetError, MapCorrupt
 from visloc.kapture import read_reconstruction
@@ -103,14 +104,71 @@ def test_other_features_are_matched_anew_and_the_points_come_back_out(
     )
 
 
+def test_sightings_by_photos_without_keypoints_are_left_out_with_a_note(
+    with_points: Path, tmp_path: Path, build_walk: Build
+) -> None:
+    known = read_reconstruction(with_points)
+    assert known is not None
+    next(with_points.rglob("left/0001.jpg.kpt")).unlink()
+    built = build_walk(with_points, tmp_path / "maps", **MODEL)
+    lost = known.observations[:, 1] == known.images.index("mapping/left/0001.jpg")
+    assert any(
+        f"{lost.sum()} observations by 1 photos without a file of keypoints" in note
+        and "left/0001.jpg.kpt" in note
+        for note in built.manifest.notes
+    )
+    imported = read_imported_points(built)
+    assert imported is not None
+    assert len(imported.observations) == (~lost).sum()
+    export_map(built, tmp_path / "out", "kapture")
+
+
+def test_a_sighting_by_a_keypoint_beyond_the_last_is_refused_by_name(
+    exported: Path, tmp_path: Path, build_walk: Build
+) -> None:
+    dataset, features = tmp_path / "dataset", tmp_path / "features"
+    shutil.copytree(exported, dataset, ignore=shutil.ignore_patterns("keypoints", "descriptors"))
+    for kind in ("keypoints", "descriptors"):
+        shutil.copytree(exported / "reconstruction" / kind, features / kind)
+        next((features / kind).rglob("left/0001.jpg.*")).write_bytes(b"")
+    with pytest.raises(DatasetError, match=r"mapping/left/0001\.jpg") as caught:
+        build_walk(
+            dataset,
+            tmp_path / "maps",
+            **MODEL,
+            local_features="kapture:sift",
+            features_dir=features,
+        )
+    assert caught.value.code == "kapture.index"
+    assert caught.value.field is not None
+    assert caught.value.field.endswith("left/0001.jpg.kpt")
+    assert not (tmp_path / "maps" / "walk").exists()
+
+
 def test_damaged_imported_points_are_refused(
     with_points: Path, tmp_path: Path, build_walk: Build
 ) -> None:
     built = build_walk(with_points, tmp_path / "maps", **MODEL)
     path = built.path / "imported_points.npz"
-    size = path.stat().st_size
     whole = path.read_bytes()
-    path.write_bytes(whole[: size // 2] + b"\0" * (size - size // 2))
+    with np.load(path) as arrays:
+        good = dict(arrays)
+    for damage, named in (
+        ({"points": good["points"] * np.nan}, "do not fit"),
+        ({"points": good["points"][:1]}, "do not fit"),
+        ({"keypoints": good["keypoints"][:-1]}, "do not fit"),
+        ({"keypoint_offsets": good["keypoint_offsets"][:0]}, "do not fit"),
+        ({"colors": np.float64(0)}, "colors float64"),
+        ({"observations": good["observations"].ravel()}, "observations int64"),
+        ({"further": np.zeros(3)}, "further"),
+    ):
+        np.savez(path, **(good | damage))
+        with pytest.raises(MapCorrupt, match=rf"imported_points\.npz.*{named}"):
+            read_imported_points(built)
+    np.savez_compressed(path, **good)
+    with pytest.raises(MapCorrupt, match=r"imported_points\.npz.*compressed"):
+        read_imported_points(built)
+    path.write_bytes(whole[: len(whole) // 2] + b"\0" * (len(whole) - len(whole) // 2))
     with pytest.raises(MapCorrupt, match=r"imported_points\.npz"):
         export_map(built, tmp_path / "out", "ply")
     assert not (tmp_path / "out").exists()

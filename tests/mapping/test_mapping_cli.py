@@ -330,7 +330,9 @@ def test_an_imported_dataset_is_written_once(run: Run, shared_data: Path, tmp_pa
     door = shared_data / "import_samples" / "lund_door" / "colmap"
     status, out, err = run("import", "colmap", door, "--output", tmp_path / "door")
     assert (status, err) == (0, "")
-    assert out.splitlines()[-1] == f"dataset: {tmp_path / 'door'}"
+    dataset, then = out.splitlines()[-2:]
+    assert dataset == f"dataset: {tmp_path / 'door'}"
+    assert then.endswith("door --map ID --method model --not-metric")
     assert len(read_dataset(tmp_path / "door").images) == 12
     error = error_of(run("import", "colmap", door, "--output", tmp_path / "door"))
     assert f"error [import.exists] {tmp_path / 'door'}" in error

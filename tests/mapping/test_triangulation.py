@@ -228,4 +228,4 @@ def test_photos_that_share_nothing_cannot_be_placed(tmp_path: Path) -> None:
     photos = [replace(photo, cam_from_world=None) for photo in world.photos]
     with pytest.raises(InvalidInput) as caught:
         reconstruct(photos, {}, [], CONFIG, (), tmp_path)
-    assert caught.value.code == "sfm.no_model"
+    assert caught.value.code == "sfm.no_matches"

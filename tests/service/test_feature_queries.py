@@ -22,6 +22,7 @@ from service.schemas import Array, Features, LocalizeRequest
 from visloc.archive import Map, MapStore
 from visloc.errors import InvalidInput
 from visloc.features import make_global_descriptor, make_local_features
+from visloc.features.readymade import MAX_READY_MADE_KEYPOINTS
 from visloc.geometry import Camera, Pose, rotation_angle
 from visloc.images import read_photo
 from visloc.types import QueryFeatures
@@ -229,7 +230,7 @@ HOSTILE = [
         lambda f: (
             f
             | {
-                "keypoints": array(np.zeros((100_001, 2)), "uint8"),
+                "keypoints": array(np.zeros((5001, 2)), "uint8"),
                 "descriptors": array(np.zeros((0, 128))),
             }
         ),
@@ -238,12 +239,7 @@ HOSTILE = [
 ]
 
 
-@pytest.mark.parametrize(("change", "code", "field"), HOSTILE)
-def test_hostile_arrays_are_refused_alike_at_both_doors(
-    change: Any, code: str, field: str, doors: Any, query: Any, features: dict[str, Any]
-) -> None:
-    message = body(query, change(features))
-    over_http = doors.http.post("/localize", json=message).json()
+def refusal_over_grpc(doors: Any, message: dict[str, Any]) -> ErrorInfo:
     with pytest.raises(grpc.RpcError) as caught:
         doors.stub.Localize(as_message(message))
     call: Any = caught.value
@@ -251,11 +247,46 @@ def test_hostile_arrays_are_refused_alike_at_both_doors(
     info = ErrorInfo()
     assert details is not None
     assert details.details[0].Unpack(info)
+    return info
+
+
+@pytest.mark.parametrize(("change", "code", "field"), HOSTILE)
+def test_hostile_arrays_are_refused_alike_at_both_doors(
+    change: Any, code: str, field: str, doors: Any, query: Any, features: dict[str, Any]
+) -> None:
+    message = body(query, change(features))
+    over_http = doors.http.post("/localize", json=message).json()
+    info = refusal_over_grpc(doors, message)
 
     assert (over_http["code"], over_http["field"]) == (code, field), over_http
     assert (info.reason, info.metadata["field"]) == (code, field)
     assert info.metadata["expected"] == over_http["expected"]
     assert over_http["status"] == (413 if code == "features.too_many" else 422)
+
+
+def zeros(num: int, kind: str) -> dict[str, Any]:
+    """Keypoints without descriptors: their number is looked at first."""
+    return {
+        "kind": kind,
+        "keypoints": array(np.zeros((num, 2)), "uint8"),
+        "descriptors": array(np.zeros((0, 128))),
+        "global_descriptors": {},
+    }
+
+
+def test_as_many_keypoints_may_be_sent_as_the_map_keeps(
+    doors: Any, query: Any, opened: Map
+) -> None:
+    most = opened.manifest.local_features.max_keypoints
+    at_most = doors.http.post("/localize", json=body(query, zeros(most, "sift"))).json()
+    more = body(query, zeros(most + 1, "sift"))
+    over_http = doors.http.post("/localize", json=more).json()
+    info = refusal_over_grpc(doors, more)
+
+    assert at_most["code"] == "features.descriptors"  # the next thing that is wrong
+    expected = ("features.too_many", f"at most {most}", str(most + 1))
+    assert (over_http["code"], over_http["expected"], over_http["got"]) == expected
+    assert (info.reason, info.metadata["expected"], info.metadata["got"]) == expected
 
 
 @pytest.mark.parametrize(
@@ -271,9 +302,17 @@ def test_hostile_arrays_are_refused_alike_at_both_doors(
         (with_array("keypoints", shape="1,2"), "request.invalid", "features.keypoints.shape"),
         (with_array("keypoints", data="*"), "request.invalid", "features.keypoints.data"),
         (with_array("keypoints", data=None), "request.invalid", "features.keypoints.data"),
-        (with_array("keypoints", order="F"), "request.unknown_field", "features.*.order"),
+        (with_array("keypoints", order="F"), "request.unknown_field", "features.keypoints.order"),
         (lambda f: f | {"scores": []}, "request.unknown_field", "features.scores"),
-        (lambda f: f | {"keypoints": [[1, 2]]}, "request.invalid", "features.*"),
+        (
+            with_global(order="F"),
+            *("request.unknown_field", "features.global_descriptors.densevlad.order"),
+        ),
+        (
+            lambda f: f | {"global_descriptors": {"g" * 5000: {"o" * 5000: 1}}},
+            *("request.unknown_field", f"features.global_descriptors.{'g' * 100}.{'o' * 100}"),
+        ),
+        (lambda f: f | {"keypoints": [[1, 2]]}, "request.invalid", "features.keypoints"),
         (
             lambda f: {n: f[n] for n in f if n != "descriptors"},
             *("request.missing_field", "features.descriptors"),
@@ -386,6 +425,10 @@ def test_a_map_of_ready_made_features_is_served_without_an_extractor(
         answer = answer_of(doors.http.post("/localize", json=body(query, brought)))
         photo = doors.http.post("/localize", data={"map": "room"}, files={"image": query.image})
         other = doors.http.post("/localize", json=body(query, features)).json()
+        at_most, more = (
+            doors.http.post("/localize", json=body(query, zeros(num, "kapture:SIFT"))).json()
+            for num in (MAX_READY_MADE_KEYPOINTS, MAX_READY_MADE_KEYPOINTS + 1)
+        )
         extractors = doors.server.engine._extractors
 
     assert ready["ready"]
@@ -399,4 +442,6 @@ def test_a_map_of_ready_made_features_is_served_without_an_extractor(
         "features of kind kapture:SIFT, with kapture:Dense, localvlad"
     )
     assert (other["code"], other["expected"]) == ("features.kind", "kapture:SIFT")
+    assert at_most["code"] == "features.descriptors"
+    assert (more["code"], more["expected"]) == ("features.too_many", "at most 20000")
     assert extractors == {}

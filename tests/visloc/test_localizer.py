@@ -24,7 +24,7 @@ from visloc.features.sift import SiftExtractor
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo, read_photo
 from visloc.localizer import Localizer, resolve_camera
-from visloc.query_features import MAX_KEYPOINTS
+from visloc.query_features import max_sent_keypoints
 from visloc.types import (
     Answer,
     CameraSource,
@@ -636,10 +636,30 @@ def test_keypoints_a_hair_beyond_the_edge_are_taken(
 def test_more_keypoints_than_the_limit_are_refused(
     localizer: Localizer, query: Query, features: QueryFeatures
 ) -> None:
-    many = replace(features, keypoints=np.zeros((MAX_KEYPOINTS + 1, 2), np.uint8))
+    most = localizer.map.manifest.local_features.max_keypoints
+    assert max_sent_keypoints(localizer.map.manifest) == most
+    many = replace(features, keypoints=np.zeros((most + 1, 2), np.uint8))
     with pytest.raises(TooLarge) as caught:
         localizer.localize_features(many, query.camera, OPTIONS)
-    assert (caught.value.code, caught.value.got) == ("features.too_many", "100001")
+    error = caught.value
+    assert (error.code, error.expected, error.got) == (
+        "features.too_many",
+        f"at most {most}",
+        str(most + 1),
+    )
+
+
+def test_a_map_of_ready_made_features_has_a_limit_of_its_own(ready_made: Localizer) -> None:
+    assert max_sent_keypoints(ready_made.map.manifest) == 20_000
+
+
+def test_a_map_with_few_keypoints_and_a_ready_made_global_descriptor_warms_up(
+    ready_made: Localizer, localizer: Localizer
+) -> None:
+    opened = ready_made.map
+    few = localizer.map.manifest.local_features.model_copy(update={"max_keypoints": 100})
+    manifest = opened.manifest.model_copy(update={"local_features": few})
+    Localizer(replace(opened, manifest=manifest), make_local_features("sift")).warm_up()
 
 
 def test_features_need_a_camera_and_have_no_orientation_to_be_read_in(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
+from visloc.archive.npz import read_npz
 from visloc.archive.schema import FORMAT_MAJOR, FORMAT_MINOR, Manifest
 from visloc.errors import MapCorrupt
 
@@ -178,19 +178,15 @@ def read_model(folder: Path, name: str) -> dict[str, NDArray[np.float32]]:
     """
     path = folder / name
     try:
-        with zipfile.ZipFile(path) as archive:
-            stored = all(
-                info.compress_type == zipfile.ZIP_STORED and info.filename.endswith(".npy")
-                for info in archive.infolist()
-            )
-        if not stored:  # a compressed entry could unpack to any size
-            raise MapCorrupt(
-                "map.array", "a model must be an .npz without compression", field=str(path)
-            )
-        with np.load(path, allow_pickle=False) as arrays:
-            model = {key: arrays[key] for key in arrays.files}
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise MapCorrupt("map.array", "not a model file", field=str(path)) from error
+        model = read_npz(path)
+    except (ValueError, OSError) as error:
+        raise MapCorrupt(
+            "map.array",
+            "not a model file",
+            field=str(path),
+            expected="an .npz without compression",
+            got=str(error),
+        ) from error
     for key, array in model.items():
         if array.dtype != np.float32 or not np.isfinite(array).all():
             raise MapCorrupt(

@@ -12,16 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.errors import InvalidInput
-from visloc.kapture import FeatureSet
+from visloc.kapture import READY_MADE_PREFIX, FeatureSet
 from visloc.types import Fingerprint, LocalFeatures
 
-_PREFIX = "kapture:"
+# Most keypoints of a photo, in the dataset and in queries. The time that a query takes grows with
+# them, and nobody chose a number when the map was built.
+MAX_READY_MADE_KEYPOINTS = 20_000
 _METRICS = ("l2", "cosine", "dot")
 
 
 def is_ready_made(name: str) -> bool:
     """Tell whether a name of features, ``kapture:TYPE``, means ready-made ones."""
-    return name.startswith(_PREFIX)
+    return name.startswith(READY_MADE_PREFIX)
 
 
 def ready_made_type(name: str) -> str:
@@ -38,7 +40,7 @@ def ready_made_type(name: str) -> str:
             expected="kapture:TYPE",
             got=name,
         )
-    return name.removeprefix(_PREFIX)
+    return name.removeprefix(READY_MADE_PREFIX)
 
 
 def ready_made_fingerprint(features: FeatureSet) -> Fingerprint:
@@ -60,7 +62,7 @@ def ready_made_fingerprint(features: FeatureSet) -> Fingerprint:
             got=features.metric_type,
         )
     return Fingerprint(
-        name=_PREFIX + features.type_name,
+        name=READY_MADE_PREFIX + features.type_name,
         revision=1,
         parameters={
             "dtype": features.dtype.name,

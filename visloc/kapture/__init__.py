@@ -4,7 +4,7 @@ NumPy only.
 """
 
 from visloc.kapture.dataset import Dataset, FileRecord, GnssRecord, Sensor
-from visloc.kapture.feature_layout import FeatureKind
+from visloc.kapture.feature_layout import READY_MADE_PREFIX, FeatureKind
 from visloc.kapture.feature_reader import (
     FeatureSet,
     feature_types,
@@ -22,6 +22,7 @@ from visloc.kapture.reconstruction import (
 from visloc.kapture.writer import write_dataset
 
 __all__ = [
+    "READY_MADE_PREFIX",
     "Dataset",
     "FeatureKind",
     "FeatureSet",

@@ -9,6 +9,9 @@ import numpy as np
 
 FeatureKind = Literal["keypoints", "descriptors", "global_features"]
 
+# What maps put before TYPE to name the features that a dataset brought along.
+READY_MADE_PREFIX = "kapture:"
+
 DTYPES: Mapping[str, np.dtype[Any]] = {
     "float32": np.dtype("<f4"),
     "float64": np.dtype("<f8"),

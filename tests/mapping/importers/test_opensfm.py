@@ -87,12 +87,11 @@ def test_the_sample_s_features_are_in_pixels(shared_data: Path) -> None:
     assert keypoints[0, 3] == pytest.approx(math.radians(-0.09376709))
 
 
-def test_the_sample_is_metric_and_its_positions_become_fixes(shared_data: Path) -> None:
+def test_the_sample_s_positions_become_fixes(shared_data: Path) -> None:
     folder = shared_data / "import_samples/opensfm_berlin"
 
     model = read(folder)
 
-    assert model.metric
     assert len(model.gnss) == 3
     for fix, image in zip(model.gnss, model.images, strict=True):
         gps = json.loads((folder / "exif" / f"{image.name}.exif").read_text())["gps"]
@@ -102,6 +101,16 @@ def test_the_sample_is_metric_and_its_positions_become_fixes(shared_data: Path) 
         assert fix.y == pytest.approx(gps["latitude"], abs=1e-9)
         assert fix.dop == 5.0
     assert any("placeholder" in note for note in model.notes)
+
+
+def test_three_fixes_as_inexact_as_the_sample_s_do_not_make_it_metric(shared_data: Path) -> None:
+    model = read(shared_data / "import_samples/opensfm_berlin")
+
+    assert not model.metric
+    assert any(
+        "does not count as metric: 3 positions, 2.6 m from the reconstruction (rms)" in note
+        for note in model.notes
+    )
 
 
 def test_observations_are_the_keypoints_where_features_are_absent(berlin: Path) -> None:
@@ -251,9 +260,25 @@ def georeferenced(**gps: list[float]) -> dict[str, Any]:
     return part
 
 
-def test_the_scale_is_unknown_without_two_different_positions(tmp_path: Path) -> None:
-    assert read(write(tmp_path, georeferenced(a=[0, 0, 0], b=[3, 0, 0]))).metric
-    assert not read(write(tmp_path, georeferenced(a=[1, 0, 0], b=[1, 0, 0]))).metric
+def walked(*scales: float) -> dict[str, Any]:
+    """Photos along a line, each at a GPS position of so many times where it was reconstructed."""
+    part = georeferenced()
+    for number, scale in enumerate(scales):
+        at = 10.0 * number
+        part["shots"][f"{number}.jpg"] = part["shots"]["a.jpg"] | {
+            "translation": [-at, 0, 0],
+            "gps_position": [scale * at, 0, 0],
+        }
+    return part
+
+
+def test_the_scale_is_known_only_where_positions_tell_it(tmp_path: Path) -> None:
+    assert read(write(tmp_path, walked(1, 1, 1))).metric
+    assert read(write(tmp_path, walked(1, 1.05, 0.99, 1.01, 1))).metric
+    assert not read(write(tmp_path, walked(1, 1.6, 0.7, 1.2, 1))).metric
+    assert not read(write(tmp_path, walked(1.2, 1.2, 1.2, 1.2))).metric
+    assert not read(write(tmp_path, walked(1, 1))).metric
+    assert not read(write(tmp_path, walked(0, 0, 0))).metric
     assert not read(write(tmp_path, georeferenced(a=[1, 0, 0]))).metric
     assert not read(write(tmp_path, georeferenced())).metric
     assert not read(write(tmp_path, reconstruction())).metric
