@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.anchor import known_positions
 from mapping.features import (
     ExtractedFeatures,
     LocalFeaturesSource,
@@ -314,6 +315,8 @@ def _refuse_early(
             _read_global(dataset, name, settings.features_dir, photos)
     if settings.method == "rgbd":
         refuse_without_depth(dataset, photos)
+    if settings.sfm.estimate_poses:
+        known_positions(dataset, photos)
     if settings.method == "sfm":
         others = tuple(name for name in settings.sfm.pairs if name != "retrieval")
         if others or settings.sfm.pairs_file is not None:

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mapping.anchor import align_positions
+from mapping.anchor import Alignment, align_positions
 from mapping.matching import Matches
 from mapping.triangulation import (
     MAPPER_CONFIGS,
@@ -209,7 +209,7 @@ def test_without_poses_the_same_world_comes_back_up_to_a_similarity(tmp_path: Pa
     centers = np.array([view.cam_from_world.center for view in model.views if view])
     known = np.array([p.cam_from_world.center for p in world.photos if p.cam_from_world])
     found = align_positions(centers, known, 0.1)
-    assert found is not None
+    assert isinstance(found, Alignment), found
     similarity, agrees = found
     assert agrees.all()
     np.testing.assert_allclose(similarity.apply(model.points), world.truth(model), atol=1e-3)
