@@ -84,7 +84,7 @@ def test_a_map_is_made_of_features_alone_and_is_that_of_the_photos(
     local = built.manifest.local_features
     assert local.fingerprint.name == f"kapture:{TYPE}"
     assert local.fingerprint.parameters["method"] == "SIFT"
-    assert (local.max_keypoints, local.descriptor_dim) == (100_000, 128)
+    assert (local.max_keypoints, local.descriptor_dim) == (20_000, 128)
     assert list(built.global_descriptors) == [f"kapture:{GLOBAL}"]
     np.testing.assert_allclose(
         built.global_descriptors[f"kapture:{GLOBAL}"],
