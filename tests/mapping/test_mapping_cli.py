@@ -338,6 +338,47 @@ def test_an_imported_dataset_is_written_once(run: Run, shared_data: Path, tmp_pa
     assert f"error [import.exists] {tmp_path / 'door'}" in error
 
 
+def test_pairs_are_written_without_a_build_and_once(run: Run, sample: Path, tmp_path: Path) -> None:
+    output = tmp_path / "pairs.txt"
+    arguments = ("pairs", sample / "mapping", "--output", output, "--pairs", "distance,sequence")
+    status, out, _ = run(*arguments, "--top-k", "3")
+    assert status == 0
+    lines = output.read_text().splitlines()
+    assert lines[0] == "# query_image, map_image, score"
+    assert out.startswith(f"{len(lines) - 1} pairs: {output}")
+    names = {record.path for record in read_dataset(sample / "mapping").images}
+    assert {name for line in lines[1:] for name in line.split(", ")[:2]} <= names
+
+    status, _, err = run(*arguments)
+    assert status == 1
+    assert f"error [pairs.exists] {output}" in err
+
+
+@pytest.mark.parametrize(
+    ("pairs", "code"),
+    [("retrieval", "pairs.no_global_descriptors"), ("covisibility", "pairs.no_tracks")],
+)
+def test_pairs_that_need_what_is_not_there_say_what(
+    run: Run, sample: Path, tmp_path: Path, pairs: str, code: str
+) -> None:
+    output = tmp_path / "pairs.txt"
+    status, _, err = run("pairs", sample / "mapping", "--output", output, "--pairs", pairs)
+    assert status == 1
+    assert f"error [{code}]" in err
+    assert not output.exists()
+
+
+@pytest.mark.parametrize("map_id", ["../../victim", ".hidden", "a/b", ""])
+def test_an_import_to_what_is_no_id_touches_nothing(run: Run, tmp_path: Path, map_id: str) -> None:
+    precious = tmp_path / "victim.imported" / "precious"
+    precious.mkdir(parents=True)
+    error = error_of(
+        run("import", "colmap", tmp_path, "--map", map_id, "--maps-dir", tmp_path / "m")
+    )
+    assert "[map.id]" in error
+    assert precious.is_dir()
+
+
 def test_ctrl_c_ends_a_build_with_130_and_says_that_it_resumes(
     sample: Path, tmp_path: Path
 ) -> None:
