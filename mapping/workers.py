@@ -81,7 +81,7 @@ class Workers:
             # A task can hold a whole dataset: many items share one journey of it.
             size = max(1, min(_MAX_BATCH, len(items) // _MIN_BATCHES))
             batches = [items[start : start + size] for start in range(0, len(items), size)]
-            with _one_thread_each():
+            with _one_thread_each(), _interrupted_later():
                 futures = [self._pool.submit(_do_all, task, batch) for batch in batches]
             done = 0
             for future in as_completed(futures):
@@ -115,6 +115,27 @@ def _end_with_parent() -> None:
     assert parent is not None
     parent.join()
     os._exit(1)
+
+
+@contextmanager
+def _interrupted_later() -> Iterator[None]:
+    """Let Ctrl-C wait while processes start: half a start would end in a traceback.
+
+    The processes that start meanwhile never hear of it: it is the parent's to handle.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    caught: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: caught.append(number))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, before)
+    if caught:
+        raise KeyboardInterrupt
 
 
 @contextmanager
