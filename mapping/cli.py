@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
-import resource
 import signal
 import sys
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, NoReturn
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from mapping.build import METHODS, BuildSettings, build_map, write_pairs_of
+from mapping.display import peak_memory_bytes, print_import, print_map, summary_of
 from mapping.export import EXPORTERS, export_map
 from mapping.export_features import export_features
 from mapping.imported_points import read_imported_points
@@ -25,7 +24,7 @@ from mapping.sample import write_sample
 from mapping.sfm import SfmSettings
 from mapping.triangulation import MAPPER_CONFIGS, REFINABLE
 from mapping.workers import DEFAULT_WORKERS
-from visloc.archive import Map, MapStore, open_map, verify_map
+from visloc.archive import MapStore, open_map, verify_map
 from visloc.errors import InvalidInput, VislocError
 from visloc.features import (
     DEFAULT_GLOBAL_FEATURES,
@@ -299,14 +298,14 @@ def pairs(
             progress,
         )
     _out.print(f"{count} pairs: {output}", highlight=False, soft_wrap=True)
-    _out.print(f"peak memory {_peak_memory_bytes() / 2**30:.2f} GiB")
+    _out.print(f"peak memory {peak_memory_bytes() / 2**30:.2f} GiB")
 
 
 def _build(settings: BuildSettings) -> None:
     with StageProgress(_err) as progress:
         folder = build_map(settings, progress)
-    _print_map(open_map(folder))
-    _out.print(f"peak memory {_peak_memory_bytes() / 2**30:.2f} GiB")
+    print_map(_out, open_map(folder))
+    _out.print(f"peak memory {peak_memory_bytes() / 2**30:.2f} GiB")
 
 
 @app.command("import")
@@ -354,7 +353,7 @@ def import_command(
         )
     if output is not None:
         summary = import_dataset(format_name, path, output, photos)
-        _print_import(summary)
+        print_import(_out, summary)
         method, sfm = _method_for(summary)
         options = ["--method", method]
         if sfm.estimate_poses:
@@ -367,7 +366,7 @@ def import_command(
         return
     assert map_id is not None
     with imported(format_name, path, maps_dir, map_id, photos) as (dataset, summary):
-        _print_import(summary)
+        print_import(_out, summary)
         method, sfm = _method_for(summary)
         _build(
             BuildSettings(
@@ -413,19 +412,6 @@ def _method_for(summary: ImportSummary) -> tuple[str, SfmSettings]:
     return "sfm", SfmSettings(estimate_poses=True, refine=("intrinsics",))
 
 
-def _print_import(summary: ImportSummary) -> None:
-    _out.print(
-        f"{summary.images} photos by {summary.cameras} cameras, {summary.posed} with a pose, "
-        f"{summary.depth_maps} with depth, {summary.gnss} GNSS fixes; {summary.points} points, "
-        f"{summary.observations} observations"
-        + (", metric" if summary.metric else ", not known to be metric"),
-        highlight=False,
-        soft_wrap=True,
-    )
-    for note in summary.notes:
-        _out.print(f"note: {note}", markup=False, soft_wrap=True)
-
-
 @app.command()
 def inspect(
     map_ref: MapArgument,
@@ -435,9 +421,9 @@ def inspect(
     """Show what a map holds."""
     opened = open_map(_folder(map_ref, maps_dir))
     if as_json:
-        sys.stdout.write(json.dumps(_summary(opened), indent=2) + "\n")
+        sys.stdout.write(json.dumps(summary_of(opened), indent=2) + "\n")
     else:
-        _print_map(opened)
+        print_map(_out, opened)
 
 
 @app.command()
@@ -541,75 +527,6 @@ def _parse_size(text: str) -> tuple[int, int]:
 def _folder(ref: str, maps_dir: Path) -> Path:
     path = Path(ref)
     return path if (path / "manifest.json").is_file() else MapStore(maps_dir).folder(ref)
-
-
-def _summary(opened: Map) -> dict[str, Any]:
-    manifest = opened.manifest.model_dump(exclude={"files"}, mode="json")
-    counts = manifest["counts"]
-    return {
-        **manifest,
-        "size_bytes": opened.size_bytes,
-        "bytes_per_observation": opened.size_bytes / counts["observations"],
-        "mean_track_length": float(opened.track_lengths.mean()),
-        "cameras": len(opened.cameras),
-        "path": str(opened.path),
-    }
-
-
-def _print_map(opened: Map) -> None:
-    summary = _summary(opened)
-    counts, local = summary["counts"], summary["local_features"]
-    extent = summary["world"]["extent"]
-    sides = [high - low for low, high in zip(extent["min"], extent["max"], strict=True)]
-    table = Table(show_header=False, box=None, title=f"map {opened.ref}", title_justify="left")
-    rows = {
-        "photos": f"{counts['images']} by {summary['cameras']} cameras",
-        "landmarks": f"{counts['landmarks']}, seen by {summary['mean_track_length']:.1f} photos "
-        "in the mean",
-        "observations": f"{counts['observations']}",
-        "local features": f"{local['fingerprint']['name']}, {local['descriptor_dim']} dimensions, "
-        f"at most {local['max_keypoints']} per photo",
-        "global features": ", ".join(
-            f"{g['fingerprint']['name']} ({g['dim']})" for g in summary["global_features"]
-        ),
-        "extent": " x ".join(f"{side:.2f}" for side in sides)
-        + (" m" if summary["world"]["metric"] else " (not metric)"),
-        "world": _world(opened),
-        "method": summary["method"]["name"],
-        "size": f"{summary['size_bytes'] / 2**20:.1f} MiB, "
-        f"{summary['bytes_per_observation']:.0f} bytes per observation",
-        "created": summary["created"],
-        "folder": summary["path"],
-    }
-    for name, value in rows.items():
-        table.add_row(name, value)
-    _out.print(table)
-    for note in summary["notes"]:
-        _out.print(f"note: {note}", markup=False, soft_wrap=True)
-
-
-def _world(opened: Map) -> str:
-    """Whether a unit is a metre, and what fixed the frame."""
-    world = opened.manifest.world
-    unit = "metric" if world.metric else "not metric"
-    if world.anchor is None:
-        return unit
-    anchor = world.anchor
-    fixed_by = {
-        "dataset": "the poses of the dataset",
-        "model": "the imported reconstruction",
-        "gnss": f"GNSS fixes of {anchor.images} photos",
-        "positions": f"known positions of {anchor.images} photos",
-        "none": "nothing: the frame is arbitrary",
-    }[anchor.kind]
-    off = "" if anchor.rms is None else f", which agree within {anchor.rms:.2g} (RMS)"
-    return f"{unit}, fixed by {fixed_by}{off}"
-
-
-def _peak_memory_bytes() -> int:
-    """The largest of this process and its workers, each at its peak."""
-    kinds = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    return max(resource.getrusage(kind).ru_maxrss for kind in kinds) * 1024
 
 
 if __name__ == "__main__":
