@@ -15,6 +15,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -56,7 +57,7 @@ def write_scene(scene: str, root: Path) -> None:
 def main() -> None:
     """Write, pair, print."""
     command = Path(sys.executable).with_name("mapping")
-    print("| scene | pairing | pairs | seconds in all | peak memory |\n|---|---|---|---|---|")  # noqa: T201
+    typer.echo("| scene | pairing | pairs | seconds in all | peak memory |\n|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         for scene in ("road", "room"):
             root = Path(folder) / scene
@@ -69,7 +70,7 @@ def main() -> None:
                 ).stdout
                 seconds = time.perf_counter() - started
                 count, peak = re.findall(r"^(\d+) pairs|peak memory (.*)", printed, re.MULTILINE)
-                print(f"| {scene} | `{pairing}` | {count[0]} | {seconds:.1f} | {peak[1]} |")  # noqa: T201
+                typer.echo(f"| {scene} | `{pairing}` | {count[0]} | {seconds:.1f} | {peak[1]} |")
 
 
 if __name__ == "__main__":

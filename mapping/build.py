@@ -286,11 +286,17 @@ def _build(
         depth_sensor=settings.depth_sensor,
         progress=partial(progress, "photos"),
     )
+    # What cannot end well is refused before the long work begins.
+    brought = {
+        name: _read_global(dataset, name, settings.features_dir, photos)
+        for name in settings.global_features
+        if is_ready_made(name)
+    }
     _refuse_early(settings, dataset, photos)
     find_local_features(features, photos, workers, progress)
     global_features = [
-        _read_global(dataset, name, settings.features_dir, photos)
-        if is_ready_made(name)
+        brought[name]
+        if name in brought
         else describe_photos(work, photos, features, name, workers, progress)
         for name in settings.global_features
     ]
@@ -309,10 +315,10 @@ def _build(
 def _refuse_early(
     settings: BuildSettings, dataset: Dataset, photos: Sequence[MappingPhoto]
 ) -> None:
-    """Refuse what cannot end well before the long work begins."""
-    for name in settings.global_features:
-        if is_ready_made(name):
-            _read_global(dataset, name, settings.features_dir, photos)
+    """Refuse photos without depth, positions or pairs, as far as that can be known already.
+
+    Pairing twice takes seconds where finding features takes hours.
+    """
     if settings.method == "rgbd":
         refuse_without_depth(dataset, photos)
     if settings.sfm.estimate_poses:
