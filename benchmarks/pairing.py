@@ -64,7 +64,14 @@ def main() -> None:
             write_scene(scene, root)
             for pairing in ("distance", "frustum"):
                 started = time.perf_counter()
-                arguments = ["pairs", str(root), "--pairs", pairing, "--output", f"{root}.txt"]
+                arguments = [
+                    "pairs",
+                    str(root),
+                    "--pairs",
+                    pairing,
+                    "--output",
+                    f"{root}-{pairing}.txt",
+                ]
                 printed = subprocess.run(
                     [command, *arguments], check=True, capture_output=True, text=True
                 ).stdout

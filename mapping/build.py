@@ -23,7 +23,7 @@ from mapping.features import (
     find_local_features,
     read_global_features,
 )
-from mapping.known_model import landmarks_from_reconstruction
+from mapping.known_model import landmarks_from_reconstruction, refuse_without_points
 from mapping.landmarks import MadeLandmarks
 from mapping.outputs import refuse_existing
 from mapping.pairing import PAIRINGS, write_pairs
@@ -315,12 +315,14 @@ def _build(
 def _refuse_early(
     settings: BuildSettings, dataset: Dataset, photos: Sequence[MappingPhoto]
 ) -> None:
-    """Refuse photos without depth, positions or pairs, as far as that can be known already.
+    """Refuse photos without depth, points, positions or pairs, as far as that can be known already.
 
     Pairing twice takes seconds where finding features takes hours.
     """
     if settings.method == "rgbd":
         refuse_without_depth(dataset, photos)
+    if settings.method == "model":
+        refuse_without_points(dataset)
     if settings.sfm.estimate_poses:
         known_positions(dataset, photos)
     if settings.method == "sfm":

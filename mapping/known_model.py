@@ -98,17 +98,32 @@ def landmarks_from_reconstruction(
     )
 
 
+def refuse_without_points(dataset: Dataset) -> None:
+    """Refuse a dataset that does not even have the files.
+
+    Raises:
+        DatasetError: ``model.no_points``.
+    """
+    folder = dataset.root / "reconstruction"
+    if not all((folder / name).is_file() for name in ("points3d.txt", "observations.txt")):
+        raise _no_points(dataset)
+
+
+def _no_points(dataset: Dataset) -> DatasetError:
+    return DatasetError(
+        "model.no_points",
+        "the dataset has no points with observations",
+        field=str(dataset.root / "reconstruction" / "points3d.txt"),
+        expected="points3d.txt and observations.txt, as mapping import writes them; "
+        "without, use --method sfm",
+    )
+
+
 def _read(dataset: Dataset, features: LocalFeaturesSource) -> tuple[Reconstruction, FeatureSet]:
     """The reconstruction, and the keypoints that see its points."""
     known = read_reconstruction(dataset.root)
     if known is None or known.keypoints_type is None or len(known.observations) == 0:
-        raise DatasetError(
-            "model.no_points",
-            "the dataset has no points with observations",
-            field=str(dataset.root / "reconstruction" / "points3d.txt"),
-            expected="points3d.txt and observations.txt, as mapping import writes them; "
-            "without, use --method sfm",
-        )
+        raise _no_points(dataset)
     if (
         isinstance(features, ReadyMadeFeatures)
         and features.keypoints.type_name == known.keypoints_type

@@ -177,7 +177,7 @@ def test_damaged_imported_points_are_refused(
 @pytest.mark.parametrize(
     ("remove", "code", "named"),
     [
-        ("points3d.txt", "kapture.unreadable", "observations of points that are missing"),
+        ("points3d.txt", "model.no_points", "points3d.txt.*--method sfm"),
         ("observations.txt", "model.no_points", "points3d.txt.*--method sfm"),
         ("", "model.no_points", "points3d.txt.*--method sfm"),
     ],
