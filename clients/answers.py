@@ -8,8 +8,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from clients.errors import not_understood
+from clients.errors import INTERNAL, not_understood, received
 from clients.requests import JsonObject
+from clients.rigs import ImageResult, InstantResult, RigPose
 from clients.types import (
     CameraUsed,
     LocalizeResult,
@@ -19,10 +20,12 @@ from clients.types import (
     PoseEstimate,
     Refusal,
     RetrievedImage,
+    RigInfo,
     ServerInfo,
 )
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
+from visloc.trajectory import PoseSource
 
 _T = TypeVar("_T")
 
@@ -56,14 +59,9 @@ def parse_result(raw: JsonObject) -> LocalizeResult:
         correspondences=int(raw["correspondences"]),
         inliers=int(raw["inliers"]),
         inlier_ratio=float(raw["inlier_ratio"]),
-        retrieved=tuple(
-            RetrievedImage(
-                image["image"], float(image["score"]), _numbers_by_name(image["similarities"])
-            )
-            for image in raw["retrieved"]
-        ),
-        camera=CameraUsed(_parse_camera(raw["camera"]), raw["camera"]["source"]),
-        orientation=Orientation(int(raw["orientation"]["exif"]), raw["orientation"]["read_as"]),
+        retrieved=_parse_retrieved(raw["retrieved"]),
+        camera=_parse_camera_used(raw["camera"]),
+        orientation=_parse_orientation(raw["orientation"]),
         map=MapVersion(raw["map"]["id"], raw["map"]["version"]),
         seconds=_numbers_by_name(raw["seconds"]),
         raw=raw,
@@ -72,18 +70,42 @@ def parse_result(raw: JsonObject) -> LocalizeResult:
 
 def parse_pose(raw: JsonObject) -> PoseEstimate:
     """Parse a PoseEstimate."""
-    transform = raw["cam_from_world"]
-    w, x, y, z = (float(value) for value in transform["rotation_wxyz"])
-    tx, ty, tz = (float(value) for value in transform["translation"])
+    rotation_wxyz, translation = _parse_transform(raw["cam_from_world"])
     return PoseEstimate(
-        cam_from_world=Pose.from_quaternion((w, x, y, z), (tx, ty, tz)),
-        rotation_wxyz=(w, x, y, z),
-        translation=(tx, ty, tz),
-        position=_array(raw["position"], 3),
-        orientation=_array(raw["orientation"], 4),
-        covariance=_array(raw["covariance"], 6, 6),
-        position_std=_array(raw["position_std"], 3),
-        orientation_std_deg=_array(raw["orientation_std_deg"], 3),
+        Pose.from_quaternion(rotation_wxyz, translation),
+        rotation_wxyz,
+        translation,
+        **_parse_uncertainty(raw),
+    )
+
+
+def parse_instant(raw: JsonObject) -> InstantResult:
+    """Parse an InstantAnswer."""
+    status = raw["status"]
+    pose = None if raw["pose"] is None else _parse_rig_pose(raw["pose"])
+    refusal = None if raw["refusal"] is None else _parse_refusal(raw["refusal"])
+    source = None if raw["source"] is None else PoseSource(raw["source"])
+    is_estimated = source is PoseSource.ESTIMATED
+    if (status, pose is None, refusal is None, source is None, is_estimated) not in (
+        ("localized", False, True, False, True),
+        ("filled", False, False, False, False),
+        ("not_localized", True, False, True, False),
+    ):
+        raise ValueError(f"status {status!r} does not fit pose, refusal and source")
+    return InstantResult(
+        request_id=raw["request_id"],
+        timestamp=None if raw["timestamp"] is None else int(raw["timestamp"]),
+        status=status,
+        source=source,
+        pose=pose,
+        refusal=refusal,
+        images=tuple(_parse_image(image) for image in raw["images"]),
+        correspondences=int(raw["correspondences"]),
+        inliers=int(raw["inliers"]),
+        inlier_ratio=float(raw["inlier_ratio"]),
+        map=MapVersion(raw["map"]["id"], raw["map"]["version"]),
+        seconds=_numbers_by_name(raw["seconds"]),
+        raw=raw,
     )
 
 
@@ -108,6 +130,8 @@ def parse_map(raw: JsonObject) -> MapInfo:
         observations=int(raw["observations"]),
         extent=(_numbers(extent["min"]), _numbers(extent["max"])),
         size_bytes=int(raw["size_bytes"]),
+        down=_numbers(raw["down"]) if raw["down"] else None,
+        rigs=tuple(RigInfo(rig["id"], tuple(rig["sensors"])) for rig in raw["rigs"]),
     )
 
 
@@ -119,6 +143,67 @@ def parse_server(raw: JsonObject) -> ServerInfo:
 def parse_ready(raw: JsonObject) -> bool:
     """Parse whether a server can answer now."""
     return bool(raw["ready"])
+
+
+def _parse_rig_pose(raw: JsonObject) -> RigPose:
+    rotation_wxyz, translation = _parse_transform(raw["rig_from_world"])
+    return RigPose(
+        Pose.from_quaternion(rotation_wxyz, translation),
+        rotation_wxyz,
+        translation,
+        **_parse_uncertainty(raw),
+    )
+
+
+def _parse_image(raw: JsonObject) -> ImageResult:
+    error, camera, orientation = raw["error"], raw["camera"], raw["orientation"]
+    pose = raw["cam_from_world"]
+    return ImageResult(
+        sensor=raw["sensor"],
+        error=None if error is None else received(error, INTERNAL, "the photo could not be used"),
+        cam_from_world=None if pose is None else Pose.from_quaternion(*_parse_transform(pose)),
+        keypoints=int(raw["keypoints"]),
+        correspondences=int(raw["correspondences"]),
+        inliers=int(raw["inliers"]),
+        retrieved=_parse_retrieved(raw["retrieved"]),
+        camera=None if camera is None else _parse_camera_used(camera),
+        orientation=None if orientation is None else _parse_orientation(orientation),
+    )
+
+
+def _parse_transform(
+    raw: JsonObject,
+) -> tuple[tuple[float, float, float, float], tuple[float, float, float]]:
+    w, x, y, z = _numbers(raw["rotation_wxyz"])
+    tx, ty, tz = _numbers(raw["translation"])
+    return (w, x, y, z), (tx, ty, tz)
+
+
+def _parse_uncertainty(raw: JsonObject) -> dict[str, NDArray[np.float64]]:
+    return {
+        "position": _array(raw["position"], 3),
+        "orientation": _array(raw["orientation"], 4),
+        "covariance": _array(raw["covariance"], 6, 6),
+        "position_std": _array(raw["position_std"], 3),
+        "orientation_std_deg": _array(raw["orientation_std_deg"], 3),
+    }
+
+
+def _parse_retrieved(raw: Sequence[JsonObject]) -> tuple[RetrievedImage, ...]:
+    return tuple(
+        RetrievedImage(
+            image["image"], float(image["score"]), _numbers_by_name(image["similarities"])
+        )
+        for image in raw
+    )
+
+
+def _parse_camera_used(raw: JsonObject) -> CameraUsed:
+    return CameraUsed(_parse_camera(raw), raw["source"])
+
+
+def _parse_orientation(raw: JsonObject) -> Orientation:
+    return Orientation(int(raw["exif"]), raw["read_as"])
 
 
 def _parse_refusal(raw: JsonObject) -> Refusal:

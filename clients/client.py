@@ -6,11 +6,22 @@ Requests are built and answers are parsed in one place (``requests``, ``answers`
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import (
+    AsyncGenerator,
+    AsyncIterable,
+    AsyncIterator,
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
+from contextlib import aclosing
 from types import TracebackType
 from typing import Any, Protocol, Self
 
 from clients import answers
+from clients.errors import not_understood
+from clients.features import PhotoOrFeatures
 from clients.grpc import AsyncGrpcTransport, GrpcTransport
 from clients.http import AsyncHttpTransport, HttpTransport
 from clients.requests import (
@@ -18,25 +29,40 @@ from clients.requests import (
     GetServer,
     JsonObject,
     ListMaps,
-    PhotoOrFeatures,
-    Request,
+    checked_search,
     checked_server,
     get_map_request,
     localize_request,
 )
+from clients.rig_requests import (
+    AnyRequest,
+    SentInstant,
+    SequenceStart,
+    rig_request,
+    sent_instant,
+    sequence_start,
+)
+from clients.rigs import Instant, InstantResult, Rig, RigImage
 from clients.types import LocalizeOptions, LocalizeResult, MapInfo, ServerInfo
 from visloc.geometry import Camera
+from visloc.priors import Priors
 
 DEFAULT_TIMEOUT_S = 60.0
 
 
 class _Transport(Protocol):
-    def send(self, request: Request) -> JsonObject: ...
+    def send(self, request: AnyRequest) -> JsonObject: ...
+    def stream(
+        self, start: SequenceStart, instants: Iterable[SentInstant]
+    ) -> Iterator[JsonObject]: ...
     def close(self) -> None: ...
 
 
 class _AsyncTransport(Protocol):
-    async def send(self, request: Request) -> JsonObject: ...
+    async def send(self, request: AnyRequest) -> JsonObject: ...
+    def stream(
+        self, start: SequenceStart, instants: AsyncIterable[SentInstant]
+    ) -> AsyncGenerator[JsonObject, None]: ...
     async def close(self) -> None: ...
 
 
@@ -59,26 +85,89 @@ class Client:
     def localize(
         self,
         query: PhotoOrFeatures,
-        map: str,
+        map: str | Sequence[str],
         camera: Camera | None = None,
         options: LocalizeOptions | Mapping[str, Any] | None = None,
         request_id: str | None = None,
+        *,
+        priors: Priors | Mapping[str, Any] | None = None,
     ) -> LocalizeResult:
-        """Estimate the camera pose of one photo, or of its features, in one map.
+        """Estimate the camera pose of one photo, or of its features.
 
         A photo that cannot be localized is an answer without a pose, not an error.
 
         Args:
             query: the encoded photo (JPEG, PNG, ...), the path of the file that holds it, or
                 the features that were found in it, which need a camera.
-            map: ``id`` or ``id@version``.
+            map: ``id`` or ``id@version``; of several, the best answer counts.
             camera: intrinsics; without them the server uses EXIF or guesses, and says so.
             options: choices for this photo.
             request_id: names the request in the server's logs; made up there when None.
+            priors: what is known of the camera, also as the API's JSON.
         """
-        request = localize_request(query, map, camera, options, request_id)
+        search = checked_search(map, options, priors, request_id)
+        request = localize_request(search, query, camera)
         raw = self._transport.send(request)
         return answers.parse_answer(self.server, answers.parse_result, raw)
+
+    def localize_rig(
+        self,
+        images: Iterable[RigImage],
+        map: str | Sequence[str],
+        rig: Rig,
+        options: LocalizeOptions | Mapping[str, Any] | None = None,
+        request_id: str | None = None,
+        *,
+        priors: Priors | Mapping[str, Any] | None = None,
+    ) -> InstantResult:
+        """Estimate one pose from the photos that the cameras of a rig took at one instant.
+
+        A photo that cannot be used fails alone: its ``error`` says why.
+
+        Args:
+            images: the photos, each of another camera; some may be missing.
+            map: ``id`` or ``id@version``; of several, the best answer counts.
+            rig: how the cameras sit, or the id of a rig that the map knows (``MapInfo.rigs``).
+            options: choices for this instant.
+            request_id: names the request in the server's logs; made up there when None.
+            priors: what is known of the rig, also as the API's JSON.
+        """
+        search = checked_search(map, options, priors, request_id)
+        raw = self._transport.send(rig_request(search, rig, images))
+        return answers.parse_answer(self.server, answers.parse_instant, raw)
+
+    def localize_sequence(
+        self,
+        instants: Iterable[Instant],
+        map: str | Sequence[str],
+        rig: Rig | None = None,
+        time_unit: str | None = None,
+        max_gap_s: float | None = None,
+        options: LocalizeOptions | Mapping[str, Any] | None = None,
+        request_id: str | None = None,
+        *,
+        priors: Priors | Mapping[str, Any] | None = None,
+    ) -> Iterator[InstantResult]:
+        """Estimate the poses of a sequence, each answered as soon as its answer is final.
+
+        Over gRPC, instants are taken from ``instants`` as the server asks for them, in another
+        thread; over HTTP all of them go into one request. What ``instants`` raises is raised here.
+
+        Args:
+            instants: in the order of time.
+            map: ``id`` or ``id@version``; of several, that of the first pose is kept.
+            rig: how the cameras sit, or the id of a rig that the map knows; None when every
+                instant is one photo of one camera.
+            time_unit: of the timestamps, s, ms, us or ns; None tells it by their size.
+            max_gap_s: longest time between measured instants across which poses are filled; None
+                leaves it to the server, 0 fills none.
+            options: choices for all instants.
+            request_id: names the request in the server's logs; made up there when None.
+            priors: what is known at every instant that has none of its own.
+        """
+        search = checked_search(map, options, priors, request_id)
+        start = sequence_start(search, rig, time_unit, max_gap_s)
+        return self._stream(start, instants)
 
     def maps(self) -> list[MapInfo]:
         """List the maps that the server has."""
@@ -104,6 +193,13 @@ class Client:
         """Close the connections."""
         self._transport.close()
 
+    def _stream(self, start: SequenceStart, instants: Iterable[Instant]) -> Iterator[InstantResult]:
+        count = _Count(self.server)
+        for raw in self._transport.stream(start, map(count.sent, instants)):
+            count.answers += 1
+            yield answers.parse_answer(self.server, answers.parse_instant, raw)
+        count.check()
+
     def __enter__(self) -> Self:
         return self
 
@@ -127,15 +223,50 @@ class AsyncClient:
     async def localize(
         self,
         query: PhotoOrFeatures,
-        map: str,
+        map: str | Sequence[str],
         camera: Camera | None = None,
         options: LocalizeOptions | Mapping[str, Any] | None = None,
         request_id: str | None = None,
+        *,
+        priors: Priors | Mapping[str, Any] | None = None,
     ) -> LocalizeResult:
         """As ``Client.localize``. A path is read in the loop; give bytes where that matters."""
-        request = localize_request(query, map, camera, options, request_id)
+        search = checked_search(map, options, priors, request_id)
+        request = localize_request(search, query, camera)
         raw = await self._transport.send(request)
         return answers.parse_answer(self.server, answers.parse_result, raw)
+
+    async def localize_rig(
+        self,
+        images: Iterable[RigImage],
+        map: str | Sequence[str],
+        rig: Rig,
+        options: LocalizeOptions | Mapping[str, Any] | None = None,
+        request_id: str | None = None,
+        *,
+        priors: Priors | Mapping[str, Any] | None = None,
+    ) -> InstantResult:
+        """As ``Client.localize_rig``."""
+        search = checked_search(map, options, priors, request_id)
+        raw = await self._transport.send(rig_request(search, rig, images))
+        return answers.parse_answer(self.server, answers.parse_instant, raw)
+
+    def localize_sequence(
+        self,
+        instants: AsyncIterable[Instant] | Iterable[Instant],
+        map: str | Sequence[str],
+        rig: Rig | None = None,
+        time_unit: str | None = None,
+        max_gap_s: float | None = None,
+        options: LocalizeOptions | Mapping[str, Any] | None = None,
+        request_id: str | None = None,
+        *,
+        priors: Priors | Mapping[str, Any] | None = None,
+    ) -> AsyncIterator[InstantResult]:
+        """As ``Client.localize_sequence``, for ``async for``."""
+        search = checked_search(map, options, priors, request_id)
+        start = sequence_start(search, rig, time_unit, max_gap_s)
+        return self._stream(start, instants)
 
     async def maps(self) -> list[MapInfo]:
         """As ``Client.maps``."""
@@ -161,6 +292,25 @@ class AsyncClient:
         """Close the connections."""
         await self._transport.close()
 
+    async def _stream(
+        self, start: SequenceStart, instants: AsyncIterable[Instant] | Iterable[Instant]
+    ) -> AsyncIterator[InstantResult]:
+        count = _Count(self.server)
+
+        async def sent() -> AsyncIterator[SentInstant]:
+            if isinstance(instants, AsyncIterable):
+                async for instant in instants:
+                    yield count.sent(instant)
+            else:
+                for instant in instants:
+                    yield count.sent(instant)
+
+        async with aclosing(self._transport.stream(start, sent())) as stream:
+            async for raw in stream:
+                count.answers += 1
+                yield answers.parse_answer(self.server, answers.parse_instant, raw)
+        count.check()
+
     async def __aenter__(self) -> Self:
         return self
 
@@ -171,3 +321,21 @@ class AsyncClient:
         traceback: TracebackType | None,
     ) -> None:
         await self.close()
+
+
+class _Count:
+    """Holds a server to one answer per instant."""
+
+    def __init__(self, server: str) -> None:
+        self._server = server
+        self._instants = 0
+        self.answers = 0
+
+    def sent(self, instant: Instant) -> SentInstant:
+        self._instants += 1
+        return sent_instant(instant)
+
+    def check(self) -> None:
+        if self.answers != self._instants:
+            got = f"{self.answers} answers to {self._instants} instants"
+            raise not_understood(self._server, got)

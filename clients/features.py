@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,10 @@ class Features:
                 name: _array_as_json(row) for name, row in self.global_descriptors.items()
             },
         }
+
+
+# The encoded photo, the path of the file that holds it, or what was found in it.
+PhotoOrFeatures = bytes | str | Path | Features
 
 
 def _array(part: str, values: ArrayLike, name: str | None = None) -> NDArray[Any]:

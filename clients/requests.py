@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import httpx
 
-from clients.features import Features
+from clients.features import Features, PhotoOrFeatures
+from clients.priors import priors_from_json
 from clients.types import LocalizeOptions
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera
+from visloc.priors import NO_PRIORS, Priors
 
 JsonObject = dict[str, Any]
-# The encoded photo, the path of the file that holds it, or what was found in it.
-PhotoOrFeatures = bytes | str | Path | Features
 
 # The first character keeps ``.`` and ``..`` out of the path of a URL; the server has the rest.
 _MAP = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]*")
@@ -30,14 +30,22 @@ _SERVER = re.compile(
 
 
 @dataclass(frozen=True, slots=True)
+class Search:
+    """Where to search, and how; see ``checked_search``."""
+
+    maps: tuple[str, ...]
+    options: LocalizeOptions
+    priors: Priors
+    request_id: str | None
+
+
+@dataclass(frozen=True, slots=True)
 class Localize:
     """Localize one photo, or its features; see ``localize_request``."""
 
+    search: Search
     query: bytes | Features
-    map: str
     camera: Camera | None
-    options: LocalizeOptions
-    request_id: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,17 +73,26 @@ class CheckReady:
 Request = Localize | ListMaps | GetMap | GetServer | CheckReady
 
 
-def localize_request(
-    query: PhotoOrFeatures,
-    map_ref: str,
-    camera: Camera | None,
-    options: LocalizeOptions | Mapping[str, Any] | None,
-    request_id: str | None,
-) -> Localize:
-    """Check and complete what ``localize`` was called with; a path is read here.
+def localize_request(search: Search, query: PhotoOrFeatures, camera: Camera | None) -> Localize:
+    """Complete what ``localize`` was called with; a path is read here.
 
     Raises:
-        InvalidInput: ``image.unreadable``, ``map.id``, ``options.*`` or ``request.id``.
+        InvalidInput: ``image.unreadable``.
+    """
+    return Localize(search, read_query(query), camera)
+
+
+def checked_search(
+    map_refs: str | Sequence[str],
+    options: LocalizeOptions | Mapping[str, Any] | None,
+    priors: Priors | Mapping[str, Any] | None,
+    request_id: str | None,
+) -> Search:
+    """Check what all that localizes has in common.
+
+    Raises:
+        InvalidInput: ``map.id``, ``request.map`` for no map, ``options.*``, ``priors.*`` or
+            ``request.id``.
     """
     if request_id is not None and not _REQUEST_ID.fullmatch(request_id):
         raise InvalidInput(
@@ -87,9 +104,14 @@ def localize_request(
         )
     if not isinstance(options, LocalizeOptions):
         options = LocalizeOptions.from_mapping(options or {})
-    if isinstance(query, str | Path):
-        query = read_image(Path(query))
-    return Localize(query, _checked(map_ref), camera, options, request_id)
+    if not isinstance(priors, Priors):
+        priors = NO_PRIORS if priors is None else priors_from_json(priors)
+    maps = (map_refs,) if isinstance(map_refs, str) else tuple(map_refs)
+    if not maps:
+        raise InvalidInput(
+            "request.map", "no map to search", field="map", expected="a map, or several"
+        )
+    return Search(tuple(map(_checked, maps)), options, priors, request_id)
 
 
 def get_map_request(map_ref: str) -> GetMap:
@@ -99,6 +121,15 @@ def get_map_request(map_ref: str) -> GetMap:
         InvalidInput: ``map.id``.
     """
     return GetMap(_checked(map_ref))
+
+
+def read_query(query: PhotoOrFeatures) -> bytes | Features:
+    """Return what is sent of a photo.
+
+    Raises:
+        InvalidInput: ``image.unreadable``.
+    """
+    return read_image(Path(query)) if isinstance(query, str | Path) else query
 
 
 def read_image(path: Path) -> bytes:

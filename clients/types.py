@@ -133,7 +133,7 @@ class Refusal:
     """Why there is no pose.
 
     Attributes:
-        stage: the stage that gave up: features, matching, pose or gate.
+        stage: the stage that gave up: features, retrieval, matching, pose or gate.
         reason: a stable word.
         message: the reason for a person.
     """
@@ -233,6 +233,19 @@ class LocalizeResult:
 
 
 @dataclass(frozen=True, slots=True)
+class RigInfo:
+    """A rig that a map knows.
+
+    Attributes:
+        id: what requests call it.
+        sensors: the names of its cameras.
+    """
+
+    id: str
+    sensors: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class MapInfo:
     """A map that the server has.
 
@@ -249,6 +262,8 @@ class MapInfo:
         observations: sightings of landmarks in mapping photos.
         extent: least and greatest x, y, z of the landmarks, in the world.
         size_bytes: on the server's disk.
+        down: unit vector that points down in the world; None when the map does not know it.
+        rigs: the rigs of the mapping photos, for requests that name one.
     """
 
     id: str
@@ -263,6 +278,8 @@ class MapInfo:
     observations: int
     extent: tuple[tuple[float, ...], tuple[float, ...]]
     size_bytes: int
+    down: tuple[float, ...] | None
+    rigs: tuple[RigInfo, ...]
 
     @property
     def ref(self) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.anchor import known_positions
+from mapping.anchor import MAX_DIRECTION_ERROR_DEG, known_positions
 from mapping.features import (
     ExtractedFeatures,
     LocalFeaturesSource,
@@ -40,6 +40,7 @@ from mapping.stages import WorkFolder, exclusive
 from mapping.triangulation import MAPPER_CONFIGS, REFINABLE
 from mapping.workers import Workers
 from visloc.archive import (
+    Anchor,
     FingerprintRecord,
     GlobalFeatures,
     ImageRecord,
@@ -60,6 +61,10 @@ from visloc.kapture import Dataset, open_features, open_local_features, read_dat
 
 # How landmarks are made: from depth, from matches, or from points that the dataset brings along.
 METHODS = ("rgbd", "sfm", "model")
+# Where the world's axes point east, north and up.
+_GEODETIC_DOWN = (0.0, 0.0, -1.0)
+# Shorter vectors are round-off, not a direction.
+_MIN_LENGTH = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +88,8 @@ class BuildSettings:
         depth: settings of ``rgbd``.
         depth_sensor: the depth sensor to use, when several go with a photo.
         sfm: settings of ``sfm``.
+        gravity: a vector of any length that points down in the map's world; None where that is
+            not known. A map that is anchored on Earth knows it without.
         workers: processes that work on photos and pairs.
         force: publish a new version of a map that exists.
     """
@@ -101,6 +108,7 @@ class BuildSettings:
     depth: DepthSettings = field(default_factory=DepthSettings)
     depth_sensor: str | None = None
     sfm: SfmSettings = field(default_factory=SfmSettings)
+    gravity: tuple[float, float, float] | None = None
     workers: int = 1
     force: bool = False
 
@@ -233,6 +241,16 @@ def _check(settings: BuildSettings) -> None:
                 expected="metres, more than 0",
                 got=value,
             )
+    if settings.gravity is not None:
+        length = math.hypot(*settings.gravity)
+        if not (math.isfinite(length) and length >= _MIN_LENGTH):
+            raise InvalidInput(
+                "build.gravity",
+                "not a direction",
+                field="--gravity",
+                expected="three finite numbers that are not all 0, such as 0,0,-1",
+                got=",".join(f"{value:g}" for value in settings.gravity),
+            )
     sfm = settings.sfm
     _check_names("--pairs", sfm.pairs, tuple(PAIRINGS))
     _check_names("--refine", sfm.refine, REFINABLE)
@@ -324,12 +342,34 @@ def _refuse_early(
     if settings.method == "model":
         refuse_without_points(dataset)
     if settings.sfm.estimate_poses:
-        known_positions(dataset, photos)
+        known = known_positions(dataset, photos)
+        if known is not None and known.anchor.geodetic is not None:
+            _refuse_gravity_that_is_not_down(settings)
     if settings.method == "sfm":
         others = tuple(name for name in settings.sfm.pairs if name != "retrieval")
         if others or settings.sfm.pairs_file is not None:
-            known = replace(settings.sfm, pairs=others)
-            find_pairs(make_scene(dataset, photos, (), known), known)
+            pairing = replace(settings.sfm, pairs=others)
+            find_pairs(make_scene(dataset, photos, (), pairing), pairing)
+
+
+def _refuse_gravity_that_is_not_down(settings: BuildSettings) -> None:
+    """Refuse a direction of gravity that contradicts a world whose axes point east, north and up.
+
+    A little off is right: the axes of such a map are as good as the fixes behind them.
+    """
+    if settings.gravity is None:
+        return
+    x, y, z = settings.gravity
+    angle_deg = math.degrees(math.atan2(math.hypot(x, y), -z))
+    if angle_deg > MAX_DIRECTION_ERROR_DEG:
+        raise InvalidInput(
+            "build.gravity",
+            "the map is anchored to GNSS fixes, its axes point east, north and up, and this is "
+            "not down there; leave the option out",
+            field="--gravity",
+            expected=f"0,0,-1 to within {MAX_DIRECTION_ERROR_DEG:g} degrees",
+            got=f"{x:g},{y:g},{z:g}, {angle_deg:.1f} degrees off",
+        )
 
 
 def _local_features(work: WorkFolder, settings: BuildSettings) -> LocalFeaturesSource:
@@ -392,6 +432,7 @@ def _content(
     notes: tuple[str, ...],
 ) -> MapContent:
     placed = [photos[row] for row in made.photos]
+    gravity, gravity_notes = _gravity(settings, made.anchor)
 
     def observed_descriptors() -> Iterator[NDArray[np.float32]]:
         for photo, kept in zip(placed, made.rows, strict=True):
@@ -401,7 +442,7 @@ def _content(
         metric=made.metric,
         method=settings.method,
         settings=made.settings,
-        notes=(*notes, *made.notes),
+        notes=(*notes, *made.notes, *gravity_notes),
         cameras={
             photo.record.sensor_id: view.camera
             for photo, view in zip(placed, made.views, strict=True)
@@ -434,7 +475,21 @@ def _content(
             for one in global_features
         ),
         anchor=made.anchor,
+        gravity=gravity,
     )
+
+
+def _gravity(
+    settings: BuildSettings, anchor: Anchor
+) -> tuple[tuple[float, float, float] | None, tuple[str, ...]]:
+    """The unit vector that points down in the map's world, as far as it is known, and notes."""
+    if settings.gravity is None:
+        return (None if anchor.geodetic is None else _GEODETIC_DOWN), ()
+    if anchor.kind == "none":
+        return None, ("the frame is arbitrary, so --gravity says nothing of it and was left out",)
+    length = math.hypot(*settings.gravity)
+    x, y, z = (value / length for value in settings.gravity)
+    return (x, y, z), ()
 
 
 def _publish(

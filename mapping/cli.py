@@ -12,14 +12,39 @@ import typer
 from rich.console import Console
 
 from mapping.build import METHODS, BuildSettings, build_map, write_pairs_of
-from mapping.display import peak_memory_bytes, print_import, print_map, summary_of
+from mapping.display import peak_memory_bytes, print_import, print_map, print_rig, summary_of
 from mapping.export import EXPORTERS, export_map
 from mapping.export_features import export_features
 from mapping.imported_points import read_imported_points
 from mapping.importers import IMPORTERS, ImportSummary, import_dataset, imported
-from mapping.pairing import PAIRINGS, PairSettings
+from mapping.options import (
+    GLOBAL_DEFAULT,
+    RGBD_PANEL,
+    SFM_PANEL,
+    BuildLocalFeaturesOption,
+    CovisibleInOption,
+    DatasetArgument,
+    FarOption,
+    FeaturesDirOption,
+    GlobalFeaturesOption,
+    LocalFeaturesOption,
+    MapArgument,
+    MapsDirOption,
+    MaxAngleOption,
+    MaxDistanceOption,
+    MaxKeypointsOption,
+    MetricOption,
+    NearOption,
+    PairsOption,
+    PixelOriginOption,
+    TopKOption,
+    WeightsDirOption,
+    WorkersOption,
+)
+from mapping.pairing import PairSettings
 from mapping.progress import StageProgress
 from mapping.rgbd import DepthSettings
+from mapping.rig_calibration import calibrate_rig, refuse_known_rigs, write_calibration
 from mapping.sample import write_sample
 from mapping.sfm import SfmSettings
 from mapping.triangulation import MAPPER_CONFIGS, REFINABLE
@@ -27,14 +52,12 @@ from mapping.workers import DEFAULT_WORKERS
 from visloc.archive import MapStore, open_map, verify_map
 from visloc.errors import InvalidInput, VislocError
 from visloc.features import (
-    DEFAULT_GLOBAL_FEATURES,
     DEFAULT_LOCAL_FEATURES,
-    GLOBAL_FEATURES,
-    LOCAL_FEATURES,
     make_local_features,
 )
 from visloc.features.readymade import is_ready_made
 from visloc.geometry import PixelOrigin
+from visloc.kapture import read_dataset
 from visloc.localizer import Localizer
 
 app = typer.Typer(
@@ -46,100 +69,7 @@ app = typer.Typer(
 )
 _out = Console()
 _err = Console(stderr=True)
-_GLOBAL_DEFAULT = ",".join(DEFAULT_GLOBAL_FEATURES)
-_RGBD, _SFM = "Method rgbd", "Method sfm"
 _DEPTH_DEFAULTS, _SFM_DEFAULTS, _PAIR_DEFAULTS = DepthSettings(), SfmSettings(), PairSettings()
-
-MapsDirOption = Annotated[
-    Path, typer.Option("--maps-dir", envvar="VISLOC_MAPS_DIR", help="Folder of maps.")
-]
-WeightsDirOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--weights-dir",
-        envvar="VISLOC_WEIGHTS_DIR",
-        help="Folder with network weights; r2d2 and faster2d2 need it.",
-    ),
-]
-LocalFeaturesOption = Annotated[
-    str, typer.Option(help=f"One of {', '.join(sorted(LOCAL_FEATURES))}.")
-]
-BuildLocalFeaturesOption = Annotated[
-    str,
-    typer.Option(
-        help=f"One of {', '.join(sorted(LOCAL_FEATURES))}, or kapture:TYPE for features that the "
-        "dataset brings along."
-    ),
-]
-GlobalFeaturesOption = Annotated[
-    str,
-    typer.Option(help=f"Comma-separated, of {', '.join(sorted(GLOBAL_FEATURES))}, kapture:TYPE."),
-]
-FeaturesDirOption = Annotated[
-    Path | None,
-    typer.Option(help="Where kapture:TYPE features lie, when not in the dataset."),
-]
-PixelOriginOption = Annotated[
-    PixelOrigin,
-    typer.Option(
-        help="The middle of the first pixel, in the dataset's principal points and in "
-        "kapture:TYPE keypoints, is (0.5, 0.5): corner, or (0, 0): center."
-    ),
-]
-MetricOption = Annotated[
-    bool | None,
-    typer.Option(
-        "--metric/--not-metric",
-        help="Whether a unit of the dataset's poses is a metre; left out: yes, but no for model.",
-    ),
-]
-WorkersOption = Annotated[
-    int,
-    typer.Option(
-        min=1, max=256, help="Processes that work on photos and pairs; they do not change the map."
-    ),
-]
-MaxKeypointsOption = Annotated[
-    int, typer.Option(min=100, max=100_000, help="Strongest keypoints kept per photo.")
-]
-MapArgument = Annotated[str, typer.Argument(metavar="MAP", help="id, id@version, or a folder.")]
-DatasetArgument = Annotated[Path, typer.Argument(help="kapture folder (holds sensors/).")]
-# How photos are paired, for build and for pairs.
-PairsOption = Annotated[
-    str,
-    typer.Option(
-        help=f"Which photos to match: comma-separated, of {', '.join(PAIRINGS)}.",
-        rich_help_panel=_SFM,
-    ),
-]
-TopKOption = Annotated[
-    int,
-    typer.Option(
-        min=1, help="Best pairs of a photo that each pairing keeps.", rich_help_panel=_SFM
-    ),
-]
-MaxDistanceOption = Annotated[
-    float,
-    typer.Option(help="distance: most between camera centres, metres.", rich_help_panel=_SFM),
-]
-MaxAngleOption = Annotated[
-    float,
-    typer.Option(help="distance: most between orientations, degrees.", rich_help_panel=_SFM),
-]
-NearOption = Annotated[
-    float, typer.Option(help="frustum: where views begin, metres.", rich_help_panel=_SFM)
-]
-FarOption = Annotated[
-    float, typer.Option(help="frustum: where views end, metres.", rich_help_panel=_SFM)
-]
-CovisibleInOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="MAP",
-        help="covisibility: the map that tells; else the dataset's own points.",
-        rich_help_panel=_SFM,
-    ),
-]
 
 
 @app.command()
@@ -155,12 +85,20 @@ def build(
         ),
     ] = METHODS[0],
     local_features: BuildLocalFeaturesOption = DEFAULT_LOCAL_FEATURES,
-    global_features: GlobalFeaturesOption = _GLOBAL_DEFAULT,
+    global_features: GlobalFeaturesOption = GLOBAL_DEFAULT,
     features_dir: FeaturesDirOption = None,
     pixel_origin: PixelOriginOption = PixelOrigin.CORNER,
     weights_dir: WeightsDirOption = None,
     max_keypoints: MaxKeypointsOption = 5000,
     metric: MetricOption = None,
+    gravity: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z",
+            help="What points down in the map's world, at any length, such as 0,0,-1 where z is "
+            "up. A map anchored to GNSS knows it.",
+        ),
+    ] = None,
     workers: WorkersOption = DEFAULT_WORKERS,
     force: Annotated[
         bool, typer.Option("--force", help="Publish a new version of a map that exists.")
@@ -168,18 +106,18 @@ def build(
     voxel_size: Annotated[
         float,
         typer.Option(
-            help="Points of one such cell become one landmark, metres.", rich_help_panel=_RGBD
+            help="Points of one such cell become one landmark, metres.", rich_help_panel=RGBD_PANEL
         ),
     ] = _DEPTH_DEFAULTS.voxel_size,
     depth_sensor: Annotated[
         str | None,
         typer.Option(
-            help="Depth sensor to use, when several go with a photo.", rich_help_panel=_RGBD
+            help="Depth sensor to use, when several go with a photo.", rich_help_panel=RGBD_PANEL
         ),
     ] = None,
     depth_scale: Annotated[
         float,
-        typer.Option(help="Metres per unit of 16-bit PNG depth.", rich_help_panel=_RGBD),
+        typer.Option(help="Metres per unit of 16-bit PNG depth.", rich_help_panel=RGBD_PANEL),
     ] = _DEPTH_DEFAULTS.depth_scale,
     pairs: PairsOption = _SFM_DEFAULTS.pairs[0],
     top_k: TopKOption = _PAIR_DEFAULTS.top_k,
@@ -192,14 +130,14 @@ def build(
         Path | None,
         typer.Option(
             help="Pairs to match instead of --pairs, such as pairs.txt of a map.",
-            rich_help_panel=_SFM,
+            rich_help_panel=SFM_PANEL,
         ),
     ] = None,
     mapper: Annotated[
         str,
         typer.Option(
             help=f"Thresholds of the paper: {' or '.join(MAPPER_CONFIGS)} (relaxed).",
-            rich_help_panel=_SFM,
+            rich_help_panel=SFM_PANEL,
         ),
     ] = _SFM_DEFAULTS.mapper,
     refine: Annotated[
@@ -207,7 +145,7 @@ def build(
         typer.Option(
             help="What bundle adjustment may change after triangulation: comma-separated, of "
             f"{', '.join(REFINABLE)}.",
-            rich_help_panel=_SFM,
+            rich_help_panel=SFM_PANEL,
         ),
     ] = "",
     poses: Annotated[
@@ -215,7 +153,7 @@ def build(
         typer.Option(
             help="given: the dataset's. estimate: find them too; poses or GNSS of some photos "
             "then say where the map lies.",
-            rich_help_panel=_SFM,
+            rich_help_panel=SFM_PANEL,
         ),
     ] = "given",
 ) -> None:
@@ -255,6 +193,7 @@ def build(
             refine=_names(refine),
             estimate_poses=poses == "estimate",
         ),
+        gravity=None if gravity is None else _parse_vector("--gravity", gravity),
         workers=workers,
         force=force,
     )
@@ -301,6 +240,44 @@ def pairs(
     _out.print(f"peak memory {peak_memory_bytes() / 2**30:.2f} GiB")
 
 
+@app.command("calibrate-rig")
+def calibrate_rig_command(
+    dataset: DatasetArgument,
+    rig: Annotated[str, typer.Option("--rig", metavar="ID", help="Id of the rig.")] = "rig",
+    reference: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SENSOR",
+            help="The camera that is the frame of the rig; left out: the one that shares most "
+            "instants with the others.",
+        ),
+    ] = None,
+    cameras: Annotated[
+        str | None,
+        typer.Option(help="Comma-separated cameras on the rig; left out: all of the dataset."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", help="The file to write; left out: the dataset's rigs.txt."),
+    ] = None,
+) -> None:
+    """Estimate where cameras sit on a rig, from the poses of photos with equal timestamps.
+
+    The file is kapture's rigs.txt; builds of the dataset then register the rig in their maps.
+    """
+    target = dataset / "sensors" / "rigs.txt" if output is None else output
+    refuse_known_rigs(target)
+    calibration = calibrate_rig(
+        read_dataset(dataset),
+        rig=rig,
+        reference=reference,
+        cameras=None if cameras is None else _names(cameras),
+    )
+    write_calibration(calibration, target)
+    print_rig(_out, calibration)
+    _out.print(f"rig: {target}", highlight=False, soft_wrap=True)
+
+
 def _build(settings: BuildSettings) -> None:
     with StageProgress(_err) as progress:
         folder = build_map(settings, progress)
@@ -333,7 +310,7 @@ def import_command(
     ] = None,
     maps_dir: MapsDirOption = Path("maps"),
     local_features: BuildLocalFeaturesOption = DEFAULT_LOCAL_FEATURES,
-    global_features: GlobalFeaturesOption = _GLOBAL_DEFAULT,
+    global_features: GlobalFeaturesOption = GLOBAL_DEFAULT,
     weights_dir: WeightsDirOption = None,
     max_keypoints: MaxKeypointsOption = 5000,
     workers: WorkersOption = DEFAULT_WORKERS,
@@ -513,6 +490,20 @@ def _fail(code: str, message: str) -> NoReturn:
 
 def _names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",")) if text.strip() else ()
+
+
+def _parse_vector(option: str, text: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(number) for number in text.split(","))
+    except ValueError:
+        raise InvalidInput(
+            f"build.{option[2:]}",
+            "not a vector",
+            field=option,
+            expected="X,Y,Z such as 0,0,-1",
+            got=text,
+        ) from None
+    return x, y, z
 
 
 def _parse_size(text: str) -> tuple[int, int]:

@@ -6,9 +6,11 @@ import resource
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from mapping.importers import ImportSummary
+from mapping.rig_calibration import OUTLIER_MULTIPLE, RigCalibration, Spread
 from visloc.archive import Map
 
 
@@ -22,6 +24,9 @@ def summary_of(opened: Map) -> dict[str, Any]:
         "bytes_per_observation": opened.size_bytes / counts["observations"],
         "mean_track_length": float(opened.track_lengths.mean()),
         "cameras": len(opened.cameras),
+        "rigs": {rig: sorted(members) for rig, members in opened.rigs.items()},
+        # What a geodetic anchor tells of it is not in every manifest.
+        "gravity": None if opened.gravity is None else opened.gravity.tolist(),
         "path": str(opened.path),
     }
 
@@ -35,6 +40,8 @@ def print_map(out: Console, opened: Map) -> None:
     table = Table(show_header=False, box=None, title=f"map {opened.ref}", title_justify="left")
     rows = {
         "photos": f"{counts['images']} by {summary['cameras']} cameras",
+        "rigs": "; ".join(f"{rig}: {', '.join(names)}" for rig, names in summary["rigs"].items())
+        or "none",
         "landmarks": f"{counts['landmarks']}, seen by {summary['mean_track_length']:.1f} photos "
         "in the mean",
         "observations": f"{counts['observations']}",
@@ -46,6 +53,9 @@ def print_map(out: Console, opened: Map) -> None:
         "extent": " x ".join(f"{side:.2f}" for side in sides)
         + (" m" if summary["world"]["metric"] else " (not metric)"),
         "world": _world(opened),
+        "gravity": "not known"
+        if opened.gravity is None
+        else f"down is ({', '.join(f'{value:.6g}' for value in opened.gravity)})",
         "method": summary["method"]["name"],
         "size": f"{summary['size_bytes'] / 2**20:.1f} MiB, "
         f"{summary['bytes_per_observation']:.0f} bytes per observation",
@@ -53,7 +63,7 @@ def print_map(out: Console, opened: Map) -> None:
         "folder": summary["path"],
     }
     for name, value in rows.items():
-        table.add_row(name, value)
+        table.add_row(name, escape(value))
     out.print(table)
     for note in summary["notes"]:
         out.print(f"note: {note}", markup=False, soft_wrap=True)
@@ -95,3 +105,39 @@ def print_import(out: Console, summary: ImportSummary) -> None:
     )
     for note in summary.notes:
         out.print(f"note: {note}", markup=False, soft_wrap=True)
+
+
+def print_rig(out: Console, calibration: RigCalibration) -> None:
+    """Show where the cameras of a rig are, and how well their instants agree."""
+    table = Table(
+        title=f"rig {escape(calibration.rig)}, at camera {escape(calibration.reference)}; "
+        "deviations: median / 90 %",
+        title_justify="left",
+    )
+    for name in ("camera", "compared with", "instants", "outliers", "degrees", "units", "position"):
+        table.add_column(name)
+    for name, camera in calibration.cameras.items():
+        x, y, z = camera.cam_from_rig.center
+        position = f"{x:.4f} {y:.4f} {z:.4f}"
+        if camera.relative is None or camera.relative_to is None:
+            table.add_row(escape(name), "", "", "", "", "", position)
+            continue
+        table.add_row(
+            *(escape(name), escape(camera.relative_to)),
+            *(str(camera.relative.instants), str(camera.relative.outliers)),
+            *(_deviation(camera.relative.rotation_deg), _deviation(camera.relative.position)),
+            position,
+        )
+    out.print(table)
+    out.print(
+        "outliers: more than "
+        f"{OUTLIER_MULTIPLE:g} times the median off; they hardly move the estimate",
+        soft_wrap=True,
+        highlight=False,
+    )
+    for note in calibration.notes:
+        out.print(f"note: {note}", markup=False, soft_wrap=True)
+
+
+def _deviation(spread: Spread) -> str:
+    return f"{spread.median:.3g} / {spread.p90:.3g}"

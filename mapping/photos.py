@@ -11,7 +11,7 @@ from visloc.archive import sha256_of
 from visloc.errors import DatasetError
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, FileRecord
-from visloc.localizer import GUESSED_FOCAL
+from visloc.query_camera import GUESSED_FOCAL
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,55 +5,49 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
+from typing import ParamSpec, TypeVar
 
 import cv2
 import torch
 
+from service.instants import Target, check_images, check_priors, look_at, rig_in_map
+from service.jobs import (
+    ImageJob,
+    Instant,
+    InstantLocalization,
+    Localization,
+    LocalizeJob,
+    Rig,
+    RigJob,
+    SequenceStart,
+)
+from service.loaded_maps import LoadedMaps
 from visloc.archive import Map, MapStore
-from visloc.errors import Conflict, InvalidInput, MapCorrupt, Overloaded, Unavailable, VislocError
-from visloc.features import LocalFeatureExtractor, make_local_features
-from visloc.features.readymade import is_ready_made
-from visloc.geometry import Camera
+from visloc.errors import (
+    InvalidInput,
+    Overloaded,
+    TooLarge,
+    Unavailable,
+    VislocError,
+)
 from visloc.images import ImageLimits, read_photo
-from visloc.localizer import Localizer
-from visloc.types import Answer, LocalizeOptions, QueryFeatures
+from visloc.localizer import FeatureCache
+from visloc.priors import Priors
+from visloc.sequence import SeenInstant, SequenceSolver, check_max_gap
+from visloc.solving import SeenImage
+from visloc.trajectory import TimeUnit, guess_time_unit
+from visloc.types import Answer, InstantAnswer, Localized, LocalizeOptions, QueryFeatures
 
 logger = logging.getLogger(__name__)
 
-# How long a published version that could not take over is left alone before it is tried again.
-RETRY_AFTER_S = 30.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LocalizeJob:
-    """One photo to localize.
-
-    Attributes:
-        map: ``id``, for its current version, or ``id@version``.
-        query: the encoded photo, or the features that were found in it.
-        camera: its intrinsics for the pixels as stored; None when unknown.
-        options: thresholds and the like.
-    """
-
-    map: str
-    query: bytes | QueryFeatures
-    camera: Camera | None
-    options: LocalizeOptions
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Localization:
-    """An answer and the map that gave it."""
-
-    answer: Answer
-    map_id: str
-    map_version: str
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,27 +66,8 @@ class Status:
     not_loaded: Mapping[str, VislocError]
 
 
-@dataclass(frozen=True, slots=True)
-class _Refused:
-    """What is current on disk and could not be loaded.
-
-    Attributes:
-        ref: ``id@version``; ``id`` when the map does not say which version is current.
-        error: why.
-        at: when, by ``perf_counter``.
-    """
-
-    ref: str
-    error: VislocError
-    at: float
-
-
 class Engine:
     """Localizes photos in the maps of a store, in a bounded pool of threads.
-
-    Every request asks the store again which version is current, so that a map that was published
-    a moment ago is served without a restart. A version that cannot be opened leaves the one
-    before it in service.
 
     Args:
         store: where the maps are.
@@ -100,6 +75,9 @@ class Engine:
         workers: photos worked on at the same time.
         threads_per_worker: processor threads for one photo. This is set for the whole process.
         max_queue: photos that may wait; one more is refused with ``server.busy``.
+        max_batches: rigs and sequences that are served at once.
+        max_rig_images: images of one instant.
+        max_instants: instants of one sequence.
         limits: of photos.
     """
 
@@ -111,25 +89,25 @@ class Engine:
         workers: int = 1,
         threads_per_worker: int = 1,
         max_queue: int = 64,
+        max_batches: int = 8,
+        max_rig_images: int = 16,
+        max_instants: int = 1000,
         limits: ImageLimits,
     ) -> None:
         torch.set_num_threads(threads_per_worker)
         cv2.setNumThreads(threads_per_worker)
-        self._store = store
-        self._weights_dir = weights_dir
+        self._maps = LoadedMaps(store, weights_dir)
         self._limits = limits
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="vision")
         self._places = threading.BoundedSemaphore(workers + max_queue)
-        self._loading = threading.Lock()
-        self._localizers: dict[str, Localizer] = {}  # by id@version
-        self._extractors: dict[str, LocalFeatureExtractor] = {}  # by name
-        self._serving: dict[str, str] = {}  # id -> id@version last served as the current one
-        self._refused: dict[str, _Refused] = {}  # by map id
+        self._batches = threading.BoundedSemaphore(max_batches)
+        self._max_rig_images = max_rig_images
+        self._max_instants = max_instants
         self._ready = False
 
     async def start(self) -> None:
         """Open and warm up all current maps. One that is broken does not keep back the others."""
-        await asyncio.get_running_loop().run_in_executor(self._pool, self._load_all)
+        await asyncio.get_running_loop().run_in_executor(self._pool, self._maps.load_all)
         self._ready = True
 
     def close(self) -> None:
@@ -140,16 +118,7 @@ class Engine:
     @property
     def status(self) -> Status:
         """What is loaded now, of the maps that are still there."""
-        ids = set(self._store.ids())
-        return Status(
-            self._ready,
-            tuple(ref for ref in sorted(self._localizers) if ref.partition("@")[0] in ids),
-            {
-                map_id: refused.error
-                for map_id, refused in sorted(self._refused.items())
-                if map_id in ids
-            },
-        )
+        return Status(self._ready, self._maps.refs, self._maps.not_loaded)
 
     async def localize(self, job: LocalizeJob) -> Localization:
         """Localize a photo, decoded first, or its features, in a worker thread.
@@ -159,8 +128,7 @@ class Engine:
             Unavailable: ``server.starting`` before ``start`` is done.
             VislocError: what the store, ``read_photo`` and the ``Localizer`` raise.
         """
-        if not self._ready:
-            raise Unavailable("server.starting", "the maps are being loaded; try again shortly")
+        self._check_ready()
         if not self._places.acquire(blocking=False):
             raise Overloaded("server.busy", "too many photos are waiting; try again shortly")
         work = self._pool.submit(self._localize, job, perf_counter())
@@ -168,9 +136,105 @@ class Engine:
         work.add_done_callback(lambda _: self._places.release())
         return await asyncio.wrap_future(work)
 
-    async def maps(self) -> list[Map]:
+    @contextmanager
+    def admit_batch(self) -> Iterator[None]:
+        """Hold one of the places for rigs and sequences, from before their images are read.
+
+        Raises:
+            Overloaded: ``server.busy`` when all are taken.
+            Unavailable: ``server.starting`` before ``start`` is done.
+        """
+        self._check_ready()
+        if not self._batches.acquire(blocking=False):
+            raise Overloaded("server.busy", "too many rigs and sequences; try again shortly")
+        try:
+            yield
+        finally:
+            self._batches.release()
+
+    async def localize_rig(self, job: RigJob) -> InstantLocalization:
+        """Localize the images of one instant together; one that cannot be used fails alone.
+
+        The caller holds a place (``admit_batch``).
+
+        Raises:
+            InvalidInput: ``rig.*``, ``priors.*``.
+            VislocError: what the store raises.
+        """
+        if not job.images:
+            raise InvalidInput("rig.empty", "there is no image", field="images")
+        targets = await self._run(self._targets, job.maps, job.rig)
+        for target in targets:
+            check_images(job.images, target.rig, self._max_rig_images, "images")
+        check_priors(targets, job.priors)
+        seen = await self._look(targets, job.images, job.options, job.priors)
+
+        def solve() -> InstantLocalization:
+            answers = [
+                target.localizer.solve(images, job.options, job.priors, job.timestamp).answer
+                for target, images in zip(targets, seen, strict=True)
+            ]
+            best = max(range(len(answers)), key=lambda i: _worth(answers[i]))
+            return _localization(targets[best], answers[best])
+
+        return await self._run(solve)
+
+    async def localize_sequence(
+        self, start: SequenceStart, instants: AsyncIterator[Instant]
+    ) -> AsyncIterator[InstantLocalization]:
+        """Answer the instants of a sequence in order, each as soon as its answer is final.
+
+        The next instant is taken when the answers to those before have been taken. The caller
+        holds a place (``admit_batch``). With several maps, nothing is answered until an instant
+        is localized: its map is kept.
+
+        Raises:
+            InvalidInput: ``sequence.*``, ``rig.*``, ``priors.*``.
+            TooLarge: ``sequence.too_many_instants``, ``rig.too_many_images``.
+            VislocError: what the store raises.
+        """
+        check_max_gap(start.max_gap_s)
+        targets = await self._run(self._targets, start.maps, start.rig)
+        check_priors(targets, start.priors)
+        solvers: list[SequenceSolver] = []
+        held: list[list[InstantAnswer]] = [[] for _ in targets]
+        before: Instant | None = None
+        index = 0
+        async for instant in instants:
+            where = f"instants[{index}]"
+            if index == self._max_instants:
+                raise _too_many_instants(self._max_instants)
+            if before is not None and instant.timestamp <= before.timestamp:
+                raise _not_later(where, before.timestamp, instant.timestamp)
+            for target in targets:
+                rig = None if start.rig is None else target.rig
+                check_images(instant.images, rig, self._max_rig_images, f"{where}.images")
+            priors = start.priors if instant.priors is None else instant.priors
+            check_priors(targets, priors)
+            if not solvers:
+                unit = start.time_unit or _guessed_unit(instant.timestamp)
+                solvers = [_solver(target, start, unit) for target in targets]
+            images = await self._look(targets, instant.images, start.options, priors)
+            added = await self._run(_add, solvers, instant, images, priors)
+            for answers, more in zip(held, added, strict=True):
+                answers += more
+            if len(targets) > 1 and any(solver.measured for solver in solvers):
+                best = max(range(len(targets)), key=lambda i: solvers[i].measured)
+                targets, solvers, held = [targets[best]], [solvers[best]], [held[best]]
+            if len(targets) == 1:
+                for answer in held[0]:
+                    yield _localization(targets[0], answer)
+                held = [[]]
+            before = instant
+            index += 1
+        if before is None:
+            raise InvalidInput("sequence.empty", "there is no instant", field="instants")
+        for answer in [*held[0], *await self._run(solvers[0].finish)]:
+            yield _localization(targets[0], answer)
+
+    async def maps(self) -> Sequence[Map]:
         """All maps that can be opened, in the version that is served, by id."""
-        return await asyncio.to_thread(self._list_maps)
+        return await asyncio.to_thread(self._maps.list)
 
     async def map(self, ref: str) -> Map:
         """One map: ``id``, or ``id@version``.
@@ -178,147 +242,126 @@ class Engine:
         Raises:
             VislocError: what the store raises.
         """
-        return await asyncio.to_thread(self._find_map, ref)
+        return await asyncio.to_thread(self._maps.find, ref)
+
+    def _check_ready(self) -> None:
+        if not self._ready:
+            raise Unavailable("server.starting", "the maps are being loaded; try again shortly")
+
+    async def _run(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Work in a thread of the pool."""
+        return await asyncio.wrap_future(self._pool.submit(work, *args, **kwargs))
+
+    async def _look(
+        self,
+        targets: Sequence[Target],
+        images: Sequence[ImageJob],
+        options: LocalizeOptions,
+        priors: Priors,
+    ) -> list[tuple[SeenImage, ...]]:
+        """Look at all images of an instant; the result is by target."""
+        now = perf_counter()
+        looks = await asyncio.gather(
+            *(
+                self._run(look_at, image, targets, options, priors, self._limits, now)
+                for image in images
+            )
+        )
+        return [tuple(look[i] for look in looks) for i in range(len(targets))]
+
+    def _targets(self, maps: Sequence[str], rig: Rig | None) -> list[Target]:
+        localizers = [self._maps.localizer(ref) for ref in maps]
+        return [Target(found, rig_in_map(rig, found.map)) for found in localizers]
 
     def _localize(self, job: LocalizeJob, submitted: float) -> Localization:
         started = perf_counter()
-        localizer = self._localizer(job.map)
+        localizers = [self._maps.localizer(ref) for ref in job.maps]
         loaded = perf_counter()
         before = {"queued": started - submitted, "open_map": loaded - started}
+        answers: list[Answer] = []
         if isinstance(job.query, QueryFeatures):
-            answer = localizer.localize_features(job.query, job.camera, job.options)
+            answers = [
+                localizer.localize_features(job.query, job.camera, job.options, job.priors)
+                for localizer in localizers
+            ]
         else:
             photo = read_photo(job.query, self._limits)
             before["decode"] = perf_counter() - loaded
-            answer = localizer.localize(photo, job.camera, job.options)
+            found: FeatureCache = {}
+            answers = [
+                localizer.localize(photo, job.camera, job.options, job.priors, found)
+                for localizer in localizers
+            ]
+        best = max(
+            range(len(answers)),
+            key=lambda i: (isinstance(answers[i], Localized), answers[i].evidence.num_inliers),
+        )
+        answer, manifest = answers[best], localizers[best].map.manifest
         seconds = {**before, **answer.evidence.seconds}
-        manifest = localizer.map.manifest
         return Localization(
             replace(answer, evidence=replace(answer.evidence, seconds=seconds)),
             manifest.id,
             manifest.version,
         )
 
-    def _load_all(self) -> None:
-        for map_id in self._store.ids():
-            try:
-                self._localizer(map_id)
-            except VislocError as error:
-                logger.error("map %s is not loaded: %s", map_id, error)  # noqa: TRY400
 
-    def _localizer(self, ref: str) -> Localizer:
-        """Return the localizer of a map, opened now if it was not before."""
-        if "@" in ref:
-            return self._loaded(ref)
-        try:
-            current = f"{ref}@{self._store.current_version(ref)}"
-        except MapCorrupt as error:
-            return self._fall_back(ref, ref, error)
-        before, refused = self._serving.get(ref), self._refused.get(ref)
-        if (
-            before is not None
-            and refused is not None
-            and refused.ref == current
-            and perf_counter() < refused.at + RETRY_AFTER_S
-        ):
-            return self._loaded(before)
-        try:
-            localizer = self._loaded(current)
-        except VislocError as error:
-            return self._fall_back(ref, current, error)
-        self._refused.pop(ref, None)
-        if before != current:
-            self._serving[ref] = current
-            if before is not None:
-                self._localizers.pop(before, None)
-        return localizer
-
-    def _fall_back(self, map_id: str, current: str, error: VislocError) -> Localizer:
-        """Note that what is current cannot be served, and return what was served before it."""
-        before, known = self._serving.get(map_id), self._refused.get(map_id)
-        self._refused[map_id] = _Refused(current, error, perf_counter())
-        if before is None:
-            raise error
-        if known is None or known.ref != current:
-            logger.error("map %s cannot take over, %s stays in service: %s", current, before, error)
-        return self._loaded(before)
-
-    def _loaded(self, ref: str) -> Localizer:
-        found = self._localizers.get(ref)
-        if found is not None:
-            return found
-        with self._loading:
-            found = self._localizers.get(ref)  # another thread may have been faster
-            if found is None:
-                found = self._load(ref)
-                self._localizers[ref] = found
-            return found
-
-    def _load(self, ref: str) -> Localizer:
-        start = perf_counter()
-        with _damage_named(ref):
-            opened = self._store.open(ref)
-            name = opened.manifest.local_features.fingerprint.name
-            try:
-                if name not in self._extractors and not is_ready_made(name):
-                    self._extractors[name] = make_local_features(name, self._weights_dir)
-                localizer = Localizer(opened, self._extractors.get(name))
-            except InvalidInput as error:  # features that are not here: not the caller's mistake
-                raise Conflict(
-                    error.code,
-                    error.message,
-                    field=error.field,
-                    expected=error.expected,
-                    got=error.got,
-                ) from error
-            localizer.warm_up()
-        logger.info("map %s loaded in %.1f s", opened.ref, perf_counter() - start)
-        return localizer
-
-    def _find_map(self, ref: str) -> Map:
-        wanted = ref if "@" in ref else self._served(ref)
-        loaded = self._localizers.get(wanted)
-        if loaded is not None:
-            return loaded.map
-        with _damage_named(wanted):
-            return self._store.open(wanted)
-
-    def _served(self, map_id: str) -> str:
-        """Return ``id@version`` of what ``id`` stands for."""
-        before, refused = self._serving.get(map_id), self._refused.get(map_id)
-        try:
-            current = f"{map_id}@{self._store.current_version(map_id)}"
-        except MapCorrupt:
-            if before is None:
-                raise
-            return before
-        return before if before and refused and refused.ref == current else current
-
-    def _list_maps(self) -> list[Map]:
-        found = []
-        for map_id in self._store.ids():
-            try:
-                found.append(self._find_map(map_id))
-            except VislocError as error:
-                logger.warning("map %s is not listed: %s", map_id, error)
-        return found
+def _solver(target: Target, start: SequenceStart, unit: TimeUnit) -> SequenceSolver:
+    return SequenceSolver(
+        target.localizer.geometry,
+        metric=target.localizer.map.manifest.world.metric,
+        options=start.options,
+        time_unit=unit,
+        max_gap_s=start.max_gap_s,
+    )
 
 
-@contextmanager
-def _damage_named(ref: str) -> Iterator[None]:
-    """Turn what should not happen while a map is opened into MapCorrupt ``map.unusable``.
+def _add(
+    solvers: Sequence[SequenceSolver],
+    instant: Instant,
+    images: Sequence[tuple[SeenImage, ...]],
+    priors: Priors,
+) -> list[list[InstantAnswer]]:
+    return [
+        solver.add(SeenInstant(instant.timestamp, seen, instant.odometry, priors))
+        for solver, seen in zip(solvers, images, strict=True)
+    ]
 
-    A damaged map can break the code that reads it in any way, and must not stop the others.
-    """
-    try:
-        yield
-    except VislocError:
-        raise
-    except Exception as error:
-        logger.exception("map %s cannot be used", ref)
-        raise MapCorrupt(
-            "map.unusable",
-            "the map cannot be used; rebuild it, or see the server's log for the cause",
-            field=ref,
-            got=type(error).__name__,
-        ) from error
+
+def _localization(target: Target, answer: InstantAnswer) -> InstantLocalization:
+    manifest = target.localizer.map.manifest
+    return InstantLocalization(answer, manifest.id, manifest.version)
+
+
+def _worth(answer: InstantAnswer) -> tuple[bool, int]:
+    return answer.pose is not None, answer.num_inliers
+
+
+def _guessed_unit(timestamp: int) -> TimeUnit:
+    unit = guess_time_unit([timestamp])
+    if unit is None:
+        raise InvalidInput(
+            "sequence.time_unit",
+            "the unit of the timestamps cannot be told by their size",
+            field="time_unit",
+            expected=f"one of {', '.join(TimeUnit)}",
+        )
+    return unit
+
+
+def _not_later(where: str, before: int, timestamp: int) -> InvalidInput:
+    return InvalidInput(
+        "sequence.timestamps",
+        "instants come in the order of time, each once",
+        field=f"{where}.timestamp",
+        expected=f"more than {before}, that of the instant before",
+        got=timestamp,
+    )
+
+
+def _too_many_instants(most: int) -> TooLarge:
+    return TooLarge(
+        "sequence.too_many_instants",
+        "too many instants in one sequence; send it in parts",
+        field="instants",
+        expected=f"at most {most}",
+    )

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
-from collections.abc import Coroutine
+from collections.abc import AsyncGenerator, AsyncIterator, Sequence
+from contextlib import aclosing
+from functools import partial
 from http import HTTPStatus
 from time import perf_counter
-from typing import Any, TypeVar
 
-from fastapi import Request, Response
+from fastapi import Depends, Request, Response
 from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
@@ -19,25 +18,33 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import visloc
 from service.engine import Engine
-from service.incoming import invalid_input
-from service.intake import read_localize_job
-from service.openapi import LOCALIZE_BODY, App, problems
+from service.incoming import refusal_of
+from service.intake import read_localize_job, read_rig_job, read_sequence_jobs
+from service.jobs import Instant, InstantLocalization
+from service.openapi import App, problems
+from service.request_bodies import LOCALIZE_BODY, RIG_BODY, SEQUENCE_BODY
+from service.responses import (
+    NDJSON,
+    Lines,
+    json_response,
+    problem_response,
+    while_connected,
+)
 from service.schemas import (
     Health,
+    InstantAnswer,
     ListMapsResponse,
     LocalizeResponse,
+    LocalizeSequenceResponse,
     MapInfo,
     MapNotLoaded,
-    Problem,
     Readiness,
 )
 from service.settings import ServiceSettings
-from service.wire import RETRY_AFTER_S, internal_error, request_id, statuses_of
-from visloc.errors import InvalidInput, NotFound, Unavailable, VislocError
+from service.wire import internal_error, request_id
+from visloc.errors import InvalidInput, NotFound, VislocError
 
 logger = logging.getLogger(__name__)
-
-T = TypeVar("T")
 
 
 def create_app(engine: Engine, settings: ServiceSettings) -> App:
@@ -66,24 +73,68 @@ def create_app(engine: Engine, settings: ServiceSettings) -> App:
         A photo that cannot be localized is an answer (`status: not_localized`), not an error.
         """
         job = await read_localize_job(request, settings)
-        found = await _while_connected(request, engine.localize(job))
-        return _json(LocalizeResponse.from_localization(found, request.state.request_id))
+        found = await while_connected(request.receive, engine.localize(job))
+        return json_response(LocalizeResponse.from_localization(found, request.state.request_id))
+
+    async def admitted() -> AsyncIterator[None]:
+        # FastAPI ends this when the answer has been sent, its last line included.
+        with engine.admit_batch():
+            yield
+
+    @app.post(
+        "/localize/rig",
+        response_model=InstantAnswer,
+        responses=problems(404, 409, 413, 422, 429, 500, 503),
+        openapi_extra={"requestBody": RIG_BODY},
+        dependencies=[Depends(admitted)],
+    )
+    async def localize_rig(request: Request) -> Response:
+        """Estimate one pose from the photos that the cameras of a rig took at one instant.
+
+        A photo that cannot be used fails alone: the others are answered.
+        """
+        job = await read_rig_job(request, settings)
+        found = await while_connected(request.receive, engine.localize_rig(job))
+        return json_response(InstantAnswer.from_localization(found, request.state.request_id))
+
+    @app.post(
+        "/localize/sequence",
+        response_model=LocalizeSequenceResponse,
+        responses=problems(404, 409, 413, 422, 429, 500, 503),
+        openapi_extra={"requestBody": SEQUENCE_BODY},
+        dependencies=[Depends(admitted)],
+    )
+    async def localize_sequence(request: Request) -> Response:
+        """Estimate the poses of a rig, or of one camera, at the instants of a sequence.
+
+        With `Accept: application/x-ndjson` every answer is a line of its own, sent as soon as it
+        is final.
+        """
+        start, instants = await read_sequence_jobs(request, settings)
+        answers = engine.localize_sequence(start, _one_by_one(instants))
+        id_ = request.state.request_id
+        if not _wants_lines(request):
+            found = await while_connected(request.receive, _all_of(answers))
+            spoken = [InstantAnswer.from_localization(each, id_) for each in found]
+            return json_response(LocalizeSequenceResponse(request_id=id_, answers=spoken))
+        first = await while_connected(request.receive, anext(answers))
+        return Lines(first, answers, partial(InstantAnswer.from_localization, request_id=id_), id_)
 
     @app.get("/maps", response_model=ListMapsResponse)
     async def list_maps() -> Response:
         """List the maps that can be opened, in the version that is served."""
         maps = [MapInfo.from_map(opened) for opened in await engine.maps()]
-        return _json(ListMapsResponse(maps=maps))
+        return json_response(ListMapsResponse(maps=maps))
 
     @app.get("/maps/{ref}", response_model=MapInfo, responses=problems(404, 422, 500))
     async def get_map(ref: str) -> Response:
         """Describe one map: `id`, or `id@version`."""
-        return _json(MapInfo.from_map(await engine.map(ref)))
+        return json_response(MapInfo.from_map(await engine.map(ref)))
 
     @app.get("/healthz", response_model=Health)
     async def healthz() -> Response:
         """Tell that the process answers."""
-        return _json(Health(version=visloc.__version__))
+        return json_response(Health(version=visloc.__version__))
 
     @app.get("/readyz", response_model=Readiness, responses={503: {"model": Readiness}})
     async def readyz() -> Response:
@@ -94,7 +145,7 @@ def create_app(engine: Engine, settings: ServiceSettings) -> App:
             for map_id, error in status.not_loaded.items()
         ]
         readiness = Readiness(ready=status.ready, maps=list(status.maps), not_loaded=not_loaded)
-        return _json(readiness, 200 if status.ready else 503)
+        return json_response(readiness, 200 if status.ready else 503)
 
     return app
 
@@ -130,7 +181,7 @@ class RequestEnvelope:
             logger.exception("request %s broke", id_)
             if status:
                 raise  # too late to answer: the server closes the connection
-            await _problem(internal_error(), id_)(scope, receive, send_with_id)
+            await problem_response(internal_error(), id_)(scope, receive, send_with_id)
         finally:
             logger.info(
                 "%s %r %d %.1f ms request_id=%s",
@@ -139,62 +190,30 @@ class RequestEnvelope:
             )
 
 
-async def _while_connected(request: Request, work: Coroutine[Any, Any, T]) -> T:
-    """Do the work, or drop it when the client hangs up: nobody waits for its answer.
-
-    Raises:
-        ClientDisconnect: when the client hung up.
-    """
-
-    async def hang_up() -> None:
-        while (await request.receive())["type"] != "http.disconnect":
-            pass
-
-    working, leaving = asyncio.create_task(work), asyncio.create_task(hang_up())
-    try:
-        await asyncio.wait({working, leaving}, return_when=asyncio.FIRST_COMPLETED)
-        if not working.done():
-            raise ClientDisconnect
-        return working.result()
-    finally:
-        working.cancel()
-        leaving.cancel()
+async def _one_by_one(instants: Sequence[Instant]) -> AsyncGenerator[Instant]:
+    for instant in instants:
+        yield instant
 
 
-def _json(message: BaseModel, status: int = 200) -> Response:
-    return Response(message.model_dump_json(), status, media_type="application/json")
+async def _all_of(answers: AsyncGenerator[InstantLocalization]) -> list[InstantLocalization]:
+    async with aclosing(answers):
+        return [answer async for answer in answers]
 
 
-def _problem(error: VislocError, id_: str, status: HTTPStatus | None = None) -> Response:
-    status = status or statuses_of(error)[0]
-    problem = Problem(
-        title=status.phrase,
-        status=status,
-        detail=error.message,
-        code=error.code,
-        field=error.field,
-        expected=error.expected,
-        got=error.got,
-        kind=type(error).__name__,
-        request_id=id_,
-    )
-    return Response(
-        problem.model_dump_json(),
-        status,
-        {"Retry-After": str(RETRY_AFTER_S)} if isinstance(error, Unavailable) else None,
-        media_type="application/problem+json",
-    )
+def _wants_lines(request: Request) -> bool:
+    accepted = ",".join(request.headers.getlist("accept")).lower().split(",")
+    return any(kind.partition(";")[0].strip() == NDJSON for kind in accepted)
 
 
 async def _on_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, VislocError)  # it is registered for these
-    return _problem(error, request.state.request_id)
+    return problem_response(error, request.state.request_id)
 
 
 async def _on_validation_error(request: Request, error: Exception) -> Response:
     """Say what FastAPI finds wrong in a path or a query in our words."""
     assert isinstance(error, RequestValidationError)
-    return _problem(invalid_input(error.errors()[0]), request.state.request_id)
+    return problem_response(refusal_of(error.errors()[0]), request.state.request_id)
 
 
 async def _on_http_exception(request: Request, error: Exception) -> Response:
@@ -204,6 +223,6 @@ async def _on_http_exception(request: Request, error: Exception) -> Response:
     kind = NotFound if status == HTTPStatus.NOT_FOUND else InvalidInput
     code = "http." + status.phrase.lower().replace(" ", "_").replace("-", "_")
     refused = kind(code, status.phrase, got=f"{request.method} {request.url.path}")
-    response = _problem(refused, request.state.request_id, status)
+    response = problem_response(refused, request.state.request_id, status)
     response.headers.update(error.headers or {})
     return response

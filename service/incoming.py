@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, ClassVar, Self
 
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
-from visloc.errors import InvalidInput
+from visloc.errors import InvalidInput, TooLarge, VislocError
 
-_NOT_AN_OBJECT, _UNKNOWN_FIELD = "not_an_object", "unknown_field"
+_NOT_AN_OBJECT, _UNKNOWN_FIELD, _REFUSED = "not_an_object", "unknown_field", "refused"
 _MAX_NAME = 100  # characters of a name from outside
+# JSON takes many times its size when it is parsed, if it is made of many small values.
+MAX_JSON_VALUES = 10_000
 
 
 class IncomingMessage(BaseModel):
@@ -36,42 +46,114 @@ class IncomingMessage(BaseModel):
         return value
 
     @classmethod
-    def read(cls, value: object) -> Self:
+    def read(cls, value: object, limits: object = None) -> Self:
         """Check a message made of Python values.
+
+        Args:
+            value: the message.
+            limits: on counts, for the fields that ask for them.
 
         Raises:
             InvalidInput: ``request.missing_field``, ``request.unknown_field``,
                 ``request.invalid``, or a code of the field.
         """
         try:
-            return cls.model_validate(value)
+            return cls.model_validate(value, context=limits)
         except ValidationError as refused:
-            raise invalid_input(refused.errors(include_url=False)[0], cls.path) from None
+            raise refusal_of(refused.errors(include_url=False)[0], cls.path) from None
 
     @classmethod
-    def read_json(cls, text: str | bytes) -> Self:
+    def read_json(
+        cls, text: str | bytes, limits: object = None, max_values: int = MAX_JSON_VALUES
+    ) -> Self:
         """Check a message written as JSON.
+
+        Args:
+            text: the message.
+            limits: as of ``read``.
+            max_values: how many values and commas in texts it may have, about.
 
         Raises:
             InvalidInput: as ``read``, and ``request.malformed``.
+            TooLarge: ``request.too_large``.
         """
+        commas = text.count(",") if isinstance(text, str) else text.count(b",")
+        if commas > max_values:
+            raise TooLarge(
+                "request.too_large",
+                "the JSON has too many values; numbers of features go in base64",
+                field=cls.path.rstrip(".") or None,
+                expected=f"at most {max_values}",
+                got=commas,
+            )
         try:
-            return cls.model_validate_json(text)
+            return cls.model_validate_json(text, context=limits)
         except ValidationError as refused:
-            raise invalid_input(refused.errors(include_url=False)[0], cls.path) from None
+            raise refusal_of(refused.errors(include_url=False)[0], cls.path) from None
 
 
-def invalid_input(complaint: Mapping[str, Any], path: str = "") -> InvalidInput:
+def converted(convert: Callable[[Any], Any]) -> BeforeValidator:
+    """Make ``convert`` the first thing that happens to a field; its refusals keep their codes.
+
+    What it names as wrong is placed where the field is: ``camera.width`` of the second image
+    becomes ``images[1].camera.width``.
+    """
+
+    def validate(value: Any) -> Any:
+        try:
+            return convert(value)
+        except InvalidInput as error:
+            raise _located(error) from None
+
+    return BeforeValidator(validate)
+
+
+def counted(check: Callable[[Any, Any], None]) -> BeforeValidator:
+    """Let ``check`` see a field and the limits of the reading before its parts are looked at."""
+
+    def validate(value: Any, info: ValidationInfo) -> Any:
+        try:
+            check(value, info.context)
+        except InvalidInput as error:
+            raise _located(error) from None
+        return value
+
+    return BeforeValidator(validate)
+
+
+def _located(error: InvalidInput) -> PydanticCustomError:
+    return PydanticCustomError(_REFUSED, "refused", {"error": error})
+
+
+@contextmanager
+def inside(place: str) -> Iterator[None]:
+    """Place what is found wrong: ``camera.width`` becomes ``PLACE.camera.width``."""
+    try:
+        yield
+    except VislocError as error:
+        raise placed(error, place) from None
+
+
+def placed(error: VislocError, place: str) -> VislocError:
+    """Return the error of a field within a larger message."""
+    field = ".".join(part for part in (place, error.field) if part)
+    return type(error)(
+        error.code, error.message, field=field or None, expected=error.expected, got=error.got
+    )
+
+
+def refusal_of(complaint: Mapping[str, Any], path: str = "") -> VislocError:
     """Say one of pydantic's complaints in our words. Never echoes a large value."""
-    kind, message = complaint["type"], complaint["msg"]
-    parts = [str(part)[:_MAX_NAME] for part in complaint["loc"]]
+    kind, message, location = complaint["type"], complaint["msg"], complaint["loc"]
+    if kind == _REFUSED:
+        return placed(complaint["ctx"]["error"], (path + _joined(location[:-1])).rstrip("."))
     if kind == _UNKNOWN_FIELD:
         name, expected = complaint["ctx"]["name"], complaint["ctx"]["expected"]
-        field = path + ".".join([*parts, name[:_MAX_NAME]])
+        field = path + _joined([*location, name])
         return InvalidInput(
             "request.unknown_field", message, field=field, expected=expected, got=name
         )
-    field = path + ".".join(parts) if parts else path.rstrip(".")
+    field = path + _joined(location) if location else path.rstrip(".")
     got = complaint["input"]
     if kind == _NOT_AN_OBJECT:
         expected, got = complaint["ctx"]["expected"], type(got).__name__
@@ -84,3 +166,11 @@ def invalid_input(complaint: Mapping[str, Any], path: str = "") -> InvalidInput:
         return InvalidInput("request.missing_field", "this field is needed", field=field)
     got = got if isinstance(got, str | int | float | None) else type(got).__name__
     return InvalidInput("request.invalid", "cannot be used", field=field, expected=message, got=got)
+
+
+def _joined(location: Sequence[str | int]) -> str:
+    """Write a place in a message as ``instants[3].images[0].camera``."""
+    text = ""
+    for part in location:
+        text += f"[{part}]" if isinstance(part, int) else f".{part[:_MAX_NAME]}"
+    return text.removeprefix(".")

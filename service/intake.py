@@ -3,20 +3,35 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TypeVar
 
 from starlette.datastructures import Headers, UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import Request
 
-from service.engine import LocalizeJob
-from service.schemas import LocalizeRequest
+from service.jobs import Instant, LocalizeJob, RigJob, SequenceStart
+from service.schemas import (
+    BatchLimits,
+    LocalizeRequest,
+    LocalizeRigRequest,
+    LocalizeSequenceRequest,
+)
 from service.settings import REQUEST_OVERHEAD_BYTES, ServiceSettings
 from visloc.errors import InvalidInput, TooLarge
 
 _CHUNK_BYTES = 64 * 1024
-# The parts of a form that are files, and how curl sends them.
+# The parts of the form of one photo that are files, and how curl sends them.
 _FILES = {"image": "photo.jpg", "features": "photo.json"}
+
+JobT = TypeVar("JobT")
+
+
+@dataclass(frozen=True, slots=True)
+class _Form:
+    texts: dict[str, str] = field(default_factory=dict)
+    files: dict[str, bytes] = field(default_factory=dict)
 
 
 async def read_localize_job(request: Request, settings: ServiceSettings) -> LocalizeJob:
@@ -26,22 +41,127 @@ async def read_localize_job(request: Request, settings: ServiceSettings) -> Loca
         TooLarge: ``request.too_large``, before the rest of the body is read.
         InvalidInput: ``request...``, or a code of the field that is wrong.
     """
-    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    # Photos and features take milliseconds to parse and decode: off the event loop with them.
-    if media_type == "multipart/form-data":
-        body = await _read_body(request, settings.max_request_bytes)
-        fields = await _read_form(request.headers, body)
-        return await asyncio.to_thread(lambda: LocalizeRequest.read(fields).to_job())
-    if media_type == "application/json":
-        body = await _read_body(request, settings.max_json_bytes)
-        return await asyncio.to_thread(lambda: LocalizeRequest.read_json(body).to_job())
-    raise InvalidInput(
-        "request.content_type",
-        "this kind of body is not read here",
-        field="Content-Type",
-        expected="multipart/form-data or application/json",
-        got=media_type or "none",
+
+    def from_form(body: bytes) -> LocalizeJob:
+        form = _parse_form(
+            request.headers,
+            body,
+            max_files=len(_FILES),
+            max_texts=len(LocalizeRequest.model_fields),
+            max_text_bytes=REQUEST_OVERHEAD_BYTES,
+            expected="a form with a file image or features, and texts map, camera, options...",
+        )
+        _check_kinds(form)
+        return LocalizeRequest.read({**form.texts, **form.files}).to_job()
+
+    return await _read(
+        request,
+        from_form=(from_form, settings.max_request_bytes),
+        from_json=(
+            lambda body: LocalizeRequest.read_json(body).to_job(),
+            settings.max_json_bytes,
+        ),
     )
+
+
+async def read_rig_job(request: Request, settings: ServiceSettings) -> RigJob:
+    """Read the body of ``POST /localize/rig``, as a form or as JSON.
+
+    Raises:
+        TooLarge: ``request.too_large``, before the rest of the body is read; ``rig.too_many_...``.
+        InvalidInput: ``request...``, or a code of the field that is wrong.
+    """
+    limits = _limits(settings)
+
+    def job(text: str | bytes, files: Mapping[str, bytes]) -> RigJob:
+        read = LocalizeRigRequest.read_json(text, limits, settings.max_batch_values)
+        return read.to_job(files)
+
+    return await _read_batch(request, settings, job, max_files=settings.max_rig_images)
+
+
+async def read_sequence_jobs(
+    request: Request, settings: ServiceSettings
+) -> tuple[SequenceStart, list[Instant]]:
+    """Read the body of ``POST /localize/sequence``, as a form or as JSON.
+
+    Raises:
+        TooLarge: ``request.too_large``, before the rest of the body is read;
+            ``sequence.too_many_instants``, ``rig.too_many_...``.
+        InvalidInput: ``request...``, or a code of the field that is wrong.
+    """
+    limits = _limits(settings)
+
+    def jobs(text: str | bytes, files: Mapping[str, bytes]) -> tuple[SequenceStart, list[Instant]]:
+        read = LocalizeSequenceRequest.read_json(text, limits, settings.max_batch_values)
+        return read.to_jobs(files)
+
+    max_files = settings.max_rig_images * settings.max_instants
+    return await _read_batch(request, settings, jobs, max_files=max_files)
+
+
+def _limits(settings: ServiceSettings) -> BatchLimits:
+    return BatchLimits(settings.max_rig_images, settings.max_instants)
+
+
+async def _read_batch(
+    request: Request,
+    settings: ServiceSettings,
+    to_job: Callable[[str | bytes, Mapping[str, bytes]], JobT],
+    *,
+    max_files: int,
+) -> JobT:
+    """Read several photos: JSON, or a form with that JSON as ``request`` and a file per photo."""
+
+    def from_form(body: bytes) -> JobT:
+        expected = f"a form with a text request (JSON) and at most {max_files} files"
+        form = _parse_form(
+            request.headers,
+            body,
+            max_files=max_files,
+            max_texts=1,
+            max_text_bytes=settings.max_batch_bytes,
+            expected=expected,
+        )
+        if form.texts.keys() != {"request"}:
+            name = next(iter(form.texts), None)
+            raise InvalidInput(
+                "request.missing_field" if name is None else "request.unknown_field",
+                "the form needs the request as a text",
+                field="request" if name is None else name[:100],
+                expected="a text, as of curl -F 'request=<request.json'",
+                got="a file" if name is None and "request" in form.files else name,
+            )
+        return to_job(form.texts["request"], form.files)
+
+    return await _read(
+        request,
+        from_form=(from_form, settings.max_batch_bytes),
+        from_json=(lambda body: to_job(body, {}), settings.max_batch_bytes),
+    )
+
+
+async def _read(
+    request: Request,
+    *,
+    from_form: tuple[Callable[[bytes], JobT], int],
+    from_json: tuple[Callable[[bytes], JobT], int],
+) -> JobT:
+    """Read a body of either kind, each with its largest number of bytes."""
+    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    kinds = {"multipart/form-data": from_form, "application/json": from_json}
+    if media_type not in kinds:
+        raise InvalidInput(
+            "request.content_type",
+            "this kind of body is not read here",
+            field="Content-Type",
+            expected=" or ".join(kinds),
+            got=media_type or "none",
+        )
+    parse, limit = kinds[media_type]
+    body = await _read_body(request, limit)
+    # Photos and features take milliseconds to parse and decode: off the event loop with them.
+    return await asyncio.to_thread(parse, body)
 
 
 async def _read_body(request: Request, limit: int) -> bytes:
@@ -66,44 +186,71 @@ def _too_large(limit: int, got: str) -> TooLarge:
     )
 
 
-async def _read_form(headers: Headers, body: bytes) -> dict[str, str | bytes]:
+def _parse_form(
+    headers: Headers,
+    body: bytes,
+    *,
+    max_files: int,
+    max_texts: int,
+    max_text_bytes: int,
+    expected: str,
+) -> _Form:
+    """Take a form apart. This runs in a thread of its own: 20 MB take half a second.
+
+    Raises:
+        InvalidInput: ``request.malformed`` or ``request.duplicate_field``.
+    """
+
     async def stream() -> AsyncGenerator[bytes, None]:
         for start in range(0, len(body), _CHUNK_BYTES):
             yield body[start : start + _CHUNK_BYTES]
-            await asyncio.sleep(0)  # parsing 20 MB takes half a second: let others have a turn
 
-    parser = MultiPartParser(
-        headers,
-        stream(),
-        max_files=len(_FILES),
-        max_fields=len(LocalizeRequest.model_fields),
-        max_part_size=REQUEST_OVERHEAD_BYTES,
-    )
-    parser.spool_max_size = len(body) + 1  # files stay in memory, none on disk
+    async def parse() -> _Form:
+        parser = MultiPartParser(
+            headers,
+            stream(),
+            max_files=max_files,
+            max_fields=max_texts,
+            max_part_size=max_text_bytes,
+        )
+        parser.spool_max_size = len(body) + 1  # files stay in memory, none on disk
+        parsed = await parser.parse()
+        form = _Form()
+        try:
+            for name, value in parsed.multi_items():
+                if name in form.texts or name in form.files:
+                    raise InvalidInput("request.duplicate_field", "given twice", field=name[:100])
+                if isinstance(value, UploadFile):
+                    form.files[name] = await value.read()
+                else:
+                    form.texts[name] = value
+        finally:
+            await parsed.close()
+        return form
+
     try:
-        form = await parser.parse()
+        return asyncio.run(parse())
     except MultiPartException as error:
+        raise InvalidInput("request.malformed", error.message, expected=expected) from None
+
+
+def _check_kinds(form: _Form) -> None:
+    """Refuse texts that must be files, and the other way round.
+
+    Raises:
+        InvalidInput: ``request.invalid``.
+    """
+    for name in form.texts.keys() & _FILES.keys():
         raise InvalidInput(
-            "request.malformed",
-            error.message,
-            expected="a form with a file image or features, and texts map, camera, options",
-        ) from None
-    fields: dict[str, str | bytes] = {}
-    try:
-        for name, value in form.multi_items():
-            if name in fields:
-                raise InvalidInput("request.duplicate_field", "given twice", field=name[:100])
-            is_file = isinstance(value, UploadFile)
-            if name in LocalizeRequest.model_fields and is_file != (name in _FILES):
-                raise InvalidInput(
-                    "request.invalid",
-                    "the wrong kind of form part",
-                    field=name,
-                    expected="a text, without a file name"
-                    if is_file
-                    else f"a file, as of curl -F {name}=@{_FILES[name]}",
-                )
-            fields[name] = await value.read() if isinstance(value, UploadFile) else value
-    finally:
-        await form.close()
-    return fields
+            "request.invalid",
+            "the wrong kind of form part",
+            field=name,
+            expected=f"a file, as of curl -F {name}=@{_FILES[name]}",
+        )
+    for name in form.files.keys() & (LocalizeRequest.model_fields.keys() - _FILES.keys()):
+        raise InvalidInput(
+            "request.invalid",
+            "the wrong kind of form part",
+            field=name,
+            expected="a text, without a file name",
+        )

@@ -36,6 +36,9 @@ class Server:
             workers=settings.workers,
             threads_per_worker=settings.threads_per_worker,
             max_queue=settings.max_queue,
+            max_batches=settings.max_batches,
+            max_rig_images=settings.max_rig_images,
+            max_instants=settings.max_instants,
             limits=ImageLimits(settings.max_image_bytes, settings.max_image_pixels),
         )
         self._listener = _listen(settings.host, settings.http_port)

@@ -25,6 +25,8 @@ Count = Annotated[int, Field(ge=1)]
 
 # Room in a request for everything but the photo.
 REQUEST_OVERHEAD_BYTES = 64 * 1024
+# Room in a request for the numbers of one photo: camera, sensor, its share of the instant's.
+VALUES_PER_IMAGE = 64
 # Room for requests besides the photos that are worked on or wait: health, maps, refusals.
 REQUESTS_BESIDES = 32
 
@@ -62,6 +64,15 @@ class ServiceSettings(BaseModel):
     """largest encoded photo, bytes"""
     max_image_pixels: Count = 50_000_000
     """largest photo, width times height"""
+    max_batches: Count = 8
+    """rigs and sequences that are served at once; one more is refused"""
+    max_batch_bytes: Count = 64 * 2**20
+    """largest request with several photos, bytes: over HTTP as it comes, in base64 or not; over
+    gRPC one message. A sequence over HTTP is one request, a stream over gRPC has no such bound"""
+    max_rig_images: Count = 16
+    """photos of one instant of a rig"""
+    max_instants: Count = 1000
+    """instants of one sequence"""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """what is logged to stderr: debug, info, warning or error"""
 
@@ -72,13 +83,18 @@ class ServiceSettings(BaseModel):
 
     @property
     def max_request_bytes(self) -> int:
-        """Largest request that carries a photo as it is: multipart and gRPC."""
+        """Largest request that carries one photo as it is: multipart and gRPC."""
         return self.max_image_bytes + REQUEST_OVERHEAD_BYTES
 
     @property
     def max_json_bytes(self) -> int:
-        """Largest request in JSON: base64 makes four bytes of three."""
+        """Largest request with one photo in JSON: base64 makes four bytes of three."""
         return self.max_image_bytes * 4 // 3 + REQUEST_OVERHEAD_BYTES
+
+    @property
+    def max_batch_values(self) -> int:
+        """Values in the JSON of a request with several photos: parsed, each takes 100 bytes."""
+        return VALUES_PER_IMAGE * (self.max_rig_images + 1) * (self.max_instants + 1)
 
 
 def read_settings(arguments: Sequence[str], environment: Mapping[str, str]) -> ServiceSettings:

@@ -1,36 +1,40 @@
-"""One query from pixels, or from features, to answer: the whole pipeline on one screen."""
+"""Queries from pixels, or from features, to answer: the whole pipeline on one screen.
+
+A photo on its own is a rig of one camera: ``look`` tells what one image shows of the map, ``solve``
+finds one pose from all images of an instant.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.archive import FingerprintRecord, Map
-from visloc.errors import Conflict, InvalidInput
+from visloc.archive import Map
+from visloc.constraints import Constraints, MapGeometry
+from visloc.errors import InvalidInput
 from visloc.features import GlobalDescriptor, LocalFeatureExtractor, make_global_descriptor
 from visloc.features.readymade import is_ready_made
-from visloc.geometry import Camera
+from visloc.fingerprints import check_fingerprint
+from visloc.geometry import Camera, Pose
 from visloc.images import Photo, stored_from_upright, upright
 from visloc.matching.correspondences import match_landmarks
-from visloc.pose.absolute import estimate_absolute_pose
-from visloc.pose.covariance import position_covariance, with_origin
+from visloc.priors import NO_PRIORS, Priors
+from visloc.query_camera import resolve_camera
 from visloc.query_features import (
     checked_global_descriptors,
     checked_local_features,
     max_sent_keypoints,
 )
 from visloc.retrieval.index import Retrieved, retrieve
+from visloc.solving import Look, Matches, SeenImage, Solved, solve_instant
+from visloc.timing import timed
 from visloc.types import (
-    DEFAULT_PRESET,
     Answer,
     CameraSource,
     Evidence,
-    Fingerprint,
     LocalFeatures,
     Localized,
     LocalizeOptions,
@@ -38,19 +42,21 @@ from visloc.types import (
     QueryFeatures,
     ReadAs,
     Reason,
-    RegistrationPreset,
+    Refusal,
     RetrievedImage,
+    Stage,
 )
 
-# Focal length in units of the longer side when nothing is known: 45 degrees across, between a
-# phone's main camera (0.7 to 0.8) and a long lens. It is COLMAP's guess too.
-GUESSED_FOCAL = 1.2
-# The default max_error_px holds for photos of this longer side and more; for smaller ones it
-# shrinks with them. 12 px are so large a part of a photo of 256 px that poses by chance explain
-# up to 10 % of the matches.
-FULL_ERROR_FROM_PX = 640
 # For global descriptors that do not look at the photo.
 _NO_PIXELS = np.empty((0, 0, 3), np.uint8)
+# Where priors narrow the search, so many photos elsewhere that look more like the query are asked
+# too: they may show that the priors are wrong.
+_NUM_ELSEWHERE = 5
+
+# Of one photo: what an extractor found with a limit, and the pixels it looked at.
+FeatureCache = dict[
+    tuple[LocalFeatureExtractor, int, ReadAs], tuple[LocalFeatures, NDArray[np.uint8]]
+]
 
 
 class Localizer:
@@ -70,7 +76,7 @@ class Localizer:
         self._extractor = extractor
         manifest = opened.manifest
         if extractor is not None:
-            _check_fingerprint(
+            check_fingerprint(
                 manifest.local_features.fingerprint, extractor.fingerprint, opened.ref
             )
         self._descriptors: dict[str, GlobalDescriptor] = {}  # those that can be computed here
@@ -78,12 +84,12 @@ class Localizer:
             name = record.fingerprint.name
             if not is_ready_made(name):
                 descriptor = make_global_descriptor(name)
-                _check_fingerprint(record.fingerprint, descriptor.fingerprint, opened.ref)
+                check_fingerprint(record.fingerprint, descriptor.fingerprint, opened.ref)
                 self._descriptors[name] = descriptor
         self._takes_photos = extractor is not None and len(self._descriptors) == len(
             manifest.global_features
         )
-        self._origin = np.array(manifest.world.origin)
+        self.geometry = MapGeometry(opened)
 
     def warm_up(self) -> None:
         """Run once on noise, so that the first query does not pay for the first use."""
@@ -103,29 +109,35 @@ class Localizer:
         camera = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
         self.localize_features(features, camera, LocalizeOptions())
 
-    def localize(self, photo: Photo, camera: Camera | None, options: LocalizeOptions) -> Answer:
+    def localize(
+        self,
+        photo: Photo,
+        camera: Camera | None,
+        options: LocalizeOptions,
+        priors: Priors = NO_PRIORS,
+        found: FeatureCache | None = None,
+    ) -> Answer:
         """Estimate the pose of one photo.
 
         Args:
             photo: pixels as stored.
             camera: its intrinsics, for the pixels as stored; None when unknown.
             options: thresholds and the like.
+            priors: what is known of the camera.
+            found: features of this photo that localizers of other maps found, to be used again.
 
         Raises:
             InvalidInput: ``camera.size_mismatch``; ``features.required`` when features of the map
-                are not computed here.
+                are not computed here; ``priors.*`` that mean nothing in this map.
         """
-        if self._extractor is None or not self._takes_photos:
-            raise self._features_required()
-        used, source = resolve_camera(photo, camera)
-        seconds: dict[str, float] = {}
-        evidence = Evidence(used, source, photo.exif_orientation, options.read_as, seconds=seconds)
-        with _timed(seconds, "local_features"):
-            local, rgb = self._find_features(self._extractor, photo, options.read_as)
-        return self._answer(local, rgb, {}, evidence, seconds, options)
+        return self._solve_one(self.look(photo, camera, options, priors, found), options, priors)
 
     def localize_features(
-        self, features: QueryFeatures, camera: Camera | None, options: LocalizeOptions
+        self,
+        features: QueryFeatures,
+        camera: Camera | None,
+        options: LocalizeOptions,
+        priors: Priors = NO_PRIORS,
     ) -> Answer:
         """Estimate the pose of the photo whose features these are.
 
@@ -134,12 +146,48 @@ class Localizer:
                 that are made of local features, which are computed when they are not sent.
             camera: the intrinsics of the photo that the keypoints are of.
             options: thresholds and the like.
+            priors: what is known of the camera.
 
         Raises:
             InvalidInput: ``camera.required``, ``options.read_as``, ``features.kind``,
-                ``features.keypoints``, ``features.descriptors``, ``features.global_descriptors``.
+                ``features.keypoints``, ``features.descriptors``, ``features.global_descriptors``,
+                ``priors.*``.
             TooLarge: ``features.too_many``.
         """
+        look = self.look_at_features(features, camera, options, priors)
+        return self._solve_one(look, options, priors)
+
+    def look(
+        self,
+        photo: Photo,
+        camera: Camera | None,
+        options: LocalizeOptions,
+        priors: Priors = NO_PRIORS,
+        found: FeatureCache | None = None,
+    ) -> Look:
+        """Find what one photo shows of the map; arguments and errors as of ``localize``."""
+        if self._extractor is None or not self._takes_photos:
+            raise self._features_required()
+        constraints = Constraints(self.geometry, priors)
+        used, source = resolve_camera(photo, camera)
+        seconds: dict[str, float] = {}
+        evidence = Evidence(used, source, photo.exif_orientation, options.read_as, seconds=seconds)
+        with timed(seconds, "local_features"):
+            max_keypoints = self.map.manifest.local_features.max_keypoints
+            key = self._extractor, max_keypoints, options.read_as
+            local, rgb = (found or {}).get(key) or _find_features(photo, *key)
+            if found is not None:
+                found[key] = local, rgb
+        return self._match(local, rgb, {}, evidence, seconds, options, constraints)
+
+    def look_at_features(
+        self,
+        features: QueryFeatures,
+        camera: Camera | None,
+        options: LocalizeOptions,
+        priors: Priors = NO_PRIORS,
+    ) -> Look:
+        """Find what features show of the map; arguments, errors as of ``localize_features``."""
         if camera is None:
             raise InvalidInput(
                 "camera.required",
@@ -155,15 +203,46 @@ class Localizer:
                 expected=ReadAs.STORED,
                 got=options.read_as,
             )
+        constraints = Constraints(self.geometry, priors)
         seconds: dict[str, float] = {}
         evidence = Evidence(camera, CameraSource.GIVEN, 1, ReadAs.STORED, seconds=seconds)
         optional = {name for name, d in self._descriptors.items() if not d.needs_image}
-        with _timed(seconds, "local_features"):
+        with timed(seconds, "local_features"):
             local = checked_local_features(features, camera, self.map.manifest)
             sent = checked_global_descriptors(features, self.map.manifest, optional)
-        return self._answer(local, _NO_PIXELS, sent, evidence, seconds, options)
+        return self._match(local, _NO_PIXELS, sent, evidence, seconds, options, constraints)
 
-    def _answer(
+    def solve(
+        self,
+        images: Sequence[SeenImage],
+        options: LocalizeOptions,
+        priors: Priors = NO_PRIORS,
+        timestamp: int | None = None,
+    ) -> Solved:
+        """Find one pose from all images of an instant, as ``solve_instant``."""
+        return solve_instant(images, self.geometry, options, priors, timestamp)
+
+    def _solve_one(self, look: Look, options: LocalizeOptions, priors: Priors) -> Answer:
+        """Solve a rig of one camera, and say it in terms of that camera."""
+        solved = self.solve([SeenImage("camera", Pose.identity(), look)], options, priors)
+        answer, pose = solved.answer, solved.answer.pose
+        evidence = replace(look.evidence, num_inliers=answer.num_inliers, seconds=answer.seconds)
+        if answer.refusal is not None or pose is None or solved.pose is None:
+            assert answer.refusal is not None  # without a pose there is a reason
+            refusal = answer.refusal
+            return NotLocalized(evidence, refusal.stage, refusal.reason, refusal.message)
+        inliers = solved.pose.inliers[0]
+        return Localized(
+            evidence=evidence,
+            cam_from_world=pose.rig_from_world,
+            covariance=pose.covariance,
+            position_std=pose.position_std,
+            orientation_std=pose.orientation_std,
+            inlier_keypoints=look.matches.pixels[inliers].astype(np.float32),
+            inlier_points=look.matches.points[inliers] + self.geometry.origin,
+        )
+
+    def _match(
         self,
         local: LocalFeatures,
         rgb: NDArray[np.uint8],
@@ -171,94 +250,61 @@ class Localizer:
         evidence: Evidence,
         seconds: dict[str, float],
         options: LocalizeOptions,
-    ) -> Answer:
-        """Find the pose from local features; global descriptors not ``sent`` are computed."""
-        camera = evidence.camera
-        registration = _registration(options, camera)
+        constraints: Constraints,
+    ) -> Look:
+        """Match local features with the map; global descriptors not ``sent`` are computed."""
         evidence = replace(evidence, num_keypoints=len(local))
         if len(local) == 0:
-            return NotLocalized(
+            return _nothing(
                 evidence,
                 "features",
                 Reason.NO_KEYPOINTS,
                 "the photo shows nothing to hold on to: it is blank, dark, blurred or too small",
             )
-
-        with _timed(seconds, "global_features"):
+        with timed(seconds, "global_features"):
             query = {
                 name: sent[name] if name in sent else self._describe(name, rgb, local)
                 for name in self.map.global_descriptors
             }
-        with _timed(seconds, "retrieval"):
-            retrieved = retrieve(query, self.map.global_descriptors, options.top_k)
+        with timed(seconds, "retrieval"):
+            weights = constraints.photo_weights
+            retrieved = retrieve(query, self.map.global_descriptors, options.top_k, weights)
+            elsewhere = self._elsewhere(query, retrieved, weights)
+        if len(retrieved.images) == 0:
+            return _nothing(
+                evidence,
+                "retrieval",
+                Reason.NO_PHOTO_NEAR,
+                "the map has no photo where the priors say that this one was taken",
+            )
         evidence = replace(evidence, retrieved=tuple(self._describe_retrieved(retrieved)))
+        with timed(seconds, "matching"):
+            matches = self._match_photos(local, retrieved.images)
+            others = self._match_photos(local, elsewhere)
+        evidence = replace(evidence, num_correspondences=len(matches.pixels))
+        return Look(evidence, matches, others)
 
-        with _timed(seconds, "matching"):
-            pairs = match_landmarks(
-                local.descriptors, (self.map.observations(int(i)) for i in retrieved.images)
-            )
-        evidence = replace(evidence, num_correspondences=len(pairs))
-        if len(pairs) < registration.min_inliers:
-            return NotLocalized(
-                evidence,
-                "matching",
-                Reason.TOO_FEW_MATCHES,
-                f"only {len(pairs)} keypoints match the map, {registration.min_inliers} are needed",
-            )
-
-        with _timed(seconds, "pose"):
-            pixels = local.keypoints[pairs.keypoints].astype(np.float64)
-            points = self.map.landmarks[pairs.landmarks].astype(np.float64)
-            found = estimate_absolute_pose(
-                pixels,
-                points,
-                camera,
-                max_error_px=registration.max_error_px,
-                seed=options.seed,
-            )
-        if found is None:
-            return NotLocalized(
-                evidence, "pose", Reason.NO_POSE, "no camera pose explains the matches"
-            )
-
-        evidence = replace(evidence, num_inliers=int(found.inliers.sum()))
-        refused = _gate(evidence, registration)
-        if refused is not None:
-            return NotLocalized(evidence, "gate", *refused)
-        if found.covariance is None:
-            return NotLocalized(
-                evidence,
-                "gate",
-                Reason.UNCERTAIN_POSE,
-                "the matched landmarks leave the pose undetermined: they lie in a line or a spot",
-            )
-        position_variance = np.diag(position_covariance(found.cam_from_world, found.covariance))
-        cam_from_world, covariance = with_origin(
-            found.cam_from_world, found.covariance, self._origin
-        )
-        return Localized(
-            evidence=evidence,
-            cam_from_world=cam_from_world,
-            covariance=covariance,
-            position_std=np.sqrt(position_variance),
-            orientation_std=np.sqrt(np.diag(covariance)[:3]),
-            inlier_keypoints=local.keypoints[pairs.keypoints[found.inliers]],
-            inlier_points=points[found.inliers] + self._origin,
+    def _match_photos(self, local: LocalFeatures, photos: NDArray[np.int64]) -> Matches:
+        """Match with the landmarks that photos of the map, most similar first, see."""
+        pairs = match_landmarks(local.descriptors, (self.map.observations(int(i)) for i in photos))
+        return Matches(
+            local.keypoints[pairs.keypoints].astype(np.float64),
+            self.map.landmarks[pairs.landmarks].astype(np.float64),
         )
 
-    def _find_features(
-        self, extractor: LocalFeatureExtractor, photo: Photo, read_as: ReadAs
-    ) -> tuple[LocalFeatures, NDArray[np.uint8]]:
-        """Features with keypoints in the stored pixels, and the image they were found in."""
-        max_keypoints = self.map.manifest.local_features.max_keypoints
-        if read_as is ReadAs.STORED or photo.exif_orientation == 1:
-            return extractor.extract(photo.rgb, max_keypoints=max_keypoints), photo.rgb
-        rgb = upright(photo.rgb, photo.exif_orientation)
-        local = extractor.extract(rgb, max_keypoints=max_keypoints)
-        keypoints = stored_from_upright(
-            local.keypoints, photo.exif_orientation, photo.width, photo.height
-        )
-        return replace(local, keypoints=keypoints), rgb
+    def _elsewhere(
+        self,
+        query: Mapping[str, NDArray[np.float32]],
+        retrieved: Retrieved,
+        weights: NDArray[np.float64] | None,
+    ) -> NDArray[np.int64]:
+        """Photos that the priors exclude and that look more like the query than all others."""
+        if weights is None:
+            return np.empty(0, dtype=np.int64)
+        excluded = np.asarray(weights == 0, dtype=np.float64)
+        others = retrieve(query, self.map.global_descriptors, _NUM_ELSEWHERE, excluded)
+        best = retrieved.scores.max() if len(retrieved.scores) else -np.inf
+        return others.images[others.scores > best]
 
     def _describe(
         self, name: str, rgb: NDArray[np.uint8], local: LocalFeatures
@@ -288,92 +334,19 @@ class Localizer:
             )
 
 
-def resolve_camera(photo: Photo, given: Camera | None) -> tuple[Camera, CameraSource]:
-    """Choose the intrinsics of a photo: given, else EXIF's focal length, else a guess.
+def _nothing(evidence: Evidence, stage: Stage, reason: Reason, message: str) -> Look:
+    return Look(evidence, Matches.none(), Matches.none(), Refusal(stage, reason, message))
 
-    A camera given for another size of the same aspect is scaled to the photo.
 
-    Raises:
-        InvalidInput: ``camera.size_mismatch``.
-    """
-    width, height = photo.width, photo.height
-    if given is None:
-        known = photo.focal_length_px is not None
-        focal = photo.focal_length_px or GUESSED_FOCAL * max(width, height)
-        camera = Camera("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
-        return camera, CameraSource.EXIF if known else CameraSource.GUESS
-    if (given.width, given.height) == (width, height):
-        return given, CameraSource.GIVEN
-    if given.has_aspect_of(width, height):
-        return given.scaled(width, height), CameraSource.GIVEN_SCALED
-    turned = photo.exif_orientation >= 5 and given.has_aspect_of(height, width)
-    raise InvalidInput(
-        "camera.size_mismatch",
-        "the camera is not for this photo"
-        + (
-            "; the photo is stored turned (EXIF orientation "
-            f"{photo.exif_orientation}) and the camera must be that of the stored pixels"
-            if turned
-            else ""
-        ),
-        field="camera",
-        expected=f"{width} x {height} or another size of the same aspect",
-        got=f"{given.width} x {given.height}",
+def _find_features(
+    photo: Photo, extractor: LocalFeatureExtractor, max_keypoints: int, read_as: ReadAs
+) -> tuple[LocalFeatures, NDArray[np.uint8]]:
+    """Features with keypoints in the stored pixels, and the image they were found in."""
+    if read_as is ReadAs.STORED or photo.exif_orientation == 1:
+        return extractor.extract(photo.rgb, max_keypoints=max_keypoints), photo.rgb
+    rgb = upright(photo.rgb, photo.exif_orientation)
+    local = extractor.extract(rgb, max_keypoints=max_keypoints)
+    keypoints = stored_from_upright(
+        local.keypoints, photo.exif_orientation, photo.width, photo.height
     )
-
-
-def _registration(options: LocalizeOptions, camera: Camera) -> RegistrationPreset:
-    """The thresholds for a photo: the default's inlier distance shrinks with a small photo."""
-    registration = options.registration
-    if options.preset != DEFAULT_PRESET or options.max_error_px is not None:
-        return registration
-    share = min(1.0, max(camera.width, camera.height) / FULL_ERROR_FROM_PX)
-    return replace(registration, max_error_px=registration.max_error_px * share)
-
-
-def _gate(evidence: Evidence, registration: RegistrationPreset) -> tuple[Reason, str] | None:
-    """Why a pose is not believed, or None (docs/decisions/0002-refuse-instead-of-guess.md)."""
-    if evidence.num_inliers < registration.min_inliers:
-        return (
-            Reason.TOO_FEW_INLIERS,
-            f"the best pose explains {evidence.num_inliers} matches, "
-            f"{registration.min_inliers} are needed; is this photo of the mapped place?",
-        )
-    if evidence.inlier_ratio < registration.min_inlier_ratio:
-        return (
-            Reason.LOW_INLIER_RATIO,
-            f"the best pose explains {evidence.inlier_ratio:.1%} of the matches, "
-            f"{registration.min_inlier_ratio:.1%} are needed; is this photo of the mapped place?",
-        )
-    return None
-
-
-def _check_fingerprint(built_with: FingerprintRecord, at_hand: Fingerprint, ref: str) -> None:
-    there, here = _flat(built_with), _flat(FingerprintRecord.of(at_hand))
-    differing = [name for name in {**there, **here} if there.get(name) != here.get(name)]
-    if not differing:
-        return
-    raise Conflict(
-        "map.features",
-        f"map {ref} was built with another {built_with.name}; use the weights and the version of "
-        "visloc that built it, or build it again",
-        field="weights_dir" if "weights_sha256" in differing else "map",
-        expected=", ".join(f"{name} {there.get(name)}" for name in differing),
-        got=", ".join(f"{name} {here.get(name)}" for name in differing),
-    )
-
-
-def _flat(record: FingerprintRecord) -> dict[str, int | float | str | None]:
-    return {
-        "name": record.name,
-        "revision": record.revision,
-        "weights_sha256": record.weights_sha256,
-        **record.parameters,
-    }
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    start = perf_counter()
-    yield
-    seconds[stage] = perf_counter() - start
+    return replace(local, keypoints=keypoints), rgb

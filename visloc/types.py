@@ -10,8 +10,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import InvalidInput
+from visloc.errors import InvalidInput, VislocError
 from visloc.geometry import Camera, Pose
+from visloc.trajectory import PoseSource
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,6 +96,14 @@ class Reason(StrEnum):
     TOO_FEW_INLIERS = "too_few_inliers"
     LOW_INLIER_RATIO = "low_inlier_ratio"
     UNCERTAIN_POSE = "uncertain_pose"
+    NO_PHOTO_NEAR = "no_photo_near"  # the map has no photo where the priors allow the device
+    CONTRADICTS_PRIOR = "contradicts_prior"
+    CONTRADICTS_MOTION = "contradicts_motion"  # the images of its neighbours, and how it moved
+    NO_USABLE_IMAGE = "no_usable_image"  # none of an instant's images could be read
+
+
+# The stages that can give up.
+Stage = Literal["features", "retrieval", "matching", "pose", "gate"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,9 +277,92 @@ class NotLocalized:
     """
 
     evidence: Evidence
-    stage: Literal["features", "matching", "pose", "gate"]
+    stage: Stage
     reason: Reason
     message: str
 
 
 Answer = Localized | NotLocalized
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why the images of an instant gave no pose.
+
+    Attributes:
+        stage: the stage that gave up.
+        reason: why, as a stable word.
+        message: why, for a person.
+    """
+
+    stage: Stage
+    reason: Reason
+    message: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigPose:
+    """Where a rig was, how sure that is, and what it rests on.
+
+    Attributes:
+        rig_from_world: the pose.
+        covariance: (6, 6) float64 of rotation (rad) then translation, for R <- Exp(w) R and
+            t <- t + dt of ``rig_from_world``.
+        position_std: (3,) standard deviations of the rig's origin along the world's axes.
+        orientation_std: (3,) standard deviations of w (rad), about the rig's x, y, z.
+        source: ESTIMATED when the instant's own images measured it.
+    """
+
+    rig_from_world: Pose
+    covariance: NDArray[np.float64]
+    position_std: NDArray[np.float64]
+    orientation_std: NDArray[np.float64]
+    source: PoseSource
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageAnswer:
+    """What one image of an instant contributed.
+
+    Attributes:
+        sensor: the camera's id in the rig.
+        cam_from_rig: where it sits.
+        evidence: what was seen in it; inliers are those of the rig's pose. None when the image
+            could not be used.
+        error: why it could not be used, or None.
+    """
+
+    sensor: str
+    cam_from_rig: Pose
+    evidence: Evidence | None
+    error: VislocError | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InstantAnswer:
+    """The answer to the images of a rig, or of one camera, at one instant.
+
+    Attributes:
+        timestamp: as it was sent; None when it was not.
+        images: in the order of the request.
+        pose: None when there is none.
+        refusal: why the instant's own images gave no pose; None when they did. A filled pose has
+            both.
+        seconds: wall time by stage, of all images together.
+    """
+
+    timestamp: int | None
+    images: tuple[ImageAnswer, ...]
+    pose: RigPose | None
+    refusal: Refusal | None
+    seconds: Mapping[str, float]
+
+    @property
+    def num_correspondences(self) -> int:
+        """2D-3D correspondences of all images."""
+        return sum(i.evidence.num_correspondences for i in self.images if i.evidence is not None)
+
+    @property
+    def num_inliers(self) -> int:
+        """Those that agree with the pose (of the best pose, when it was refused)."""
+        return sum(i.evidence.num_inliers for i in self.images if i.evidence is not None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import threading
 import time
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import grpc
+import numpy as np
 import pytest
 import uvicorn
 from google.protobuf.any_pb2 import Any as AnyMessage
@@ -23,16 +25,17 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from visloc.errors import InvalidInput, NotFound, Overloaded, TooLarge, VislocError, WeightsError
+from visloc.geometry import Pose
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.v1 import localization_pb2_grpc as pb2_grpc
 
 VERSION = "1.2.3"
 CAMERA = "SIMPLE_PINHOLE, 64, 48, 60, 32, 24"
-POSE = {
+POSE: dict[str, Any] = {
     "cam_from_world": {
         "rotation_wxyz": [0.9298410554097046, 0.01755162593, 0.31931803130557, 0.1819987554486438],
         "translation": [0.24164110554685916, -0.0, 1e-17],
@@ -42,6 +45,11 @@ POSE = {
     "covariance": [1e-9 * (i * 6 + j + 1) for i in range(6) for j in range(6)],
     "position_std": [0.004, 0.005, 1 / 3],
     "orientation_std_deg": [0.1, 0.2, 0.3],
+}
+# The rig that the canned map knows: the right camera is half a metre to the right of the left one.
+STEREO = {
+    "left": Pose.identity(),
+    "right": Pose.from_quaternion([1.0, 0.0, 0.0, 0.0], [-0.5, 0.0, 0.0]),
 }
 STATUSES = {
     InvalidInput: (422, grpc.StatusCode.INVALID_ARGUMENT),
@@ -75,7 +83,7 @@ class CannedService:
     ) -> dict[str, Any]:
         self.seen.append({"image": image} if features is None else {"features": features})
         self.seen[-1] |= asked
-        self.map_info(asked["map"])
+        self.map_info(asked["map"] or asked["maps"][0])
         match image.partition(b" ")[0]:
             case b"broken":
                 raise InvalidInput(
@@ -126,6 +134,97 @@ class CannedService:
             "seconds": {"features": 0.25, "pose": 0.0} if refusal is None else {"features": 0.75},
         }
 
+    def localize_instant(
+        self, asked: dict[str, Any], images: list[dict[str, Any]], timestamp: int | None
+    ) -> dict[str, Any]:
+        """Take the pose of the first photo that is one in JSON; see ``localize`` for others.
+
+        A rig whose first photo is ``filled`` is between two others.
+        """
+        self.seen.append(asked | {"images": images, "timestamp": timestamp})
+        self.map_info(asked["map"])
+        cam_from_rig = _calibration(asked["rig"])
+        answers, rig_from_world = [], None
+        for image in images:
+            content = image["image"]
+            if image["sensor"] not in cam_from_rig:
+                raise InvalidInput(
+                    "rig.sensor", "no such camera", field="sensor", got=image["sensor"]
+                )
+            error = None
+            if content.startswith(b"broken"):
+                error = {"kind": "InvalidInput", "code": "image.undecodable", "message": "no photo"}
+            elif content.startswith(b"crash"):
+                raise VislocError("server.internal", "the server made a mistake")
+            elif content.startswith(b"busy"):
+                self.busy[content] += 1
+                if self.busy[content] <= 2:
+                    raise Overloaded("server.busy", "too many requests are waiting")
+            elif content.startswith(b"slow"):
+                time.sleep(self.slow_s)
+            elif content.startswith((b"{", b"photo", b"filled")) and rig_from_world is None:
+                pose = json.loads(content) if content.startswith(b"{") else POSE["cam_from_world"]
+                cam_from_world = Pose.from_quaternion(**pose)
+                rig_from_world = cam_from_rig[image["sensor"]].inverse() @ cam_from_world
+            answers.append(
+                {
+                    "sensor": image["sensor"],
+                    "error": error,
+                    "cam_from_world": None,
+                    "keypoints": 0 if error else 4096,
+                    "correspondences": 0 if error else 700,
+                    "inliers": 0,
+                    "retrieved": [],
+                    "camera": None
+                    if error
+                    else {"model": "SIMPLE_PINHOLE", "width": 64, "height": 48}
+                    | {"params": [60.0, 32.0, 24.0], "source": "given"},
+                    "orientation": None if error else {"exif": 1, "read_as": "stored"},
+                }
+            )
+        is_filled = bool(images) and images[0]["image"].startswith(b"filled")
+        if rig_from_world is not None:
+            for answer in answers:
+                if answer["error"] is None:
+                    answer["cam_from_world"] = _transform(
+                        cam_from_rig[answer["sensor"]] @ rig_from_world
+                    )
+                    answer["inliers"] = 311
+        refusal = {"stage": "matching", "reason": "too_few_matches", "message": "3 [matches]"}
+        num_inliers = sum(answer["inliers"] for answer in answers)
+        num_correspondences = sum(answer["correspondences"] for answer in answers)
+        return {
+            "request_id": asked["request_id"] or "made-up",
+            "timestamp": timestamp,
+            "status": "not_localized"
+            if rig_from_world is None
+            else "filled"
+            if is_filled
+            else "localized",
+            "source": None
+            if rig_from_world is None
+            else "interpolated"
+            if is_filled
+            else "estimated",
+            "pose": None
+            if rig_from_world is None
+            else {
+                "rig_from_world": _transform(rig_from_world),
+                "position": rig_from_world.center.tolist(),
+                "orientation": rig_from_world.inverse().rotation_wxyz.tolist(),
+                "covariance": (np.eye(6) * (4e-4 if is_filled else 1e-4)).ravel().tolist(),
+                "position_std": [0.01, 0.01, 0.01],
+                "orientation_std_deg": [0.57, 0.57, 0.57],
+            },
+            "refusal": refusal if rig_from_world is None or is_filled else None,
+            "images": answers,
+            "correspondences": num_correspondences,
+            "inliers": num_inliers,
+            "inlier_ratio": num_inliers / max(num_correspondences, 1),
+            "map": {"id": "room", "version": self.version},
+            "seconds": {"features": 0.5, "pose": 0.25},
+        }
+
     def map_info(self, ref: str) -> dict[str, Any]:
         if ref not in ("room", f"room@{self.version}"):
             raise NotFound(
@@ -144,6 +243,8 @@ class CannedService:
             "observations": 5,
             "extent": {"min": [-1.5, 0.0, 0.0], "max": [1.0, 2.0, 0.1]},
             "size_bytes": 2**53 + 1,
+            "down": [0.0, 1.0, 0.0],
+            "rigs": [{"id": "stereo", "sensors": list(STEREO)}],
         }
 
 
@@ -200,20 +301,85 @@ def _http_app(canned: CannedService) -> Starlette:
 
     async def post(request: Request) -> Response:
         async with request.form() as form:
-            assert set(form) <= {"image", "features", "map", "camera", "options"}
+            known = {"image", "features", "map", "maps", "camera", "options", "priors"}
+            assert set(form) <= known
+            assert ("map" in form) != ("maps" in form)
             assert ("image" in form) != ("features" in form)
             file = form["image" if "image" in form else "features"]
             assert not isinstance(file, str)
             content = await file.read()
+
+            def read(name: str) -> Any:
+                return json.loads(str(form[name])) if name in form else None
+
             asked = {
-                "map": form["map"],
-                "camera": json.loads(str(form["camera"])) if "camera" in form else None,
-                "options": json.loads(str(form["options"])),
+                "map": form.get("map"),
+                "camera": read("camera"),
+                "options": read("options") or {},
                 "request_id": request.headers.get("x-request-id"),
+                **{name: read(name) for name in ("maps", "priors") if name in form},
             }
             if "image" in form:
                 return await run_in_threadpool(localize, content, asked)
             return await run_in_threadpool(localize, b"", asked, json.loads(content))
+
+    async def read_batch(request: Request) -> tuple[dict[str, Any], dict[str, bytes]]:
+        async with request.form() as form:
+            asked = json.loads(str(form["request"]))
+            files = {
+                name: await part.read()
+                for name, part in form.items()
+                if name != "request" and not isinstance(part, str)
+            }
+            assert len(files) == len(form) - 1
+        return asked, files
+
+    def images_of(said: dict[str, Any], files: dict[str, bytes]) -> list[dict[str, Any]]:
+        return [
+            {name: value for name, value in image.items() if name != "part"}
+            | ({"image": files[image["part"]]} if "part" in image else {"image": b"photo"})
+            for image in said["images"]
+        ]
+
+    def shared(asked: dict[str, Any], request: Request) -> dict[str, Any]:
+        common = {"map": None, "options": {}, "rig": None} | asked
+        common["request_id"] = request.headers.get("x-request-id")
+        return {name: v for name, v in common.items() if name not in ("images", "instants")}
+
+    async def post_rig(request: Request) -> Response:
+        asked, files = await read_batch(request)
+        images = images_of(asked, files)
+        timestamp = images[0].get("timestamp") if images else None
+        return JSONResponse(
+            await run_in_threadpool(
+                canned.localize_instant, shared(asked, request), images, timestamp
+            )
+        )
+
+    async def post_sequence(request: Request) -> Response:
+        assert request.headers["accept"] == "application/x-ndjson"
+        asked, files = await read_batch(request)
+        common = shared(asked, request)
+
+        async def lines() -> Any:
+            for instant in asked["instants"]:
+                extra = {k: instant[k] for k in ("odometry", "priors") if k in instant}
+                try:
+                    answer = await run_in_threadpool(
+                        canned.localize_instant,
+                        common | extra,
+                        images_of(instant, files),
+                        instant["timestamp"],
+                    )
+                except VislocError as error:
+                    yield json.dumps({"problem": problem_of(error)}).encode() + b"\n"
+                    return
+                text = json.dumps(answer, ensure_ascii=False).encode() + b"\n"
+                yield text[:100]  # lines come in pieces
+                yield text[100:]
+
+        canned.map_info(asked["map"])
+        return StreamingResponse(lines(), media_type="application/x-ndjson")
 
     async def maps(_: Request) -> Response:
         return JSONResponse({"maps": [canned.map_info("room")]})
@@ -229,8 +395,12 @@ def _http_app(canned: CannedService) -> Starlette:
 
     async def problem(_: Request, error: Exception) -> Response:
         assert isinstance(error, VislocError)
+        body = problem_of(error)
+        return JSONResponse(body, body["status"], media_type="application/problem+json")
+
+    def problem_of(error: VislocError) -> dict[str, Any]:
         status = STATUSES[type(error)][0]
-        body = {
+        return {
             "type": "about:blank",
             "title": "Problem",
             "status": status,
@@ -242,11 +412,12 @@ def _http_app(canned: CannedService) -> Starlette:
             "kind": type(error).__name__,
             "request_id": "made-up",
         }
-        return JSONResponse(body, status, media_type="application/problem+json")
 
     return Starlette(
         routes=[
             Route("/localize", post, methods=["POST"]),
+            Route("/localize/rig", post_rig, methods=["POST"]),
+            Route("/localize/sequence", post_sequence, methods=["POST"]),
             Route("/maps", maps),
             Route("/maps/{id}", get_map),
             Route("/healthz", healthz),
@@ -263,12 +434,7 @@ class _Servicer(pb2_grpc.LocalizationServicer):
     def Localize(self, request: Any, context: Any) -> Any:  # noqa: N802
         camera = MessageToDict(request.camera) if request.HasField("camera") else None
         options = MessageToDict(request.options, preserving_proto_field_name=True)
-        asked = {
-            "map": request.map,
-            "camera": camera,
-            "options": options,
-            "request_id": request.request_id or None,
-        }
+        asked = _asked(request) | {"camera": camera, "options": options}
         features = None
         if request.WhichOneof("query") == "features":
             # protobuf writes bytes in base64, and no empty maps.
@@ -281,6 +447,48 @@ class _Servicer(pb2_grpc.LocalizationServicer):
             pb2.LocalizeResponse(),
         )
 
+    def LocalizeRig(self, request: Any, context: Any) -> Any:  # noqa: N802
+        images = [_image_of(image) for image in request.images]
+        timestamp = images[0].get("timestamp") if images else None
+        return self._answer(
+            context,
+            lambda: _without_nulls(
+                self._canned.localize_instant(_asked_of_rig(request), images, timestamp)
+            ),
+            pb2.InstantAnswer(),
+        )
+
+    def LocalizeSequence(self, requests: Any, context: Any) -> Any:  # noqa: N802
+        asked: dict[str, Any] = {}
+        for request in requests:
+            if request.WhichOneof("message") == "start":
+                asked = _asked_of_rig(request.start)
+                for name in ("time_unit", "max_gap_s"):
+                    if (
+                        request.start.HasField(name)
+                        if name == "max_gap_s"
+                        else request.start.time_unit
+                    ):
+                        asked[name] = getattr(request.start, name)
+                continue
+            instant = request.instant
+            extra = {
+                name: MessageToDict(getattr(instant, name), preserving_proto_field_name=True)
+                for name in ("odometry", "priors")
+                if instant.HasField(name)
+            }
+            yield self._answer(
+                context,
+                lambda instant=instant, asked=asked | extra: _without_nulls(
+                    self._canned.localize_instant(
+                        asked,
+                        [_image_of(image) for image in instant.images],
+                        instant.timestamp,
+                    )
+                ),
+                pb2.InstantAnswer(),
+            )
+
     def ListMaps(self, request: Any, context: Any) -> Any:  # noqa: ARG002, N802
         return self._answer(
             context, lambda: {"maps": [self._canned.map_info("room")]}, pb2.ListMapsResponse()
@@ -290,7 +498,8 @@ class _Servicer(pb2_grpc.LocalizationServicer):
         return self._answer(context, lambda: self._canned.map_info(request.map), pb2.MapInfo())
 
     def _answer(self, context: Any, make: Any, message: Any) -> Any:
-        context.send_initial_metadata((("visloc-version", VERSION),))
+        with contextlib.suppress(ValueError):  # once in a stream
+            context.send_initial_metadata((("visloc-version", VERSION),))
         try:
             return ParseDict(make(), message)
         except VislocError as error:
@@ -323,8 +532,66 @@ class _Health(health.HealthServicer):
         return response(status=response.SERVING if self._canned.is_ready else response.NOT_SERVING)
 
 
-def _without_nulls(answer: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in answer.items() if value is not None}
+def _asked(request: Any) -> dict[str, Any]:
+    asked = {"map": request.map or None, "request_id": request.request_id or None}
+    if request.maps:
+        asked["maps"] = list(request.maps)
+    if request.HasField("priors"):
+        asked["priors"] = MessageToDict(request.priors, preserving_proto_field_name=True)
+    return asked
+
+
+def _asked_of_rig(request: Any) -> dict[str, Any]:
+    rig: Any = None
+    match request.WhichOneof("rig"):
+        case "rig_id":
+            rig = request.rig_id
+        case "calibration":
+            rig = MessageToDict(request.calibration, preserving_proto_field_name=True)
+    options = MessageToDict(request.options, preserving_proto_field_name=True)
+    return _asked(request) | {"rig": rig, "options": options}
+
+
+def _image_of(image: Any) -> dict[str, Any]:
+    said: dict[str, Any] = {"sensor": image.sensor}
+    if image.WhichOneof("query") == "features":
+        features = MessageToDict(image.features, preserving_proto_field_name=True)
+        said |= {"features": {"global_descriptors": {}} | features, "image": b"photo"}
+    else:
+        said["image"] = image.image
+    if image.HasField("camera"):
+        said["camera"] = MessageToDict(image.camera)
+    if image.HasField("timestamp"):
+        said["timestamp"] = image.timestamp
+    return said
+
+
+def _calibration(rig: Any) -> dict[str, Pose]:
+    if rig is None:
+        return {"camera": Pose.identity()}
+    if isinstance(rig, str):
+        if rig != "stereo":
+            raise NotFound("rig.unknown", "no such rig", field="rig", got=rig)
+        return STEREO
+    return {
+        name: Pose.from_quaternion(**sensor["cam_from_rig"])
+        for name, sensor in rig["sensors"].items()
+    }
+
+
+def _transform(pose: Pose) -> dict[str, Any]:
+    return {
+        "rotation_wxyz": pose.rotation_wxyz.tolist(),
+        "translation": pose.translation.tolist(),
+    }
+
+
+def _without_nulls(answer: Any) -> Any:
+    if isinstance(answer, list):
+        return [_without_nulls(value) for value in answer]
+    if not isinstance(answer, dict):
+        return answer
+    return {name: _without_nulls(value) for name, value in answer.items() if value is not None}
 
 
 @pytest.fixture
@@ -341,7 +608,7 @@ def make_dataset(tmp_path: Path) -> Callable[..., Path]:
             "trajectories.txt": [],
         }
         pose = POSE["cam_from_world"]
-        numbers = [*pose["rotation_wxyz"], *pose["translation"]]  # type: ignore[index, call-overload]
+        numbers = [*pose["rotation_wxyz"], *pose["translation"]]
         for timestamp, (name, content) in enumerate(photos.items()):
             (data / name).parent.mkdir(parents=True, exist_ok=True)
             (data / name).write_bytes(content)

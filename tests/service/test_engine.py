@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from service import engine as engine_module
-from service.engine import Engine, LocalizeJob
+from service import loaded_maps
+from service.engine import Engine
+from service.jobs import LocalizeJob
 from visloc.archive import MapStore
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound, Overloaded, Unavailable
 from visloc.geometry import Camera
@@ -38,7 +40,7 @@ def run(coroutine: Coroutine[Any, Any, T]) -> T:
 
 
 def job_for(query: Query, ref: str = "room") -> LocalizeJob:
-    return LocalizeJob(ref, query.image, query.camera, LocalizeOptions())
+    return LocalizeJob((ref,), query.image, query.camera, LocalizeOptions())
 
 
 def publish(maps_dir: Path, version: str, map_id: str = "room") -> None:
@@ -226,7 +228,7 @@ def test_a_refused_version_is_named_left_alone_for_a_while_and_tried_again(
 
         landmarks.with_name("away").rename(landmarks)
         assert (await engine.localize(job_for(query))).map_version == old
-        monkeypatch.setattr(engine_module, "RETRY_AFTER_S", 0.0)
+        monkeypatch.setattr(loaded_maps, "RETRY_AFTER_S", 0.0)
         assert (await engine.localize(job_for(query))).map_version == "v2"
         assert engine.status.not_loaded == {}
         engine.close()
@@ -420,7 +422,7 @@ def test_one_extractor_serves_all_maps_that_use_it(
             used.append(extractor)
             super().__init__(opened, extractor)
 
-    monkeypatch.setattr(engine_module, "Localizer", Recording)
+    monkeypatch.setattr(loaded_maps, "Localizer", Recording)
 
     async def play() -> None:
         engine = make(maps_dir)

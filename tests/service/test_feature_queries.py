@@ -429,7 +429,7 @@ def test_a_map_of_ready_made_features_is_served_without_an_extractor(
             doors.http.post("/localize", json=body(query, zeros(num, "kapture:SIFT"))).json()
             for num in (MAX_READY_MADE_KEYPOINTS, MAX_READY_MADE_KEYPOINTS + 1)
         )
-        extractors = doors.server.engine._extractors
+        extractors = doors.server.engine._maps._extractors
 
     assert ready["ready"]
     assert ready["not_loaded"] == []

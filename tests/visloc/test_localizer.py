@@ -23,7 +23,7 @@ from visloc.features import (
 from visloc.features.sift import SiftExtractor
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo, read_photo
-from visloc.localizer import Localizer, resolve_camera
+from visloc.localizer import Localizer
 from visloc.query_features import max_sent_keypoints
 from visloc.types import (
     Answer,

@@ -73,6 +73,19 @@ class Map:
         return f"{self.manifest.id}@{self.manifest.version}"
 
     @property
+    def gravity(self) -> NDArray[np.float64] | None:
+        """(3,) unit vector that points down in the world; None where that is not known.
+
+        A geodetic anchor tells it too: its axes point east, north and up.
+        """
+        world = self.manifest.world
+        if world.gravity is not None:
+            return np.array(world.gravity)
+        if world.anchor is not None and world.anchor.geodetic is not None:
+            return np.array([0.0, 0.0, -1.0])
+        return None
+
+    @property
     def size_bytes(self) -> int:
         """Size of all files but the manifest."""
         return sum(entry.size for entry in self.manifest.files.values())

@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
 
 from visloc.types import Fingerprint
 
 FORMAT = "visloc-map"
-FORMAT_MAJOR, FORMAT_MINOR = 1, 1
+FORMAT_MAJOR, FORMAT_MINOR = 1, 2
 
 ID_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 Vector = tuple[float, float, float]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+def _of_unit_length(vector: Vector) -> Vector:
+    length = math.hypot(*vector)
+    if abs(length - 1.0) > 1e-6:
+        raise ValueError(f"the vector should have the length 1, not {length:g}")
+    return vector
+
+
+Direction = Annotated[Vector, AfterValidator(_of_unit_length)]
 
 
 class _Record(BaseModel):
@@ -109,12 +120,17 @@ class Anchor(_Record):
 
 
 class World(_Record):
-    """The frame of the map; maps of format 1.0 do not tell their anchor."""
+    """The frame of the map; maps of format 1.0 do not tell their anchor, those of 1.1 no gravity.
+
+    ``gravity`` points down. ``visloc.archive.Map.gravity`` knows more: a geodetic anchor tells
+    it too.
+    """
 
     metric: bool
     origin: Vector
     extent: Extent
     anchor: Anchor | None = None
+    gravity: Direction | None = None
 
 
 class Counts(_Record):

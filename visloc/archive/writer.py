@@ -20,6 +20,7 @@ from visloc.archive.schema import (
     Anchor,
     FingerprintRecord,
     ImageRecord,
+    Vector,
 )
 from visloc.geometry import Camera, Pose
 
@@ -65,7 +66,8 @@ class MapContent:
     """Everything a map holds, but its id, version and creation time.
 
     ``descriptors()`` yields, photo by photo, the unit descriptors (m_i, D) float32 of that photo's
-    observations in the order of ``landmarks``; it is read twice.
+    observations in the order of ``landmarks``; it is read twice. ``gravity`` is the unit vector
+    that points down in the world, None where that is not known.
     """
 
     metric: bool
@@ -83,6 +85,7 @@ class MapContent:
     descriptors: Callable[[], Iterator[NDArray[np.float32]]]
     global_features: tuple[GlobalFeatures, ...]
     anchor: Anchor | None = None
+    gravity: Vector | None = None
 
 
 def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, created: str) -> str:
@@ -156,6 +159,7 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
                 "max": (landmarks.origin + extent[1]).tolist(),
             },
             **({} if content.anchor is None else {"anchor": content.anchor.model_dump()}),
+            **({} if content.gravity is None else {"gravity": list(content.gravity)}),
         },
         "method": {"name": content.method, "settings": dict(content.settings)},
         "local_features": {

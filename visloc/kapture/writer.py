@@ -1,9 +1,9 @@
-"""Writing the ``sensors`` folder of a dataset as kapture 1.1."""
+"""Writing the ``sensors`` folder of a dataset, or its rigs alone, as kapture 1.1."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from visloc.kapture.text import is_field, relative_path
 VERSION_LINE = "# kapture format: 1.1"
 
 _POSE = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
+_RIG_COLUMNS = ("rig_id", "sensor_id", *_POSE)
 # How far kapture's own tools pad the fields of a column.
 _WIDTHS = {"timestamp": 8, "device_id": 3, **dict.fromkeys(_POSE, 4)}
 _PATHS = ("image_path", "depth_map_path")
@@ -47,6 +48,25 @@ def write_dataset(dataset: Dataset) -> None:
         write_atomically(folder / name, text.encode("utf-8"))
 
 
+def write_rigs(path: Path, rigs: Mapping[str, Mapping[str, Pose | None]]) -> None:
+    """Write a ``rigs.txt``: rig id -> sensor id -> ``sensor_from_rig``.
+
+    Raises:
+        Conflict: ``kapture.exists`` if the file exists.
+        DatasetError: ``kapture.field`` for a text that kapture cannot hold, such as a comma.
+    """
+    if path.exists() or path.is_symlink():
+        raise Conflict(
+            "kapture.exists",
+            "there is a file already",
+            field=str(path),
+            expected="a path that does not exist",
+        )
+    text = _text("rigs.txt", _RIG_COLUMNS, _rig_rows(rigs))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, text.encode("utf-8"))
+
+
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file that is either complete or not there."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
@@ -61,12 +81,8 @@ def write_atomically(path: Path, content: bytes) -> None:
 def _tables(dataset: Dataset) -> Iterator[tuple[str, Sequence[str], list[list[str]]]]:
     yield (
         "rigs.txt",
-        ("rig_id", "sensor_id", *_POSE),
-        [
-            [rig_id, sensor_id, *_pose_fields(sensor_from_rig)]
-            for rig_id, members in dataset.rigs.items()
-            for sensor_id, sensor_from_rig in members.items()
-        ],
+        _RIG_COLUMNS,
+        _rig_rows(dataset.rigs),
     )
     yield (
         "trajectories.txt",
@@ -100,6 +116,14 @@ def _tables(dataset: Dataset) -> Iterator[tuple[str, Sequence[str], list[list[st
         ("sensor_id", "name", "sensor_type", "[sensor_params]+"),
         [[s.id, s.name, s.kind, *s.params] for s in dataset.sensors.values()],
     )
+
+
+def _rig_rows(rigs: Mapping[str, Mapping[str, Pose | None]]) -> list[list[str]]:
+    return [
+        [rig_id, sensor_id, *_pose_fields(sensor_from_rig)]
+        for rig_id, members in rigs.items()
+        for sensor_id, sensor_from_rig in members.items()
+    ]
 
 
 def _pose_fields(pose: Pose | None) -> list[str]:

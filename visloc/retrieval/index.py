@@ -30,6 +30,7 @@ def retrieve(
     query: Mapping[str, NDArray[np.float32]],
     index: Mapping[str, NDArray[np.float32]],
     top_k: int,
+    weights: NDArray[np.float64] | None = None,
 ) -> Retrieved:
     """Rank the photos of a map by fused similarity to a query.
 
@@ -37,11 +38,17 @@ def retrieve(
         query: unit vector (D,) by global descriptor; a zero vector is similar to nothing.
         index: unit rows (n, D) of the map's photos by the same global descriptors.
         top_k: how many to return; fewer when the map has fewer photos.
+        weights: (n,) from 0, never to be returned, to 1; they scale how much better a photo is
+            than the worst that may be returned. The scores that are returned stay as they are.
     """
     cosines = np.stack([_cosines(query[name], index[name]) for name in index])
     scores = gharm(cosines)
+    candidates = np.arange(len(scores)) if weights is None else np.flatnonzero(weights)
+    ranked = scores[candidates]
+    if weights is not None and len(candidates):
+        ranked = (ranked - ranked.min()) * weights[candidates]
     # A stable sort: of equal scores the earlier photo comes first, on every machine.
-    best = np.argsort(-scores, kind="stable")[:top_k]
+    best = candidates[np.argsort(-ranked, kind="stable")[:top_k]]
     return Retrieved(
         images=best,
         scores=scores[best],

@@ -218,6 +218,173 @@ class Features(_message.Message):
 Global___Features: _TypeAlias = Features  # noqa: Y015
 
 @_typing.final
+class PositionPrior(_message.Message):
+    """The device is within a sphere."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    POSITION_FIELD_NUMBER: _builtins.int
+    RADIUS_FIELD_NUMBER: _builtins.int
+    radius: _builtins.float
+    """in units of the world"""
+    @_builtins.property
+    def position(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """x, y, z in the world"""
+
+    def __init__(
+        self,
+        *,
+        position: _abc.Iterable[_builtins.float] | None = ...,
+        radius: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["position", b"position", "radius", b"radius"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___PositionPrior: _TypeAlias = PositionPrior  # noqa: Y015
+
+@_typing.final
+class HeightBand(_message.Message):
+    """The device is between two heights, measured along the world's up from its (0, 0, 0)."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MIN_FIELD_NUMBER: _builtins.int
+    MAX_FIELD_NUMBER: _builtins.int
+    min: _builtins.float
+    max: _builtins.float
+    def __init__(
+        self,
+        *,
+        min: _builtins.float = ...,
+        max: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["max", b"max", "min", b"min"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___HeightBand: _TypeAlias = HeightBand  # noqa: Y015
+
+@_typing.final
+class PosePrior(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    DEVICE_FROM_WORLD_FIELD_NUMBER: _builtins.int
+    COVARIANCE_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def device_from_world(self) -> Global___Transform:
+        """of the camera, or of the rig when a rig is localized"""
+
+    @_builtins.property
+    def covariance(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """6 x 6, row by row: rotation (rad), then translation, for R <- Exp(w) R and t <- t + dt."""
+
+    def __init__(
+        self,
+        *,
+        device_from_world: Global___Transform | None = ...,
+        covariance: _abc.Iterable[_builtins.float] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["device_from_world", b"device_from_world"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["covariance", b"covariance", "device_from_world", b"device_from_world"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___PosePrior: _TypeAlias = PosePrior  # noqa: Y015
+
+@_typing.final
+class GravityPrior(_message.Message):
+    """Which way is down."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    DIRECTION_FIELD_NUMBER: _builtins.int
+    STD_DEG_FIELD_NUMBER: _builtins.int
+    WORLD_FIELD_NUMBER: _builtins.int
+    std_deg: _builtins.float
+    """of its angle; 1 when left out"""
+    @_builtins.property
+    def direction(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """x, y, z in the frame of the camera, or of the rig"""
+
+    @_builtins.property
+    def world(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """down in the world, for maps that do not know it"""
+
+    def __init__(
+        self,
+        *,
+        direction: _abc.Iterable[_builtins.float] | None = ...,
+        std_deg: _builtins.float | None = ...,
+        world: _abc.Iterable[_builtins.float] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_std_deg", b"_std_deg", "std_deg", b"std_deg"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_std_deg", b"_std_deg", "direction", b"direction", "std_deg", b"std_deg", "world", b"world"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__std_deg: _TypeAlias = _typing.Literal["std_deg"]  # noqa: Y015
+    _WhichOneofArgType__std_deg: _TypeAlias = _typing.Literal["_std_deg", b"_std_deg"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__std_deg) -> _WhichOneofReturnType__std_deg | None: ...
+
+Global___GravityPrior: _TypeAlias = GravityPrior  # noqa: Y015
+
+@_typing.final
+class Priors(_message.Message):
+    """What is known before any photo is looked at. A prior narrows the search, and a pose that
+    contradicts it is refused; it never bends a pose.
+    """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    POSITION_FIELD_NUMBER: _builtins.int
+    HEIGHT_FIELD_NUMBER: _builtins.int
+    POSE_FIELD_NUMBER: _builtins.int
+    GRAVITY_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def position(self) -> Global___PositionPrior: ...
+    @_builtins.property
+    def height(self) -> Global___HeightBand: ...
+    @_builtins.property
+    def pose(self) -> Global___PosePrior: ...
+    @_builtins.property
+    def gravity(self) -> Global___GravityPrior: ...
+    def __init__(
+        self,
+        *,
+        position: Global___PositionPrior | None = ...,
+        height: Global___HeightBand | None = ...,
+        pose: Global___PosePrior | None = ...,
+        gravity: Global___GravityPrior | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_gravity", b"_gravity", "_height", b"_height", "_pose", b"_pose", "_position", b"_position", "gravity", b"gravity", "height", b"height", "pose", b"pose", "position", b"position"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_gravity", b"_gravity", "_height", b"_height", "_pose", b"_pose", "_position", b"_position", "gravity", b"gravity", "height", b"height", "pose", b"pose", "position", b"position"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__gravity: _TypeAlias = _typing.Literal["gravity"]  # noqa: Y015
+    _WhichOneofArgType__gravity: _TypeAlias = _typing.Literal["_gravity", b"_gravity"]  # noqa: Y015
+    _WhichOneofReturnType__height: _TypeAlias = _typing.Literal["height"]  # noqa: Y015
+    _WhichOneofArgType__height: _TypeAlias = _typing.Literal["_height", b"_height"]  # noqa: Y015
+    _WhichOneofReturnType__pose: _TypeAlias = _typing.Literal["pose"]  # noqa: Y015
+    _WhichOneofArgType__pose: _TypeAlias = _typing.Literal["_pose", b"_pose"]  # noqa: Y015
+    _WhichOneofReturnType__position: _TypeAlias = _typing.Literal["position"]  # noqa: Y015
+    _WhichOneofArgType__position: _TypeAlias = _typing.Literal["_position", b"_position"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__gravity) -> _WhichOneofReturnType__gravity | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__height) -> _WhichOneofReturnType__height | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__pose) -> _WhichOneofReturnType__pose | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__position) -> _WhichOneofReturnType__position | None: ...
+
+Global___Priors: _TypeAlias = Priors  # noqa: Y015
+
+@_typing.final
 class LocalizeRequest(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -227,6 +394,8 @@ class LocalizeRequest(_message.Message):
     CAMERA_FIELD_NUMBER: _builtins.int
     OPTIONS_FIELD_NUMBER: _builtins.int
     REQUEST_ID_FIELD_NUMBER: _builtins.int
+    MAPS_FIELD_NUMBER: _builtins.int
+    PRIORS_FIELD_NUMBER: _builtins.int
     map: _builtins.str
     """id, or id@version"""
     image: _builtins.bytes
@@ -243,6 +412,12 @@ class LocalizeRequest(_message.Message):
 
     @_builtins.property
     def options(self) -> Global___LocalizeOptions: ...
+    @_builtins.property
+    def maps(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """instead of map: search all of these, the best answer counts"""
+
+    @_builtins.property
+    def priors(self) -> Global___Priors: ...
     def __init__(
         self,
         *,
@@ -252,16 +427,326 @@ class LocalizeRequest(_message.Message):
         camera: Global___Camera | None = ...,
         options: Global___LocalizeOptions | None = ...,
         request_id: _builtins.str = ...,
+        maps: _abc.Iterable[_builtins.str] | None = ...,
+        priors: Global___Priors | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "features", b"features", "image", b"image", "options", b"options", "query", b"query"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "features", b"features", "image", b"image", "options", b"options", "priors", b"priors", "query", b"query"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "features", b"features", "image", b"image", "map", b"map", "options", b"options", "query", b"query", "request_id", b"request_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "features", b"features", "image", b"image", "map", b"map", "maps", b"maps", "options", b"options", "priors", b"priors", "query", b"query", "request_id", b"request_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType_query: _TypeAlias = _typing.Literal["image", "features"]  # noqa: Y015
     _WhichOneofArgType_query: _TypeAlias = _typing.Literal["query", b"query"]  # noqa: Y015
     def WhichOneof(self, oneof_group: _WhichOneofArgType_query) -> _WhichOneofReturnType_query | None: ...
 
 Global___LocalizeRequest: _TypeAlias = LocalizeRequest  # noqa: Y015
+
+@_typing.final
+class RigSensor(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    CAM_FROM_RIG_FIELD_NUMBER: _builtins.int
+    CAMERA_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def cam_from_rig(self) -> Global___Transform: ...
+    @_builtins.property
+    def camera(self) -> Global___Camera:
+        """intrinsics of its photos, where they are known"""
+
+    def __init__(
+        self,
+        *,
+        cam_from_rig: Global___Transform | None = ...,
+        camera: Global___Camera | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["cam_from_rig", b"cam_from_rig", "camera", b"camera"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["cam_from_rig", b"cam_from_rig", "camera", b"camera"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___RigSensor: _TypeAlias = RigSensor  # noqa: Y015
+
+@_typing.final
+class RigCalibration(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    @_typing.final
+    class SensorsEntry(_message.Message):
+        DESCRIPTOR: _descriptor.Descriptor
+
+        KEY_FIELD_NUMBER: _builtins.int
+        VALUE_FIELD_NUMBER: _builtins.int
+        key: _builtins.str
+        @_builtins.property
+        def value(self) -> Global___RigSensor: ...
+        def __init__(
+            self,
+            *,
+            key: _builtins.str = ...,
+            value: Global___RigSensor | None = ...,
+        ) -> None: ...
+        _HasFieldArgType: _TypeAlias = _typing.Literal["value", b"value"]  # noqa: Y015
+        def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+        _ClearFieldArgType: _TypeAlias = _typing.Literal["key", b"key", "value", b"value"]  # noqa: Y015
+        def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+        def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+    SENSORS_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def sensors(self) -> _containers.MessageMap[_builtins.str, Global___RigSensor]: ...
+    def __init__(
+        self,
+        *,
+        sensors: _abc.Mapping[_builtins.str, Global___RigSensor] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["sensors", b"sensors"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___RigCalibration: _TypeAlias = RigCalibration  # noqa: Y015
+
+@_typing.final
+class RigImage(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    SENSOR_FIELD_NUMBER: _builtins.int
+    IMAGE_FIELD_NUMBER: _builtins.int
+    FEATURES_FIELD_NUMBER: _builtins.int
+    CAMERA_FIELD_NUMBER: _builtins.int
+    TIMESTAMP_FIELD_NUMBER: _builtins.int
+    sensor: _builtins.str
+    """a camera of the rig"""
+    image: _builtins.bytes
+    timestamp: _builtins.int
+    """equal for all images of an instant"""
+    @_builtins.property
+    def features(self) -> Global___Features: ...
+    @_builtins.property
+    def camera(self) -> Global___Camera:
+        """left out: the rig's for this sensor, else the map's, else EXIF"""
+
+    def __init__(
+        self,
+        *,
+        sensor: _builtins.str = ...,
+        image: _builtins.bytes = ...,
+        features: Global___Features | None = ...,
+        camera: Global___Camera | None = ...,
+        timestamp: _builtins.int | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_timestamp", b"_timestamp", "camera", b"camera", "features", b"features", "image", b"image", "query", b"query", "timestamp", b"timestamp"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_timestamp", b"_timestamp", "camera", b"camera", "features", b"features", "image", b"image", "query", b"query", "sensor", b"sensor", "timestamp", b"timestamp"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__timestamp: _TypeAlias = _typing.Literal["timestamp"]  # noqa: Y015
+    _WhichOneofArgType__timestamp: _TypeAlias = _typing.Literal["_timestamp", b"_timestamp"]  # noqa: Y015
+    _WhichOneofReturnType_query: _TypeAlias = _typing.Literal["image", "features"]  # noqa: Y015
+    _WhichOneofArgType_query: _TypeAlias = _typing.Literal["query", b"query"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__timestamp) -> _WhichOneofReturnType__timestamp | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType_query) -> _WhichOneofReturnType_query | None: ...
+
+Global___RigImage: _TypeAlias = RigImage  # noqa: Y015
+
+@_typing.final
+class LocalizeRigRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MAP_FIELD_NUMBER: _builtins.int
+    MAPS_FIELD_NUMBER: _builtins.int
+    RIG_ID_FIELD_NUMBER: _builtins.int
+    CALIBRATION_FIELD_NUMBER: _builtins.int
+    IMAGES_FIELD_NUMBER: _builtins.int
+    OPTIONS_FIELD_NUMBER: _builtins.int
+    PRIORS_FIELD_NUMBER: _builtins.int
+    REQUEST_ID_FIELD_NUMBER: _builtins.int
+    map: _builtins.str
+    rig_id: _builtins.str
+    """a rig that the map knows"""
+    request_id: _builtins.str
+    @_builtins.property
+    def maps(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]: ...
+    @_builtins.property
+    def calibration(self) -> Global___RigCalibration: ...
+    @_builtins.property
+    def images(self) -> _containers.RepeatedCompositeFieldContainer[Global___RigImage]: ...
+    @_builtins.property
+    def options(self) -> Global___LocalizeOptions: ...
+    @_builtins.property
+    def priors(self) -> Global___Priors: ...
+    def __init__(
+        self,
+        *,
+        map: _builtins.str = ...,
+        maps: _abc.Iterable[_builtins.str] | None = ...,
+        rig_id: _builtins.str = ...,
+        calibration: Global___RigCalibration | None = ...,
+        images: _abc.Iterable[Global___RigImage] | None = ...,
+        options: Global___LocalizeOptions | None = ...,
+        priors: Global___Priors | None = ...,
+        request_id: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["calibration", b"calibration", "options", b"options", "priors", b"priors", "rig", b"rig", "rig_id", b"rig_id"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["calibration", b"calibration", "images", b"images", "map", b"map", "maps", b"maps", "options", b"options", "priors", b"priors", "request_id", b"request_id", "rig", b"rig", "rig_id", b"rig_id"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType_rig: _TypeAlias = _typing.Literal["rig_id", "calibration"]  # noqa: Y015
+    _WhichOneofArgType_rig: _TypeAlias = _typing.Literal["rig", b"rig"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType_rig) -> _WhichOneofReturnType_rig | None: ...
+
+Global___LocalizeRigRequest: _TypeAlias = LocalizeRigRequest  # noqa: Y015
+
+@_typing.final
+class Odometry(_message.Message):
+    """Where a tracker (visual-inertial, wheel odometry, ARKit, ARCore) has the rig, in a world of its
+    own whose unit is the metre. Only the motion from one instant to the next is used.
+    """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    RIG_FROM_ODOMETRY_FIELD_NUMBER: _builtins.int
+    COVARIANCE_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def rig_from_odometry(self) -> Global___Transform: ...
+    @_builtins.property
+    def covariance(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """6 x 6 of the motion since the previous instant, rig_from_previous_rig, as other covariances;
+        left out: an allowance for drift.
+        """
+
+    def __init__(
+        self,
+        *,
+        rig_from_odometry: Global___Transform | None = ...,
+        covariance: _abc.Iterable[_builtins.float] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["rig_from_odometry", b"rig_from_odometry"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["covariance", b"covariance", "rig_from_odometry", b"rig_from_odometry"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Odometry: _TypeAlias = Odometry  # noqa: Y015
+
+@_typing.final
+class Instant(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    TIMESTAMP_FIELD_NUMBER: _builtins.int
+    IMAGES_FIELD_NUMBER: _builtins.int
+    ODOMETRY_FIELD_NUMBER: _builtins.int
+    PRIORS_FIELD_NUMBER: _builtins.int
+    timestamp: _builtins.int
+    @_builtins.property
+    def images(self) -> _containers.RepeatedCompositeFieldContainer[Global___RigImage]: ...
+    @_builtins.property
+    def odometry(self) -> Global___Odometry: ...
+    @_builtins.property
+    def priors(self) -> Global___Priors:
+        """of this instant, instead of those of the start"""
+
+    def __init__(
+        self,
+        *,
+        timestamp: _builtins.int = ...,
+        images: _abc.Iterable[Global___RigImage] | None = ...,
+        odometry: Global___Odometry | None = ...,
+        priors: Global___Priors | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["odometry", b"odometry", "priors", b"priors"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["images", b"images", "odometry", b"odometry", "priors", b"priors", "timestamp", b"timestamp"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Instant: _TypeAlias = Instant  # noqa: Y015
+
+@_typing.final
+class SequenceStart(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MAP_FIELD_NUMBER: _builtins.int
+    MAPS_FIELD_NUMBER: _builtins.int
+    RIG_ID_FIELD_NUMBER: _builtins.int
+    CALIBRATION_FIELD_NUMBER: _builtins.int
+    TIME_UNIT_FIELD_NUMBER: _builtins.int
+    MAX_GAP_S_FIELD_NUMBER: _builtins.int
+    OPTIONS_FIELD_NUMBER: _builtins.int
+    PRIORS_FIELD_NUMBER: _builtins.int
+    REQUEST_ID_FIELD_NUMBER: _builtins.int
+    map: _builtins.str
+    rig_id: _builtins.str
+    time_unit: _builtins.str
+    """of timestamps: s, ms, us or ns; left out: by their size"""
+    max_gap_s: _builtins.float
+    """Longest time between two measured instants across which gaps are filled; 1 when left out,
+    0 fills none.
+    """
+    request_id: _builtins.str
+    @_builtins.property
+    def maps(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]: ...
+    @_builtins.property
+    def calibration(self) -> Global___RigCalibration: ...
+    @_builtins.property
+    def options(self) -> Global___LocalizeOptions: ...
+    @_builtins.property
+    def priors(self) -> Global___Priors: ...
+    def __init__(
+        self,
+        *,
+        map: _builtins.str = ...,
+        maps: _abc.Iterable[_builtins.str] | None = ...,
+        rig_id: _builtins.str = ...,
+        calibration: Global___RigCalibration | None = ...,
+        time_unit: _builtins.str = ...,
+        max_gap_s: _builtins.float | None = ...,
+        options: Global___LocalizeOptions | None = ...,
+        priors: Global___Priors | None = ...,
+        request_id: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_max_gap_s", b"_max_gap_s", "calibration", b"calibration", "max_gap_s", b"max_gap_s", "options", b"options", "priors", b"priors", "rig", b"rig", "rig_id", b"rig_id"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_max_gap_s", b"_max_gap_s", "calibration", b"calibration", "map", b"map", "maps", b"maps", "max_gap_s", b"max_gap_s", "options", b"options", "priors", b"priors", "request_id", b"request_id", "rig", b"rig", "rig_id", b"rig_id", "time_unit", b"time_unit"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__max_gap_s: _TypeAlias = _typing.Literal["max_gap_s"]  # noqa: Y015
+    _WhichOneofArgType__max_gap_s: _TypeAlias = _typing.Literal["_max_gap_s", b"_max_gap_s"]  # noqa: Y015
+    _WhichOneofReturnType_rig: _TypeAlias = _typing.Literal["rig_id", "calibration"]  # noqa: Y015
+    _WhichOneofArgType_rig: _TypeAlias = _typing.Literal["rig", b"rig"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__max_gap_s) -> _WhichOneofReturnType__max_gap_s | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType_rig) -> _WhichOneofReturnType_rig | None: ...
+
+Global___SequenceStart: _TypeAlias = SequenceStart  # noqa: Y015
+
+@_typing.final
+class LocalizeSequenceRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    START_FIELD_NUMBER: _builtins.int
+    INSTANT_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def start(self) -> Global___SequenceStart: ...
+    @_builtins.property
+    def instant(self) -> Global___Instant: ...
+    def __init__(
+        self,
+        *,
+        start: Global___SequenceStart | None = ...,
+        instant: Global___Instant | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["instant", b"instant", "message", b"message", "start", b"start"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["instant", b"instant", "message", b"message", "start", b"start"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType_message: _TypeAlias = _typing.Literal["start", "instant"]  # noqa: Y015
+    _WhichOneofArgType_message: _TypeAlias = _typing.Literal["message", b"message"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType_message) -> _WhichOneofReturnType_message | None: ...
+
+Global___LocalizeSequenceRequest: _TypeAlias = LocalizeSequenceRequest  # noqa: Y015
 
 @_typing.final
 class Transform(_message.Message):
@@ -353,7 +838,7 @@ class Refusal(_message.Message):
     REASON_FIELD_NUMBER: _builtins.int
     MESSAGE_FIELD_NUMBER: _builtins.int
     stage: _builtins.str
-    """features, matching, pose or gate"""
+    """features, retrieval, matching, pose or gate"""
     reason: _builtins.str
     """a stable word"""
     message: _builtins.str
@@ -594,6 +1079,242 @@ class LocalizeResponse(_message.Message):
 Global___LocalizeResponse: _TypeAlias = LocalizeResponse  # noqa: Y015
 
 @_typing.final
+class RigPose(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    RIG_FROM_WORLD_FIELD_NUMBER: _builtins.int
+    POSITION_FIELD_NUMBER: _builtins.int
+    ORIENTATION_FIELD_NUMBER: _builtins.int
+    COVARIANCE_FIELD_NUMBER: _builtins.int
+    POSITION_STD_FIELD_NUMBER: _builtins.int
+    ORIENTATION_STD_DEG_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def rig_from_world(self) -> Global___Transform: ...
+    @_builtins.property
+    def position(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """the rig's origin in the world"""
+
+    @_builtins.property
+    def orientation(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """rotation of world_from_rig as w, x, y, z"""
+
+    @_builtins.property
+    def covariance(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """as of PoseEstimate, of rig_from_world"""
+
+    @_builtins.property
+    def position_std(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
+    @_builtins.property
+    def orientation_std_deg(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
+    def __init__(
+        self,
+        *,
+        rig_from_world: Global___Transform | None = ...,
+        position: _abc.Iterable[_builtins.float] | None = ...,
+        orientation: _abc.Iterable[_builtins.float] | None = ...,
+        covariance: _abc.Iterable[_builtins.float] | None = ...,
+        position_std: _abc.Iterable[_builtins.float] | None = ...,
+        orientation_std_deg: _abc.Iterable[_builtins.float] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["rig_from_world", b"rig_from_world"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["covariance", b"covariance", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "position", b"position", "position_std", b"position_std", "rig_from_world", b"rig_from_world"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___RigPose: _TypeAlias = RigPose  # noqa: Y015
+
+@_typing.final
+class ImageError(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    KIND_FIELD_NUMBER: _builtins.int
+    CODE_FIELD_NUMBER: _builtins.int
+    MESSAGE_FIELD_NUMBER: _builtins.int
+    kind: _builtins.str
+    """the kind of error, such as InvalidInput"""
+    code: _builtins.str
+    """a stable word, such as image.undecodable"""
+    message: _builtins.str
+    def __init__(
+        self,
+        *,
+        kind: _builtins.str = ...,
+        code: _builtins.str = ...,
+        message: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["code", b"code", "kind", b"kind", "message", b"message"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ImageError: _TypeAlias = ImageError  # noqa: Y015
+
+@_typing.final
+class ImageAnswer(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    SENSOR_FIELD_NUMBER: _builtins.int
+    ERROR_FIELD_NUMBER: _builtins.int
+    CAM_FROM_WORLD_FIELD_NUMBER: _builtins.int
+    KEYPOINTS_FIELD_NUMBER: _builtins.int
+    CORRESPONDENCES_FIELD_NUMBER: _builtins.int
+    INLIERS_FIELD_NUMBER: _builtins.int
+    RETRIEVED_FIELD_NUMBER: _builtins.int
+    CAMERA_FIELD_NUMBER: _builtins.int
+    ORIENTATION_FIELD_NUMBER: _builtins.int
+    sensor: _builtins.str
+    keypoints: _builtins.int
+    correspondences: _builtins.int
+    inliers: _builtins.int
+    @_builtins.property
+    def error(self) -> Global___ImageError:
+        """why it could not be used; then the rest is empty"""
+
+    @_builtins.property
+    def cam_from_world(self) -> Global___Transform:
+        """when there is a pose"""
+
+    @_builtins.property
+    def retrieved(self) -> _containers.RepeatedCompositeFieldContainer[Global___RetrievedImage]: ...
+    @_builtins.property
+    def camera(self) -> Global___CameraUsed: ...
+    @_builtins.property
+    def orientation(self) -> Global___Orientation: ...
+    def __init__(
+        self,
+        *,
+        sensor: _builtins.str = ...,
+        error: Global___ImageError | None = ...,
+        cam_from_world: Global___Transform | None = ...,
+        keypoints: _builtins.int = ...,
+        correspondences: _builtins.int = ...,
+        inliers: _builtins.int = ...,
+        retrieved: _abc.Iterable[Global___RetrievedImage] | None = ...,
+        camera: Global___CameraUsed | None = ...,
+        orientation: Global___Orientation | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_cam_from_world", b"_cam_from_world", "_camera", b"_camera", "_error", b"_error", "_orientation", b"_orientation", "cam_from_world", b"cam_from_world", "camera", b"camera", "error", b"error", "orientation", b"orientation"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_cam_from_world", b"_cam_from_world", "_camera", b"_camera", "_error", b"_error", "_orientation", b"_orientation", "cam_from_world", b"cam_from_world", "camera", b"camera", "correspondences", b"correspondences", "error", b"error", "inliers", b"inliers", "keypoints", b"keypoints", "orientation", b"orientation", "retrieved", b"retrieved", "sensor", b"sensor"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__cam_from_world: _TypeAlias = _typing.Literal["cam_from_world"]  # noqa: Y015
+    _WhichOneofArgType__cam_from_world: _TypeAlias = _typing.Literal["_cam_from_world", b"_cam_from_world"]  # noqa: Y015
+    _WhichOneofReturnType__camera: _TypeAlias = _typing.Literal["camera"]  # noqa: Y015
+    _WhichOneofArgType__camera: _TypeAlias = _typing.Literal["_camera", b"_camera"]  # noqa: Y015
+    _WhichOneofReturnType__error: _TypeAlias = _typing.Literal["error"]  # noqa: Y015
+    _WhichOneofArgType__error: _TypeAlias = _typing.Literal["_error", b"_error"]  # noqa: Y015
+    _WhichOneofReturnType__orientation: _TypeAlias = _typing.Literal["orientation"]  # noqa: Y015
+    _WhichOneofArgType__orientation: _TypeAlias = _typing.Literal["_orientation", b"_orientation"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__cam_from_world) -> _WhichOneofReturnType__cam_from_world | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__camera) -> _WhichOneofReturnType__camera | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__error) -> _WhichOneofReturnType__error | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__orientation) -> _WhichOneofReturnType__orientation | None: ...
+
+Global___ImageAnswer: _TypeAlias = ImageAnswer  # noqa: Y015
+
+@_typing.final
+class InstantAnswer(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    @_typing.final
+    class SecondsEntry(_message.Message):
+        DESCRIPTOR: _descriptor.Descriptor
+
+        KEY_FIELD_NUMBER: _builtins.int
+        VALUE_FIELD_NUMBER: _builtins.int
+        key: _builtins.str
+        value: _builtins.float
+        def __init__(
+            self,
+            *,
+            key: _builtins.str = ...,
+            value: _builtins.float = ...,
+        ) -> None: ...
+        _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+        def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+        _ClearFieldArgType: _TypeAlias = _typing.Literal["key", b"key", "value", b"value"]  # noqa: Y015
+        def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+        def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+    REQUEST_ID_FIELD_NUMBER: _builtins.int
+    TIMESTAMP_FIELD_NUMBER: _builtins.int
+    STATUS_FIELD_NUMBER: _builtins.int
+    SOURCE_FIELD_NUMBER: _builtins.int
+    POSE_FIELD_NUMBER: _builtins.int
+    REFUSAL_FIELD_NUMBER: _builtins.int
+    IMAGES_FIELD_NUMBER: _builtins.int
+    CORRESPONDENCES_FIELD_NUMBER: _builtins.int
+    INLIERS_FIELD_NUMBER: _builtins.int
+    INLIER_RATIO_FIELD_NUMBER: _builtins.int
+    MAP_FIELD_NUMBER: _builtins.int
+    SECONDS_FIELD_NUMBER: _builtins.int
+    request_id: _builtins.str
+    timestamp: _builtins.int
+    status: _builtins.str
+    """localized; filled, when the pose rests on other instants; or not_localized"""
+    source: _builtins.str
+    """estimated, from the instant's own images; motion, interpolated or nearest when filled"""
+    correspondences: _builtins.int
+    inliers: _builtins.int
+    inlier_ratio: _builtins.float
+    @_builtins.property
+    def pose(self) -> Global___RigPose: ...
+    @_builtins.property
+    def refusal(self) -> Global___Refusal:
+        """why the instant's own images gave no pose"""
+
+    @_builtins.property
+    def images(self) -> _containers.RepeatedCompositeFieldContainer[Global___ImageAnswer]: ...
+    @_builtins.property
+    def map(self) -> Global___MapRef: ...
+    @_builtins.property
+    def seconds(self) -> _containers.ScalarMap[_builtins.str, _builtins.float]: ...
+    def __init__(
+        self,
+        *,
+        request_id: _builtins.str = ...,
+        timestamp: _builtins.int | None = ...,
+        status: _builtins.str = ...,
+        source: _builtins.str | None = ...,
+        pose: Global___RigPose | None = ...,
+        refusal: Global___Refusal | None = ...,
+        images: _abc.Iterable[Global___ImageAnswer] | None = ...,
+        correspondences: _builtins.int = ...,
+        inliers: _builtins.int = ...,
+        inlier_ratio: _builtins.float = ...,
+        map: Global___MapRef | None = ...,
+        seconds: _abc.Mapping[_builtins.str, _builtins.float] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_pose", b"_pose", "_refusal", b"_refusal", "_source", b"_source", "_timestamp", b"_timestamp", "map", b"map", "pose", b"pose", "refusal", b"refusal", "source", b"source", "timestamp", b"timestamp"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_pose", b"_pose", "_refusal", b"_refusal", "_source", b"_source", "_timestamp", b"_timestamp", "correspondences", b"correspondences", "images", b"images", "inlier_ratio", b"inlier_ratio", "inliers", b"inliers", "map", b"map", "pose", b"pose", "refusal", b"refusal", "request_id", b"request_id", "seconds", b"seconds", "source", b"source", "status", b"status", "timestamp", b"timestamp"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__pose: _TypeAlias = _typing.Literal["pose"]  # noqa: Y015
+    _WhichOneofArgType__pose: _TypeAlias = _typing.Literal["_pose", b"_pose"]  # noqa: Y015
+    _WhichOneofReturnType__refusal: _TypeAlias = _typing.Literal["refusal"]  # noqa: Y015
+    _WhichOneofArgType__refusal: _TypeAlias = _typing.Literal["_refusal", b"_refusal"]  # noqa: Y015
+    _WhichOneofReturnType__source: _TypeAlias = _typing.Literal["source"]  # noqa: Y015
+    _WhichOneofArgType__source: _TypeAlias = _typing.Literal["_source", b"_source"]  # noqa: Y015
+    _WhichOneofReturnType__timestamp: _TypeAlias = _typing.Literal["timestamp"]  # noqa: Y015
+    _WhichOneofArgType__timestamp: _TypeAlias = _typing.Literal["_timestamp", b"_timestamp"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__pose) -> _WhichOneofReturnType__pose | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__refusal) -> _WhichOneofReturnType__refusal | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__source) -> _WhichOneofReturnType__source | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__timestamp) -> _WhichOneofReturnType__timestamp | None: ...
+
+Global___InstantAnswer: _TypeAlias = InstantAnswer  # noqa: Y015
+
+@_typing.final
 class ListMapsRequest(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -687,6 +1408,8 @@ class MapInfo(_message.Message):
     OBSERVATIONS_FIELD_NUMBER: _builtins.int
     EXTENT_FIELD_NUMBER: _builtins.int
     SIZE_BYTES_FIELD_NUMBER: _builtins.int
+    DOWN_FIELD_NUMBER: _builtins.int
+    RIGS_FIELD_NUMBER: _builtins.int
     id: _builtins.str
     version: _builtins.str
     created: _builtins.str
@@ -705,6 +1428,12 @@ class MapInfo(_message.Message):
     def extent(self) -> Global___Extent:
         """of the landmarks, in the world"""
 
+    @_builtins.property
+    def down(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """unit vector in the world, when the map knows it"""
+
+    @_builtins.property
+    def rigs(self) -> _containers.RepeatedCompositeFieldContainer[Global___RigInfo]: ...
     def __init__(
         self,
         *,
@@ -720,11 +1449,36 @@ class MapInfo(_message.Message):
         observations: _builtins.int = ...,
         extent: Global___Extent | None = ...,
         size_bytes: _builtins.int = ...,
+        down: _abc.Iterable[_builtins.float] | None = ...,
+        rigs: _abc.Iterable[Global___RigInfo] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["extent", b"extent"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["created", b"created", "extent", b"extent", "global_features", b"global_features", "id", b"id", "images", b"images", "landmarks", b"landmarks", "local_features", b"local_features", "method", b"method", "metric", b"metric", "observations", b"observations", "size_bytes", b"size_bytes", "version", b"version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["created", b"created", "down", b"down", "extent", b"extent", "global_features", b"global_features", "id", b"id", "images", b"images", "landmarks", b"landmarks", "local_features", b"local_features", "method", b"method", "metric", b"metric", "observations", b"observations", "rigs", b"rigs", "size_bytes", b"size_bytes", "version", b"version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___MapInfo: _TypeAlias = MapInfo  # noqa: Y015
+
+@_typing.final
+class RigInfo(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    ID_FIELD_NUMBER: _builtins.int
+    SENSORS_FIELD_NUMBER: _builtins.int
+    id: _builtins.str
+    @_builtins.property
+    def sensors(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]: ...
+    def __init__(
+        self,
+        *,
+        id: _builtins.str = ...,
+        sensors: _abc.Iterable[_builtins.str] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["id", b"id", "sensors", b"sensors"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___RigInfo: _TypeAlias = RigInfo  # noqa: Y015

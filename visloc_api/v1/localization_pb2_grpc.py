@@ -39,6 +39,16 @@ class LocalizationStub:
                 request_serializer=visloc__api_dot_v1_dot_localization__pb2.LocalizeRequest.SerializeToString,
                 response_deserializer=visloc__api_dot_v1_dot_localization__pb2.LocalizeResponse.FromString,
                 _registered_method=True)
+        self.LocalizeRig = channel.unary_unary(
+                '/visloc.v1.Localization/LocalizeRig',
+                request_serializer=visloc__api_dot_v1_dot_localization__pb2.LocalizeRigRequest.SerializeToString,
+                response_deserializer=visloc__api_dot_v1_dot_localization__pb2.InstantAnswer.FromString,
+                _registered_method=True)
+        self.LocalizeSequence = channel.stream_stream(
+                '/visloc.v1.Localization/LocalizeSequence',
+                request_serializer=visloc__api_dot_v1_dot_localization__pb2.LocalizeSequenceRequest.SerializeToString,
+                response_deserializer=visloc__api_dot_v1_dot_localization__pb2.InstantAnswer.FromString,
+                _registered_method=True)
         self.ListMaps = channel.unary_unary(
                 '/visloc.v1.Localization/ListMaps',
                 request_serializer=visloc__api_dot_v1_dot_localization__pb2.ListMapsRequest.SerializeToString,
@@ -57,6 +67,21 @@ class LocalizationServicer:
     def Localize(self, request, context):
         """Estimates the camera pose of one photo in one map, from the photo or from its features. A photo
         that cannot be localized is an answer (status "not_localized"), not an error.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def LocalizeRig(self, request, context):
+        """Estimates one pose from the photos that the cameras of a rig took at one instant.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def LocalizeSequence(self, request_iterator, context):
+        """Takes the instants of a sequence one by one and answers each as soon as its answer is final, in
+        order. The first message is a start, all others are instants.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -81,6 +106,16 @@ def add_LocalizationServicer_to_server(servicer, server):
                     servicer.Localize,
                     request_deserializer=visloc__api_dot_v1_dot_localization__pb2.LocalizeRequest.FromString,
                     response_serializer=visloc__api_dot_v1_dot_localization__pb2.LocalizeResponse.SerializeToString,
+            ),
+            'LocalizeRig': grpc.unary_unary_rpc_method_handler(
+                    servicer.LocalizeRig,
+                    request_deserializer=visloc__api_dot_v1_dot_localization__pb2.LocalizeRigRequest.FromString,
+                    response_serializer=visloc__api_dot_v1_dot_localization__pb2.InstantAnswer.SerializeToString,
+            ),
+            'LocalizeSequence': grpc.stream_stream_rpc_method_handler(
+                    servicer.LocalizeSequence,
+                    request_deserializer=visloc__api_dot_v1_dot_localization__pb2.LocalizeSequenceRequest.FromString,
+                    response_serializer=visloc__api_dot_v1_dot_localization__pb2.InstantAnswer.SerializeToString,
             ),
             'ListMaps': grpc.unary_unary_rpc_method_handler(
                     servicer.ListMaps,
@@ -120,6 +155,60 @@ class Localization:
             '/visloc.v1.Localization/Localize',
             visloc__api_dot_v1_dot_localization__pb2.LocalizeRequest.SerializeToString,
             visloc__api_dot_v1_dot_localization__pb2.LocalizeResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def LocalizeRig(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/visloc.v1.Localization/LocalizeRig',
+            visloc__api_dot_v1_dot_localization__pb2.LocalizeRigRequest.SerializeToString,
+            visloc__api_dot_v1_dot_localization__pb2.InstantAnswer.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def LocalizeSequence(request_iterator,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.stream_stream(
+            request_iterator,
+            target,
+            '/visloc.v1.Localization/LocalizeSequence',
+            visloc__api_dot_v1_dot_localization__pb2.LocalizeSequenceRequest.SerializeToString,
+            visloc__api_dot_v1_dot_localization__pb2.InstantAnswer.FromString,
             options,
             channel_credentials,
             insecure,

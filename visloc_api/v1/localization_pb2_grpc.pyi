@@ -37,6 +37,12 @@ class LocalizationStub:
     """Estimates the camera pose of one photo in one map, from the photo or from its features. A photo
     that cannot be localized is an answer (status "not_localized"), not an error.
     """
+    LocalizeRig: _grpc.UnaryUnaryMultiCallable[_localization_pb2.LocalizeRigRequest, _localization_pb2.InstantAnswer]
+    """Estimates one pose from the photos that the cameras of a rig took at one instant."""
+    LocalizeSequence: _grpc.StreamStreamMultiCallable[_localization_pb2.LocalizeSequenceRequest, _localization_pb2.InstantAnswer]
+    """Takes the instants of a sequence one by one and answers each as soon as its answer is final, in
+    order. The first message is a start, all others are instants.
+    """
     ListMaps: _grpc.UnaryUnaryMultiCallable[_localization_pb2.ListMapsRequest, _localization_pb2.ListMapsResponse]
     GetMap: _grpc.UnaryUnaryMultiCallable[_localization_pb2.GetMapRequest, _localization_pb2.MapInfo]
 
@@ -46,6 +52,12 @@ class LocalizationAsyncStub(LocalizationStub):
     Localize: _aio.UnaryUnaryMultiCallable[_localization_pb2.LocalizeRequest, _localization_pb2.LocalizeResponse]  # type: ignore[assignment]
     """Estimates the camera pose of one photo in one map, from the photo or from its features. A photo
     that cannot be localized is an answer (status "not_localized"), not an error.
+    """
+    LocalizeRig: _aio.UnaryUnaryMultiCallable[_localization_pb2.LocalizeRigRequest, _localization_pb2.InstantAnswer]  # type: ignore[assignment]
+    """Estimates one pose from the photos that the cameras of a rig took at one instant."""
+    LocalizeSequence: _aio.StreamStreamMultiCallable[_localization_pb2.LocalizeSequenceRequest, _localization_pb2.InstantAnswer]  # type: ignore[assignment]
+    """Takes the instants of a sequence one by one and answers each as soon as its answer is final, in
+    order. The first message is a start, all others are instants.
     """
     ListMaps: _aio.UnaryUnaryMultiCallable[_localization_pb2.ListMapsRequest, _localization_pb2.ListMapsResponse]  # type: ignore[assignment]
     GetMap: _aio.UnaryUnaryMultiCallable[_localization_pb2.GetMapRequest, _localization_pb2.MapInfo]  # type: ignore[assignment]
@@ -59,6 +71,24 @@ class LocalizationServicer(metaclass=_abc_1.ABCMeta):
     ) -> _typing.Union[_localization_pb2.LocalizeResponse, _abc.Awaitable[_localization_pb2.LocalizeResponse]]:
         """Estimates the camera pose of one photo in one map, from the photo or from its features. A photo
         that cannot be localized is an answer (status "not_localized"), not an error.
+        """
+
+    @_abc_1.abstractmethod
+    def LocalizeRig(
+        self,
+        request: _localization_pb2.LocalizeRigRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_localization_pb2.InstantAnswer, _abc.Awaitable[_localization_pb2.InstantAnswer]]:
+        """Estimates one pose from the photos that the cameras of a rig took at one instant."""
+
+    @_abc_1.abstractmethod
+    def LocalizeSequence(
+        self,
+        request_iterator: _MaybeAsyncIterator[_localization_pb2.LocalizeSequenceRequest],
+        context: _ServicerContext,
+    ) -> _typing.Union[_abc.Iterator[_localization_pb2.InstantAnswer], _abc.AsyncIterator[_localization_pb2.InstantAnswer]]:
+        """Takes the instants of a sequence one by one and answers each as soon as its answer is final, in
+        order. The first message is a start, all others are instants.
         """
 
     @_abc_1.abstractmethod

@@ -1,0 +1,106 @@
+"""The options that several ``mapping`` commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mapping.pairing import PAIRINGS
+from visloc.features import DEFAULT_GLOBAL_FEATURES, GLOBAL_FEATURES, LOCAL_FEATURES
+from visloc.geometry import PixelOrigin
+
+GLOBAL_DEFAULT = ",".join(DEFAULT_GLOBAL_FEATURES)
+RGBD_PANEL, SFM_PANEL = "Method rgbd", "Method sfm"
+
+MapsDirOption = Annotated[
+    Path, typer.Option("--maps-dir", envvar="VISLOC_MAPS_DIR", help="Folder of maps.")
+]
+WeightsDirOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--weights-dir",
+        envvar="VISLOC_WEIGHTS_DIR",
+        help="Folder with network weights; r2d2 and faster2d2 need it.",
+    ),
+]
+LocalFeaturesOption = Annotated[
+    str, typer.Option(help=f"One of {', '.join(sorted(LOCAL_FEATURES))}.")
+]
+BuildLocalFeaturesOption = Annotated[
+    str,
+    typer.Option(
+        help=f"One of {', '.join(sorted(LOCAL_FEATURES))}, or kapture:TYPE for features that the "
+        "dataset brings along."
+    ),
+]
+GlobalFeaturesOption = Annotated[
+    str,
+    typer.Option(help=f"Comma-separated, of {', '.join(sorted(GLOBAL_FEATURES))}, kapture:TYPE."),
+]
+FeaturesDirOption = Annotated[
+    Path | None,
+    typer.Option(help="Where kapture:TYPE features lie, when not in the dataset."),
+]
+PixelOriginOption = Annotated[
+    PixelOrigin,
+    typer.Option(
+        help="The middle of the first pixel, in the dataset's principal points and in "
+        "kapture:TYPE keypoints, is (0.5, 0.5): corner, or (0, 0): center."
+    ),
+]
+MetricOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--metric/--not-metric",
+        help="Whether a unit of the dataset's poses is a metre; left out: yes, but no for model.",
+    ),
+]
+WorkersOption = Annotated[
+    int,
+    typer.Option(
+        min=1, max=256, help="Processes that work on photos and pairs; they do not change the map."
+    ),
+]
+MaxKeypointsOption = Annotated[
+    int, typer.Option(min=100, max=100_000, help="Strongest keypoints kept per photo.")
+]
+MapArgument = Annotated[str, typer.Argument(metavar="MAP", help="id, id@version, or a folder.")]
+DatasetArgument = Annotated[Path, typer.Argument(help="kapture folder (holds sensors/).")]
+# How photos are paired, for build and for pairs.
+PairsOption = Annotated[
+    str,
+    typer.Option(
+        help=f"Which photos to match: comma-separated, of {', '.join(PAIRINGS)}.",
+        rich_help_panel=SFM_PANEL,
+    ),
+]
+TopKOption = Annotated[
+    int,
+    typer.Option(
+        min=1, help="Best pairs of a photo that each pairing keeps.", rich_help_panel=SFM_PANEL
+    ),
+]
+MaxDistanceOption = Annotated[
+    float,
+    typer.Option(help="distance: most between camera centres, metres.", rich_help_panel=SFM_PANEL),
+]
+MaxAngleOption = Annotated[
+    float,
+    typer.Option(help="distance: most between orientations, degrees.", rich_help_panel=SFM_PANEL),
+]
+NearOption = Annotated[
+    float, typer.Option(help="frustum: where views begin, metres.", rich_help_panel=SFM_PANEL)
+]
+FarOption = Annotated[
+    float, typer.Option(help="frustum: where views end, metres.", rich_help_panel=SFM_PANEL)
+]
+CovisibleInOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="MAP",
+        help="covisibility: the map that tells; else the dataset's own points.",
+        rich_help_panel=SFM_PANEL,
+    ),
+]

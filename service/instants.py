@@ -1,0 +1,171 @@
+"""The images of one instant: checked, looked at, solved. Runs in worker threads."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+from service.jobs import ONLY_SENSOR, ImageJob, Rig, RigSensor
+from visloc.archive import Map
+from visloc.constraints import Constraints
+from visloc.errors import InvalidInput, NotFound, TooLarge
+from visloc.geometry import Pose
+from visloc.images import ImageLimits, Photo, read_photo
+from visloc.localizer import FeatureCache, Localizer
+from visloc.priors import Priors
+from visloc.solving import Look, SeenImage
+from visloc.types import LocalizeOptions, QueryFeatures
+
+# What is wrong with all images is wrong with the request.
+_CODES_OF_ALL_IMAGES = ("features.required", "options.read_as")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Target:
+    """A map to search, and the rig as it is known there."""
+
+    localizer: Localizer
+    rig: Mapping[str, RigSensor]
+
+
+def rig_in_map(rig: Rig | None, opened: Map) -> Mapping[str, RigSensor]:
+    """Return a rig's cameras; of None, one camera on its own.
+
+    Raises:
+        NotFound: ``rig.unknown`` when it is the id of a rig that the map does not know.
+    """
+    if rig is None:
+        return {ONLY_SENSOR: RigSensor(Pose.identity(), None)}
+    if not isinstance(rig, str):
+        return rig
+    known = opened.rigs.get(rig)
+    if known is None:
+        raise NotFound(
+            "rig.unknown",
+            f"map {opened.ref} knows no such rig",
+            field="rig",
+            expected=f"one of {', '.join(opened.rigs)}" if opened.rigs else "a rig given inline",
+            got=rig,
+        )
+    return {
+        sensor: RigSensor(cam_from_rig, opened.cameras.get(sensor))
+        for sensor, cam_from_rig in known.items()
+    }
+
+
+def check_images(
+    images: Sequence[ImageJob], rig: Collection[str] | None, max_images: int, where: str
+) -> None:
+    """Refuse images that are not those of one instant of a rig.
+
+    Args:
+        images: of one instant.
+        rig: its cameras; None when every instant is one image.
+        max_images: most images of an instant.
+        where: the field that holds them, for errors.
+
+    Raises:
+        InvalidInput: ``rig.sensor``, ``rig.duplicate`` or ``sequence.rig``.
+        TooLarge: ``rig.too_many_images``.
+    """
+    if len(images) > max_images:
+        raise TooLarge(
+            "rig.too_many_images",
+            "too many images at one instant",
+            field=where,
+            expected=f"at most {max_images}",
+            got=len(images),
+        )
+    if rig is None and len(images) > 1:
+        raise InvalidInput(
+            "sequence.rig",
+            "an instant of several images needs a rig that says how their cameras sit",
+            field=where,
+            expected="a rig, or one image",
+            got=f"{len(images)} images",
+        )
+    for index, image in enumerate(images):
+        if rig is not None and image.sensor not in rig:
+            raise InvalidInput(
+                "rig.sensor",
+                "the rig has no such camera",
+                field=f"{where}[{index}].sensor",
+                expected=f"one of {', '.join(rig)}",
+                got=image.sensor,
+            )
+    twice = [sensor for sensor, n in Counter(image.sensor for image in images).items() if n > 1]
+    if twice:
+        raise InvalidInput(
+            "rig.duplicate",
+            "a camera takes one image at an instant",
+            field=where,
+            expected="every sensor once",
+            got=f"{twice[0]} more than once",
+        )
+
+
+def check_priors(targets: Sequence[Target], priors: Priors) -> None:
+    """Refuse priors that mean nothing in a map, before anything is computed.
+
+    Raises:
+        InvalidInput: ``priors.*``.
+    """
+    for target in targets:
+        Constraints(target.localizer.geometry, priors)
+
+
+def look_at(
+    image: ImageJob,
+    targets: Sequence[Target],
+    options: LocalizeOptions,
+    priors: Priors,
+    limits: ImageLimits,
+    submitted: float,
+) -> list[SeenImage]:
+    """Look at one image for every target. An image that cannot be used fails alone.
+
+    Raises:
+        VislocError: what concerns more than this image.
+    """
+    seconds = {"queued": perf_counter() - submitted}
+    photo: Photo | QueryFeatures | InvalidInput
+    if isinstance(image.query, QueryFeatures):
+        photo = image.query
+    else:
+        started = perf_counter()
+        try:
+            photo = read_photo(image.query, limits)
+        except InvalidInput as error:
+            photo = error
+        seconds["decode"] = perf_counter() - started
+    found: FeatureCache = {}
+    return [_look(image, photo, target, options, priors, found, seconds) for target in targets]
+
+
+def _look(
+    image: ImageJob,
+    photo: Photo | QueryFeatures | InvalidInput,
+    target: Target,
+    options: LocalizeOptions,
+    priors: Priors,
+    found: FeatureCache,
+    seconds: Mapping[str, float],
+) -> SeenImage:
+    sensor = target.rig.get(image.sensor) or RigSensor(Pose.identity(), None)
+    camera = image.camera or sensor.camera
+    try:
+        look: Look
+        if isinstance(photo, InvalidInput):
+            raise photo
+        if isinstance(photo, QueryFeatures):
+            look = target.localizer.look_at_features(photo, camera, options, priors)
+        else:
+            look = target.localizer.look(photo, camera, options, priors, found)
+    except InvalidInput as error:
+        if error.code in _CODES_OF_ALL_IMAGES or error.code.startswith("priors."):
+            raise
+        return SeenImage(image.sensor, sensor.cam_from_rig, None, error)
+    evidence = replace(look.evidence, seconds={**seconds, **look.evidence.seconds})
+    return SeenImage(image.sensor, sensor.cam_from_rig, replace(look, evidence=evidence))

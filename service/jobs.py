@@ -1,0 +1,146 @@
+"""What can be asked of the engine, and what it answers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from visloc.geometry import Camera, Pose
+from visloc.priors import NO_PRIORS, Priors
+from visloc.sequence import Odometry
+from visloc.trajectory import TimeUnit
+from visloc.types import Answer, InstantAnswer, LocalizeOptions, QueryFeatures
+
+# The longest time between two measured instants across which gaps are filled, by default.
+DEFAULT_MAX_GAP_S = 1.0
+# The sensor of the only image of an instant, when no rig is named.
+ONLY_SENSOR = "camera"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalizeJob:
+    """One photo to localize.
+
+    Attributes:
+        maps: where to search, one or several; each ``id``, for its current version, or
+            ``id@version``.
+        query: the encoded photo, or the features that were found in it.
+        camera: its intrinsics for the pixels as stored; None when unknown.
+        options: thresholds and the like.
+        priors: what is known of the camera.
+    """
+
+    maps: tuple[str, ...]
+    query: bytes | QueryFeatures
+    camera: Camera | None
+    options: LocalizeOptions
+    priors: Priors = NO_PRIORS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigSensor:
+    """One camera of a rig.
+
+    Attributes:
+        cam_from_rig: where it sits.
+        camera: the intrinsics of its photos; None when unknown.
+    """
+
+    cam_from_rig: Pose
+    camera: Camera | None
+
+
+# The id of a rig that the map knows, or a rig as it is.
+Rig = str | Mapping[str, RigSensor]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageJob:
+    """One image of an instant.
+
+    Attributes:
+        sensor: the camera of the rig.
+        query: the encoded photo, or the features that were found in it.
+        camera: its intrinsics, instead of those of the rig; None for those.
+    """
+
+    sensor: str
+    query: bytes | QueryFeatures
+    camera: Camera | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigJob:
+    """The images of one instant.
+
+    Attributes:
+        maps: where to search, one or several.
+        rig: how the cameras sit.
+        images: each of another sensor.
+        timestamp: of all of them; None when unknown.
+        options: thresholds and the like.
+        priors: what is known of the rig.
+    """
+
+    maps: tuple[str, ...]
+    rig: Rig
+    images: tuple[ImageJob, ...]
+    timestamp: int | None
+    options: LocalizeOptions
+    priors: Priors = NO_PRIORS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Instant:
+    """One instant of a sequence.
+
+    Attributes:
+        timestamp: greater than that of the instant before.
+        images: each of another sensor; there may be none when there is odometry.
+        odometry: None when there is none.
+        priors: of this instant; None for those of the sequence.
+    """
+
+    timestamp: int
+    images: tuple[ImageJob, ...]
+    odometry: Odometry | None
+    priors: Priors | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SequenceStart:
+    """What all instants of a sequence share.
+
+    Attributes:
+        maps: where to search; with several, the map of the first localized instant is kept.
+        rig: how the cameras sit; None when every instant is one image of one camera.
+        time_unit: of the timestamps; None to tell by their size.
+        max_gap_s: longest time between measured instants across which gaps are filled; 0: none.
+        options: thresholds and the like.
+        priors: what is known of the rig at every instant.
+    """
+
+    maps: tuple[str, ...]
+    rig: Rig | None
+    time_unit: TimeUnit | None
+    max_gap_s: float
+    options: LocalizeOptions
+    priors: Priors = NO_PRIORS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Localization:
+    """An answer and the map that gave it."""
+
+    answer: Answer
+    map_id: str
+    map_version: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InstantLocalization:
+    """The answer to an instant and the map that gave it."""
+
+    answer: InstantAnswer
+    map_id: str
+    map_version: str

@@ -1,0 +1,80 @@
+"""What was seen on the way to an answer."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, Field
+
+import visloc.types
+
+
+class Refusal(BaseModel):
+    """Why there is no pose."""
+
+    stage: Annotated[visloc.types.Stage, Field(description="the stage that gave up")]
+    reason: Annotated[visloc.types.Reason, Field(description="a stable word")]
+    message: Annotated[str, Field(description="for a person")]
+
+
+class RetrievedImage(BaseModel):
+    """A mapping photo that was matched against."""
+
+    image: Annotated[str, Field(description="its name in the map")]
+    score: Annotated[float, Field(description="fused, comparable within one answer only")]
+    similarities: Annotated[dict[str, float], Field(description="cosine by global descriptor")]
+
+    @staticmethod
+    def all_of(evidence: visloc.types.Evidence) -> list[RetrievedImage]:
+        """Say it in the API's words."""
+        return [
+            RetrievedImage(image=r.name, score=r.score, similarities=dict(r.similarities))
+            for r in evidence.retrieved
+        ]
+
+
+class CameraUsed(BaseModel):
+    """The intrinsics used, for the pixels as stored."""
+
+    model: str
+    width: int
+    height: int
+    params: list[float]
+    source: Annotated[
+        visloc.types.CameraSource,
+        Field(
+            description="given; given_scaled, for another size of the same aspect; exif, its "
+            "focal length; or guess, 1.2 times the longer side"
+        ),
+    ]
+
+    @staticmethod
+    def of(evidence: visloc.types.Evidence) -> CameraUsed:
+        """Say it in the API's words."""
+        camera = evidence.camera
+        return CameraUsed(
+            model=camera.model,
+            width=camera.width,
+            height=camera.height,
+            params=list(camera.params),
+            source=evidence.camera_source,
+        )
+
+
+class Orientation(BaseModel):
+    """How the pixels were read."""
+
+    exif: Annotated[int, Field(description="1 to 8 as stored in the photo, 1 when absent")]
+    read_as: visloc.types.ReadAs
+
+    @staticmethod
+    def of(evidence: visloc.types.Evidence) -> Orientation:
+        """Say it in the API's words."""
+        return Orientation(exif=evidence.exif_orientation, read_as=evidence.read_as)
+
+
+class MapRef(BaseModel):
+    """The map that answered."""
+
+    id: str
+    version: str

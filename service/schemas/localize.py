@@ -1,0 +1,110 @@
+"""The request for one photo."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated
+
+from pydantic import FailFast, Field
+
+from service.incoming import IncomingMessage, converted
+from service.jobs import LocalizeJob
+from service.schemas.features import GivenFeatures, GivenImage, query_to_core
+from service.schemas.geometry import GivenCamera
+from service.schemas.options import GivenOptions, LocalizeOptions
+from service.schemas.priors import GivenPriors, priors_to_core
+from visloc.errors import InvalidInput
+
+MAX_MAPS = 16
+
+
+def _maps_from_text(value: object) -> object:
+    """Read ids separated by commas, or a list in JSON, as forms have them."""
+    if not isinstance(value, str):
+        return value
+    if not value.lstrip().startswith("["):
+        return [name.strip() for name in value.split(",")]
+    try:
+        return json.loads(value)
+    except (ValueError, RecursionError):
+        raise InvalidInput(
+            "request.malformed", "not JSON", field="maps", expected="id,id,... or a list in JSON"
+        ) from None
+
+
+# Maps as a list, or as text in a field of a form.
+GivenMaps = Annotated[
+    list[str] | None,
+    FailFast(),
+    converted(_maps_from_text),
+    Field(
+        description=f"instead of map: at most {MAX_MAPS} maps to search; the best answer counts"
+    ),
+]
+
+
+def maps_to_core(map_ref: str | None, maps: list[str] | None) -> tuple[str, ...]:
+    """Return where to search.
+
+    Raises:
+        InvalidInput: ``request.map`` for neither or both, for one map twice, and for too many.
+    """
+    if (map_ref is None) == (not maps):
+        got = "neither" if map_ref is None else "both"
+        raise InvalidInput(
+            "request.map",
+            "a request names a map, or several",
+            field="map",
+            expected="one of map, maps",
+            got=got,
+        )
+    if not maps:
+        assert map_ref is not None
+        return (map_ref,)
+    if len(maps) > MAX_MAPS or len(set(maps)) != len(maps):
+        raise InvalidInput(
+            "request.map",
+            "too many maps" if len(maps) > MAX_MAPS else "a map is named twice",
+            field="maps",
+            expected=f"at most {MAX_MAPS} different ones",
+            got=len(maps) if len(maps) > MAX_MAPS else ", ".join(maps),
+        )
+    return tuple(maps)
+
+
+class LocalizeRequest(IncomingMessage):
+    """A photo, or what was found in it, and the map to find it in."""
+
+    map: Annotated[str | None, Field(description="id, or id@version")] = None
+    image: Annotated[
+        GivenImage, Field(description="the encoded photo: JPEG, PNG, WebP, TIFF or BMP")
+    ] = None
+    features: Annotated[
+        GivenFeatures,
+        Field(description="what was found in the photo, instead of it; needs a camera"),
+    ] = None
+    camera: Annotated[
+        GivenCamera,
+        Field(
+            description="an object, or MODEL,width,height,params...; left out: the focal length "
+            "of the photo's EXIF, else a guess that the answer marks"
+        ),
+    ] = None
+    options: GivenOptions = Field(default_factory=LocalizeOptions)
+    maps: GivenMaps = None
+    priors: GivenPriors = None
+
+    def to_job(self) -> LocalizeJob:
+        """Return the work to do.
+
+        Raises:
+            InvalidInput: ``request.query``, ``request.map``, ``features...``, ``camera...``,
+                ``options...``, ``priors...`` or ``pose...``.
+        """
+        return LocalizeJob(
+            maps_to_core(self.map, self.maps),
+            query_to_core(self.image, self.features),
+            None if self.camera is None else self.camera.to_core(),
+            self.options.to_core(),
+            priors_to_core(self.priors),
+        )

@@ -1,0 +1,45 @@
+"""Health, readiness and errors."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, Field
+
+
+class Health(BaseModel):
+    """The process answers."""
+
+    status: Literal["ok"] = "ok"
+    version: str
+
+
+class MapNotLoaded(BaseModel):
+    """A map that is on disk and cannot be served."""
+
+    id: str
+    code: str
+    message: str
+
+
+class Readiness(BaseModel):
+    """Whether photos are accepted."""
+
+    ready: Annotated[bool, Field(description="whether the maps of the start are open and warm")]
+    maps: Annotated[list[str], Field(description="id@version of what is loaded")]
+    not_loaded: Annotated[list[MapNotLoaded], Field(description="they do not prevent readiness")]
+
+
+class Problem(BaseModel):
+    """An error, as RFC 9457 problem details. ``code`` and ``kind`` are stable."""
+
+    type: str = "about:blank"
+    title: Annotated[str, Field(description="the HTTP status in words")]
+    status: int
+    detail: Annotated[str, Field(description="what is wrong, for a person")]
+    code: Annotated[str, Field(description="a stable word such as camera.param_count")]
+    field: Annotated[str | None, Field(description="the field that is wrong")] = None
+    expected: Annotated[str | None, Field(description="what would have been right")] = None
+    got: Annotated[str | None, Field(description="what came instead")] = None
+    kind: Annotated[str, Field(description="the kind of error, such as InvalidInput")]
+    request_id: str

@@ -1,0 +1,230 @@
+"""What priors mean in one map: which photos to search, and which poses to refuse.
+
+Everything here is in coordinates relative to the map's origin, where the numbers are small.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from visloc.archive import Map
+from visloc.errors import InvalidInput
+from visloc.geometry import Pose
+from visloc.pose.colmap import normalized_rays
+from visloc.pose.covariance import position_covariance, with_origin
+from visloc.pose.generalized import KnownGravity
+from visloc.pose.gravity import gravity_deviation
+from visloc.pose.views import MatchedView
+from visloc.priors import Priors
+from visloc.trajectory import center_covariance
+
+# How far beyond an area a photo may have been taken and still show it, in units of how far the
+# map's photos see; within that, photos further away count less.
+_REACH = 2.0
+# An area of so many standard deviations around a pose prior is searched.
+_POSE_PRIOR_STDS = 3.0
+# A pose contradicts a prior when it is further away than so many of its own standard deviations.
+_OWN_STDS = 3.0
+# Chi-square with six degrees of freedom is above this once in 10 000 times.
+_MAX_MAHALANOBIS2 = 27.86
+# Poses of different sessions disagree by this much for reasons that no covariance tells.
+_MAP_STD_RAD, _MAP_STD = math.radians(0.1), 0.01
+_NUM_REACH_PHOTOS, _NUM_REACH_LANDMARKS = 100, 200
+
+
+class MapGeometry:
+    """Where a map's photos were taken and how far they see; in the map's own coordinates.
+
+    Args:
+        opened: the map.
+    """
+
+    def __init__(self, opened: Map) -> None:
+        self._map = opened
+        self.origin = np.array(opened.manifest.world.origin)
+        self.down = opened.gravity
+
+    @cached_property
+    def centers(self) -> NDArray[np.float64]:
+        """(n, 3) camera centres of the photos, relative to the origin."""
+        poses = self._map.image_poses
+        rotations = Rotation.from_quat(poses[:, :4], scalar_first=True)
+        return np.asarray(-rotations.inv().apply(poses[:, 4:]) - self.origin)
+
+    @cached_property
+    def reach(self) -> float:
+        """Median distance from photos to the landmarks that they see, in units of the world."""
+        num_photos = len(self.centers)
+        distances = []
+        offsets = self._map.observation_offsets
+        for photo in range(0, num_photos, max(1, num_photos // _NUM_REACH_PHOTOS)):
+            start, stop = int(offsets[photo]), int(offsets[photo + 1])
+            step = max(1, (stop - start) // _NUM_REACH_LANDMARKS)
+            seen = self._map.observation_landmarks[start:stop:step]
+            if len(seen):
+                away = self._map.landmarks[seen].astype(np.float64) - self.centers[photo]
+                distances.append(float(np.median(np.linalg.norm(away, axis=1))))
+        return float(np.median(distances)) if distances else 0.0
+
+
+class Constraints:
+    """The priors of one query in one map.
+
+    Args:
+        geometry: of the map.
+        priors: as they were sent, in the world.
+
+    Raises:
+        InvalidInput: ``priors.gravity`` or ``priors.height`` when neither the map nor the request
+            knows which way is down in the world.
+    """
+
+    def __init__(self, geometry: MapGeometry, priors: Priors) -> None:
+        self._geometry = geometry
+        self._priors = priors
+        gravity = priors.gravity
+        down = geometry.down
+        if gravity is not None and gravity.world is not None:
+            down = gravity.world
+        if down is None and (gravity is not None or priors.height is not None):
+            name = "gravity" if gravity is not None else "height"
+            raise InvalidInput(
+                f"priors.{name}",
+                "this map does not know which way is down",
+                field=f"priors.{name}",
+                expected="priors.gravity.world, or a map that was built with --gravity",
+            )
+        self.gravity = (
+            None
+            if gravity is None or down is None
+            else KnownGravity(gravity.direction, down, gravity.std)
+        )
+        self._up = None if down is None else -down
+        self._pose = None
+        if priors.pose is not None:
+            self._pose = with_origin(
+                priors.pose.device_from_world, priors.pose.covariance, -geometry.origin
+            )
+
+    @cached_property
+    def photo_weights(self) -> NDArray[np.float64] | None:
+        """(n,) how much each photo of the map counts, 0 to 1; None when all count the same."""
+        spheres = []
+        if self._priors.position is not None:
+            prior = self._priors.position
+            spheres.append((prior.position - self._geometry.origin, prior.radius))
+        if self._pose is not None:
+            spheres.append((self._pose[0].center, _POSE_PRIOR_STDS * _largest_std(*self._pose)))
+        if not spheres and self._priors.height is None:
+            return None
+        centers = self._geometry.centers
+        weights = np.ones(len(centers))
+        reach = max(self._geometry.reach, np.finfo(float).tiny)
+        for center, radius in spheres:
+            beyond = (np.linalg.norm(centers - center, axis=1) - radius) / reach
+            weights *= np.where(beyond <= _REACH, np.exp(-0.5 * np.maximum(beyond, 0.0) ** 2), 0.0)
+        band = self._priors.height
+        if band is not None and self._up is not None:
+            # The floor above is at least one height of the band away from the middle of this one.
+            slack = (band.max - band.min) / 2
+            heights = (centers + self._geometry.origin) @ self._up
+            weights[(heights < band.min - slack) | (heights > band.max + slack)] = 0.0
+        return weights
+
+    def contradiction(self, pose: Pose, covariance: NDArray[np.float64]) -> str | None:
+        """Say which prior a pose contradicts, and by how much; None when it obeys all.
+
+        Args:
+            pose: ``device_from_world`` relative to the origin.
+            covariance: (6, 6) of it.
+        """
+        own = _OWN_STDS * _largest_std(pose, covariance)
+        center = pose.center + self._geometry.origin
+        position = self._priors.position
+        if position is not None:
+            away = float(np.linalg.norm(center - position.position))
+            if away > position.radius + own:
+                return f"it lies {away:.2f} from the prior position, at most {position.radius:g}"
+        band = self._priors.height
+        if band is not None and self._up is not None:
+            height = float(center @ self._up)
+            if not band.min - own <= height <= band.max + own:
+                return f"its height is {height:.2f}, the prior says {band.min:g} to {band.max:g}"
+        if self.gravity is not None:
+            angle = gravity_deviation(pose, self.gravity)
+            allowed = _OWN_STDS * math.hypot(
+                self.gravity.std, math.sqrt(covariance[:3, :3].trace())
+            )
+            if angle > allowed:
+                return (
+                    f"its down is {math.degrees(angle):.1f} degrees from the prior gravity, at "
+                    f"most {math.degrees(allowed):.1f}"
+                )
+        if self._pose is not None:
+            excess = _mahalanobis2(pose, covariance, *self._pose)
+            if excess > _MAX_MAHALANOBIS2:
+                away = float(np.linalg.norm(pose.center - self._pose[0].center))
+                turned = Rotation.from_matrix(pose.rotation @ self._pose[0].rotation.T).magnitude()
+                return (
+                    f"it lies {away:.2f} and {math.degrees(turned):.1f} degrees from the prior "
+                    f"pose, {math.sqrt(excess):.0f} standard deviations of both together"
+                )
+        return None
+
+    def near_pose_prior(
+        self, views: Sequence[MatchedView], max_error_px: float
+    ) -> list[MatchedView] | None:
+        """Keep the correspondences that a pose within the pose prior can explain.
+
+        Returns:
+            The views with fewer correspondences; None without a pose prior.
+        """
+        if self._pose is None:
+            return None
+        pose, covariance = self._pose
+        turn = _POSE_PRIOR_STDS * math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+        move = _POSE_PRIOR_STDS * _largest_std(pose, covariance)
+        kept = []
+        for view in views:
+            seen = (view.cam_from_rig @ pose).apply(view.points)
+            # The angle between where the landmark should be and where it was seen.
+            expected = seen / np.linalg.norm(seen, axis=1, keepdims=True)
+            rays = normalized_rays(view.camera, view.pixels)
+            angle = _angles(expected, rays / np.linalg.norm(rays, axis=1, keepdims=True))
+            depth = np.linalg.norm(seen, axis=1)
+            slack = max_error_px / view.camera.focal_length
+            near = angle <= turn + slack + np.arctan2(move, depth)
+            kept.append(replace(view, pixels=view.pixels[near], points=view.points[near]))
+        return kept
+
+
+def _largest_std(pose: Pose, covariance: NDArray[np.float64]) -> float:
+    """Standard deviation of a device's position along its worst axis."""
+    return math.sqrt(max(float(np.linalg.eigvalsh(position_covariance(pose, covariance))[-1]), 0.0))
+
+
+def _mahalanobis2(
+    a: Pose, covariance_a: NDArray[np.float64], b: Pose, covariance_b: NDArray[np.float64]
+) -> float:
+    """Squared distance of two poses in units of what both leave open."""
+    # In terms of rotation and centre: far from the origin, t is not linear in the rotation.
+    difference = np.concatenate(
+        [Rotation.from_matrix(a.rotation @ b.rotation.T).as_rotvec(), a.center - b.center]
+    )
+    floor = np.diag([_MAP_STD_RAD**2] * 3 + [_MAP_STD**2] * 3)
+    total = center_covariance(a, covariance_a) + center_covariance(b, covariance_b) + floor
+    return float(difference @ np.linalg.solve(total, difference))
+
+
+def _angles(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angles (n,) between unit vectors (n, 3), rad."""
+    return np.asarray(
+        np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ni,ni->n", a, b))
+    )

@@ -1,0 +1,36 @@
+"""Whether the features of a map are those that are at hand."""
+
+from __future__ import annotations
+
+from visloc.archive import FingerprintRecord
+from visloc.errors import Conflict
+from visloc.types import Fingerprint
+
+
+def check_fingerprint(built_with: FingerprintRecord, at_hand: Fingerprint, ref: str) -> None:
+    """Refuse a map that was built with other features than those at hand.
+
+    Raises:
+        Conflict: ``map.features``.
+    """
+    there, here = _flat(built_with), _flat(FingerprintRecord.of(at_hand))
+    differing = [name for name in {**there, **here} if there.get(name) != here.get(name)]
+    if not differing:
+        return
+    raise Conflict(
+        "map.features",
+        f"map {ref} was built with another {built_with.name}; use the weights and the version of "
+        "visloc that built it, or build it again",
+        field="weights_dir" if "weights_sha256" in differing else "map",
+        expected=", ".join(f"{name} {there.get(name)}" for name in differing),
+        got=", ".join(f"{name} {here.get(name)}" for name in differing),
+    )
+
+
+def _flat(record: FingerprintRecord) -> dict[str, int | float | str | None]:
+    return {
+        "name": record.name,
+        "revision": record.revision,
+        "weights_sha256": record.weights_sha256,
+        **record.parameters,
+    }

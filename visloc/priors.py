@@ -1,0 +1,159 @@
+"""What a caller knows about a pose before any photo is looked at.
+
+A prior is taken at its word: it narrows the search, and a pose that contradicts it is refused. It
+never bends a pose towards itself, so that a wrong one costs an answer and not the truth of one
+(docs/decisions/0010-priors-restrict-and-refuse.md).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.errors import InvalidInput
+from visloc.geometry import Pose
+
+# A gravity prior of a larger spread says too little to search by.
+MAX_GRAVITY_STD = math.radians(15.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PositionPrior:
+    """The device is within a sphere.
+
+    Attributes:
+        position: (3,) its centre in the world.
+        radius: in units of the world, positive.
+    """
+
+    position: NDArray[np.float64]
+    radius: float
+
+    def __post_init__(self) -> None:
+        if self.position.shape != (3,) or not np.isfinite(self.position).all():
+            raise _unusable("position.position", "three finite numbers", self.position)
+        if not (math.isfinite(self.radius) and self.radius > 0):
+            raise _unusable("position.radius", "a positive number", self.radius)
+
+
+@dataclass(frozen=True, slots=True)
+class HeightBand:
+    """The device is between two heights, such as those of a floor and its ceiling.
+
+    Heights are measured along the world's up, from the world's (0, 0, 0).
+
+    Attributes:
+        min: in units of the world.
+        max: greater than ``min``.
+    """
+
+    min: float
+    max: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.min) and math.isfinite(self.max) and self.min < self.max):
+            got = f"{self.min} to {self.max}"
+            raise _unusable("height", "two finite numbers, min < max", got)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosePrior:
+    """The device is where it was, give or take.
+
+    Attributes:
+        device_from_world: of the camera, or of the rig when a rig is localized.
+        covariance: (6, 6) of rotation (rad) then translation, for R <- Exp(w) R and t <- t + dt;
+            symmetric and positive definite.
+    """
+
+    device_from_world: Pose
+    covariance: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        check_covariance(self.covariance, "priors.pose.covariance")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GravityPrior:
+    """Which way is down, as an accelerometer or a tracker tells it.
+
+    Attributes:
+        direction: (3,) unit vector that points down, in the frame of the camera, or of the rig
+            when a rig is localized.
+        std: standard deviation of its angle, rad.
+        world: (3,) unit vector that points down in the world, for maps that do not know it.
+    """
+
+    direction: NDArray[np.float64]
+    std: float
+    world: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "direction", unit_vector("gravity.direction", self.direction))
+        if self.world is not None:
+            object.__setattr__(self, "world", unit_vector("gravity.world", self.world))
+        if not 0 < self.std <= MAX_GRAVITY_STD:  # NaN fails too
+            most = f"more than 0 and at most {math.degrees(MAX_GRAVITY_STD):g} degrees"
+            raise _unusable("gravity.std_deg", most, math.degrees(self.std))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Priors:
+    """What is known; None where nothing is."""
+
+    position: PositionPrior | None = None
+    height: HeightBand | None = None
+    pose: PosePrior | None = None
+    gravity: GravityPrior | None = None
+
+
+NO_PRIORS = Priors()
+
+
+def unit_vector(field: str, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a direction (3,) at length 1.
+
+    Raises:
+        InvalidInput: ``priors.FIELD`` when it has none.
+    """
+    norm = math.hypot(*vector) if vector.shape == (3,) else math.nan
+    if not (math.isfinite(norm) and norm > 1e-6):
+        raise _unusable(field, "three finite numbers, not all zero", vector)
+    return np.asarray(vector / norm)
+
+
+def check_covariance(covariance: NDArray[np.float64], field: str) -> None:
+    """Refuse what is not the covariance (6, 6) of a pose.
+
+    Raises:
+        InvalidInput: ``pose.covariance``.
+    """
+    fine = covariance.shape == (6, 6) and bool(np.isfinite(covariance).all())
+    if fine:
+        scale = np.sqrt(np.abs(np.diag(covariance)))
+        fine = bool((scale > 0).all()) and np.allclose(covariance, covariance.T, rtol=1e-6)
+        if fine:
+            with np.errstate(over="ignore", invalid="ignore"):
+                unitless = covariance / np.outer(scale, scale)
+            fine = bool(np.isfinite(unitless).all() and np.linalg.eigvalsh(unitless)[0] > 1e-9)
+    if not fine:
+        raise InvalidInput(
+            "pose.covariance",
+            "not the covariance of a pose",
+            field=field,
+            expected="6 x 6 finite numbers, symmetric and positive definite: rotation (rad), then "
+            "translation",
+        )
+
+
+def _unusable(field: str, expected: str, got: object) -> InvalidInput:
+    return InvalidInput(
+        f"priors.{field.partition('.')[0]}",
+        "not usable",
+        field=f"priors.{field}",
+        expected=expected,
+        got=str(got)[:100],
+    )

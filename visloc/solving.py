@@ -1,0 +1,337 @@
+"""From what the images of an instant show to one pose that can be believed, or a refusal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.constraints import Constraints, MapGeometry
+from visloc.errors import VislocError
+from visloc.geometry import Camera, Pose
+from visloc.pose.covariance import position_covariance, with_origin
+from visloc.pose.generalized import (
+    GeneralizedPose,
+    estimate_generalized_pose,
+    refine_generalized_pose,
+)
+from visloc.pose.views import MatchedView
+from visloc.priors import Priors
+from visloc.timing import timed
+from visloc.trajectory import PoseSource
+from visloc.types import (
+    DEFAULT_PRESET,
+    Evidence,
+    ImageAnswer,
+    InstantAnswer,
+    LocalizeOptions,
+    Reason,
+    Refusal,
+    RegistrationPreset,
+    RigPose,
+)
+
+# The default max_error_px holds for photos of this longer side and more; for smaller ones it
+# shrinks with them. 12 px are so large a part of a photo of 256 px that poses by chance explain
+# up to 10 % of the matches.
+FULL_ERROR_FROM_PX = 640
+# A prior decides between two poses when the photo leaves them open: when the one that it allows
+# has at least this share of the inliers of the one that it forbids.
+_AMBIGUOUS_SHARE = 0.7
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matches:
+    """2D-3D correspondences of one image.
+
+    Attributes:
+        pixels: (n, 2) float64.
+        points: (n, 3) float64, relative to the map's origin.
+    """
+
+    pixels: NDArray[np.float64]
+    points: NDArray[np.float64]
+
+    @staticmethod
+    def none() -> Matches:
+        """Return no correspondences."""
+        return Matches(np.empty((0, 2)), np.empty((0, 3)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """What one image shows of the map, before any pose is looked for.
+
+    Attributes:
+        evidence: without inliers.
+        matches: with landmarks.
+        elsewhere: with landmarks of photos that the priors exclude, though they look more like
+            the query; mostly none.
+        refusal: why there is nothing to solve; None when there may be.
+    """
+
+    evidence: Evidence
+    matches: Matches
+    elsewhere: Matches
+    refusal: Refusal | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenImage:
+    """One image of an instant, looked at.
+
+    Attributes:
+        sensor: the camera's id in the rig.
+        cam_from_rig: where it sits; the identity for a camera on its own.
+        look: None when the image could not be used.
+        error: why it could not.
+    """
+
+    sensor: str
+    cam_from_rig: Pose
+    look: Look | None
+    error: VislocError | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solved:
+    """An instant's pose, or why there is none.
+
+    Attributes:
+        answer: for the caller.
+        views: what each usable image contributed, relative to the map's origin.
+        pose: the accepted pose, relative to the map's origin; None when there is none.
+    """
+
+    answer: InstantAnswer
+    views: tuple[MatchedView, ...]
+    pose: GeneralizedPose | None
+
+
+def solve_instant(
+    images: Sequence[SeenImage],
+    geometry: MapGeometry,
+    options: LocalizeOptions,
+    priors: Priors,
+    timestamp: int | None = None,
+) -> Solved:
+    """Find one pose from all images of an instant; a photo on its own is a rig of one camera.
+
+    Args:
+        images: each of another camera of the rig.
+        geometry: of the map.
+        options: those that the images were looked at with.
+        priors: what is known of the rig.
+        timestamp: for the answer.
+
+    Raises:
+        InvalidInput: ``priors.*`` that mean nothing in this map.
+    """
+    constraints = Constraints(geometry, priors)
+    looks = [image.look for image in images if image.look is not None]
+    views = views_of(images, [look.matches for look in looks])
+    seconds = _summed([look.evidence.seconds for look in looks])
+    with timed(seconds, "pose"):
+        found, refusal = _find_pose(images, views, options, constraints)
+    pose = None
+    if refusal is None and found is not None and found.covariance is not None:
+        pose = rig_pose(found.rig_from_world, found.covariance, geometry, PoseSource.ESTIMATED)
+    inliers = [] if found is None else found.inliers
+    answer = InstantAnswer(timestamp, image_answers(images, inliers), pose, refusal, seconds)
+    return Solved(answer, views, found if refusal is None else None)
+
+
+def views_of(images: Sequence[SeenImage], matches: Sequence[Matches]) -> tuple[MatchedView, ...]:
+    """Return the views of the images that could be used, with their ``matches`` in order."""
+    usable = [(image.cam_from_rig, image.look) for image in images if image.look is not None]
+    return tuple(
+        MatchedView(look.evidence.camera, cam_from_rig, of_image.pixels, of_image.points)
+        for (cam_from_rig, look), of_image in zip(usable, matches, strict=True)
+    )
+
+
+def image_answers(
+    images: Sequence[SeenImage], inliers: Sequence[NDArray[np.bool_]]
+) -> tuple[ImageAnswer, ...]:
+    """Say what each image contributed to a pose with these ``inliers``, one mask per usable image.
+
+    No masks mean no inliers.
+    """
+    masks = iter(inliers)
+    answers = []
+    for image in images:
+        evidence = None
+        if image.look is not None:
+            num_inliers = int(next(masks).sum()) if inliers else 0
+            evidence = replace(image.look.evidence, num_inliers=num_inliers)
+        answers.append(ImageAnswer(image.sensor, image.cam_from_rig, evidence, image.error))
+    return tuple(answers)
+
+
+def rig_pose(
+    rig_from_local: Pose,
+    covariance: NDArray[np.float64],
+    geometry: MapGeometry,
+    source: PoseSource,
+) -> RigPose:
+    """Move a pose and its covariance (6, 6) from the map's own coordinates to the world."""
+    position_variance = np.diag(position_covariance(rig_from_local, covariance))
+    rig_from_world, covariance = with_origin(rig_from_local, covariance, geometry.origin)
+    return RigPose(
+        rig_from_world,
+        covariance,
+        position_std=np.sqrt(position_variance),
+        orientation_std=np.sqrt(np.diag(covariance)[:3]),
+        source=source,
+    )
+
+
+def registration_for(options: LocalizeOptions, cameras: Sequence[Camera]) -> RegistrationPreset:
+    """The thresholds for photos: the default's inlier distance shrinks with the smallest."""
+    registration = options.registration
+    if options.preset != DEFAULT_PRESET or options.max_error_px is not None:
+        return registration
+    smallest = min(max(camera.width, camera.height) for camera in cameras)
+    share = min(1.0, smallest / FULL_ERROR_FROM_PX)
+    return replace(registration, max_error_px=registration.max_error_px * share)
+
+
+def _find_pose(
+    images: Sequence[SeenImage],
+    views: Sequence[MatchedView],
+    options: LocalizeOptions,
+    constraints: Constraints,
+) -> tuple[GeneralizedPose | None, Refusal | None]:
+    """Return the best pose, if any, and why it is not believed, if it is not."""
+    looks = [image.look for image in images if image.look is not None]
+    if not looks:
+        return None, Refusal("features", Reason.NO_USABLE_IMAGE, "none of the images could be used")
+    refusals = [look.refusal for look in looks if look.refusal is not None]
+    if len(refusals) == len(looks):
+        return None, refusals[0]
+    registration = registration_for(options, [view.camera for view in views])
+    num_pairs = sum(len(view) for view in views)
+    if num_pairs < registration.min_inliers:
+        return None, Refusal(
+            "matching",
+            Reason.TOO_FEW_MATCHES,
+            f"only {num_pairs} keypoints match the map, {registration.min_inliers} are needed",
+        )
+    found = _estimate(views, registration, options, constraints)
+    if found is None:
+        return None, Refusal("pose", Reason.NO_POSE, "no camera pose explains the matches")
+    refusal = _gate(found, num_pairs, registration, constraints)
+    if refusal is not None and refusal.reason is Reason.CONTRADICTS_PRIOR:
+        other = _near_pose_prior(views, found, registration, options, constraints)
+        if other is not None and _gate(other, num_pairs, registration, constraints) is None:
+            found, refusal = other, None
+    if refusal is None:
+        elsewhere = views_of(images, [look.elsewhere for look in looks])
+        refusal = _better_elsewhere(elsewhere, found, registration, options)
+    return found, refusal
+
+
+def _estimate(
+    views: Sequence[MatchedView],
+    registration: RegistrationPreset,
+    options: LocalizeOptions,
+    constraints: Constraints,
+) -> GeneralizedPose | None:
+    return estimate_generalized_pose(
+        views,
+        max_error_px=registration.max_error_px,
+        seed=options.seed,
+        gravity=constraints.gravity,
+    )
+
+
+def _gate(
+    found: GeneralizedPose,
+    num_pairs: int,
+    registration: RegistrationPreset,
+    constraints: Constraints,
+) -> Refusal | None:
+    """Why a pose is not believed, or None (docs/decisions/0002-refuse-instead-of-guess.md)."""
+    if found.num_inliers < registration.min_inliers:
+        return Refusal(
+            "gate",
+            Reason.TOO_FEW_INLIERS,
+            f"the best pose explains {found.num_inliers} matches, "
+            f"{registration.min_inliers} are needed; is this photo of the mapped place?",
+        )
+    if found.num_inliers / num_pairs < registration.min_inlier_ratio:
+        return Refusal(
+            "gate",
+            Reason.LOW_INLIER_RATIO,
+            f"the best pose explains {found.num_inliers / num_pairs:.1%} of the matches, "
+            f"{registration.min_inlier_ratio:.1%} are needed; is this photo of the mapped place?",
+        )
+    if found.covariance is None:
+        return Refusal(
+            "gate",
+            Reason.UNCERTAIN_POSE,
+            "the matched landmarks leave the pose undetermined: they lie in a line or a spot",
+        )
+    contradiction = constraints.contradiction(found.rig_from_world, found.covariance)
+    if contradiction is not None:
+        return Refusal(
+            "gate",
+            Reason.CONTRADICTS_PRIOR,
+            f"the best pose contradicts what is known: {contradiction}",
+        )
+    return None
+
+
+def _near_pose_prior(
+    views: Sequence[MatchedView],
+    forbidden: GeneralizedPose,
+    registration: RegistrationPreset,
+    options: LocalizeOptions,
+    constraints: Constraints,
+) -> GeneralizedPose | None:
+    """Where the images leave the place open, return the pose that the pose prior decides for."""
+    near = constraints.near_pose_prior(views, registration.max_error_px)
+    if near is None:
+        return None
+    start = _estimate(near, registration, options, constraints)
+    if start is None:
+        return None
+    found = refine_generalized_pose(
+        views, start.rig_from_world, max_error_px=registration.max_error_px
+    )
+    if found is None or found.num_inliers < _AMBIGUOUS_SHARE * forbidden.num_inliers:
+        return None
+    return found
+
+
+def _better_elsewhere(
+    elsewhere: Sequence[MatchedView],
+    found: GeneralizedPose,
+    registration: RegistrationPreset,
+    options: LocalizeOptions,
+) -> Refusal | None:
+    """Refuse a pose that priors allow when one that they forbid explains the images better."""
+    if sum(len(view) for view in elsewhere) < registration.min_inliers:
+        return None
+    other = estimate_generalized_pose(
+        elsewhere, max_error_px=registration.max_error_px, seed=options.seed
+    )
+    if other is None or found.num_inliers >= _AMBIGUOUS_SHARE * other.num_inliers:
+        return None
+    return Refusal(
+        "gate",
+        Reason.CONTRADICTS_PRIOR,
+        f"a place that the priors exclude explains {other.num_inliers} matches, the one that "
+        f"they allow {found.num_inliers}: the priors are wrong, or both places look alike",
+    )
+
+
+def _summed(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Seconds by stage of several images together."""
+    total: dict[str, float] = {}
+    for part in parts:
+        for stage, seconds in part.items():
+            total[stage] = total.get(stage, 0.0) + seconds
+    return total
