@@ -219,8 +219,7 @@ def _one_camera_harmed(bench: Bench, moments: Sequence[Moment], harmed: str) -> 
         typer.echo(
             f"| {name} | {sum(a.pose is not None for a in alone)} of {len(alone)} | "
             f"{sum(a.pose is not None for a in together)} of {len(together)} | "
-            f"{_summary(_errors(together, moments))} |",
-            flush=True,
+            f"{_summary(_errors(together, moments))} |"
         )
     typer.echo()
 

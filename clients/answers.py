@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,17 +27,18 @@ from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.trajectory import PoseSource
 
+_P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 
-def parse_answer(server: str, parse: Callable[[JsonObject], _T], raw: JsonObject) -> _T:
+def parse_answer(server: str, parse: Callable[_P, _T], *given: _P.args, **named: _P.kwargs) -> _T:
     """Parse an answer, and blame the server for one that cannot be.
 
     Raises:
         Unavailable: ``server.answer``.
     """
     try:
-        return parse(raw)
+        return parse(*given, **named)
     except (KeyError, TypeError, ValueError, InvalidInput) as error:
         raise not_understood(server, f"{type(error).__name__}: {error}") from error
 
@@ -180,10 +181,16 @@ def _parse_transform(
 
 
 def _parse_uncertainty(raw: JsonObject) -> dict[str, NDArray[np.float64]]:
+    covariance = _array(raw["covariance"], 6, 6)
+    if not np.isfinite(covariance).all():
+        raise ValueError("a covariance that is not finite")
+    least, *_, largest = np.linalg.eigvalsh(covariance)
+    if least < -1e-9 * largest or not np.allclose(covariance, covariance.T, rtol=1e-6):
+        raise ValueError("a covariance that is none")
     return {
         "position": _array(raw["position"], 3),
         "orientation": _array(raw["orientation"], 4),
-        "covariance": _array(raw["covariance"], 6, 6),
+        "covariance": covariance,
         "position_std": _array(raw["position_std"], 3),
         "orientation_std_deg": _array(raw["orientation_std_deg"], 3),
     }

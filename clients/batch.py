@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from clients.client import AsyncClient
 from clients.features import Features
+from clients.instants import QueryInstant
+from clients.modes import Arrangement, Mode
 from clients.queries import Query
 from clients.results import (
     copy_lines,
@@ -20,7 +22,8 @@ from clients.results import (
     write_poses,
     write_whole,
 )
-from clients.running import Outcome, localize_all
+from clients.running import InstantOutcome, Outcome, localize_all, localize_instants
+from clients.traced import estimate_of, measured
 from clients.types import LocalizeOptions
 from visloc.errors import Conflict
 from visloc.geometry import PixelOrigin
@@ -39,6 +42,8 @@ class Batch:
         pixel_origin: where its cameras and keypoints count from.
         map_ref: ``id@version``, so that all results are of one map.
         options: for every photo.
+        mode: what is made of the answers.
+        arranged: what more the mode is told, for the description.
     """
 
     output: Path
@@ -47,6 +52,8 @@ class Batch:
     pixel_origin: PixelOrigin
     map_ref: str
     options: LocalizeOptions
+    mode: Mode = Mode.SINGLE
+    arranged: Mapping[str, object] = field(default_factory=dict)
 
     @property
     def results(self) -> Path:
@@ -55,7 +62,7 @@ class Batch:
 
     @property
     def poses(self) -> Path:
-        """The poses of the localized photos, written when all are done."""
+        """The poses of the localized and filled photos, written when all are done."""
         return self.output / "poses.txt"
 
     @property
@@ -86,6 +93,8 @@ def open_batch(batch: Batch, *, restart: bool) -> set[str]:
         "pixel_origin": batch.pixel_origin,
         "options": batch.options.given(),
     }
+    if batch.mode is not Mode.SINGLE:
+        described |= {"mode": batch.mode.value, **batch.arranged}
     if batch.results.exists():
         _check_same_run(batch.description, described)
     else:
@@ -118,19 +127,56 @@ async def run_batch(
         await localize_all(client, queries, batch.map_ref, batch.options, concurrency, keep, read)
 
 
-def finish_batch(batch: Batch, queries: Sequence[Query]) -> Counter[str]:
-    """Bring ``results.jsonl`` into the order of the dataset and write ``poses.txt``.
+async def run_instants(
+    batch: Batch,
+    client: AsyncClient,
+    instants: Sequence[QueryInstant],
+    concurrency: int,
+    on_outcome: Callable[[InstantOutcome], None],
+    read: Callable[[Query], bytes | Features],
+) -> None:
+    """As ``run_batch``, for instants; the results of an instant are appended together.
+
+    Raises:
+        VislocError: as ``run_batch``.
+    """
+    with batch.results.open("a", encoding="utf-8") as file:
+
+        def keep(outcome: InstantOutcome) -> None:
+            file.write("".join(map(result_line, outcome.photos)))
+            file.flush()
+            on_outcome(outcome)
+
+        await localize_instants(
+            client, instants, batch.map_ref, batch.options, concurrency, keep, read
+        )
+
+
+def finish_batch(batch: Batch, arrangement: Arrangement) -> Counter[str]:
+    """Bring ``results.jsonl`` into the order of the dataset, fill, and write ``poses.txt``.
 
     Of a photo that was asked about again the newest result is kept.
 
     Returns:
-        How many photos are localized, not_localized, and error.
+        How many photos are localized, filled, not_localized, and error; and how many were filled
+        from each source.
     """
     by_name = {result.name: result for result in read_results(batch.results)}
-    ordered = [by_name[query.name] for query in queries]
-    copy_lines(batch.results, ordered, batch.results)
-    write_poses(batch.poses, ((r.name, r.pose) for r in ordered if r.pose is not None))
-    return Counter(result.status for result in ordered)
+    ordered = [by_name[query.name] for query in arrangement.photos]
+    own = [None if r.pose is None else measured(r.pose, r.num_inliers) for r in ordered]
+    poses = arrangement.fill(batch.mode, own)
+    filled = {
+        result.name: pose
+        for result, pose in zip(ordered, poses, strict=True)
+        if result.pose is None and pose is not None
+    }
+    copy_lines(batch.results, ordered, batch.results, filled)
+    estimates = {result.name: result.pose for result in ordered} | {
+        name: estimate_of(pose) for name, pose in filled.items()
+    }
+    write_poses(batch.poses, ((name, p) for name, p in estimates.items() if p is not None))
+    statuses = ("filled" if r.name in filled else r.status for r in ordered)
+    return Counter(statuses) + Counter(pose.source.value for pose in filled.values())
 
 
 def _check_same_run(path: Path, described: dict[str, Any]) -> None:
@@ -141,12 +187,13 @@ def _check_same_run(path: Path, described: dict[str, Any]) -> None:
     if found == described:
         return
     known = found if isinstance(found, dict) else {}
-    differing = [name for name, value in described.items() if known.get(name) != value]
+    names = dict.fromkeys((*described, *known))
+    differing = [name for name in names if known.get(name) != described.get(name)]
     raise Conflict(
         "batch.other_run",
         "the folder holds results of another run; give another folder, what that run was given, "
         "or --restart to remove its results",
         field=str(path),
-        expected=", ".join(f"{name} {described[name]}" for name in differing),
+        expected=", ".join(f"{name} {described.get(name)}" for name in differing),
         got=", ".join(f"{name} {known.get(name, 'unknown')}" for name in differing),
     )

@@ -2,41 +2,44 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import sys
-import time
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, NoReturn
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from clients.batch import Batch, finish_batch, open_batch, run_batch
-from clients.benchmark import make_report, parse_threshold
+from clients.asking import Asking
+from clients.batch import Batch, finish_batch, open_batch, run_batch, run_instants
+from clients.benchmark import Run, make_report, parse_threshold
 from clients.client import DEFAULT_TIMEOUT_S, AsyncClient, Client
 from clients.display import (
     UNKNOWN_UNIT,
+    print_batch,
     print_failed,
     print_line,
     print_report,
     print_result,
     unit_of,
 )
+from clients.modes import DEFAULT_MAX_GAP_S, Arrangement, Mode, arrange, parse_modes
+from clients.priors import priors_from_text
+from clients.progress import run_with_progress
 from clients.queries import read_queries
 from clients.results import check_can_be_written, write_poses, write_whole
-from clients.running import Outcome, localize_all
+from clients.running import InstantOutcome, Outcome
 from clients.sending import choose_reader
-from clients.types import LocalizeOptions
+from clients.traced import estimate_of, measured
+from clients.types import LocalizeOptions, PoseEstimate
 from visloc.errors import VislocError
 from visloc.evaluation import DEFAULT_THRESHOLDS
 from visloc.geometry import Camera, PixelOrigin
+from visloc.trajectory import TimeUnit, TracedPose
 
 EXIT_ERROR = 1  # 2 is wrong usage, by convention
 EXIT_NOT_LOCALIZED = 3
-EXIT_STOPPED = 130
 
 app = typer.Typer(
     name="localize",
@@ -93,6 +96,35 @@ Origin = Annotated[
         "top-left pixel: corner, (0.5, 0.5), or center, (0, 0).",
     ),
 ]
+_MODES = (
+    "single: each photo on its own. rig: a photo without a pose gets that of the best camera of "
+    "its rig and instant. seq: ... that between the instants before and after, or of the nearest. "
+    "rig+seq: both. gp3p: the photos of a rig and instant solve one pose."
+)
+MaxGap = Annotated[
+    float,
+    typer.Option(
+        "--max-gap",
+        min=0,
+        metavar="SECONDS",
+        help="For seq: longest time between poses that others are filled from.",
+    ),
+]
+TimeUnitOption = Annotated[
+    TimeUnit | None,
+    typer.Option(
+        "--time-unit",
+        help="For seq: what the dataset's timestamps count; without it, by their size.",
+    ),
+]
+RigOption = Annotated[
+    str | None,
+    typer.Option(
+        "--rig",
+        metavar="ID",
+        help="For gp3p: a rig that the map knows, instead of the dataset's own rigs.txt.",
+    ),
+]
 DEFAULT_SERVER = "http://127.0.0.1:8000"
 
 
@@ -122,6 +154,13 @@ def image(
     as_json: Annotated[bool, typer.Option("--json", help="Print the answer as JSON.")] = False,
     option: Options = None,
     seed: Seed = None,
+    priors: Annotated[
+        str | None,
+        typer.Option(
+            metavar="JSON_OR_FILE",
+            help="What is known of the pose: position, height, pose or gravity, as in the API.",
+        ),
+    ] = None,
     timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
 ) -> None:
     """Localize one photo.
@@ -130,8 +169,9 @@ def image(
     """
     options = _options(option, seed)
     intrinsics = None if camera is None else Camera.from_text(camera)
+    known = None if priors is None else priors_from_text(priors)
     with Client(server, timeout_s=timeout_s) as client:
-        result = client.localize(photo, map_ref, intrinsics, options)
+        result = client.localize(photo, map_ref, intrinsics, options, priors=known)
         if as_json:
             typer.echo(json.dumps(result.raw, indent=2))
         else:
@@ -149,6 +189,10 @@ def localize_batch(
     option: Options = None,
     seed: Seed = None,
     concurrency: Concurrency = 1,
+    mode: Annotated[Mode, typer.Option(help=_MODES)] = Mode.SINGLE,
+    time_unit: TimeUnitOption = None,
+    max_gap: MaxGap = DEFAULT_MAX_GAP_S,
+    rig: RigOption = None,
     features_dir: FeaturesDir = None,
     pixel_origin: Origin = PixelOrigin.CORNER,
     restart: Annotated[
@@ -161,7 +205,8 @@ def localize_batch(
     Writes results.jsonl, one answer per line, and at the end poses.txt with lines
     'name qw qx qy qz tx ty tz' (cam_from_world) of the localized photos. The same command takes
     up a stopped run where it was. A photo that cannot be answered is recorded and passed over;
-    where that was the server's fault, the same command asks again.
+    where that was the server's fault, the same command asks again. The modes rig, seq and rig+seq
+    fill photos without a pose at the end: their status is filled, and source says from what.
 
     Exits with 0 when every photo has its line, 1 on an error, 130 when stopped.
     """
@@ -169,31 +214,47 @@ def localize_batch(
     queries = read_queries(source, pixel_origin)
     with Client(server, timeout_s=timeout_s) as client:
         info = client.map(map_ref)
+    arrangement = arrange(queries, [mode], info, rig_id=rig, time_unit=time_unit, max_gap_s=max_gap)
     read = choose_reader(source, info, features_dir, pixel_origin)
-    batch = Batch(output, source, features_dir, pixel_origin, info.ref, options)
+    arranged = _arranged(mode, arrangement, rig)
+    batch = Batch(output, source, features_dir, pixel_origin, info.ref, options, mode, arranged)
     done = open_batch(batch, restart=restart)
-    waiting = [query for query in queries if query.name not in done]
-    if len(waiting) < len(queries):
-        _err.print(f"{len(queries) - len(waiting)} of {len(queries)} are done already")
+    photos = queries.photos
+    waiting = [query for query in photos if query.name not in done]
+    # An instant is asked about again as a whole.
+    instants = [i for i in arrangement.asked if not all(q.name in done for q in i.photos)]
+    if len(waiting) < len(photos):
+        _err.print(f"{len(photos) - len(waiting)} of {len(photos)} are done already")
     failed: list[Outcome] = []
 
     async def run(advance: Callable[[], None]) -> None:
         def count(outcome: Outcome) -> None:
-            advance()
             if outcome.error is not None:
                 failed.append(outcome)
 
-        async with AsyncClient(server, timeout_s=timeout_s) as client:
-            await run_batch(batch, client, waiting, concurrency, count, read)
+        def count_photo(outcome: Outcome) -> None:
+            advance()
+            count(outcome)
 
-    _run(run, len(waiting), "the same command takes the run up where it was")
-    counts = finish_batch(batch, queries)
+        def count_instant(outcome: InstantOutcome) -> None:
+            advance()
+            for photo in outcome.photos:
+                count(photo)
+
+        async with AsyncClient(server, timeout_s=timeout_s) as client:
+            if mode is Mode.GP3P:
+                await run_instants(batch, client, instants, concurrency, count_instant, read)
+            else:
+                await run_batch(batch, client, waiting, concurrency, count_photo, read)
+
+    if mode is Mode.GP3P:
+        what, total = "instants", len(instants)
+    else:
+        what, total = "photos", len(waiting)
+    run_with_progress(_err, run, what, total, "the same command takes the run up where it was")
+    counts = finish_batch(batch, arrangement)
     print_failed(_err, failed)
-    _out.print(
-        f"{counts['localized']} of {len(queries)} localized, "
-        f"{counts['not_localized']} not localized, {counts['error']} without an answer",
-        highlight=False,
-    )
+    print_batch(_out, counts, len(photos), mode.fills)
 
 
 @app.command()
@@ -205,6 +266,16 @@ def benchmark(
     option: Options = None,
     seed: Seed = None,
     concurrency: Concurrency = 1,
+    mode: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="MODE[,MODE...]",
+            help=f"Columns of the table; can be repeated; all for all. {_MODES}",
+        ),
+    ] = None,
+    time_unit: TimeUnitOption = None,
+    max_gap: MaxGap = DEFAULT_MAX_GAP_S,
+    rig: RigOption = None,
     features_dir: FeaturesDir = None,
     pixel_origin: Origin = PixelOrigin.CORNER,
     threshold: Annotated[
@@ -216,50 +287,65 @@ def benchmark(
         ),
     ] = None,
     poses: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write poses as localize batch does.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Write poses as localize batch does, of the first mode."),
     ] = None,
     timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
 ) -> None:
     """Measure how fast and, where the dataset has true poses, how well photos are localized.
 
-    Recall counts all photos with a true pose; those not localized are failures. The median
-    errors are over the localized photos only. Latencies are what this client sees.
+    Recall counts all photos with a true pose; those without one of their own or a filled one are
+    failures. The errors are those of the photos that have a pose. Latencies are what this client
+    sees. Photos are asked about once, whatever the number of modes, and once more for gp3p.
 
     Exits with 0 when done, 1 on an error, 130 when stopped; then there is no report.
     """
     options = _options(option, seed)
+    modes = parse_modes(mode or ())
     thresholds = [parse_threshold(text) for text in threshold or ()] or DEFAULT_THRESHOLDS
     check_can_be_written([report] if poses is None else [report, poses])
     queries = read_queries(source, pixel_origin)
     with Client(server, timeout_s=timeout_s) as client:
         info, about = client.map(map_ref), client.server_info()
+    arrangement = arrange(queries, modes, info, rig_id=rig, time_unit=time_unit, max_gap_s=max_gap)
     read = choose_reader(source, info, features_dir, pixel_origin)
-    outcomes: dict[str, Outcome] = {}
-    seconds = 0.0
-
-    async def run(advance: Callable[[], None]) -> None:
-        def keep(outcome: Outcome) -> None:
-            outcomes[outcome.query.name] = outcome
-            advance()
-
-        nonlocal seconds
-        async with AsyncClient(server, timeout_s=timeout_s) as client:
-            started = time.perf_counter()
-            await localize_all(client, queries, info.ref, options, concurrency, keep, read)
-            seconds = time.perf_counter() - started
-
-    _run(run, len(queries), "no report was written")
-    ordered = [outcomes[query.name] for query in queries]
-    figures = make_report(ordered, seconds, thresholds, about, info)
+    ask = Asking(server, timeout_s, info.ref, options, concurrency, read, _err)
+    of_photos = ask.photos(arrangement) if set(modes) != {Mode.GP3P} else None
+    of_instants = ask.instants(arrangement) if Mode.GP3P in modes else None
+    runs = {m: of_instants if m is Mode.GP3P else of_photos for m in modes}
+    figures_of = {m: run for m, run in runs.items() if run is not None}
+    poses_of = {m: arrangement.fill(m, _measured(run)) for m, run in figures_of.items()}
+    figures = make_report(figures_of, poses_of, thresholds, about, info)
     write_whole(report, [json.dumps(figures, indent=2, allow_nan=False).encode() + b"\n"])
     if poses is not None:
-        results = [outcome.result for outcome in ordered]
-        named = zip((query.name for query in queries), results, strict=True)
-        write_poses(poses, ((name, r.pose) for name, r in named if r is not None and r.pose))
-    failed = [outcome for outcome in ordered if outcome.error is not None]
-    num_with_truth = sum(query.truth is not None for query in queries)
+        write_poses(poses, _estimates(figures_of[modes[0]], poses_of[modes[0]]))
+    asked = [run for run in (of_photos, of_instants) if run is not None]
+    failed = [outcome for run in asked for outcome in run.outcomes if outcome.error is not None]
+    num_with_truth = sum(query.truth is not None for query in queries.photos)
     print_report(_out, figures, num_with_truth, len(failed), unit_of(info))
     print_failed(_err, failed)
+
+
+def _measured(run: Run) -> list[TracedPose | None]:
+    results = [outcome.result for outcome in run.outcomes]
+    return [None if r is None or r.pose is None else measured(r.pose, r.inliers) for r in results]
+
+
+def _estimates(run: Run, poses: Sequence[TracedPose | None]) -> Iterator[tuple[str, PoseEstimate]]:
+    """Give the poses of the photos that have one; measured ones with every digit as received."""
+    for outcome, pose in zip(run.outcomes, poses, strict=True):
+        if outcome.result is not None and outcome.result.pose is not None:
+            yield outcome.query.name, outcome.result.pose
+        elif pose is not None:
+            yield outcome.query.name, estimate_of(pose)
+
+
+def _arranged(mode: Mode, arrangement: Arrangement, rig_id: str | None) -> dict[str, object]:
+    if mode is Mode.GP3P:
+        return {"rig": rig_id}
+    if mode.fills_sequences:
+        return {"time_unit": arrangement.time_unit, "max_gap_s": arrangement.max_gap_s}
+    return {}
 
 
 def _unit(client: Client, map_ref: str) -> str:
@@ -272,31 +358,6 @@ def _unit(client: Client, map_ref: str) -> str:
 
 def _options(texts: Sequence[str] | None, seed: int | None) -> LocalizeOptions:
     return LocalizeOptions.from_texts([*(texts or ()), *([] if seed is None else [f"seed={seed}"])])
-
-
-def _run(
-    work: Callable[[Callable[[], None]], Coroutine[Any, Any, None]], total: int, if_stopped: str
-) -> None:
-    """Run ``work``, which calls what it is given after each photo, under a progress bar."""
-    columns = (
-        TextColumn("photos"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=_err) as progress:
-        task = progress.add_task("photos", total=total)
-        try:
-            asyncio.run(work(lambda: progress.advance(task)))
-        except KeyboardInterrupt:
-            progress.stop()
-            _err.print(f"stopped; {if_stopped}", highlight=False)
-            raise typer.Exit(EXIT_STOPPED) from None
-        except VislocError:
-            progress.stop()
-            _err.print(f"cannot go on; {if_stopped}", highlight=False)
-            raise
 
 
 def _fail(code: str, message: str) -> NoReturn:

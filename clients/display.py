@@ -21,7 +21,13 @@ _CAMERA_SOURCES: Mapping[str, str] = {
     "exif": "from the focal length in EXIF",
     "guess": "a guess: give --camera for a better pose",
 }
-
+# What a filled pose rests on.
+_FILLED: Mapping[str, str] = {
+    "rig": "from another camera of the rig",
+    "interpolated": "between two instants",
+    "nearest": "from the nearest instant",
+}
+_PERCENTILES = ("p50", "p75", "p90", "max")
 
 # Lengths in a world that is not metric, or may not be.
 UNKNOWN_UNIT = "units of the map"
@@ -74,11 +80,12 @@ def print_result(console: Console, result: LocalizeResult, unit: str) -> None:
 def print_report(
     console: Console, report: Mapping[str, Any], num_with_truth: int, num_errors: int, unit: str
 ) -> None:
-    """Print what the report of a benchmark says."""
-    server = report["server"]
+    """Print what the report of a benchmark says, with its modes side by side."""
+    server, modes = report["server"], report["modes"]
     features = ", ".join((server["features"]["local"], *server["features"]["global"]))
     console.print(
-        f"[bold]{report['localized']} of {report['queries']} localized[/bold] "
+        f"[bold]{report['localized']} of {report['queries']} localized[/bold]"
+        f"{f' ({next(iter(modes))})' if len(modes) > 1 else ''} "
         f"in {escape(server['map'])} ({escape(features)}), "
         f"server {escape(server['version'] or 'of unknown version')}",
         highlight=False,
@@ -86,11 +93,21 @@ def print_report(
     )
     if num_errors:
         console.print(f"[red]{num_errors} without an answer[/red]", highlight=False)
-    if report["recall"] is not None:
-        console.print(_accuracy(report, num_with_truth, unit))
-    else:
+    if report["recall"] is None:
         console.print("no ground truth in the dataset: no accuracy", highlight=False)
-    console.print(_speed(report))
+    if report["recall"] is not None or len(modes) > 1:
+        console.print(_poses(modes, num_with_truth, unit))
+    console.print(_speed(modes))
+
+
+def print_batch(console: Console, counts: Mapping[str, int], num_photos: int, fills: bool) -> None:
+    """Print how many photos have a pose, and what it rests on."""
+    parts = [f"{counts['localized']} of {num_photos} localized"]
+    if fills:
+        sources = [f"{counts[name]} {words}" for name, words in _FILLED.items() if counts[name]]
+        parts.append(f"{counts['filled']} filled" + (f" ({', '.join(sources)})" if sources else ""))
+    parts += [f"{counts['not_localized']} not localized", f"{counts['error']} without an answer"]
+    console.print(", ".join(parts), highlight=False)
 
 
 def print_failed(console: Console, failed: Sequence[Outcome]) -> None:
@@ -125,38 +142,94 @@ def _print_pose(console: Console, pose: PoseEstimate, unit: str) -> None:
     )
 
 
-def _accuracy(report: Mapping[str, Any], num_with_truth: int, unit: str) -> Table:
-    table = Table(title=f"accuracy over {num_with_truth} with known pose", title_justify="left")
-    table.add_column("within")
-    table.add_column("localized", justify="right")
-    for row in report["recall"]:
-        table.add_row(
-            f"{row['max_position_error_m']:g} {unit}, {row['max_orientation_error_deg']:g}°",
-            f"{row['fraction']:.1%}  ({round(row['fraction'] * num_with_truth)})",
+def _poses(modes: Mapping[str, Mapping[str, Any]], num_with_truth: int, unit: str) -> Table:
+    """The paper's table: what the modes make of the same photos."""
+    figures = list(modes.values())
+    has_truth = figures[0]["recall"] is not None
+    title = f"accuracy over {num_with_truth} with known pose" if has_truth else "poses"
+    table = Table(title=title, title_justify="left")
+    table.add_column("", no_wrap=True)
+    for mode in modes:
+        table.add_column(mode, justify="right", no_wrap=True)
+
+    def row(label: str, cells: Iterable[str]) -> None:
+        table.add_row(label, *cells)
+
+    row("localized", (f"{f['localized']} of {f['queries']}" for f in figures))
+    if any(f["instants"] is not None for f in figures):
+        instants = (f["instants"] for f in figures)
+        row(
+            "instants",
+            ("-" if i is None else f"{i['localized']} of {i['asked']}" for i in instants),
         )
-    if report["median_position_error_m"] is not None:
+    for source in _FILLED:
+        of_modes = [f["sources"].get(source) for f in figures]
+        if any(of_modes):
+            row(f"filled, {source}", ("-" if of is None else f"{of['poses']}" for of in of_modes))
+            row(
+                f"  their std ({unit})",
+                ("-" if of is None else f"{of['median_position_std_m']:.4f}" for of in of_modes),
+            )
+    if not has_truth:
+        return table
+    table.add_section()
+    for rows in zip(*(f["recall"] for f in figures), strict=True):
+        row(
+            f"within {rows[0]['max_position_error_m']:g} {unit}, "
+            f"{rows[0]['max_orientation_error_deg']:g}°",
+            (_share(r["fraction"], num_with_truth, len(modes)) for r in rows),
+        )
+    for label, field in (
+        (f"position ({unit})", "position_error_m"),
+        ("orientation (°)", "orientation_error_deg"),
+    ):
         table.add_section()
-        table.add_row(
-            "median of the localized",
-            f"{report['median_position_error_m']:.4f} {unit}, "
-            f"{report['median_orientation_error_deg']:.3f}°",
-        )
+        for name in _PERCENTILES:
+            row(
+                f"{label} {name}",
+                ("-" if f[field] is None else f"{f[field][name]:.4f}" for f in figures),
+            )
     return table
 
 
-def _speed(report: Mapping[str, Any]) -> Table:
+def _share(fraction: float, total: int, num_columns: int) -> str:
+    share = f"{fraction:.1%}"
+    return f"{share}  ({round(fraction * total)})" if num_columns == 1 else share
+
+
+def _speed(modes: Mapping[str, Mapping[str, Any]]) -> Table:
+    # The modes that fill ask nothing of their own.
+    asked: dict[str, Mapping[str, Any]] = {}
+    for figures in modes.values():
+        asked.setdefault("a photo" if figures["instants"] is None else "an instant", figures)
     table = Table(title="time, as the client sees it", title_justify="left")
     table.add_column("")
-    table.add_column("seconds", justify="right")
-    for name, seconds in report["latency_s"].items():
-        table.add_row(f"latency {name}", "-" if seconds is None else f"{seconds:.3f}")
+    for what in asked:
+        table.add_column("seconds" if len(asked) == 1 else f"seconds, {what}", justify="right")
+    columns = list(asked.values())
+    for name in columns[0]["latency_s"]:
+        table.add_row(
+            f"latency {name}", *(_seconds(figures["latency_s"][name], 3) for figures in columns)
+        )
     table.add_section()
-    for stage, seconds in _longest_first(report["stage_seconds"]):
-        table.add_row(f"server, {escape(stage)} (mean)", f"{seconds:.4f}")
-    if report["throughput_qps"] is not None:
+    stages: dict[str, float] = {}
+    for figures in columns:
+        for stage, seconds in figures["stage_seconds"].items():
+            stages[stage] = max(seconds, stages.get(stage, 0.0))
+    for stage, _ in _longest_first(stages):
+        table.add_row(
+            f"server, {escape(stage)} (mean)",
+            *(_seconds(figures["stage_seconds"].get(stage), 4) for figures in columns),
+        )
+    if columns[0]["throughput_qps"] is not None:
         table.add_section()
-        table.add_row("answers per second", f"{report['throughput_qps']:.2f}")
+        rates = (figures["throughput_qps"] for figures in columns)
+        table.add_row("answers per second", *(_seconds(rate, 2) for rate in rates))
     return table
+
+
+def _seconds(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def _longest_first(seconds: Mapping[str, float]) -> list[tuple[str, float]]:

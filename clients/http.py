@@ -3,30 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import AsyncGenerator, AsyncIterable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, assert_never
+from collections.abc import AsyncGenerator, AsyncIterable, Iterable, Iterator, Mapping
 
 import httpx
 
 from clients import errors
-from clients.features import Features
-from clients.priors import priors_as_json
-from clients.requests import CheckReady, GetMap, GetServer, JsonObject, ListMaps, Localize, Search
-from clients.rig_requests import (
-    AnyRequest,
-    LocalizeRig,
-    SentImage,
-    SentInstant,
-    SequenceStart,
-    camera_as_json,
-    odometry_as_json,
-    rig_as_json,
-    search_as_json,
-)
+from clients.http_requests import NDJSON, encode_request, encode_sequence
+from clients.requests import CheckReady, JsonObject
+from clients.rig_requests import AnyRequest, SentInstant, SequenceStart
 from visloc.errors import Unavailable, VislocError
 
 _CONNECT_TIMEOUT_S = 10.0
-_NDJSON = "application/x-ndjson"
 _LIMITS = httpx.Limits(
     max_connections=None,  # the caller decides how many requests run at once
     max_keepalive_connections=None,
@@ -60,7 +47,7 @@ class HttpTransport:
         Raises:
             VislocError: what the server refused, or ``server.*``.
         """
-        method, path, parts = _encode(request)
+        method, path, parts = encode_request(request)
         try:
             response = self._http.request(method, path, **parts)
         except httpx.HTTPError as error:
@@ -73,7 +60,7 @@ class HttpTransport:
         Raises:
             VislocError: as ``send``.
         """
-        method, path, parts = _encode_sequence(start, list(instants))
+        method, path, parts = encode_sequence(start, list(instants))
         try:
             with self._http.stream(method, path, **parts) as response:
                 if response.status_code != 200:
@@ -100,7 +87,7 @@ class AsyncHttpTransport:
 
     async def send(self, request: AnyRequest) -> JsonObject:
         """As ``HttpTransport.send``."""
-        method, path, parts = _encode(request)
+        method, path, parts = encode_request(request)
         try:
             response = await self._http.request(method, path, **parts)
         except httpx.HTTPError as error:
@@ -111,7 +98,7 @@ class AsyncHttpTransport:
         self, start: SequenceStart, instants: AsyncIterable[SentInstant]
     ) -> AsyncGenerator[JsonObject, None]:
         """As ``HttpTransport.stream``."""
-        method, path, parts = _encode_sequence(start, [instant async for instant in instants])
+        method, path, parts = encode_sequence(start, [instant async for instant in instants])
         try:
             async with self._http.stream(method, path, **parts) as response:
                 if response.status_code != 200:
@@ -132,113 +119,6 @@ class AsyncHttpTransport:
 
 def _timeout(timeout_s: float) -> httpx.Timeout:
     return httpx.Timeout(timeout_s, connect=min(_CONNECT_TIMEOUT_S, timeout_s))
-
-
-def _encode(request: AnyRequest) -> tuple[str, str, dict[str, Any]]:
-    """Return method, path and the rest of what httpx wants."""
-    match request:
-        case Localize():
-            headers = _id_header(request.search)
-            fields = _fields(request)
-            parts = {"data": fields, "files": _file(request.query), "headers": headers}
-            return "POST", "/localize", parts
-        case LocalizeRig():
-            files = _Files()
-            asked = search_as_json(request.search) | {
-                "rig": rig_as_json(request.rig),
-                "images": files.images(request.images),
-            }
-            return "POST", "/localize/rig", files.form(asked, _id_header(request.search))
-        case ListMaps():
-            return "GET", "/maps", {}
-        case GetMap():
-            return "GET", f"/maps/{request.map}", {}
-        case GetServer():
-            return "GET", "/healthz", {}
-        case CheckReady():
-            return "GET", "/readyz", {}
-    assert_never(request)
-
-
-def _encode_sequence(
-    start: SequenceStart, instants: Sequence[SentInstant]
-) -> tuple[str, str, dict[str, Any]]:
-    files = _Files()
-    asked = search_as_json(start.search) | {"instants": [files.instant(i) for i in instants]}
-    if start.rig is not None:
-        asked["rig"] = rig_as_json(start.rig)
-    if start.time_unit is not None:
-        asked["time_unit"] = start.time_unit
-    if start.max_gap_s is not None:
-        asked["max_gap_s"] = start.max_gap_s
-    headers = _id_header(start.search) | {"Accept": _NDJSON}
-    return "POST", "/localize/sequence", files.form(asked, headers)
-
-
-class _Files:
-    """The photos of a form, whose other part says what each is."""
-
-    def __init__(self) -> None:
-        self._parts: dict[str, tuple[str, bytes, str]] = {}
-
-    def images(self, images: Iterable[SentImage]) -> list[JsonObject]:
-        """Add photos, and return what the form says of them."""
-        return [self._image(image) for image in images]
-
-    def instant(self, instant: SentInstant) -> JsonObject:
-        """Add the photos of an instant, and return what the form says of it."""
-        said: JsonObject = {
-            "timestamp": instant.timestamp,
-            "images": self.images(instant.images),
-        }
-        if instant.odometry is not None:
-            said["odometry"] = odometry_as_json(instant.odometry)
-        if instant.priors is not None:
-            said["priors"] = priors_as_json(instant.priors)
-        return said
-
-    def form(self, asked: JsonObject, headers: Mapping[str, str]) -> dict[str, Any]:
-        """Return what httpx wants."""
-        # As a part of its own kind also where there is no file, so that it is a form in any case.
-        text = json.dumps(asked).encode()
-        files = {"request": (None, text, "application/json"), **self._parts}
-        return {"files": files, "headers": headers}
-
-    def _image(self, image: SentImage) -> JsonObject:
-        said: JsonObject = {"sensor": image.sensor}
-        if isinstance(image.query, Features):
-            said["features"] = image.query.as_json()
-        else:
-            name = f"image{len(self._parts)}"
-            self._parts[name] = ("photo", image.query, "application/octet-stream")
-            said["part"] = name
-        if image.camera is not None:
-            said["camera"] = camera_as_json(image.camera)
-        if image.timestamp is not None:
-            said["timestamp"] = image.timestamp
-        return said
-
-
-def _fields(request: Localize) -> dict[str, str]:
-    """Return the texts of a form for one photo."""
-    said = search_as_json(request.search)
-    fields = {name: json.dumps(value) for name, value in said.items() if name != "map"}
-    if "map" in said:
-        fields["map"] = said["map"]
-    if request.camera is not None:
-        fields["camera"] = json.dumps(camera_as_json(request.camera))
-    return fields
-
-
-def _id_header(search: Search) -> dict[str, str]:
-    return {} if search.request_id is None else {"X-Request-ID": search.request_id}
-
-
-def _file(query: bytes | Features) -> dict[str, tuple[str, bytes, str]]:
-    if isinstance(query, Features):
-        text = json.dumps(query.as_json()).encode()
-        return {"features": ("features.json", text, "application/json")}
-    return {"image": ("photo", query, "application/octet-stream")}
 
 
 def _decode(server: str, request: AnyRequest | None, response: httpx.Response) -> JsonObject:
@@ -262,7 +142,7 @@ def _check_lines(server: str, response: httpx.Response) -> None:
     content_type = response.headers.get("content-type", "nothing")
     if response.status_code != 200:
         _decode(server, None, response)
-    elif content_type.partition(";")[0].strip().lower() != _NDJSON:
+    elif content_type.partition(";")[0].strip().lower() != NDJSON:
         raise errors.not_understood(server, f"200 with {content_type}")
 
 

@@ -111,7 +111,13 @@ def _pose_prior(raw: Mapping[str, Any]) -> PosePrior:
     )
     rotation_wxyz = _numbers(f"{where}.rotation_wxyz", transform)
     if not abs(math.hypot(*rotation_wxyz) - 1.0) <= _MAX_LENGTH_ERROR:
-        raise _unusable(f"{where}.rotation_wxyz", "a unit quaternion", rotation_wxyz.tolist())
+        raise InvalidInput(
+            "pose.rotation",
+            "not a rotation: its quaternion has not length 1",
+            field=f"priors.{where}.rotation_wxyz",
+            expected="a unit quaternion w, x, y, z",
+            got=rotation_wxyz.tolist(),
+        )
     pose = Pose.from_quaternion(rotation_wxyz, _numbers(f"{where}.translation", transform))
     covariance = _numbers("pose.covariance", raw)
     return PosePrior(pose, covariance.reshape(6, 6) if covariance.size == 36 else covariance)

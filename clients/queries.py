@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,16 +22,40 @@ class Query:
         name: as the dataset or list has it; unique.
         path: the file, which may be missing.
         camera: intrinsics; None when unknown.
-        truth: the true ``cam_from_world``, when known.
+        truth: the true ``cam_from_world``, when known; never sent.
+        sensor_id: the sensor that took it; None in a list.
+        timestamp: when, in the dataset's own unit; None in a list.
     """
 
     name: str
     path: Path
     camera: Camera | None
     truth: Pose | None
+    sensor_id: str | None = None
+    timestamp: int | None = None
+
+    @property
+    def sensor(self) -> str:
+        """What a request calls the sensor, also when it is not known."""
+        return "camera" if self.sensor_id is None else self.sensor_id
 
 
-def read_queries(source: Path, origin: PixelOrigin = PixelOrigin.CORNER) -> list[Query]:
+@dataclass(frozen=True, slots=True, eq=False)
+class QuerySet:
+    """The photos to localize and how their cameras hang together.
+
+    Attributes:
+        source: the folder or list.
+        photos: in its order; a folder's by time, then by sensor.
+        rigs: rig id -> sensor id -> ``cam_from_rig``, None where it is unknown; none in a list.
+    """
+
+    source: Path
+    photos: tuple[Query, ...]
+    rigs: Mapping[str, Mapping[str, Pose | None]]
+
+
+def read_queries(source: Path, origin: PixelOrigin = PixelOrigin.CORNER) -> QuerySet:
     """Read a kapture folder or a text file that lists photos, in their order.
 
     Each line of a list is ``image_name`` or ``image_name MODEL width height params...``,
@@ -46,7 +70,7 @@ def read_queries(source: Path, origin: PixelOrigin = PixelOrigin.CORNER) -> list
     if source.is_dir():
         queries = _read_kapture(source, origin)
     elif source.is_file():
-        queries = _read_list(source, origin)
+        queries = QuerySet(source, tuple(_read_list(source, origin)), {})
     else:
         raise DatasetError(
             "queries.missing",
@@ -54,7 +78,7 @@ def read_queries(source: Path, origin: PixelOrigin = PixelOrigin.CORNER) -> list
             field=str(source),
             expected="a kapture folder, or a text file that lists photos",
         )
-    if not queries:
+    if not queries.photos:
         raise DatasetError(
             "queries.empty",
             "there is no photo in it",
@@ -64,17 +88,20 @@ def read_queries(source: Path, origin: PixelOrigin = PixelOrigin.CORNER) -> list
     return queries
 
 
-def _read_kapture(root: Path, origin: PixelOrigin) -> list[Query]:
+def _read_kapture(root: Path, origin: PixelOrigin) -> QuerySet:
     dataset = read_dataset(root).with_pixels_from(origin)
-    return [
+    photos = (
         Query(
             record.path,
             dataset.path_of(record),
             dataset.sensors[record.sensor_id].camera,
             dataset.pose(record),
+            record.sensor_id,
+            record.timestamp,
         )
         for record in dataset.images
-    ]
+    )
+    return QuerySet(root, tuple(photos), dataset.rigs)
 
 
 def _read_list(path: Path, origin: PixelOrigin) -> list[Query]:

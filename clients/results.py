@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from clients.answers import parse_pose
 from clients.running import Outcome
+from clients.traced import pose_as_json
 from clients.types import PoseEstimate
 from visloc.errors import DatasetError, InvalidInput
+from visloc.trajectory import PoseSource, TracedPose
 
-_ERROR = "error"
-_STATUSES = ("localized", "not_localized", _ERROR)
+_LOCALIZED, _NOT_LOCALIZED, _ERROR, _FILLED = "localized", "not_localized", "error", "filled"
 # Errors that say nothing about the photo: it may be answered when it is asked about again.
 _PASSING_CODES = ("server.internal", "server.timeout")
 _PASSING_KINDS = ("Unavailable", "Overloaded")
@@ -27,8 +28,10 @@ class StoredResult:
 
     Attributes:
         name: of the photo.
-        status: localized, not_localized or error.
+        status: localized, not_localized or error; of a filled one, what it was before.
         pose: when localized.
+        num_inliers: of the pose.
+        was_filled: whether the line has a pose from other photos.
         is_final: whether asking again is pointless; False for errors of the server.
         offset: where the line begins in the file, bytes.
         length: of the line with its end, bytes.
@@ -37,6 +40,8 @@ class StoredResult:
     name: str
     status: str
     pose: PoseEstimate | None
+    num_inliers: int
+    was_filled: bool
     is_final: bool
     offset: int
     length: int
@@ -45,12 +50,14 @@ class StoredResult:
 def result_line(outcome: Outcome) -> str:
     """Write an outcome as one line of JSON: the name, then the answer as received.
 
+    ``source`` tells what the pose rests on, null without one; here nothing is filled yet.
     A photo without an answer has ``"status": "error"`` and an object ``error`` with kind, code,
     message, field, expected and got.
     """
     entry: dict[str, Any] = {"name": outcome.query.name}
     if outcome.result is not None:
-        entry |= outcome.result.raw
+        source = PoseSource.ESTIMATED.value if outcome.result.localized else None
+        entry |= {**outcome.result.raw, "source": source}
     else:
         error = outcome.error
         assert error is not None
@@ -58,6 +65,7 @@ def result_line(outcome: Outcome) -> str:
             name: getattr(error, name) for name in ("code", "message", "field", "expected", "got")
         }
         entry |= {"status": _ERROR, "error": {"kind": type(error).__name__} | details}
+        entry["source"] = None
     return json.dumps(entry) + "\n"
 
 
@@ -92,7 +100,7 @@ def read_results(path: Path) -> Iterator[StoredResult]:
     with path.open("rb") as file:
         for number, line in enumerate(file, start=1):
             try:
-                name, status, pose, is_final = _parse_line(line)
+                parsed = _parse_line(line)
             except (KeyError, TypeError, ValueError, InvalidInput) as error:
                 raise DatasetError(
                     "results.line",
@@ -100,18 +108,33 @@ def read_results(path: Path) -> Iterator[StoredResult]:
                     field=f"{path}:{number}",
                     got=str(error),
                 ) from error
-            yield StoredResult(name, status, pose, is_final, offset, len(line))
+            yield StoredResult(*parsed, offset, len(line))
             offset += len(line)
 
 
-def copy_lines(source: Path, results: Iterable[StoredResult], target: Path) -> None:
-    """Copy lines of ``source`` to ``target``, in the order given; they may be the same file."""
+def copy_lines(
+    source: Path,
+    results: Iterable[StoredResult],
+    target: Path,
+    filled: Mapping[str, TracedPose] | None = None,
+) -> None:
+    """Copy lines of ``source`` to ``target``, in the order given; they may be the same file.
+
+    Args:
+        source: what ``results`` were read from.
+        results: the lines.
+        target: written whole.
+        filled: poses from other photos, by the photo's name; other lines lose theirs.
+    """
+    filled = filled or {}
     with source.open("rb") as file:
 
         def lines() -> Iterator[bytes]:
             for result in results:
                 file.seek(result.offset)
-                yield file.read(result.length)
+                line = file.read(result.length)
+                pose = filled.get(result.name)
+                yield line if pose is None and not result.was_filled else _refilled(line, pose)
 
         write_whole(target, lines())
 
@@ -148,16 +171,39 @@ def check_can_be_written(paths: Sequence[Path]) -> None:
             )
 
 
-def _parse_line(line: bytes) -> tuple[str, str, PoseEstimate | None, bool]:
+def _parse_line(line: bytes) -> tuple[str, str, PoseEstimate | None, int, bool, bool]:
     entry = json.loads(line)
     name, status = entry["name"], entry["status"]
-    if not isinstance(name, str) or status not in _STATUSES:
+    was_filled = status == _FILLED
+    if was_filled:
+        status = _before_filling(entry)
+    if not isinstance(name, str) or status not in (_LOCALIZED, _NOT_LOCALIZED, _ERROR):
         raise ValueError(f"name {name!r}, status {status!r}")
-    pose = parse_pose(entry["pose"]) if status == "localized" else None
+    pose, num_inliers = None, 0
+    if status == _LOCALIZED:
+        pose, num_inliers = parse_pose(entry["pose"]), int(entry["inliers"])
     is_final = status != _ERROR or not (
         entry["error"]["code"] in _PASSING_CODES or entry["error"]["kind"] in _PASSING_KINDS
     )
-    return name, status, pose, is_final
+    return name, status, pose, num_inliers, was_filled, is_final
+
+
+def _before_filling(entry: Mapping[str, Any]) -> str:
+    return _ERROR if "error" in entry else _NOT_LOCALIZED
+
+
+def _refilled(line: bytes, pose: TracedPose | None) -> bytes:
+    """Write a pose from other photos into a line, or take it out; the rest stays as it is."""
+    entry = json.loads(line)
+    entry["status"], entry["source"] = _before_filling(entry), None
+    if "error" in entry:
+        entry.pop("pose", None)
+    else:
+        entry["pose"] = None
+    if pose is not None:
+        entry["status"], entry["source"] = _FILLED, pose.source.value
+        entry["pose"] = pose_as_json(pose)
+    return json.dumps(entry).encode() + b"\n"
 
 
 def _pose_line(name: str, pose: PoseEstimate) -> str:

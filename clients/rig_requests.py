@@ -111,13 +111,13 @@ def sent_instant(instant: Instant) -> SentInstant:
     """Check an instant and read its photos.
 
     Raises:
-        InvalidInput: ``sequence.timestamps``, ``rig.rotation``, ``pose.translation``,
+        InvalidInput: ``sequence.timestamps``, ``pose.rotation``, ``pose.translation``,
             ``pose.covariance`` or ``image.unreadable``.
     """
     _check_timestamp(instant.timestamp, "sequence.timestamps")
     odometry = instant.odometry
     if odometry is not None:
-        _check_rigid(odometry.rig_from_odometry, "odometry.rig_from_odometry")
+        _check_rigid(odometry.rig_from_odometry, "odometry.rig_from_odometry", "pose.rotation")
         if odometry.covariance is not None:
             check_covariance(np.asarray(odometry.covariance), "odometry.covariance")
     images = tuple(map(_sent_image, instant.images))
@@ -191,15 +191,15 @@ def _check_timestamp(timestamp: int, code: str) -> None:
 def _check_rig(rig: Rig) -> None:
     if isinstance(rig, Mapping):
         for name, sensor in rig.items():
-            _check_rigid(sensor.cam_from_rig, f"rig.sensors.{name}.cam_from_rig")
+            _check_rigid(sensor.cam_from_rig, f"rig.sensors.{name}.cam_from_rig", "rig.rotation")
 
 
-def _check_rigid(pose: Pose, field: str) -> None:
+def _check_rigid(pose: Pose, field: str, code: str) -> None:
     # A quaternion is made of it, which would hide the scale.
     scale_error = np.abs(pose.rotation @ pose.rotation.T - np.eye(3)).max()
     if not (scale_error <= _MAX_SCALE_ERROR and np.linalg.det(pose.rotation) > 0):
         raise InvalidInput(
-            "rig.rotation",
+            code,
             "not a rotation: scaled, sheared or mirrored",
             field=field,
             expected="a rotation matrix",

@@ -115,7 +115,7 @@ class ImageResult:
 
     Attributes:
         sensor: the camera of the rig.
-        error: why the photo could not be used; then nothing else is known of it.
+        error: why the photo could not be used; then at most ``cam_from_world`` is known.
         cam_from_world: where the camera was, by the rig's pose; None without one.
         keypoints: found in the photo.
         correspondences: 2D-3D, given to the solver.

@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import dataclass
+from typing import TypeVar
 
+from clients.answers import parse_answer
 from clients.client import AsyncClient
+from clients.errors import not_understood
 from clients.features import Features
+from clients.instants import QueryInstant
 from clients.queries import Query
+from clients.rigs import InstantResult, RigImage
+from clients.traced import photo_result
 from clients.types import LocalizeOptions, LocalizeResult
 from visloc.errors import InvalidInput, Overloaded, VislocError, WeightsError
+
+_T = TypeVar("_T")
 
 # After these waits a server that is still overloaded ends the run.
 _RETRY_AFTER_S = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 # What may go wrong with one photo while the others are fine ...
 _CODES_OF_ONE_PHOTO = ("server.internal", "server.timeout")
 # ... and what would be refused with every photo.
-_CODES_OF_ALL_PHOTOS = ("options.", "map.", "features.required", "features.kind")
+_CODES_OF_ALL_PHOTOS = ("options.", "map.", "rig.", "features.required", "features.kind")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +44,23 @@ class Outcome:
     query: Query
     result: LocalizeResult | None
     error: VislocError | None
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InstantOutcome:
+    """What became of the photos of one instant.
+
+    Attributes:
+        photos: what became of each, in the order of the instant; their seconds are the instant's.
+        localized: whether the instant has a pose of its own.
+        has_answer: whether the server said anything.
+        seconds: as of ``Outcome``.
+    """
+
+    photos: tuple[Outcome, ...]
+    localized: bool
+    has_answer: bool
     seconds: float
 
 
@@ -58,55 +83,125 @@ async def localize_all(
     Raises:
         VislocError: what makes going on pointless, such as a server that is gone.
     """
-    waiting = iter(queries)
 
-    async def work() -> None:
-        for query in waiting:
-            on_outcome(await _localize(client, query, map_ref, options, read))
+    async def work(query: Query) -> None:
+        started = time.perf_counter()
+        try:
+            sent = await asyncio.to_thread(read, query)
+            started = time.perf_counter()
+            result = await _ask_patiently(
+                lambda: client.localize(sent, map_ref, query.camera, options)
+            )
+        except VislocError as error:
+            _raise_unless_of_one(error)
+            on_outcome(Outcome(query, None, error, time.perf_counter() - started))
+        else:
+            on_outcome(Outcome(query, result, None, time.perf_counter() - started))
+
+    await _work_through(queries, concurrency, work)
+
+
+async def localize_instants(
+    client: AsyncClient,
+    instants: Iterable[QueryInstant],
+    map_ref: str,
+    options: LocalizeOptions,
+    concurrency: int,
+    on_outcome: Callable[[InstantOutcome], None],
+    read: Callable[[Query], bytes | Features],
+) -> None:
+    """Localize instants as ``localize_all`` does photos.
+
+    Of an instant, photos that cannot be read fail alone, and the others are asked about.
+
+    Raises:
+        VislocError: what makes going on pointless, such as a server that is gone.
+    """
+
+    async def work(instant: QueryInstant) -> None:
+        images: dict[str, RigImage] = {}
+        errors: dict[str, VislocError] = {}
+        for query in instant.photos:
+            try:
+                sent = await asyncio.to_thread(read, query)
+            except VislocError as error:
+                _raise_unless_of_one(error)
+                errors[query.name] = error
+            else:
+                images[query.name] = RigImage(query.sensor, sent, query.camera, query.timestamp)
+        started = time.perf_counter()
+        result = None
+        try:
+            if images:
+                result = await _ask_patiently(
+                    lambda: client.localize_rig(images.values(), map_ref, instant.rig, options)
+                )
+        except VislocError as error:
+            _raise_unless_of_one(error)
+            errors |= dict.fromkeys(images, error)
+        seconds = time.perf_counter() - started
+        results: dict[str, LocalizeResult] = {}
+        if result is not None:
+            _take_answer(client.server, result, images, results, errors)
+        photos = tuple(
+            Outcome(query, results.get(query.name), errors.get(query.name), seconds)
+            for query in instant.photos
+        )
+        localized = result is not None and result.localized
+        on_outcome(InstantOutcome(photos, localized, result is not None, seconds))
+
+    await _work_through(instants, concurrency, work)
+
+
+def _take_answer(
+    server: str,
+    result: InstantResult,
+    images: dict[str, RigImage],
+    results: dict[str, LocalizeResult],
+    errors: dict[str, VislocError],
+) -> None:
+    """Sort the answers to the photos of an instant, by name, into results and errors."""
+    answered = [image.sensor for image in result.images]
+    if answered != [image.sensor for image in images.values()]:
+        raise not_understood(server, f"answers to photos of {', '.join(answered)}"[:200])
+    for index, (name, image) in enumerate(zip(images, result.images, strict=True)):
+        if image.error is not None:
+            errors[name] = image.error
+        else:
+            results[name] = parse_answer(server, photo_result, result, index)
+
+
+async def _work_through(
+    items: Iterable[_T], concurrency: int, work: Callable[[_T], Awaitable[None]]
+) -> None:
+    waiting = iter(items)
+
+    async def take() -> None:
+        for item in waiting:
+            await work(item)
 
     try:
         async with asyncio.TaskGroup() as group:
             for _ in range(concurrency):
-                group.create_task(work())
+                group.create_task(take())
     except ExceptionGroup as failed:
         raise failed.exceptions[0] from None
 
 
-async def _localize(
-    client: AsyncClient,
-    query: Query,
-    map_ref: str,
-    options: LocalizeOptions,
-    read: Callable[[Query], bytes | Features],
-) -> Outcome:
-    started = time.perf_counter()
-    try:
-        sent = await asyncio.to_thread(read, query)
-        started = time.perf_counter()
-        result = await _ask_patiently(client, sent, query, map_ref, options)
-    except VislocError as error:
-        if not _concerns_one_photo(error):
-            raise
-        return Outcome(query, None, error, time.perf_counter() - started)
-    return Outcome(query, result, None, time.perf_counter() - started)
-
-
-def _concerns_one_photo(error: VislocError) -> bool:
+def _raise_unless_of_one(error: VislocError) -> None:
+    """Raise what does not concern one photo or instant only."""
     if isinstance(error, InvalidInput) and not isinstance(error, WeightsError):
-        return not error.code.startswith(_CODES_OF_ALL_PHOTOS)
-    return error.code in _CODES_OF_ONE_PHOTO
+        is_of_one = not error.code.startswith(_CODES_OF_ALL_PHOTOS)
+    else:
+        is_of_one = error.code in _CODES_OF_ONE_PHOTO
+    if not is_of_one:
+        raise error
 
 
-async def _ask_patiently(
-    client: AsyncClient,
-    sent: bytes | Features,
-    query: Query,
-    map_ref: str,
-    options: LocalizeOptions,
-) -> LocalizeResult:
+async def _ask_patiently(ask: Callable[[], Awaitable[_T]]) -> _T:
     for wait_s in _RETRY_AFTER_S:
         try:
-            return await client.localize(sent, map_ref, query.camera, options)
+            return await ask()
         except Overloaded:
             await asyncio.sleep(wait_s)
-    return await client.localize(sent, map_ref, query.camera, options)
+    return await ask()

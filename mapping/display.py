@@ -110,28 +110,26 @@ def print_import(out: Console, summary: ImportSummary) -> None:
 def print_rig(out: Console, calibration: RigCalibration) -> None:
     """Show where the cameras of a rig are, and how well their instants agree."""
     table = Table(
-        title=f"rig {escape(calibration.rig)}, at camera {escape(calibration.reference)}; "
-        "deviations: median / 90 %",
+        box=None,
+        title=f"rig {escape(calibration.rig)}, its frame is camera {escape(calibration.reference)}",
         title_justify="left",
     )
-    for name in ("camera", "compared with", "instants", "outliers", "degrees", "units", "position"):
-        table.add_column(name)
+    for name in ("camera", "through", "instants", "outliers", "degrees", "units", "position"):
+        table.add_column(name, justify="right" if name in ("instants", "outliers") else "left")
     for name, camera in calibration.cameras.items():
-        x, y, z = camera.cam_from_rig.center
-        position = f"{x:.4f} {y:.4f} {z:.4f}"
+        position = " ".join(_figure(value) for value in camera.cam_from_rig.center)
         if camera.relative is None or camera.relative_to is None:
             table.add_row(escape(name), "", "", "", "", "", position)
             continue
+        found = camera.relative
         table.add_row(
-            *(escape(name), escape(camera.relative_to)),
-            *(str(camera.relative.instants), str(camera.relative.outliers)),
-            *(_deviation(camera.relative.rotation_deg), _deviation(camera.relative.position)),
-            position,
+            *(escape(name), escape(camera.relative_to), str(found.instants), str(found.outliers)),
+            *(_deviation(found.rotation_deg), _deviation(found.position), position),
         )
     out.print(table)
     out.print(
-        "outliers: more than "
-        f"{OUTLIER_MULTIPLE:g} times the median off; they hardly move the estimate",
+        "degrees, units: deviation of the instants from the estimate, median / 90 %; "
+        f"outliers: instants {OUTLIER_MULTIPLE:g} times further off than the median",
         soft_wrap=True,
         highlight=False,
     )
@@ -140,4 +138,9 @@ def print_rig(out: Console, calibration: RigCalibration) -> None:
 
 
 def _deviation(spread: Spread) -> str:
-    return f"{spread.median:.3g} / {spread.p90:.3g}"
+    return f"{_figure(spread.median)} / {_figure(spread.p90)}"
+
+
+def _figure(value: float) -> str:
+    """Four digits, and 0 for round-off."""
+    return f"{value:.4g}" if abs(value) > 1e-9 else "0"

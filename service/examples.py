@@ -121,6 +121,8 @@ MAP: dict[str, Any] = {
     "observations": 297457,
     "extent": {"min": [-3.0, -2.25, -9.4e-08], "max": [3.0, 2.25, 2.8]},
     "size_bytes": 33037821,
+    "down": [],
+    "rigs": [{"id": "rig", "sensors": ["left", "right"]}],
 }
 READY: dict[str, Any] = {
     "ready": True,

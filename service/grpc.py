@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import AsyncGenerator, AsyncIterator
+from contextlib import aclosing, asynccontextmanager
 from time import perf_counter
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import grpc
 from google.protobuf.any_pb2 import Any as AnyMessage
@@ -21,13 +21,17 @@ from pydantic import BaseModel
 
 import visloc
 from service.engine import Engine
+from service.grpc_requests import (
+    instant_of,
+    localize_job_of,
+    rig_job_of,
+    sequence_start_of,
+)
+from service.jobs import Instant, InstantLocalization
 from service.schemas import (
-    Array,
-    Camera,
-    Features,
+    BatchLimits,
+    InstantAnswer,
     ListMapsResponse,
-    LocalizeOptions,
-    LocalizeRequest,
     LocalizeResponse,
     MapInfo,
 )
@@ -53,8 +57,10 @@ MessageT = TypeVar("MessageT", bound=Message)
 class LocalizationServicer(pb2_grpc.LocalizationServicer):
     """``visloc.v1.Localization`` over the engine."""
 
-    def __init__(self, engine: Engine) -> None:
+    def __init__(self, engine: Engine, settings: ServiceSettings) -> None:
         self._engine = engine
+        self._max_request_bytes = settings.max_request_bytes
+        self._limits = BatchLimits(settings.max_rig_images, settings.max_instants)
 
     async def Localize(  # noqa: N802  the name in the proto
         self, request: pb2.LocalizeRequest, context: Context
@@ -63,10 +69,56 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
         id_ = request_id(request.request_id)
         async with _envelope("Localize", id_, context):
             # Features take a moment to check: off the event loop with them.
-            job = await asyncio.to_thread(lambda: _localize_request(request).to_job())
+            job = await asyncio.to_thread(localize_job_of, request, self._max_request_bytes)
             found = await self._engine.localize(job)
             answer = LocalizeResponse.from_localization(found, id_)
             return _message(answer, pb2.LocalizeResponse())
+
+    async def LocalizeRig(  # noqa: N802
+        self, request: pb2.LocalizeRigRequest, context: Context
+    ) -> pb2.InstantAnswer:
+        """Estimate one pose from the photos that the cameras of a rig took at one instant."""
+        id_ = request_id(request.request_id)
+        async with _envelope("LocalizeRig", id_, context):
+            with self._engine.admit_batch():
+                job = await asyncio.to_thread(rig_job_of, request, self._limits)
+                found = await self._engine.localize_rig(job)
+                answer = InstantAnswer.from_localization(found, id_)
+                return _message(answer, pb2.InstantAnswer())
+
+    # A coroutine that writes, not a generator: it ends, whatever becomes of the call, before the
+    # place that it holds is given to another.
+    async def LocalizeSequence(  # type: ignore[override]  # noqa: N802
+        self, request_iterator: AsyncIterator[pb2.LocalizeSequenceRequest], context: Context
+    ) -> None:
+        """Answer the instants of a sequence in order, each as soon as its answer is final.
+
+        No instant is read from the wire before the answers to those before it are taken.
+        """
+        first = await anext(request_iterator, None)
+        id_ = request_id(first.start.request_id if first is not None else None)
+        async with _envelope("LocalizeSequence", id_, context):
+            with self._engine.admit_batch():
+                start = await asyncio.to_thread(sequence_start_of, first)
+                instants = self._instants(request_iterator, has_rig=start.rig is not None)
+                answers = cast(
+                    AsyncGenerator[InstantLocalization],
+                    self._engine.localize_sequence(start, instants),
+                )
+                async with aclosing(answers):
+                    async for found in answers:
+                        answer = InstantAnswer.from_localization(found, id_)
+                        await context.write(_message(answer, pb2.InstantAnswer()))
+
+    async def _instants(
+        self, messages: AsyncIterator[pb2.LocalizeSequenceRequest], *, has_rig: bool
+    ) -> AsyncGenerator[Instant]:
+        number = 0
+        async for message in messages:
+            yield await asyncio.to_thread(
+                instant_of, message, self._limits, number, has_rig=has_rig
+            )
+            number += 1
 
     async def ListMaps(  # noqa: N802
         self, request: pb2.ListMapsRequest, context: Context
@@ -95,13 +147,15 @@ class GrpcServer:
     def __init__(self, engine: Engine, settings: ServiceSettings) -> None:
         self._server = grpc.aio.server(
             options=[
-                ("grpc.max_receive_message_length", settings.max_request_bytes),
+                ("grpc.max_receive_message_length", settings.max_message_bytes),
                 ("grpc.so_reuseport", 0),  # a second server on the port is a mistake
             ],
             maximum_concurrent_rpcs=settings.max_requests,
         )
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]
-        pb2_grpc.add_LocalizationServicer_to_server(LocalizationServicer(engine), self._server)
+        pb2_grpc.add_LocalizationServicer_to_server(
+            LocalizationServicer(engine, settings), self._server
+        )
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         reflection.enable_server_reflection(
             (SERVICE_NAME, health.SERVICE_NAME, reflection.SERVICE_NAME), self._server
@@ -126,41 +180,6 @@ class GrpcServer:
     async def _set_health(self, status: health_pb2.HealthCheckResponse.ServingStatus) -> None:
         for name in ("", SERVICE_NAME):
             await self._health.set(name, status)
-
-
-def _localize_request(request: pb2.LocalizeRequest) -> LocalizeRequest:
-    camera = request.camera
-    return LocalizeRequest(
-        map=request.map,
-        image=request.image if request.HasField("image") else None,
-        features=_features(request.features) if request.HasField("features") else None,
-        camera=Camera(
-            model=camera.model,
-            width=camera.width,
-            height=camera.height,
-            params=list(camera.params),
-        )
-        if request.HasField("camera")
-        else None,
-        options=LocalizeOptions(
-            **{field.name: value for field, value in request.options.ListFields()}
-        ),
-    )
-
-
-def _features(features: pb2.Features) -> Features:
-    return Features(
-        kind=features.kind,
-        keypoints=_array(features.keypoints),
-        descriptors=_array(features.descriptors),
-        global_descriptors={
-            name: _array(features.global_descriptors[name]) for name in features.global_descriptors
-        },
-    )
-
-
-def _array(array: pb2.Array) -> Array:
-    return Array(dtype=array.dtype, shape=list(array.shape), data=array.data)
 
 
 def _message(answer: BaseModel, message: MessageT) -> MessageT:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import AsyncGenerator, AsyncIterator, Sequence
 from contextlib import aclosing
 from functools import partial
 from http import HTTPStatus
 from time import perf_counter
+from typing import cast
 
 from fastapi import Depends, Request, Response
 from fastapi.exceptions import RequestValidationError
@@ -111,14 +113,17 @@ def create_app(engine: Engine, settings: ServiceSettings) -> App:
         is final.
         """
         start, instants = await read_sequence_jobs(request, settings)
-        answers = engine.localize_sequence(start, _one_by_one(instants))
+        answers = cast(
+            AsyncGenerator[InstantLocalization],
+            engine.localize_sequence(start, _one_by_one(instants)),
+        )
         id_ = request.state.request_id
-        if not _wants_lines(request):
-            found = await while_connected(request.receive, _all_of(answers))
-            spoken = [InstantAnswer.from_localization(each, id_) for each in found]
-            return json_response(LocalizeSequenceResponse(request_id=id_, answers=spoken))
-        first = await while_connected(request.receive, anext(answers))
-        return Lines(first, answers, partial(InstantAnswer.from_localization, request_id=id_), id_)
+        if _wants_lines(request):
+            message = partial(InstantAnswer.from_localization, request_id=id_)
+            first = await while_connected(request.receive, _next_of(answers))
+            return Lines(first, answers, message, id_)
+        found = await while_connected(request.receive, _all_of(answers))
+        return await asyncio.to_thread(_sequence_response, found, id_)
 
     @app.get("/maps", response_model=ListMapsResponse)
     async def list_maps() -> Response:
@@ -195,9 +200,18 @@ async def _one_by_one(instants: Sequence[Instant]) -> AsyncGenerator[Instant]:
         yield instant
 
 
+async def _next_of(answers: AsyncGenerator[InstantLocalization]) -> InstantLocalization:
+    return await anext(answers)
+
+
 async def _all_of(answers: AsyncGenerator[InstantLocalization]) -> list[InstantLocalization]:
     async with aclosing(answers):
         return [answer async for answer in answers]
+
+
+def _sequence_response(found: Sequence[InstantLocalization], id_: str) -> Response:
+    answers = [InstantAnswer.from_localization(each, id_) for each in found]
+    return json_response(LocalizeSequenceResponse(request_id=id_, answers=answers))
 
 
 def _wants_lines(request: Request) -> bool:

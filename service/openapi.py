@@ -1,106 +1,32 @@
-"""What FastAPI cannot derive for /openapi.json: two kinds of bodies, examples, problems."""
+"""What FastAPI cannot derive for /openapi.json: schemas of bodies, examples, problems."""
 
 from __future__ import annotations
 
-import base64
-import json
 from typing import Any
 
 from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
-from service import examples
-from service.schemas import Camera, LocalizeRequest, Problem
-
-# A grey photo of 64 x 48 pixels: small enough to read, real enough to be posted as it is.
-EXAMPLE_IMAGE = (
-    "iVBORw0KGgoAAAANSUhEUgAAAEAAAAAwCAAAAACEICPDAAAAJ0lEQVR42u3MMREAAAgEoNfkRjeEmwcB"
-    "qMlNRyAQCAQCgUAgEDwNFm0oAOBnO1pYAAAAAElFTkSuQmCC"
+from service import batch_examples, examples
+from service.responses import NDJSON
+from service.schemas import (
+    Camera,
+    LocalizeRequest,
+    LocalizeRigRequest,
+    LocalizeSequenceRequest,
+    Problem,
+    RigCalibration,
 )
-EXAMPLE_REQUEST = {
-    "map": "office",
-    "image": EXAMPLE_IMAGE,
-    "camera": {"model": "PINHOLE", "width": 64, "height": 48, "params": [52.5, 52.5, 32, 24]},
-    "options": {"top_k": 10, "seed": 1},
-}
-# Two keypoints of a map of XFeat features (64 numbers each) and localvlad, which is not sent.
-EXAMPLE_FEATURES_REQUEST = {
-    "map": "office",
-    "features": {
-        "kind": "xfeat",
-        "keypoints": {"dtype": "float32", "shape": [2, 2], "data": "AABIQQAAyEEAAABCAACQQQ=="},
-        "descriptors": {
-            "dtype": "int8",
-            "shape": [2, 64],
-            "data": base64.b64encode(bytes(range(128))).decode(),
-        },
-        "global_descriptors": {},
-    },
-    "camera": {"model": "PINHOLE", "width": 64, "height": 48, "params": [52.5, 52.5, 32, 24]},
-}
-_REF = "#/components/schemas/{model}"
 
-LOCALIZE_BODY: dict[str, Any] = {
-    "required": True,
-    "content": {
-        "multipart/form-data": {
-            "schema": {
-                "type": "object",
-                "required": ["map"],
-                "oneOf": [{"required": ["image"]}, {"required": ["features", "camera"]}],
-                "additionalProperties": False,
-                "properties": {
-                    "map": {"type": "string", "description": "id, or id@version"},
-                    "image": {
-                        "type": "string",
-                        "contentMediaType": "application/octet-stream",
-                        "description": "the file: JPEG, PNG, WebP, TIFF or BMP",
-                    },
-                    "features": {
-                        "type": "string",
-                        "contentMediaType": "application/json",
-                        "description": "instead of the image, a file: Features as JSON",
-                    },
-                    "camera": {
-                        "type": "string",
-                        "description": "MODEL,width,height,params... or a Camera as JSON",
-                    },
-                    "options": {"type": "string", "description": "LocalizeOptions as JSON"},
-                },
-            },
-            "examples": {
-                "photo": {
-                    "value": {
-                        "map": "office",
-                        "image": "(the bytes of the file)",
-                        "camera": "PINHOLE,640,480,525,525,320,240",
-                        "options": '{"top_k": 10, "seed": 1}',
-                    }
-                },
-                "features": {
-                    "value": {
-                        "map": "office",
-                        "features": json.dumps(EXAMPLE_FEATURES_REQUEST["features"]),
-                        "camera": "PINHOLE,64,48,52.5,52.5,32,24",
-                    }
-                },
-            },
-        },
-        "application/json": {
-            "schema": {"$ref": _REF.format(model="LocalizeRequest")},
-            "examples": {
-                "photo": {"value": EXAMPLE_REQUEST},
-                "features": {"value": EXAMPLE_FEATURES_REQUEST},
-            },
-        },
-    },
-}
+_REF = "#/components/schemas/{model}"
 
 _ANSWERS: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {
     ("/localize", "post", "200"): {
         "localized": examples.LOCALIZED,
         "not_localized": examples.NOT_LOCALIZED,
     },
+    ("/localize/rig", "post", "200"): {"localized": batch_examples.RIG},
+    ("/localize/sequence", "post", "200"): {"sequence": batch_examples.SEQUENCE},
     ("/maps", "get", "200"): {"maps": {"maps": [examples.MAP]}},
     ("/maps/{ref}", "get", "200"): {"map": examples.MAP},
     ("/readyz", "get", "200"): {"ready": examples.READY},
@@ -108,11 +34,11 @@ _ANSWERS: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {
 }
 
 _PROBLEMS = {
-    404: "no such map or version",
+    404: "no such map, version or rig",
     409: "the features or weights that the map was built with are not here",
-    413: "over a limit on bytes or pixels",
+    413: "over a limit on bytes, pixels, photos or instants",
     422: "the request cannot be used as it is",
-    429: "too many photos are waiting; try again",
+    429: "too many photos are waiting, or rigs and sequences being served; try again",
     500: "a map on disk is damaged, or the server made a mistake",
     503: "the maps are being loaded; try again",
 }
@@ -141,7 +67,10 @@ class App(FastAPI):
             _, ours = models_json_schema(
                 [
                     (LocalizeRequest, "validation"),
-                    (Camera, "validation"),  # named by LocalizeRequest's own schema of camera
+                    (LocalizeRigRequest, "validation"),
+                    (LocalizeSequenceRequest, "validation"),
+                    (RigCalibration, "validation"),
+                    (Camera, "validation"),  # named by the requests' own schema of camera
                     (Problem, "serialization"),
                 ],
                 ref_template=_REF,
@@ -165,4 +94,9 @@ class App(FastAPI):
                 response["content"]["application/json"]["examples"] = {
                     name: {"value": answer} for name, answer in shown.items()
                 }
+            lines = schema["paths"]["/localize/sequence"]["post"]["responses"]["200"]["content"]
+            lines[NDJSON] = {
+                "schema": {"$ref": _REF.format(model="InstantAnswer")},
+                "example": batch_examples.RIG,
+            }
         return super().openapi()

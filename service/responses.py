@@ -102,6 +102,7 @@ class Lines(Response):
     ) -> None:
         super().__init__(media_type=NDJSON)
         del self.headers["content-length"]
+        self.headers["X-Accel-Buffering"] = "no"  # or nginx would keep the lines to itself
         self._answers = _with_first(first, others)
         self._message = message
         self._id = id_

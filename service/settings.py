@@ -27,6 +27,8 @@ Count = Annotated[int, Field(ge=1)]
 REQUEST_OVERHEAD_BYTES = 64 * 1024
 # Room in a request for the numbers of one photo: camera, sensor, its share of the instant's.
 VALUES_PER_IMAGE = 64
+# So many are parsed at least, that too many photos or instants can be told as such.
+FEWEST_BATCH_VALUES = 100_000
 # Room for requests besides the photos that are worked on or wait: health, maps, refusals.
 REQUESTS_BESIDES = 32
 
@@ -67,8 +69,8 @@ class ServiceSettings(BaseModel):
     max_batches: Count = 8
     """rigs and sequences that are served at once; one more is refused"""
     max_batch_bytes: Count = 64 * 2**20
-    """largest request with several photos, bytes: over HTTP as it comes, in base64 or not; over
-    gRPC one message. A sequence over HTTP is one request, a stream over gRPC has no such bound"""
+    """largest request with several photos, bytes: over HTTP as it comes, base64 included; over gRPC
+    one message, that is a rig's photos or those of one instant of a sequence"""
     max_rig_images: Count = 16
     """photos of one instant of a rig"""
     max_instants: Count = 1000
@@ -92,9 +94,15 @@ class ServiceSettings(BaseModel):
         return self.max_image_bytes * 4 // 3 + REQUEST_OVERHEAD_BYTES
 
     @property
+    def max_message_bytes(self) -> int:
+        """Largest message of gRPC: of one photo, or of an instant's."""
+        return max(self.max_request_bytes, self.max_batch_bytes)
+
+    @property
     def max_batch_values(self) -> int:
         """Values in the JSON of a request with several photos: parsed, each takes 100 bytes."""
-        return VALUES_PER_IMAGE * (self.max_rig_images + 1) * (self.max_instants + 1)
+        images = (self.max_rig_images + 1) * (self.max_instants + 1)
+        return max(FEWEST_BATCH_VALUES, VALUES_PER_IMAGE * images)
 
 
 def read_settings(arguments: Sequence[str], environment: Mapping[str, str]) -> ServiceSettings:

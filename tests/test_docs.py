@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from http import HTTPStatus
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +25,23 @@ from pydantic import BaseModel
 import clients.cli
 import mapping.cli
 from mapping.export import export_map
-from service.schemas import LocalizeRequest, LocalizeResponse, MapInfo, PoseEstimate, Problem
+from service.schemas import (
+    InstantAnswer,
+    LocalizeRequest,
+    LocalizeResponse,
+    LocalizeRigRequest,
+    LocalizeSequenceRequest,
+    MapInfo,
+    PoseEstimate,
+    Problem,
+)
 from service.settings import CONFIG_VARIABLE, PREFIX, ServiceSettings, read_settings
 from service.wire import STATUSES
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.pose.covariance import position_covariance
+from visloc.priors import Priors
 from visloc.types import PRESETS, LocalizeOptions, Reason
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -140,8 +151,9 @@ def desk(
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).symlink_to(target)
     export_map(MapStore(built_maps).open("room"), folder / "lund_door" / "colmap", "colmap")
-    (line,) = (line for line in shell_lines(API) if line.startswith("cp "))
-    subprocess.run(line.split(), cwd=folder, check=True)
+    for line in shell_lines(API):
+        if line.startswith("cp "):
+            subprocess.run(line.split(), cwd=folder, check=True)
     assert (folder / "photo.jpg").read_bytes() == query.image
     frame = {"file_path": "photo.jpg", "transform_matrix": np.eye(4).tolist()}
     recording = {"camera_angle_x": 1.0, "frames": [frame]}
@@ -228,7 +240,7 @@ JSON_EXAMPLES = [json.loads(text) for page in PAGES for text in blocks(page, "js
 
 
 def model_of(example: dict[str, Any]) -> type[BaseModel]:
-    models = (LocalizeResponse, MapInfo, Problem)
+    models = (LocalizeResponse, InstantAnswer, MapInfo, Problem)
     (model,) = (model for model in models if model.model_fields.keys() == example.keys())
     return model
 
@@ -243,10 +255,11 @@ def test_an_answer_and_a_refusal_are_shown() -> None:
     assert statuses == {"localized", "not_localized"}
 
 
-def test_the_numbers_of_the_example_follow_the_conventions_that_it_explains() -> None:
-    (answer,) = (example for example in JSON_EXAMPLES if example.get("pose"))
-    pose = answer["pose"]
-    cam_from_world = Pose.from_quaternion(*pose["cam_from_world"].values())
+@pytest.mark.parametrize("device", ["cam", "rig"])
+def test_the_numbers_of_the_example_follow_the_conventions_that_it_explains(device: str) -> None:
+    poses = [example["pose"] for example in JSON_EXAMPLES if example.get("pose")]
+    (pose,) = (pose for pose in poses if f"{device}_from_world" in pose)
+    cam_from_world = Pose.from_quaternion(*pose[f"{device}_from_world"].values())
     covariance = np.array(pose["covariance"]).reshape(6, 6)
 
     np.testing.assert_allclose(pose["position"], cam_from_world.center, atol=1e-4)
@@ -327,10 +340,12 @@ def test_every_relative_link_leads_somewhere(page: Path) -> None:
 
 # docs/api.md and the code
 
-CODE = re.compile(r"(request|image|camera|options|map|features|weights|server)\.[a-z0-9_]+")
+CODE = re.compile(
+    r"(request|image|camera|options|map|features|weights|server|pose|rig|sequence)\.[a-z0-9_]+"
+)
 # Modules that take part in an answer, and the codes of theirs that no client meets.
 ANSWERING = (
-    *("service/*.py", "visloc/*.py", "visloc/archive/*.py", "visloc/features/*.py"),
+    *("service/**/*.py", "visloc/*.py", "visloc/archive/*.py", "visloc/features/*.py"),
     *("clients/requests.py", "clients/errors.py", "clients/types.py"),
 )
 NOT_MET = {
@@ -363,11 +378,12 @@ def test_the_codes_listed_are_those_that_a_client_may_meet() -> None:
         for code in codes_in(ast.parse(path.read_text()))
     }
     of_options = {f"options.{name}" for name in LocalizeOptions.__slots__}
+    of_priors = {f"priors.{name}" for name in Priors.__slots__}
     of_http = {f"http.{status.name.lower()}" for status in HTTPStatus}
     listed = [code for row in table("codes") for code in words(row[0])]
 
     assert len(listed) == len(set(listed))
-    assert set(listed) - of_http == (in_source | of_options) - NOT_MET
+    assert set(listed) - of_http == (in_source | of_options | of_priors) - NOT_MET
 
 
 def test_the_errors_have_the_statuses_that_are_listed() -> None:
@@ -382,18 +398,16 @@ def test_the_errors_have_the_statuses_that_are_listed() -> None:
 
 def test_every_reason_is_listed_with_the_stage_that_gives_it() -> None:
     listed = {words(reason)[0]: stage for stage, reason, *_ in table("stage")}
-    localizer = ast.parse((ROOT / "visloc" / "localizer.py").read_text())
     given = {}
-    for node in ast.walk(localizer):
-        match node:
-            case ast.Call(
-                func=ast.Name(id="NotLocalized"),
-                args=[_, ast.Constant(value=str(stage)), ast.Attribute(attr=reason), *_],
-            ):
-                given[Reason[reason].value] = stage
+    for path in (ROOT / "visloc").glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            for stage, reason in pairwise(node.args if isinstance(node, ast.Call) else ()):
+                match stage, reason:
+                    case ast.Constant(value=str(word)), ast.Attribute(ast.Name("Reason"), name):
+                        given[Reason[name].value] = word
 
     assert set(listed) == set(Reason)
-    assert given
+    assert len(given) > 3
     assert given.items() <= listed.items()
 
 
@@ -403,6 +417,10 @@ def test_the_fields_of_the_request_and_the_answer_are_listed() -> None:
     for model, prefix in ((LocalizeResponse, ""), (PoseEstimate, "pose.")):
         for name in model.model_fields:
             assert f"`{prefix}{name}" in answer
+    for title, model in (("rig", LocalizeRigRequest), ("sequence", LocalizeSequenceRequest)):
+        text = API.read_text().partition(f"## Localize a {title}")[2].partition("\n## ")[0]
+        for name in model.model_fields:
+            assert re.search(rf"`({name}|{name}\[\].*)`", text), name
 
 
 def test_the_options_have_the_defaults_and_ranges_that_are_listed() -> None:

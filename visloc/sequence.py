@@ -19,12 +19,8 @@ from visloc.constraints import Constraints, MapGeometry
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose
 from visloc.pose.covariance import with_origin
-from visloc.pose.window import (
-    RelativeMotion,
-    WindowInstant,
-    default_motion_covariance,
-    solve_window,
-)
+from visloc.pose.motion import RelativeMotion, default_motion_covariance
+from visloc.pose.window import WindowInstant, solve_window
 from visloc.priors import Priors
 from visloc.solving import (
     SeenImage,

@@ -66,7 +66,9 @@ class Array(IncomingMessage):
     """Numbers in little-endian order, the last index running fastest."""
 
     dtype: Annotated[str, Field(description=f"one of {', '.join(ARRAY_DTYPES)}")]
-    shape: Annotated[list[int], FailFast(), Field(description="rows and columns; of a single row its length")]
+    shape: Annotated[
+        list[int], FailFast(), Field(description="rows and columns; of a single row its length")
+    ]
     data: Annotated[
         bytes,
         BeforeValidator(_array_bytes_from_base64),

@@ -156,7 +156,9 @@ def _rig_pose(pose: visloc.types.RigPose) -> RigPose:
     )
 
 
-def _image_answer(image: visloc.types.ImageAnswer, pose: visloc.types.RigPose | None) -> ImageAnswer:
+def _image_answer(
+    image: visloc.types.ImageAnswer, pose: visloc.types.RigPose | None
+) -> ImageAnswer:
     seen = image.evidence
     return ImageAnswer(
         sensor=image.sensor,

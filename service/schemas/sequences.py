@@ -8,6 +8,7 @@ from typing import Annotated
 from pydantic import FailFast, Field
 
 import service.jobs
+import visloc.sequence
 from service.incoming import IncomingMessage, counted, inside
 from service.jobs import DEFAULT_MAX_GAP_S
 from service.schemas.geometry import Numbers, Transform, covariance_to_core
@@ -25,7 +26,6 @@ from service.schemas.rigs import (
     rig_to_core,
 )
 from visloc.errors import InvalidInput, TooLarge
-from visloc.sequence import MAX_GAP_S
 from visloc.trajectory import TimeUnit
 
 
@@ -44,13 +44,11 @@ class Odometry(IncomingMessage):
         ),
     ] = None
 
-    def to_core(self) -> service.jobs.Odometry:
+    def to_core(self) -> visloc.sequence.Odometry:
         """Return the odometry, checked."""
-        return service.jobs.Odometry(
+        return visloc.sequence.Odometry(
             self.rig_from_odometry.to_core("odometry.rig_from_odometry"),
-            covariance_to_core(self.covariance, "odometry.covariance")
-            if self.covariance
-            else None,
+            covariance_to_core(self.covariance, "odometry.covariance") if self.covariance else None,
         )
 
 
@@ -96,7 +94,7 @@ class SequenceStart(IncomingMessage):
         float | None,
         Field(
             description="longest time between two measured instants across which gaps are "
-            f"filled: 0 (none) to {MAX_GAP_S:g}, by default {DEFAULT_MAX_GAP_S:g}"
+            f"filled: 0 (none) to {visloc.sequence.MAX_GAP_S:g}, by default {DEFAULT_MAX_GAP_S:g}"
         ),
     ] = None
     options: GivenOptions = Field(default_factory=LocalizeOptions)
@@ -136,7 +134,7 @@ def _few_instants(instants: object, limits: object) -> None:
     ):
         raise TooLarge(
             "sequence.too_many_instants",
-            "the sequence has too many instants; send it in pieces, or as a stream over gRPC",
+            "the sequence has too many instants; send it in pieces",
             field="instants",
             expected=f"at most {limits.max_instants}",
             got=len(instants),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import threading
 import time
 from collections import Counter
@@ -42,7 +43,7 @@ POSE: dict[str, Any] = {
     },
     "position": [1.0, 0.1 + 0.2, -3.5],
     "orientation": [0.9298410554097046, -0.01755162593, -0.31931803130557, -0.1819987554486438],
-    "covariance": [1e-9 * (i * 6 + j + 1) for i in range(6) for j in range(6)],
+    "covariance": [1e-9 * (1 / (i + j + 1) + 7 * (i == j)) for i in range(6) for j in range(6)],
     "position_std": [0.004, 0.005, 1 / 3],
     "orientation_std_deg": [0.1, 0.2, 0.3],
 }
@@ -622,3 +623,50 @@ def make_dataset(tmp_path: Path) -> Callable[..., Path]:
         return sensors.parent
 
     return make
+
+
+@pytest.fixture
+def make_rig_dataset(tmp_path: Path) -> Callable[..., Path]:
+    """Write a kapture dataset of a moving ``STEREO`` rig.
+
+    ``photos`` are by (timestamp, sensor); None is a photo that localizes at its true pose, which
+    is that of ``rig_at(timestamp)``. All true poses are in trajectories.txt.
+    """
+
+    def make(
+        photos: dict[tuple[int, str], bytes | None],
+        *,
+        rigs: str = "rig, left, 1, 0, 0, 0, 0, 0, 0\nrig, right, 1, 0, 0, 0, -0.5, 0, 0\n",
+    ) -> Path:
+        sensors = tmp_path / "rig dataset" / "sensors"
+        (sensors / "records_data").mkdir(parents=True)
+        known = dict.fromkeys(sensor for _, sensor in photos)
+        header = "# kapture format: 1.1\n"
+        (sensors / "sensors.txt").write_text(
+            header + "".join(f"{sensor}, , camera, {CAMERA}\n" for sensor in known)
+        )
+        if rigs:
+            (sensors / "rigs.txt").write_text(header + rigs)
+        records, trajectories = header, header
+        for (timestamp, sensor), content in photos.items():
+            name = f"{sensor}-{timestamp}.jpg"
+            pose = STEREO.get(sensor, Pose.identity()) @ rig_at(timestamp)
+            photo = json.dumps(_transform(pose)).encode() if content is None else content
+            (sensors / "records_data" / name).write_bytes(photo)
+            records += f"{timestamp}, {sensor}, {name}\n"
+            numbers = [*pose.rotation_wxyz, *pose.translation]
+            trajectories += f"{timestamp}, {sensor}, {', '.join(map(repr, map(float, numbers)))}\n"
+        (sensors / "records_camera.txt").write_text(records)
+        (sensors / "trajectories.txt").write_text(trajectories)
+        return sensors.parent
+
+    return make
+
+
+def rig_at(timestamp: int) -> Pose:
+    """``rig_from_world``, in milliseconds, of a rig at 10 m/s along x that turns 10 degrees/s."""
+    timestamp %= 100_000  # near the world's origin, whenever
+    angle = math.radians(0.01 * timestamp)
+    rotation = Pose.from_quaternion([math.cos(angle / 2), 0, math.sin(angle / 2), 0], [0, 0, 0])
+    center = np.array([0.01 * timestamp, 0.0, 2.0])
+    return Pose(rotation.rotation, -rotation.rotation @ center)

@@ -62,7 +62,9 @@ def test_the_report_holds_what_was_measured(
         "throughput_qps",
         "stage_seconds",
         "server",
+        "modes",
     ]
+    assert list(figures["modes"]) == ["single"]
     assert figures["queries"] == 6
     assert figures["localized"] == 4
     assert figures["median_position_error_m"] == pytest.approx(0.12)

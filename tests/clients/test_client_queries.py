@@ -32,7 +32,7 @@ def test_a_list_gives_names_paths_and_cameras_in_its_order(
         "c.jpg UNKNOWN_CAMERA 640 480\n"
     )
 
-    queries = read_queries(path)
+    queries = read_queries(path).photos
 
     assert [query.name for query in queries] == ["b/2.jpg", "a/1.jpg", "c.jpg"]
     assert queries[0].path == path.parent / "b/2.jpg"
@@ -101,7 +101,7 @@ def test_a_dataset_without_photos_is_refused(make_dataset: Callable[..., Path]) 
 
 def test_a_dataset_gives_cameras_and_true_poses(make_dataset: Callable[..., Path]) -> None:
     root = make_dataset({"seq 1/ä.jpg": b"photo"})
-    (query,) = read_queries(root)
+    (query,) = read_queries(root).photos
     assert query.name == "seq 1/ä.jpg"
     assert query.path.read_bytes() == b"photo"
     assert query.camera == Camera("SIMPLE_PINHOLE", 64, 48, (60.0, 32.0, 24.0))
@@ -110,12 +110,12 @@ def test_a_dataset_gives_cameras_and_true_poses(make_dataset: Callable[..., Path
 
 
 def test_an_unknown_camera_is_not_sent(make_dataset: Callable[..., Path]) -> None:
-    (query,) = read_queries(make_dataset({"a.jpg": b""}, camera="UNKNOWN_CAMERA, 64, 48"))
+    (query,) = read_queries(make_dataset({"a.jpg": b""}, camera="UNKNOWN_CAMERA, 64, 48")).photos
     assert query.camera is None
 
 
 def test_a_rig_gives_the_pose_of_its_camera(shared_data: Path) -> None:
-    queries = read_queries(shared_data / "redkitchen" / "query")
+    queries = read_queries(shared_data / "redkitchen" / "query").photos
     assert len(queries) == 39
     # The camera sits 2.6 cm beside the rig's origin, turned by under a degree (rigs.txt).
     first = queries[0].truth

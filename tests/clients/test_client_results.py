@@ -75,6 +75,7 @@ def test_an_error_is_stored_with_all_its_parts(tmp_path: Path) -> None:
             "expected": "JPEG",
             "got": "x",
         },
+        "source": None,
     }
     path = tmp_path / "results.jsonl"
     path.write_text(line)

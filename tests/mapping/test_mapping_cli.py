@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from rich.console import ConsoleDimensions
 from mapping import cli
 from mapping.pairing import PAIRINGS
 from visloc.archive import MapStore, open_map
-from visloc.kapture import read_dataset
+from visloc.kapture import read_dataset, write_dataset
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -67,6 +68,8 @@ def test_inspect_gives_json_for_programs(run: Run, built_maps: Path) -> None:
     assert summary["size_bytes"] == opened.size_bytes
     assert summary["world"]["extent"]["min"] < summary["world"]["extent"]["max"]
     assert summary["method"]["name"] == "rgbd"
+    assert summary["rigs"] == {"rig": ["left", "right"]}
+    assert summary["gravity"] is None
 
 
 @pytest.mark.parametrize("by", ["id", "version", "folder"])
@@ -76,6 +79,7 @@ def test_inspect_shows_people_what_a_map_holds(run: Run, built_maps: Path, by: s
     status, out, err = run("inspect", ref, "--maps-dir", built_maps)
     assert (status, err) == (0, "")
     for shown in (
+        *("rig: left, right", "not known"),
         *(opened.ref, "8 by 2 cameras", str(len(opened.landmarks)), "sift, 128 dimensions"),
         *(str(len(opened.observation_landmarks)), "densevlad", "localvlad", " m", "MiB"),
     ):
@@ -116,8 +120,6 @@ def test_verify_names_the_file_in_which_one_bit_was_flipped(
 def test_verify_tells_that_the_features_of_a_map_are_others(
     run: Run, maps_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from dataclasses import replace
-
     from visloc.features.sift import SiftExtractor
 
     other = replace(SiftExtractor.fingerprint, revision=2)
@@ -156,6 +158,11 @@ def test_verify_tells_that_the_features_of_a_map_are_others(
         (("build", "x", "--map", "new", "--max-angle", "270"), "[pairs.max_angle] --max-angle"),
         (("build", "x", "--map", "new", "--near", "9", "--far", "2"), "[pairs.far] --far"),
         (("build", "x", "--map", "new", "--covisible-in", "y"), "[map.unknown]"),
+        (("build", "x", "--map", "new", "--gravity", "down"), "[build.gravity] --gravity: not a"),
+        (("build", "x", "--map", "new", "--gravity", "0,0"), "[build.gravity] --gravity: not a"),
+        (("build", "x", "--map", "new", "--gravity", "0,0,0"), "[build.gravity] --gravity: not a"),
+        (("build", "x", "--map", "new", "--gravity", "0,nan,1"), "[build.gravity] --gravity"),
+        (("calibrate-rig", "nowhere"), "[kapture.no_dataset] sensors/sensors.txt: nowhere"),
         (("import", "colmap", "x"), "[import.target] --map: say what to make"),
         (("import", "colmap", "x", "--map", "m", "--output", "o"), "[import.target] --map"),
         (("import", "meshroom", "x", "--output", "o"), "[import.unknown_format] FORMAT"),
@@ -210,7 +217,10 @@ def test_what_the_system_refuses_is_one_line_too(run: Run, tmp_path: Path) -> No
 
 @pytest.mark.parametrize(
     "command",
-    ["", "build", "import", "export", "inspect", "verify", "export-features", "sample"],
+    [
+        *("", "build", "pairs", "calibrate-rig", "import", "export", "inspect", "verify"),
+        *("export-features", "sample"),
+    ],
 )
 def test_every_command_has_help(run: Run, command: str) -> None:
     status, out, err = run(*command.split(), "--help")
@@ -227,7 +237,7 @@ def test_build_explains_all_its_options(run: Run, monkeypatch: pytest.MonkeyPatc
         *("--features-dir", "--pixel-origin", "--weights-dir", "--max-keypoints", "--metric"),
         *("--workers", "--force", "--voxel-size", "--depth-sensor", "--depth-scale", "--pairs"),
         *("--top-k", "--max-distance", "--max-angle", "--near", "--far", "--covisible-in"),
-        *("--pairs-file", "--mapper", "--refine", "--poses"),
+        *("--pairs-file", "--mapper", "--refine", "--poses", "--gravity"),
     ):
         assert re.search(rf"{option}\b", out), option
     for name in PAIRINGS:
@@ -377,6 +387,63 @@ def test_an_import_to_what_is_no_id_touches_nothing(run: Run, tmp_path: Path, ma
     )
     assert "[map.id]" in error
     assert precious.is_dir()
+
+
+def test_gravity_is_in_the_map_and_shown(run: Run, sample: Path, tmp_path: Path) -> None:
+    maps = ("--maps-dir", tmp_path)
+    status, out, _ = run(
+        *("build", sample / "mapping", "--map", "room", *maps, "--gravity", "-3,0,-4"),
+        *("--local-features", "sift", "--global-features", "localvlad"),
+    )
+    assert status == 0
+    assert "down is (-0.6, 0, -0.8)" in out
+    opened = MapStore(tmp_path).open("room")
+    assert opened.gravity is not None
+    assert opened.gravity.tolist() == [-0.6, 0.0, -0.8]
+    assert json.loads(run("inspect", "room", *maps, "--json")[1])["gravity"] == [-0.6, 0.0, -0.8]
+
+
+def test_a_rig_is_calibrated_shown_and_written_once(run: Run, sample: Path, tmp_path: Path) -> None:
+    known = read_dataset(sample / "mapping")
+    poses = {(r.timestamp, r.sensor_id): known.pose(r) for r in known.images}
+    write_dataset(
+        replace(known, root=tmp_path, rigs={}, trajectories=poses)  # type: ignore[arg-type]
+    )
+    command = ("calibrate-rig", tmp_path, "--rig", "car", "--reference", "right")
+    output = tmp_path / "sensors" / "rigs.txt"
+    status, out, err = run(*command, "--cameras", "left, right")
+    assert (status, err) == (0, "")
+    assert "rig car, its frame is camera right" in out
+    assert re.search(r"left +right +4 +0 +0 / 0 +0 / 0 +-0.1999", out)
+    assert out.endswith(f"rig: {output}\n")
+    assert list(read_dataset(tmp_path).rigs["car"]) == ["right", "left"]
+
+    text = output.read_text()
+    error = error_of(run(*command))
+    assert f"error [rig.exists] {output}" in error
+    assert "--output" in error
+    assert output.read_text() == text
+    assert run(*command, "--output", tmp_path / "new" / "rigs.txt")[0] == 0
+    assert "left" in (tmp_path / "new" / "rigs.txt").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--cameras", "left,roof"), "[rig.cameras] --cameras: not cameras of the dataset"),
+        (("--cameras", ""), "[rig.cameras] --cameras: a rig has two cameras at least"),
+        (("--reference", "roof"), "[rig.reference] --reference: the reference is not one"),
+        (("--rig", "left"), "[rig.id] --rig: not the id of a rig"),
+        (("--rig", "a,b"), "[kapture.field]"),
+    ],
+)
+def test_a_rig_that_cannot_be_calibrated_is_one_line(
+    run: Run, sample: Path, tmp_path: Path, options: tuple[str, ...], said: str
+) -> None:
+    output = tmp_path / "rigs.txt"
+    error = error_of(run("calibrate-rig", sample / "mapping", "--output", output, *options))
+    assert f"error {said}" in error
+    assert not output.exists()
 
 
 def test_ctrl_c_ends_a_build_with_130_and_says_that_it_resumes(

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from mapping.export import export_map
 from mapping.rig_calibration import (
     MAX_CAMERAS,
     MIN_INSTANTS,
@@ -416,3 +417,23 @@ def test_a_build_registers_the_rig_that_was_estimated(
     expected = truth["right"] @ truth["left"].inverse()
     np.testing.assert_allclose(rigs["car"]["right"].translation, expected.translation, atol=1e-9)
     np.testing.assert_allclose(rigs["car"]["right"].rotation, expected.rotation, atol=1e-9)
+
+
+def test_a_map_of_a_reconstruction_registers_rigs_too(
+    sfm_walk: Map, tmp_path: Path, build_walk: Callable[..., Map]
+) -> None:
+    export_map(sfm_walk, tmp_path / "dataset", "kapture")
+    (tmp_path / "dataset" / "sensors" / "rigs.txt").unlink()
+    found = calibrate_rig(read_dataset(tmp_path / "dataset"), rig="car")
+    write_calibration(found, tmp_path / "dataset" / "sensors" / "rigs.txt")
+    built = build_walk(
+        tmp_path / "dataset",
+        tmp_path / "maps",
+        method="model",
+        metric=True,
+        local_features="kapture:sift",
+    )
+    expected = sfm_walk.rigs["rig"]["right"] @ sfm_walk.rigs["rig"]["left"].inverse()
+    np.testing.assert_allclose(
+        built.rigs["car"]["right"].translation, expected.translation, atol=1e-6
+    )

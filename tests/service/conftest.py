@@ -55,14 +55,16 @@ def serving(maps_dir: Path, *, load: bool = True, **settings: object) -> Iterato
     try:
         server = run(make())
         run(server.open())
-        if load:
-            run(server.load())
-        with (
-            httpx.Client(base_url=f"http://127.0.0.1:{server.http_port}", timeout=60) as http,
-            grpc.insecure_channel(f"127.0.0.1:{server.grpc_port}") as channel,
-        ):
-            yield Doors(server, http, channel, LocalizationStub(channel))
-        run(server.close(5))
+        try:
+            if load:
+                run(server.load())
+            with (
+                httpx.Client(base_url=f"http://127.0.0.1:{server.http_port}", timeout=60) as http,
+                grpc.insecure_channel(f"127.0.0.1:{server.grpc_port}") as channel,
+            ):
+                yield Doors(server, http, channel, LocalizationStub(channel))
+        finally:
+            run(server.close(5))
     finally:
         loop.call_soon_threadsafe(loop.stop)
         thread.join()
@@ -72,7 +74,14 @@ def serving(maps_dir: Path, *, load: bool = True, **settings: object) -> Iterato
 @pytest.fixture(scope="session")
 def doors(built_maps: Path) -> Iterator[Doors]:
     """The service with the map ``room``."""
-    with serving(built_maps, max_image_bytes=200_000, max_image_pixels=1_000_000) as doors:
+    limits = {
+        "max_image_bytes": 200_000,
+        "max_image_pixels": 1_000_000,
+        "max_batch_bytes": 600_000,
+        "max_rig_images": 3,
+        "max_instants": 20,
+    }
+    with serving(built_maps, **limits) as doors:
         yield doors
 
 

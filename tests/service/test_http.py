@@ -24,7 +24,7 @@ import visloc
 from service import engine as engine_module
 from service import schemas
 from service.http import create_app
-from service.openapi import EXAMPLE_REQUEST
+from service.request_bodies import EXAMPLE_REQUEST
 from visloc.geometry import Pose, rotation_angle
 
 
@@ -275,7 +275,7 @@ def test_a_form_that_is_not_one_is_refused(doors: Any) -> None:
     refused("request.content_type", content=b"")
     refused("request.content_type", data={"map": "room"})
     refused("request.malformed", content=b"{", headers={"Content-Type": "application/json"})
-    refused("request.missing_field", files={"image": photo})
+    refused("request.map", files={"image": photo})
     refused("request.duplicate_field", files=[("image", photo), ("image", photo)])
     refused("request.malformed", files=[("image", photo)] * 3)
     refused("request.malformed", data={"map": "x" * 100_000}, files={"image": photo})
@@ -439,9 +439,12 @@ def test_a_map_that_is_not_loaded_is_named_with_the_reason(serve: Any, maps_dir:
 
 def test_openapi_describes_both_kinds_of_bodies_and_every_reference_resolves(doors: Any) -> None:
     schema = doors.http.get("/openapi.json").json()
-    body = schema["paths"]["/localize"]["post"]["requestBody"]["content"]
-    assert set(body) == {"multipart/form-data", "application/json"}
-    assert all(content["examples"].keys() == {"photo", "features"} for content in body.values())
+    for path in ("/localize", "/localize/rig", "/localize/sequence"):
+        body = schema["paths"][path]["post"]["requestBody"]["content"]
+        assert set(body) == {"multipart/form-data", "application/json"}
+        assert all(content["examples"] for content in body.values())
+    answers = schema["paths"]["/localize/sequence"]["post"]["responses"]["200"]["content"]
+    assert set(answers) == {"application/json", "application/x-ndjson"}
 
     def references(part: Any) -> Iterator[str]:
         if isinstance(part, dict):
@@ -461,6 +464,8 @@ def test_openapi_describes_both_kinds_of_bodies_and_every_reference_resolves(doo
     ("path", "method", "status", "model", "names"),
     [
         ("/localize", "post", "200", schemas.LocalizeResponse, {"localized", "not_localized"}),
+        ("/localize/rig", "post", "200", schemas.InstantAnswer, {"localized"}),
+        ("/localize/sequence", "post", "200", schemas.LocalizeSequenceResponse, {"sequence"}),
         ("/maps", "get", "200", schemas.ListMapsResponse, {"maps"}),
         ("/maps/{ref}", "get", "200", schemas.MapInfo, {"map"}),
         ("/readyz", "get", "200", schemas.Readiness, {"ready"}),

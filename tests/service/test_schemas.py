@@ -2,20 +2,26 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 from typing import Any
 
+import numpy as np
 import pytest
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from pydantic import BaseModel
 
 from service import schemas
 from service.schemas import LocalizeOptions, LocalizeRequest
-from visloc.errors import InvalidInput
+from visloc.errors import InvalidInput, TooLarge
+from visloc.priors import NO_PRIORS, HeightBand
 from visloc.types import LocalizeOptions as CoreOptions
 from visloc.types import ReadAs
 from visloc_api.v1 import localization_pb2 as pb2
 
 CAMERA = {"model": "PINHOLE", "width": 640, "height": 480, "params": [525, 525.5, 320, 240]}
+
+
+FIELDS = "map, image, features, camera, options, maps, priors"
 
 
 def request(**fields: object) -> dict[str, Any]:
@@ -41,7 +47,7 @@ def test_a_full_request_becomes_the_job_that_it_says() -> None:
 
     job = LocalizeRequest.read_json(json.dumps(request(camera=CAMERA, options=options))).to_job()
 
-    assert (job.map, job.query) == ("room", b"photo")
+    assert (job.maps, job.query) == (("room",), b"photo")
     assert job.camera is not None
     assert job.camera.params == (525.0, 525.5, 320.0, 240.0)
     assert job.options == CoreOptions("config1", 5, 8.0, 12, 0.5, ReadAs.UPRIGHT, 9)
@@ -69,14 +75,14 @@ def test_options_may_be_text() -> None:
 @pytest.mark.parametrize(
     ("message", "code", "field", "expected"),
     [
-        ({}, "request.missing_field", "map", None),
+        ({}, "request.map", "map", "one of map, maps"),
         ({"map": "room"}, "request.query", "image", "one of image, features"),
-        ([], "request.invalid", None, "an object with map, image, features, camera, options"),
+        ([], "request.invalid", None, f"an object with {FIELDS}"),
         (
             request(extra=1),
             "request.unknown_field",
             "extra",
-            "one of map, image, features, camera, options",
+            f"one of {FIELDS}",
         ),
         (
             request(options={"topk": 1}),
@@ -171,14 +177,166 @@ def test_a_refusal_never_echoes_a_large_value() -> None:
         assert len(str(refusal(message))) < 2000
 
 
+# Maps and priors
+
+GRAVITY = {"direction": [0, 9.81, 0], "std_deg": 2, "world": [0, 0, -2]}
+IDENTITY = {"rotation_wxyz": [1, 0, 0, 0], "translation": [0, 0, 0]}
+COVARIANCE = np.diag([1e-4] * 3 + [1e-2] * 3).ravel().tolist()
+PRIORS = {
+    "position": {"position": [1, 2, 3], "radius": 5},
+    "height": {"min": -1, "max": 1.5},
+    "pose": {"device_from_world": IDENTITY, "covariance": COVARIANCE},
+    "gravity": GRAVITY,
+}
+
+
+def test_priors_become_those_of_the_core() -> None:
+    priors = LocalizeRequest.read_json(json.dumps(request(priors=PRIORS))).to_job().priors
+
+    assert priors.position is not None
+    assert priors.position.position.tolist() == [1, 2, 3]
+    assert priors.position.radius == 5
+    assert priors.height == HeightBand(-1, 1.5)
+    assert priors.pose is not None
+    np.testing.assert_array_equal(priors.pose.device_from_world.rotation, np.eye(3))
+    np.testing.assert_array_equal(np.diag(priors.pose.covariance), [1e-4] * 3 + [1e-2] * 3)
+    assert priors.gravity is not None
+    assert priors.gravity.direction.tolist() == [0, 1, 0]
+    assert priors.gravity.std == math.radians(2)
+    assert priors.gravity.world is not None
+    assert priors.gravity.world.tolist() == [0, 0, -1]
+
+
+def test_priors_may_be_text_and_parts_of_them_left_out() -> None:
+    text = json.dumps({"gravity": {"direction": [0, 1, 0]}})
+    priors = LocalizeRequest.read(request(priors=text)).to_job().priors
+
+    assert priors.position is priors.height is priors.pose is None
+    assert priors.gravity is not None
+    assert (priors.gravity.std, priors.gravity.world) == (math.radians(1), None)
+    assert LocalizeRequest.read(request(priors=None)).to_job().priors is NO_PRIORS
+
+
+@pytest.mark.parametrize("given", [["a", "b@1"], "a,b@1", " a , b@1", '["a", "b@1"]'])
+def test_several_maps_may_be_a_list_or_text(given: object) -> None:
+    message = {"maps": given, "image": request()["image"]}
+
+    assert LocalizeRequest.read(message).to_job().maps == ("a", "b@1")
+
+
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("fields", "code", "field"),
+    [
+        ({"maps": ["a"]}, "request.map", "map"),
+        ({"map": None}, "request.map", "map"),
+        ({"map": None, "maps": []}, "request.map", "map"),
+        ({"map": None, "maps": [f"m{i}" for i in range(17)]}, "request.map", "maps"),
+        ({"map": None, "maps": ["a", "a"]}, "request.map", "maps"),
+        ({"map": None, "maps": ["a", 3]}, "request.invalid", "maps[1]"),
+        ({"map": None, "maps": "[1"}, "request.malformed", "maps"),
+        ({"map": None, "maps": 3}, "request.invalid", "maps"),
+        ({"priors": 3}, "request.invalid", "priors"),
+        ({"priors": "{"}, "request.malformed", "priors"),
+        ({"priors": {"floor": 2}}, "request.unknown_field", "priors.floor"),
+        *(
+            ({"priors": {name: PRIORS[name] | change}}, code, f"priors.{field}")
+            for name, change, code, field in [
+                ("position", {"radius": 0}, "priors.position", "position.radius"),
+                ("position", {"radius": NAN}, "priors.position", "position.radius"),
+                ("position", {"position": [1, 2]}, "priors.position", "position.position"),
+                ("position", {"position": [1, 2, NAN]}, "priors.position", "position.position"),
+                ("position", {"position": ["1"]}, "request.invalid", "position.position[0]"),
+                ("height", {"min": 2}, "priors.height", "height"),
+                ("height", {"max": NAN}, "priors.height", "height"),
+                ("gravity", {"direction": [0, 0, 0]}, "priors.gravity", "gravity.direction"),
+                ("gravity", {"direction": [0, NAN, 0]}, "priors.gravity", "gravity.direction"),
+                ("gravity", {"direction": [1]}, "priors.gravity", "gravity.direction"),
+                ("gravity", {"std_deg": 16}, "priors.gravity", "gravity.std_deg"),
+                ("gravity", {"std_deg": 0}, "priors.gravity", "gravity.std_deg"),
+                ("gravity", {"world": [0, 0, 0]}, "priors.gravity", "gravity.world"),
+                ("pose", {"covariance": [1]}, "pose.covariance", "pose.covariance"),
+                ("pose", {"covariance": []}, "pose.covariance", "pose.covariance"),
+                ("pose", {"covariance": [0.0] * 36}, "pose.covariance", "pose.covariance"),
+                ("pose", {"covariance": [NAN] * 36}, "pose.covariance", "pose.covariance"),
+                (
+                    "pose",
+                    {"device_from_world": IDENTITY | {"rotation_wxyz": [2, 0, 0, 0]}},
+                    *("pose.rotation", "pose.device_from_world.rotation_wxyz"),
+                ),
+                (
+                    "pose",
+                    {"device_from_world": IDENTITY | {"translation": [0, NAN, 0]}},
+                    *("pose.translation", "pose.device_from_world.translation"),
+                ),
+            ]
+        ),
+    ],
+)
+def test_wrong_maps_and_priors_are_refused(fields: dict[str, Any], code: str, field: str) -> None:
+    error = refusal(request(**fields))
+
+    assert (error.code, error.field) == (code, field)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        json.dumps({"map": "room", "camera": {"params": ["x"] * 200_000}}),
+        json.dumps(
+            {
+                "map": "room",
+                "features": {"global_descriptors": dict.fromkeys(map(str, range(99_999)), 0)},
+            }
+        ),
+        '{"map": "room", "image": [' + "{}," * 3_000_000 + "{}]}",
+    ],
+)
+def test_json_of_very_many_values_is_refused_before_it_is_parsed(text: str) -> None:
+    with pytest.raises(TooLarge) as caught:
+        LocalizeRequest.read_json(text)
+
+    assert (caught.value.code, caught.value.expected) == ("request.too_large", "at most 10000")
+
+
+def test_too_many_global_descriptors_are_refused() -> None:
+    array = {"dtype": "int8", "shape": [0], "data": ""}
+    features = {"kind": "sift", "keypoints": array, "descriptors": array}
+    many = features | {"global_descriptors": dict.fromkeys(map(str, range(33)), array)}
+
+    error = refusal({"map": "room", "features": many})
+
+    assert (error.code, error.got) == ("features.global_descriptors", "33")
+    assert error.field == "features.global_descriptors"
+
+
 # The proto's messages and ours are the same
+
+
+# Of the stream there is no counterpart: over HTTP a sequence is one request.
+STREAM = "LocalizeSequenceRequest"
+
+
+def fields_of(message: Descriptor) -> list[str]:
+    """The fields of a message as JSON has them."""
+    fields = [field.name for field in message.fields]
+    if message.name in ("LocalizeRequest", "LocalizeRigRequest", "SequenceStart"):
+        fields.remove("request_id")  # over HTTP it is a header
+    if "calibration" in fields:
+        fields.remove("calibration")
+        fields[fields.index("rig_id")] = "rig"
+    if message.name == "RigImage":
+        fields.append("part")  # of a form
+    return fields
 
 
 def pairs() -> list[tuple[type[BaseModel], Descriptor]]:
     return [
         (getattr(schemas, name), message)
         for name, message in pb2.DESCRIPTOR.message_types_by_name.items()
-        if hasattr(schemas, name)
+        if hasattr(schemas, name) and name != STREAM
     ]
 
 
@@ -188,15 +346,11 @@ def pairs() -> list[tuple[type[BaseModel], Descriptor]]:
 def test_json_has_the_fields_of_the_proto_in_the_same_order(
     model: type[BaseModel], message: Descriptor
 ) -> None:
-    fields = [field.name for field in message.fields]
-    if model is LocalizeRequest:
-        fields.remove("request_id")  # over HTTP it is a header
-
-    assert list(model.model_fields) == fields
+    assert list(model.model_fields) == fields_of(message)
 
 
 def test_all_messages_of_the_proto_have_a_model() -> None:
-    without = {"ListMapsRequest", "GetMapRequest"}
+    without = {"ListMapsRequest", "GetMapRequest", STREAM}
 
     assert {message.name for _, message in pairs()} == (
         set(pb2.DESCRIPTOR.message_types_by_name) - without

@@ -24,6 +24,7 @@ from visloc.features.sift import SiftExtractor
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo, read_photo
 from visloc.localizer import Localizer
+from visloc.query_camera import resolve_camera
 from visloc.query_features import max_sent_keypoints
 from visloc.types import (
     Answer,

@@ -5,11 +5,14 @@ Poses are perturbed as R <- Exp(w) R, t <- t + dt; covariances are 6 x 6, w (rad
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import project
+from visloc.pose.views import MatchedView
 
 _MIN_POINTS = 4
 _MIN_VARIANCE_PX2 = 1e-12
@@ -18,13 +21,9 @@ _MIN_INFORMATION = 1e-9
 
 
 def pose_covariance(
-    camera: Camera,
-    cam_from_world: Pose,
-    pixels: NDArray[np.float64],
-    points: NDArray[np.float64],
-    loss_scale_px: float,
+    views: Sequence[MatchedView], rig_from_world: Pose, loss_scale_px: float
 ) -> NDArray[np.float64] | None:
-    """Covariance of a pose that was refined on these inliers with a Cauchy loss.
+    """Covariance of a rig's pose that was refined on these inliers with a Cauchy loss.
 
     Two classical estimates for an M-estimator: Huber's for residuals of one common spread
     (Huber 1981, section 7.6: scaled by the residuals themselves; steady with few points), and
@@ -34,22 +33,19 @@ def pose_covariance(
     rotation in half-angles. Checked by Monte Carlo in tests/visloc/pose.
 
     Args:
-        camera: intrinsics.
-        cam_from_world: the refined pose.
-        pixels: (n, 2) inliers.
-        points: (n, 3) in the world.
+        views: inliers only; views without any are fine.
+        rig_from_world: the refined pose.
         loss_scale_px: scale c of the loss c^2 log(1 + r^2 / c^2).
 
     Returns:
-        (6, 6), or None when the inliers leave the pose undetermined.
+        (6, 6) of ``rig_from_world``, or None when the inliers leave the pose undetermined.
     """
-    if len(pixels) < _MIN_POINTS:
+    num_points = sum(len(view) for view in views)
+    if num_points < _MIN_POINTS:
         return None
-    seen = cam_from_world.apply(points)
-    residuals = project(camera, seen) - pixels
-    jacobian = _projection_jacobian(camera, seen) @ _motion_jacobian(
-        seen - cam_from_world.translation
-    )
+    linear = [_linearize(view, rig_from_world) for view in views]
+    residuals = np.concatenate([view_residuals for view_residuals, _ in linear])
+    jacobian = np.concatenate([view_jacobian for _, view_jacobian in linear])
     weight = 1.0 / (1.0 + np.sum(residuals**2, axis=1) / loss_scale_px**2)
     outer = residuals[:, :, None] * residuals[:, None, :]
     curvature = (
@@ -58,7 +54,7 @@ def pose_covariance(
     )
     psi = weight[:, None] * residuals
 
-    num_residuals = 2 * len(pixels)
+    num_residuals = 2 * num_points
     spare = num_residuals - 6
     slope = np.trace(curvature, axis1=1, axis2=2).sum() / num_residuals
     if not (np.isfinite(jacobian).all() and slope > 0):
@@ -105,6 +101,17 @@ def with_origin(
 
 def _cross_matrix(v: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def _linearize(
+    view: MatchedView, rig_from_world: Pose
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Residuals (n, 2) of a view in pixels, and their derivative (n, 2, 6) by the rig's pose."""
+    in_rig = rig_from_world.apply(view.points)
+    seen = view.cam_from_rig.apply(in_rig)
+    motion = _motion_jacobian(in_rig - rig_from_world.translation)
+    jacobian = _projection_jacobian(view.camera, seen) @ view.cam_from_rig.rotation @ motion
+    return project(view.camera, seen) - view.pixels, jacobian
 
 
 def _motion_jacobian(rotated: NDArray[np.float64]) -> NDArray[np.float64]:

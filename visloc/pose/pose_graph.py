@@ -20,8 +20,9 @@ from visloc.pose.views import MatchedView
 
 _MAX_STEPS = 30
 # In units of chi-square: less moves nothing by a hundredth of its standard deviation.
-_CONVERGED = 1e-5
-_START_DAMPING = 1e-6
+_CONVERGED = 1e-4
+_MIN_DAMPING = 1e-6
+_REJECTED_DAMPING = 1e-2  # at least, after a step that went too far
 _MAX_DAMPING = 1e6
 _MIN_SCALE_PX2 = 1e-6
 # Smallest eigenvalue of the unit-free information matrix, of diagonal 1.
@@ -63,18 +64,18 @@ def solve_chain(
     now = _linearized(chain, poses, loss_scale_px, error_scale_px2)
     if not _determined(now.information):
         return None
-    damping = _START_DAMPING
+    damping = _MIN_DAMPING
     for _ in range(_MAX_STEPS):
         damped = now.information + damping * np.diag(np.diag(now.information))
-        step: NDArray[np.float64] = -np.linalg.solve(damped, now.slope).reshape(-1, 6)
+        step = np.asarray(-np.linalg.solve(damped, now.slope), dtype=np.float64).reshape(-1, 6)
         tried = [moved(pose, change) for pose, change in zip(poses, step, strict=True)]
         then = _linearized(chain, tried, loss_scale_px, error_scale_px2)
         gain = now.cost - then.cost
         if gain >= 0:
             poses, now = tried, then
-            damping = max(damping / 10.0, _START_DAMPING)
+            damping = max(damping / 10.0, _MIN_DAMPING)
         else:
-            damping *= 10.0
+            damping = max(10.0 * damping, _REJECTED_DAMPING)
         if 0 <= gain < _CONVERGED or damping > _MAX_DAMPING:
             break
     if not _determined(now.information):
@@ -157,12 +158,12 @@ def _pixel_terms(
     for view in views:
         in_rig = rig_from_world.apply(view.points)
         in_cam = view.cam_from_rig.apply(in_rig)
-        errors.append(project(view.camera, in_cam) - view.pixels)
+        pixels, by_point = _projected(view.camera, in_cam)
+        errors.append(pixels - view.pixels)
         by_pose = np.zeros((len(view), 3, 6))
         by_pose[:, :, :3] = -_cross_matrices(in_rig)
         by_pose[:, :, 3:] = np.eye(3)
-        by_rig = projection_jacobian(view.camera, in_cam) @ view.cam_from_rig.rotation
-        jacobians.append(by_rig @ by_pose)
+        jacobians.append(by_point @ view.cam_from_rig.rotation @ by_pose)
     error, jacobian = np.concatenate(errors), np.concatenate(jacobians)
     # A step too far puts points behind the camera, where there is no error to speak of: infinite.
     squared = np.sum(error**2, axis=1) / loss_scale_px**2
@@ -219,15 +220,15 @@ def _linearized(
     return _Linearized(cost, information, slope)
 
 
-def projection_jacobian(camera: Camera, in_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivative (n, 2, 3) of the pixel by the point in the camera's frame, numerically."""
+def _projected(
+    camera: Camera, in_cam: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixels (n, 2) of points, and their derivatives (n, 2, 3) by central differences."""
     step = 1e-5 * np.linalg.norm(in_cam, axis=1)
-    columns = []
-    for axis in np.eye(3):
-        shift = step[:, None] * axis
-        there, back = project(camera, in_cam + shift), project(camera, in_cam - shift)
-        columns.append((there - back) / (2 * step[:, None]))
-    return np.stack(columns, axis=2)
+    shifts = step[:, None] * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])[:, None]
+    # All at once: with few points, the calls take longer than the work.
+    pixels = project(camera, (in_cam + shifts).reshape(-1, 3)).reshape(7, -1, 2)
+    return pixels[0], np.stack([*(pixels[1:4] - pixels[4:])], axis=2) / (2 * step)[:, None, None]
 
 
 def _cross_matrices(vectors: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,47 +10,42 @@ is filled, and both stay as they were measured.
 
 from __future__ import annotations
 
-import itertools
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from visloc.geometry import Pose
-from visloc.pose.colmap import project
-from visloc.pose.generalized import GeneralizedPose, estimate_generalized_pose
+from visloc.pose.agreement import agreeing_pieces
+from visloc.pose.generalized import (
+    LOSS_SCALE_PX,
+    GeneralizedPose,
+    reprojection_errors,
+)
+from visloc.pose.group import carried, find_groups, selected
 from visloc.pose.motion import (
     RelativeMotion,
     UncertainPose,
-    chain,
-    difference,
+    default_motion_covariance,
     link_from_motion,
 )
 from visloc.pose.pose_graph import Chain, error_scale, solve_chain
 from visloc.pose.views import MatchedView
 from visloc.types import RegistrationPreset
 
-__all__ = ["RelativeMotion", "WindowInstant", "WindowPose", "solve_window"]
+__all__ = [
+    "RelativeMotion",
+    "WindowInstant",
+    "WindowPose",
+    "default_motion_covariance",
+    "solve_window",
+]
 
-# Scale of the Cauchy loss, as in the refinement of single poses.
-_LOSS_SCALE_PX = 3.0
-# Chi-square quantiles for six degrees of freedom.
-_CHI2_99 = 16.81
-_CHI2_999 = 22.46
-# A measured pose may be off by more than its covariance tells, because maps have errors that its
-# points share: 0.1 degrees and 1 cm. A contradiction must be beyond that.
-_MAP_ERROR = np.diag([math.radians(0.1) ** 2] * 3 + [0.01**2] * 3)
 # Fewer inliers under a pose that others gave are chance: blurred images have such, too.
 _MIN_OWN_INLIERS = 8
 # In a group that passed the gate together, three of the consensus are enough.
 _MIN_GROUP_INLIERS = 3
-# Instants belong to one generalized camera while drift shifts pixels by less than this share of
-# the largest error of an inlier, at one standard deviation.
-_DRIFT_SHARE = 0.5
-# RANSAC of a group looks at no more than about this many correspondences.
-_MAX_GROUP_CORRESPONDENCES = 3000
 _MAX_ROUNDS = 8
 _SCALE_SETTLED = 0.05
 
@@ -141,127 +136,50 @@ def _solve_segment(
     seed: int,
 ) -> list[WindowPose | None]:
     """Solve for instants that motion links without a gap."""
-    measured = _measured_poses(instants)
+    found: list[WindowPose | None] = [_alone(instant) for instant in instants]
+    measured = {
+        i: UncertainPose.from_additive(pose.rig_from_world, pose.covariance)
+        for i, pose in enumerate(found)
+        if pose is not None
+    }
     if not measured:
         return _solve_unmeasured(instants, links, registration, seed)
-    found: list[WindowPose | None] = [
-        None
-        if instant.alone is None or instant.alone.covariance is None
-        else WindowPose(
-            instant.alone.rig_from_world, instant.alone.covariance, instant.alone.inliers, True
-        )
-        for instant in instants
-    ]
-    anchors = _without_outliers(sorted(measured), measured, links)
-    for i in set(measured) - set(anchors):
+    pieces, links = agreeing_pieces(measured, links)
+    counted = {i for piece in pieces for i in piece.measured}
+    for i in measured.keys() - counted:
         found[i] = None
-    pieces, factors = _agreeing_pieces(anchors, measured, links)
-    if len(pieces) == 1:  # nothing contradicts the motion: it may be followed to the ends
-        pieces = [(0, len(instants) - 1)]
-    ends = max(factors.values(), default=1.0)
-    scaled = [link.scaled(factors.get(i, ends)) for i, link in enumerate(links)]
-    for first, last in pieces:
-        inside = range(first, last + 1)
+    for piece in pieces:
+        inside = range(piece.first, piece.last + 1)
         if len(inside) == 1:
             continue
-        known = {i - first: measured[i] for i in anchors if i in inside}
-        some = instants[first : last + 1]
-        between = scaled[first:last]
+        known = {i - piece.first: measured[i] for i in piece.measured}
+        between = links[piece.first : piece.last]
         start = _propagated({i: pose.pose for i, pose in known.items()}, between)
+        some = instants[piece.first : piece.last + 1]
         solved = _solve_together(some, between, known, start, {}, registration)
         if solved is not None:
             for i, pose in zip(inside, solved, strict=True):
                 # What passed on its own is not lost when an inlier or two leave the threshold.
-                if pose.measured or i not in anchors:
+                if pose.measured or i not in counted:
                     found[i] = pose
     return found
 
 
-def _measured_poses(instants: Sequence[WindowInstant]) -> dict[int, UncertainPose]:
-    """The poses that instants have on their own, by instant."""
-    return {
-        i: UncertainPose.from_additive(instant.alone.rig_from_world, instant.alone.covariance)
-        for i, instant in enumerate(instants)
-        if instant.alone is not None and instant.alone.covariance is not None
-    }
-
-
-def _disagreement(
-    a: int, b: int, measured: dict[int, UncertainPose], links: Sequence[UncertainPose]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """How the measured pose b differs from a moved on (6,), and the covariances (6, 6) of that.
-
-    The first is due to the two measured poses, the second to the motion.
-    """
-    motion = chain(links, a, b)
-    predicted = UncertainPose(motion.pose, np.zeros((6, 6))) @ measured[a]
-    poses = predicted.covariance + measured[b].covariance
-    return difference(measured[b].pose, predicted.pose), poses, motion.covariance
-
-
-def _contradict(
-    a: int, b: int, measured: dict[int, UncertainPose], links: Sequence[UncertainPose]
-) -> bool:
-    """Whether two measured poses and the motion between them cannot all be right."""
-    error, poses, motion = _disagreement(a, b, measured, links)
-    return _chi2(error, poses + motion + 2.0 * _MAP_ERROR) > _CHI2_999
-
-
-def _chi2(error: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
-    return float(error @ np.linalg.solve(covariance, error))
-
-
-def _without_outliers(
-    anchors: Sequence[int], measured: dict[int, UncertainPose], links: Sequence[UncertainPose]
-) -> list[int]:
-    """Leave out those that contradict both neighbours while these agree with each other."""
-    kept = list(anchors)
-    i = 1
-    while i < len(kept) - 1:
-        before, this, after = kept[i - 1 : i + 2]
-        if (
-            _contradict(before, this, measured, links)
-            and _contradict(this, after, measured, links)
-            and not _contradict(before, after, measured, links)
-        ):
-            del kept[i]
-        else:
-            i += 1
-    return kept
-
-
-def _agreeing_pieces(
-    anchors: Sequence[int], measured: dict[int, UncertainPose], links: Sequence[UncertainPose]
-) -> tuple[list[tuple[int, int]], dict[int, float]]:
-    """Cut where consecutive anchors contradict the motion.
-
-    Returns:
-        The first and last instant of each piece, and for each link between agreeing anchors the
-        factor by which its covariance is too small.
-    """
-    pieces = [(anchors[0], anchors[0])]
-    factors: dict[int, float] = {}
-    for a, b in itertools.pairwise(anchors):
-        if _contradict(a, b, measured, links):
-            pieces.append((b, b))
-            continue
-        pieces[-1] = (pieces[-1][0], b)
-        error, poses, motion = _disagreement(a, b, measured, links)
-        factor = 1.0
-        if _chi2(error, poses + motion) > _CHI2_99:
-            # Understated: enlarged until the difference is one standard deviation.
-            while _chi2(error, poses + factor * motion) > 1.0:
-                factor *= 2.0
-        factors |= dict.fromkeys(range(a, b), factor)
-    return pieces, factors
+def _alone(instant: WindowInstant) -> WindowPose | None:
+    """The pose that an instant has on its own."""
+    pose = instant.alone
+    if pose is None or pose.covariance is None:
+        return None
+    return WindowPose(pose.rig_from_world, pose.covariance, pose.inliers, measured=True)
 
 
 def _propagated(known: dict[int, Pose], links: Sequence[UncertainPose]) -> list[Pose]:
     """Each instant's pose as the motion carries it from the nearest known one."""
+    from_first = carried(links)
     poses = []
-    for i in range(len(links) + 1):
+    for i, here in enumerate(from_first):
         nearest = min(known, key=lambda k: (abs(k - i), k))
-        poses.append(chain(links, nearest, i).pose @ known[nearest])
+        poses.append(here @ from_first[nearest].inverse() @ known[nearest])
     return poses
 
 
@@ -271,70 +189,17 @@ def _solve_unmeasured(
     registration: RegistrationPreset,
     seed: int,
 ) -> list[WindowPose | None]:
-    """Solve for instants of which none has a pose: first a group of them as one camera."""
-    for first, last in _groups(instants, links, registration.max_error_px):
-        middle = (first + last) // 2
-        from_middle = [chain(links, middle, i).pose for i in range(first, last + 1)]
-        views = [
-            MatchedView(view.camera, view.cam_from_rig @ moved_on, view.pixels, view.points)
-            for instant, moved_on in zip(instants[first : last + 1], from_middle, strict=True)
-            for view in instant.views
-        ]
-        pose = estimate_generalized_pose(
-            _thinned(views, seed), max_error_px=registration.max_error_px, seed=seed
-        )
-        if pose is None:
-            continue
-        start = _propagated({middle: pose.rig_from_world}, links)
-        group = dict.fromkeys(range(first, last + 1), _MIN_GROUP_INLIERS)
-        solved = _solve_together(instants, links, {}, start, group, registration)
-        if solved is None:
-            continue
-        inliers = [np.concatenate(p.inliers) for p in solved[first : last + 1] if p.inliers]
-        if _passes(np.concatenate(inliers), registration):
-            return list(solved)
+    """Solve for instants of which none has a pose: first a group of them, then around it."""
+    for group in find_groups([i.views for i in instants], links, registration, seed):
+        start = _propagated({group.reference: group.rig_from_world}, links)
+        members = range(group.first, group.last + 1)
+        fewest = dict.fromkeys(members, _MIN_GROUP_INLIERS)
+        solved = _solve_together(instants, links, {}, start, fewest, registration)
+        if solved is not None:
+            inliers = [mask for i in members for mask in solved[i].inliers]
+            if _supports(inliers, registration.min_inliers, registration):
+                return list(solved)
     return [None] * len(instants)
-
-
-def _groups(
-    instants: Sequence[WindowInstant], links: Sequence[UncertainPose], max_error_px: float
-) -> Iterator[tuple[int, int]]:
-    """First and last instants of overlapping groups within which drift stays small."""
-    views = [view for instant in instants for view in instant.views if len(view)]
-    if not views:
-        return
-    focal = float(np.median([view.camera.focal_length for view in views]))
-    # How far the points are is not known before the pose; how far apart they are comes near.
-    spread = [np.median(np.linalg.norm(v.points - np.median(v.points, 0), axis=1)) for v in views]
-    depth = max(float(np.median(spread)), 1e-3)
-
-    def drifts(middle: int, end: int) -> bool:
-        variance = np.diag(chain(links, middle, end).covariance)
-        shift = focal * math.sqrt(max(variance[:3]) + max(variance[3:]) / depth**2)
-        return shift > _DRIFT_SHARE * max_error_px
-
-    first = 0
-    while True:
-        last = first
-        while last + 1 < len(instants):
-            middle = (first + last + 1) // 2
-            if drifts(middle, first) or drifts(middle, last + 1):
-                break
-            last += 1
-        yield first, last
-        if last == len(instants) - 1:
-            return
-        first += max((last - first + 1) // 2, 1)
-
-
-def _thinned(views: Sequence[MatchedView], seed: int) -> list[MatchedView]:
-    """The views with so few of their correspondences that RANSAC is done in a moment."""
-    count = sum(len(view) for view in views)
-    if count <= _MAX_GROUP_CORRESPONDENCES:
-        return list(views)
-    rng = np.random.default_rng(seed)
-    share = _MAX_GROUP_CORRESPONDENCES / count
-    return [_selected(view, rng.random(len(view)) < share) for view in views]
 
 
 def _solve_together(
@@ -367,7 +232,7 @@ def _solve_together(
         inliers = [_inliers(i.views, p, registration) for i, p in zip(instants, poses, strict=True)]
         seen = {
             i: tuple(
-                _selected(v, k) for v, k in zip(instant.views, inliers[i], strict=True) if k.any()
+                selected(v, k) for v, k in zip(instant.views, inliers[i], strict=True) if k.any()
             )
             for i, instant in enumerate(instants)
             if i not in measured
@@ -375,13 +240,13 @@ def _solve_together(
         }
         known = Chain(links, measured, seen)
         old_scale = scale
-        scale = error_scale(known, poses, covariances, _LOSS_SCALE_PX, old_scale)
+        scale = error_scale(known, poses, covariances, LOSS_SCALE_PX, old_scale)
         now = [mask for i in seen for mask in inliers[i]]
         same = len(now) == len(before) and all(map(np.array_equal, now, before))
         if same and covariances is not None and abs(scale / old_scale - 1.0) < _SCALE_SETTLED:
             break
         before = now
-        solved = solve_chain(known, poses, _LOSS_SCALE_PX, scale)
+        solved = solve_chain(known, poses, LOSS_SCALE_PX, scale)
         if solved is None:
             return None
         poses, covariances = solved
@@ -405,16 +270,11 @@ def _solve_together(
 def _inliers(
     views: Sequence[MatchedView], rig_from_world: Pose, registration: RegistrationPreset
 ) -> tuple[NDArray[np.bool_], ...]:
-    masks = []
-    for view in views:
-        in_cam = view.cam_from_rig.apply(rig_from_world.apply(view.points))
-        errors = np.linalg.norm(project(view.camera, in_cam) - view.pixels, axis=1)
-        masks.append(errors <= registration.max_error_px)  # False for NaN: behind the camera
-    return tuple(masks)
-
-
-def _selected(view: MatchedView, which: NDArray[np.bool_]) -> MatchedView:
-    return MatchedView(view.camera, view.cam_from_rig, view.pixels[which], view.points[which])
+    # False for NaN: behind the camera.
+    return tuple(
+        np.asarray(reprojection_errors(view, rig_from_world) <= registration.max_error_px)
+        for view in views
+    )
 
 
 def _supports(
@@ -423,7 +283,3 @@ def _supports(
     """Whether an instant's inliers are at least ``fewest``, and the share that the gate demands."""
     inliers, count = sum(int(m.sum()) for m in masks), sum(len(m) for m in masks)
     return inliers >= max(fewest, registration.min_inlier_ratio * count)
-
-
-def _passes(inliers: NDArray[np.bool_], registration: RegistrationPreset) -> bool:
-    return _supports([inliers], registration.min_inliers, registration)

@@ -281,7 +281,7 @@ def test_a_map_of_ready_made_features_with_colours_and_anchor_reads_back(tmp_pat
     folder = write_content(tmp_path / "incoming", make_ready_made_content())
     MapStore(tmp_path / "maps").publish(folder, "room", "v1")
     opened = MapStore(tmp_path / "maps").open("room")
-    assert opened.manifest.format_version == "1.1"
+    assert opened.manifest.format_version == "1.2"
     assert opened.manifest.world.anchor == ANCHOR
     assert opened.manifest.local_features.fingerprint.name == "kapture:D2-Net"
     assert opened.colors is not None
@@ -306,9 +306,50 @@ def test_a_map_without_colours_and_anchor_says_so(folder: Path) -> None:
     assert "anchor" not in json.loads((folder / "manifest.json").read_text())["world"]
 
 
-def test_a_map_of_format_1_0_opens(folder: Path) -> None:
-    edit_manifest(format_version="1.0")(folder)
-    assert open_map(folder).manifest.format_version == "1.0"
+@pytest.mark.parametrize("version", ["1.0", "1.1"])
+def test_a_map_of_an_older_minor_format_opens(folder: Path, version: str) -> None:
+    edit_manifest(format_version=version)(folder)
+    opened = open_map(folder)
+    assert opened.manifest.format_version == version
+    assert opened.gravity is None
+
+
+def test_gravity_reads_back_as_it_was(tmp_path: Path) -> None:
+    content = replace(make_content(), gravity=(0.6, 0.0, -0.8))
+    opened = verify_map(write_content(tmp_path / "map", content))
+    assert opened.gravity is not None
+    assert opened.gravity.tolist() == [0.6, 0.0, -0.8]
+    assert opened.manifest.world.gravity == (0.6, 0.0, -0.8)
+
+
+def test_a_map_without_gravity_says_so(folder: Path) -> None:
+    opened = verify_map(folder)
+    assert opened.gravity is None
+    assert "gravity" not in json.loads((folder / "manifest.json").read_text())["world"]
+
+
+@pytest.mark.parametrize(("geodetic", "down"), [(ANCHOR.geodetic, [0, 0, -1]), (None, None)])
+def test_a_geodetic_anchor_tells_what_is_down(
+    tmp_path: Path, geodetic: Geodetic | None, down: list[float] | None
+) -> None:
+    anchor = ANCHOR.model_copy(update={"geodetic": geodetic})
+    folder = write_content(tmp_path / "map", replace(make_content(), anchor=anchor))
+    edit_manifest(format_version="1.1")(folder)
+    opened = open_map(folder)
+    assert opened.manifest.world.gravity is None
+    assert (None if opened.gravity is None else opened.gravity.tolist()) == down
+
+
+@pytest.mark.parametrize(
+    "gravity",
+    [[0, 0, 0], [0, 0, -2], [0, 0, -1.00001], [0, -1], [0, 0, "down"], [1e308, 1e308, 0], 1],
+)
+def test_a_gravity_that_cannot_be_is_refused(folder: Path, gravity: object) -> None:
+    world = json.loads((folder / "manifest.json").read_text())["world"]
+    edit_manifest(world={**world, "gravity": gravity})(folder)
+    with pytest.raises(MapCorrupt, match=r"world\.gravity") as caught:
+        open_map(folder)
+    assert caught.value.code == "map.manifest"
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,140 @@
+"""Requests as HTTP has them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, assert_never
+
+from clients.features import Features
+from clients.priors import priors_as_json
+from clients.requests import (
+    CheckReady,
+    GetMap,
+    GetServer,
+    JsonObject,
+    ListMaps,
+    Localize,
+    Search,
+)
+from clients.rig_requests import (
+    AnyRequest,
+    LocalizeRig,
+    SentImage,
+    SentInstant,
+    SequenceStart,
+    camera_as_json,
+    odometry_as_json,
+    rig_as_json,
+    search_as_json,
+)
+
+NDJSON = "application/x-ndjson"
+
+
+def encode_request(request: AnyRequest) -> tuple[str, str, dict[str, Any]]:
+    """Return method, path and the rest of what httpx wants."""
+    match request:
+        case Localize():
+            headers = _id_header(request.search)
+            fields = _fields(request)
+            parts = {"data": fields, "files": _file(request.query), "headers": headers}
+            return "POST", "/localize", parts
+        case LocalizeRig():
+            files = _Files()
+            asked = search_as_json(request.search) | {
+                "rig": rig_as_json(request.rig),
+                "images": files.images(request.images),
+            }
+            return "POST", "/localize/rig", files.form(asked, _id_header(request.search))
+        case ListMaps():
+            return "GET", "/maps", {}
+        case GetMap():
+            return "GET", f"/maps/{request.map}", {}
+        case GetServer():
+            return "GET", "/healthz", {}
+        case CheckReady():
+            return "GET", "/readyz", {}
+    assert_never(request)
+
+
+def encode_sequence(
+    start: SequenceStart, instants: Sequence[SentInstant]
+) -> tuple[str, str, dict[str, Any]]:
+    """As ``encode_request``, for a sequence."""
+    files = _Files()
+    asked = search_as_json(start.search) | {"instants": [files.instant(i) for i in instants]}
+    if start.rig is not None:
+        asked["rig"] = rig_as_json(start.rig)
+    if start.time_unit is not None:
+        asked["time_unit"] = start.time_unit
+    if start.max_gap_s is not None:
+        asked["max_gap_s"] = start.max_gap_s
+    headers = _id_header(start.search) | {"Accept": NDJSON}
+    return "POST", "/localize/sequence", files.form(asked, headers)
+
+
+class _Files:
+    """The photos of a form, whose other part says what each is."""
+
+    def __init__(self) -> None:
+        self._parts: dict[str, tuple[str, bytes, str]] = {}
+
+    def images(self, images: Iterable[SentImage]) -> list[JsonObject]:
+        """Add photos, and return what the form says of them."""
+        return [self._image(image) for image in images]
+
+    def instant(self, instant: SentInstant) -> JsonObject:
+        """Add the photos of an instant, and return what the form says of it."""
+        said: JsonObject = {
+            "timestamp": instant.timestamp,
+            "images": self.images(instant.images),
+        }
+        if instant.odometry is not None:
+            said["odometry"] = odometry_as_json(instant.odometry)
+        if instant.priors is not None:
+            said["priors"] = priors_as_json(instant.priors)
+        return said
+
+    def form(self, asked: JsonObject, headers: Mapping[str, str]) -> dict[str, Any]:
+        """Return what httpx wants."""
+        # As a part of its own kind also where there is no file, so that it is a form in any case.
+        text = json.dumps(asked).encode()
+        files = {"request": (None, text, "application/json"), **self._parts}
+        return {"files": files, "headers": headers}
+
+    def _image(self, image: SentImage) -> JsonObject:
+        said: JsonObject = {"sensor": image.sensor}
+        if isinstance(image.query, Features):
+            said["features"] = image.query.as_json()
+        else:
+            name = f"image{len(self._parts)}"
+            self._parts[name] = ("photo", image.query, "application/octet-stream")
+            said["part"] = name
+        if image.camera is not None:
+            said["camera"] = camera_as_json(image.camera)
+        if image.timestamp is not None:
+            said["timestamp"] = image.timestamp
+        return said
+
+
+def _fields(request: Localize) -> dict[str, str]:
+    """Return the texts of a form for one photo."""
+    said = search_as_json(request.search)
+    fields = {name: json.dumps(value) for name, value in said.items() if name != "map"}
+    if "map" in said:
+        fields["map"] = said["map"]
+    if request.camera is not None:
+        fields["camera"] = json.dumps(camera_as_json(request.camera))
+    return fields
+
+
+def _id_header(search: Search) -> dict[str, str]:
+    return {} if search.request_id is None else {"X-Request-ID": search.request_id}
+
+
+def _file(query: bytes | Features) -> dict[str, tuple[str, bytes, str]]:
+    if isinstance(query, Features):
+        text = json.dumps(query.as_json()).encode()
+        return {"features": ("features.json", text, "application/json")}
+    return {"image": ("photo", query, "application/octet-stream")}

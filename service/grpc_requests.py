@@ -1,0 +1,124 @@
+"""Messages of gRPC checked by the models of the API's words, as JSON is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from google.protobuf.message import Message
+
+from service.incoming import inside
+from service.jobs import Instant, LocalizeJob, RigJob, SequenceStart
+from service.schemas import (
+    BatchLimits,
+    LocalizeRequest,
+    LocalizeRigRequest,
+    Parts,
+)
+from service.schemas import Instant as InstantWords
+from service.schemas import SequenceStart as SequenceStartWords
+from visloc.errors import InvalidInput, TooLarge
+from visloc_api.v1 import localization_pb2 as pb2
+
+# A rig has one name in JSON.
+_RIG_NAMES = {"rig_id": "rig", "calibration": "rig"}
+
+
+def localize_job_of(request: pb2.LocalizeRequest, max_bytes: int) -> LocalizeJob:
+    """Return the work of ``Localize``.
+
+    Raises:
+        TooLarge: ``request.too_large``; larger messages are for several photos.
+        InvalidInput: as ``LocalizeRequest`` raises.
+    """
+    size = request.ByteSize()
+    if size > max_bytes:
+        raise TooLarge(
+            "request.too_large",
+            "the request has too many bytes",
+            expected=f"at most {max_bytes} bytes",
+            got=f"{size} bytes",
+        )
+    return LocalizeRequest.read(_plain(request)).to_job()
+
+
+def rig_job_of(request: pb2.LocalizeRigRequest, limits: BatchLimits) -> RigJob:
+    """Return the work of ``LocalizeRig``.
+
+    Raises:
+        InvalidInput: as ``LocalizeRigRequest`` raises.
+    """
+    return LocalizeRigRequest.read(_plain(request), limits).to_job()
+
+
+def sequence_start_of(message: pb2.LocalizeSequenceRequest | None) -> SequenceStart:
+    """Return the start of a sequence.
+
+    Args:
+        message: the first of the stream; None when there was none.
+
+    Raises:
+        InvalidInput: ``sequence.message`` when it is no start, or as ``SequenceStart`` raises.
+    """
+    kind = None if message is None else message.WhichOneof("message")
+    if message is None or kind != "start":
+        raise _wrong_message("the first message", "start", kind)
+    return SequenceStartWords.read(_plain(message.start)).to_core()
+
+
+def instant_of(
+    message: pb2.LocalizeSequenceRequest, limits: BatchLimits, number: int, *, has_rig: bool
+) -> Instant:
+    """Return an instant of a sequence.
+
+    Args:
+        message: any but the first of the stream.
+        limits: on its images.
+        number: how many came before, for errors.
+        has_rig: whether the start named a rig.
+
+    Raises:
+        InvalidInput: ``sequence.message`` when it is no instant, or as ``Instant`` raises.
+    """
+    kind = message.WhichOneof("message")
+    if kind != "instant":
+        raise _wrong_message(f"message {number + 2}", "instant", kind)
+    with inside(f"instants[{number}]"):
+        words = InstantWords.read(_plain(message.instant), limits)
+        return words.to_core(Parts({}), has_rig=has_rig)
+
+
+def _wrong_message(name: str, expected: str, got: str | None) -> InvalidInput:
+    return InvalidInput(
+        "sequence.message",
+        f"{name} of the stream is not what it must be: first one start, then only instants",
+        field="message",
+        expected=expected,
+        got=got or "nothing",
+    )
+
+
+def _plain(message: Message) -> dict[str, Any]:
+    """Return a message's fields as JSON would have them; fields that are not there are left out.
+
+    Numbers and texts without presence are there when they are zero or empty.
+    """
+    plain = {
+        _RIG_NAMES.get(field.name, field.name): _plain_value(getattr(message, field.name))
+        for field in message.DESCRIPTOR.fields
+        if not field.has_presence or message.HasField(field.name)
+    }
+    plain.pop("request_id", None)  # of the envelope
+    if plain.get("maps") and not plain.get("map"):
+        del plain["map"]
+    return plain
+
+
+def _plain_value(value: Any) -> object:
+    if isinstance(value, Message):
+        return _plain(value)
+    if isinstance(value, Mapping):  # of all maps, the values are messages
+        return {name: _plain(value[name]) for name in sorted(value)}
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [_plain_value(each) for each in value]
+    return value
