@@ -320,10 +320,12 @@ def benchmark(
     if poses is not None:
         write_poses(poses, _estimates(figures_of[modes[0]], poses_of[modes[0]]))
     asked = [run for run in (of_photos, of_instants) if run is not None]
-    failed = [outcome for run in asked for outcome in run.outcomes if outcome.error is not None]
+    # A photo that fails on its own mostly fails in its rig as well: told once.
+    outcomes = (outcome for run in asked for outcome in run.outcomes)
+    failed = {o.query.name: o for o in outcomes if o.error is not None}
     num_with_truth = sum(query.truth is not None for query in queries.photos)
     print_report(_out, figures, num_with_truth, len(failed), unit_of(info))
-    print_failed(_err, failed)
+    print_failed(_err, list(failed.values()))
 
 
 def _measured(run: Run) -> list[TracedPose | None]:

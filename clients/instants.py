@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from clients.queries import Query, QuerySet
 from clients.rigs import Rig, RigSensor
 from clients.types import MapInfo
-from visloc.errors import DatasetError, InvalidInput, NotFound
+from visloc.errors import DatasetError, NotFound
 from visloc.geometry import Pose
 
 
@@ -121,7 +121,7 @@ def _alone(photos: Iterable[Query]) -> Rig:
     return {query.sensor: RigSensor(Pose.identity()) for query in photos}
 
 
-def _no_rigs(queries: QuerySet, expected: str) -> InvalidInput:
+def _no_rigs(queries: QuerySet, expected: str) -> DatasetError:
     return DatasetError(
         "queries.no_rigs",
         "no photo was taken by a rig",

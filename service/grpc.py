@@ -149,6 +149,10 @@ class GrpcServer:
             options=[
                 ("grpc.max_receive_message_length", settings.max_message_bytes),
                 ("grpc.so_reuseport", 0),  # a second server on the port is a mistake
+                # A robot that lost its network in the middle of a stream would keep its place.
+                ("grpc.keepalive_time_ms", 60_000),
+                ("grpc.keepalive_timeout_ms", 20_000),
+                ("grpc.http2.max_pings_without_data", 0),
             ],
             maximum_concurrent_rpcs=settings.max_requests,
         )

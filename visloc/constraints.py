@@ -28,6 +28,11 @@ from visloc.trajectory import center_covariance
 # How far beyond an area a photo may have been taken and still show it, in units of how far the
 # map's photos see; within that, photos further away count less.
 _REACH = 2.0
+_LEAST_REACH = 1e-9  # of a map whose photos see nothing
+# How far beyond a height band a photo may have been taken, in units of its height. On the floors
+# above and below, photos are further away than this from the band of a floor: they are taken from
+# the middle half of their own.
+_HEIGHT_REACH = 0.25
 # An area of so many standard deviations around a pose prior is searched.
 _POSE_PRIOR_STDS = 3.0
 # A pose contradicts a prior when it is further away than so many of its own standard deviations.
@@ -126,14 +131,13 @@ class Constraints:
             return None
         centers = self._geometry.centers
         weights = np.ones(len(centers))
-        reach = max(self._geometry.reach, np.finfo(float).tiny)
+        reach = max(self._geometry.reach, _LEAST_REACH)
         for center, radius in spheres:
             beyond = (np.linalg.norm(centers - center, axis=1) - radius) / reach
             weights *= np.where(beyond <= _REACH, np.exp(-0.5 * np.maximum(beyond, 0.0) ** 2), 0.0)
         band = self._priors.height
         if band is not None and self._up is not None:
-            # The floor above is at least one height of the band away from the middle of this one.
-            slack = (band.max - band.min) / 2
+            slack = _HEIGHT_REACH * (band.max - band.min)
             heights = (centers + self._geometry.origin) @ self._up
             weights[(heights < band.min - slack) | (heights > band.max + slack)] = 0.0
         return weights
@@ -213,14 +217,19 @@ def _largest_std(pose: Pose, covariance: NDArray[np.float64]) -> float:
 def _mahalanobis2(
     a: Pose, covariance_a: NDArray[np.float64], b: Pose, covariance_b: NDArray[np.float64]
 ) -> float:
-    """Squared distance of two poses in units of what both leave open."""
+    """Squared distance of two poses in units of what both leave open; infinite when in doubt."""
     # In terms of rotation and centre: far from the origin, t is not linear in the rotation.
     difference = np.concatenate(
         [Rotation.from_matrix(a.rotation @ b.rotation.T).as_rotvec(), a.center - b.center]
     )
     floor = np.diag([_MAP_STD_RAD**2] * 3 + [_MAP_STD**2] * 3)
     total = center_covariance(a, covariance_a) + center_covariance(b, covariance_b) + floor
-    return float(difference @ np.linalg.solve(total, difference))
+    try:
+        squared = float(difference @ np.linalg.solve(total, difference))
+    except np.linalg.LinAlgError:
+        return math.inf
+    # So far from the origin that rounding left no digits, it may be negative or no number.
+    return squared if squared >= 0 else math.inf
 
 
 def _angles(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

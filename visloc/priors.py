@@ -18,6 +18,11 @@ from visloc.geometry import Pose
 
 # A gravity prior of a larger spread says too little to search by.
 MAX_GRAVITY_STD = math.radians(15.0)
+# Further than any place, wider than any doubt; squares and products of it are still numbers.
+_MOST = 1e15
+# Of a covariance without units. That of a pose 5000 km from the origin is within a hair of singular
+# there, where t moves by kilometres with the rotation.
+_LEAST_EIGENVALUE = 1e-15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,10 +38,12 @@ class PositionPrior:
     radius: float
 
     def __post_init__(self) -> None:
-        if self.position.shape != (3,) or not np.isfinite(self.position).all():
-            raise _unusable("position.position", "three finite numbers", self.position)
-        if not (math.isfinite(self.radius) and self.radius > 0):
-            raise _unusable("position.radius", "a positive number", self.radius)
+        if self.position.shape != (3,) or not _usable(self.position):
+            expected = f"three finite numbers, none beyond {_MOST:g}"
+            raise _unusable("position.position", expected, self.position)
+        if not 0 < self.radius <= _MOST:  # NaN fails too
+            expected = f"a positive number, at most {_MOST:g}"
+            raise _unusable("position.radius", expected, self.radius)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +80,11 @@ class PosePrior:
     covariance: NDArray[np.float64]
 
     def __post_init__(self) -> None:
+        if not (
+            _usable(self.device_from_world.rotation) and _usable(self.device_from_world.translation)
+        ):
+            expected = f"a rotation and a translation, no number beyond {_MOST:g}"
+            raise _unusable("pose.device_from_world", expected, self.device_from_world)
         check_covariance(self.covariance, "priors.pose.covariance")
 
 
@@ -131,22 +143,26 @@ def check_covariance(covariance: NDArray[np.float64], field: str) -> None:
     Raises:
         InvalidInput: ``pose.covariance``.
     """
-    fine = covariance.shape == (6, 6) and bool(np.isfinite(covariance).all())
+    fine = covariance.shape == (6, 6) and _usable(covariance)
     if fine:
         scale = np.sqrt(np.abs(np.diag(covariance)))
         fine = bool((scale > 0).all()) and np.allclose(covariance, covariance.T, rtol=1e-6)
         if fine:
             with np.errstate(over="ignore", invalid="ignore"):
                 unitless = covariance / np.outer(scale, scale)
-            fine = bool(np.isfinite(unitless).all() and np.linalg.eigvalsh(unitless)[0] > 1e-9)
+            fine = _usable(unitless) and bool(np.linalg.eigvalsh(unitless)[0] > _LEAST_EIGENVALUE)
     if not fine:
         raise InvalidInput(
             "pose.covariance",
             "not the covariance of a pose",
             field=field,
             expected="6 x 6 finite numbers, symmetric and positive definite: rotation (rad), then "
-            "translation",
+            f"translation; none beyond {_MOST:g}",
         )
+
+
+def _usable(numbers: NDArray[np.float64]) -> bool:
+    return bool((np.abs(numbers) <= _MOST).all())  # False for NaN
 
 
 def _unusable(field: str, expected: str, got: object) -> InvalidInput:

@@ -18,6 +18,8 @@ from visloc.errors import InvalidInput
 _CAMERA_TEXT = "PINHOLE,640,480,525,525,320,240"
 # How far the length of a quaternion may be from 1: it was written with three digits at least.
 _MAX_QUATERNION_ERROR = 1e-3
+# Further than any place; its square is still a number.
+_MAX_TRANSLATION = 1e15
 
 # One complaint is enough of a list with a million of them.
 Numbers = Annotated[list[float], Field(fail_fast=True)]
@@ -92,7 +94,8 @@ class Transform(IncomingMessage):
 
         Raises:
             InvalidInput: ``rotation_code`` for what is not a unit quaternion within 1e-3, as of a
-                transform with a scale; ``pose.translation`` for what is not three finite numbers.
+                transform with a scale; ``pose.translation`` for what is not three finite numbers
+                of any place.
         """
         length = math.hypot(*self.rotation_wxyz)
         # NaN fails too.
@@ -106,12 +109,13 @@ class Transform(IncomingMessage):
                 if len(self.rotation_wxyz) == 4
                 else f"{len(self.rotation_wxyz)} numbers",
             )
-        if len(self.translation) != 3 or not all(map(math.isfinite, self.translation)):
+        far = [number for number in self.translation if not abs(number) <= _MAX_TRANSLATION]
+        if len(self.translation) != 3 or far:  # NaN is far too
             raise InvalidInput(
                 "pose.translation",
                 "not a translation",
                 field=f"{field}.translation",
-                expected="three finite numbers",
+                expected=f"three finite numbers, none beyond {_MAX_TRANSLATION:g}",
                 got=str(self.translation[:4]),
             )
         return visloc.geometry.Pose.from_quaternion(self.rotation_wxyz, self.translation)

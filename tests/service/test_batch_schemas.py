@@ -169,6 +169,10 @@ AT_RIGHT = "rig.sensors.right.cam_from_rig"
             *("pose.translation", f"{AT_RIGHT}.translation"),
         ),
         (
+            {"rig": rig(right={"cam_from_rig": TURNED | {"translation": [0, 1e300, 0]}})},
+            *("pose.translation", f"{AT_RIGHT}.translation"),
+        ),
+        (
             {"rig": rig(right={"cam_from_rig": TURNED, "camera": CAMERA | {"model": "FISHY"}})},
             *("camera.model", "rig.sensors.right.camera.model"),
         ),

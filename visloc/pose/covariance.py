@@ -5,6 +5,7 @@ Poses are perturbed as R <- Exp(w) R, t <- t + dt; covariances are 6 x 6, w (rad
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -18,6 +19,7 @@ _MIN_POINTS = 4
 _MIN_VARIANCE_PX2 = 1e-12
 # Smallest eigenvalue of the unit-free information matrix, of largest diagonal 1.
 _MIN_INFORMATION = 1e-9
+_SANDWICH_SCATTER = 2.0
 
 
 def pose_covariance(
@@ -67,7 +69,9 @@ def pose_covariance(
     common *= max(np.sum(psi**2) / spare, _MIN_VARIANCE_PX2) / slope**2
     gradients = np.einsum("nai,na->ni", jacobian, psi)
     sandwich = bread @ (gradients.T @ gradients) @ bread * (num_residuals / spare)
-    return _wider(common, sandwich)
+    # The sandwich scatters by about 1 / sqrt(n) in each direction: the largest of both would be
+    # too wide by that in half of them, were it not taken off first.
+    return _wider(common, sandwich / (1.0 + _SANDWICH_SCATTER / math.sqrt(num_points)))
 
 
 def position_covariance(
