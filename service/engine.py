@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -28,21 +28,19 @@ from service.jobs import (
     SequenceStart,
 )
 from service.loaded_maps import LoadedMaps
+from service.sequences import SequenceRun
 from visloc.archive import Map, MapStore
 from visloc.errors import (
     InvalidInput,
     Overloaded,
-    TooLarge,
     Unavailable,
     VislocError,
 )
 from visloc.images import ImageLimits, read_photo
 from visloc.localizer import FeatureCache
 from visloc.priors import Priors
-from visloc.sequence import SeenInstant, SequenceSolver, check_max_gap
 from visloc.solving import SeenImage
-from visloc.trajectory import TimeUnit, guess_time_unit
-from visloc.types import Answer, InstantAnswer, Localized, LocalizeOptions, QueryFeatures
+from visloc.types import Answer, Localized, LocalizeOptions, QueryFeatures
 
 logger = logging.getLogger(__name__)
 
@@ -174,63 +172,43 @@ class Engine:
                 target.localizer.solve(images, job.options, job.priors, job.timestamp).answer
                 for target, images in zip(targets, seen, strict=True)
             ]
-            best = max(range(len(answers)), key=lambda i: _worth(answers[i]))
-            return _localization(targets[best], answers[best])
+            best = max(
+                range(len(answers)),
+                key=lambda i: (answers[i].pose is not None, answers[i].num_inliers),
+            )
+            return targets[best].localization(answers[best])
 
         return await self._run(solve)
 
     async def localize_sequence(
-        self, start: SequenceStart, instants: AsyncIterator[Instant]
-    ) -> AsyncIterator[InstantLocalization]:
+        self, start: SequenceStart, instants: AsyncIterator[Instant] | Sequence[Instant]
+    ) -> AsyncGenerator[InstantLocalization]:
         """Answer the instants of a sequence in order, each as soon as its answer is final.
 
-        The next instant is taken when the answers to those before have been taken. The caller
-        holds a place (``admit_batch``). With several maps, nothing is answered until an instant
-        is localized: its map is kept.
+        The next instant is taken when the answers to those before have been taken; those that
+        are all there are checked before any work. The caller holds a place (``admit_batch``).
+        With several maps, nothing is answered until an instant is localized: its map is kept.
 
         Raises:
             InvalidInput: ``sequence.*``, ``rig.*``, ``priors.*``.
             TooLarge: ``sequence.too_many_instants``, ``rig.too_many_images``.
             VislocError: what the store raises.
         """
-        check_max_gap(start.max_gap_s)
         targets = await self._run(self._targets, start.maps, start.rig)
-        check_priors(targets, start.priors)
-        solvers: list[SequenceSolver] = []
-        held: list[list[InstantAnswer]] = [[] for _ in targets]
-        before: Instant | None = None
+        run = SequenceRun(start, targets, self._max_rig_images, self._max_instants)
+        if isinstance(instants, Sequence):
+            for index, instant in enumerate(instants):
+                run.check(index, instant)
+            instants = _one_by_one(instants)
         index = 0
         async for instant in instants:
-            where = f"instants[{index}]"
-            if index == self._max_instants:
-                raise _too_many_instants(self._max_instants)
-            if before is not None and instant.timestamp <= before.timestamp:
-                raise _not_later(where, before.timestamp, instant.timestamp)
-            for target in targets:
-                rig = None if start.rig is None else target.rig
-                check_images(instant.images, rig, self._max_rig_images, f"{where}.images")
-            priors = start.priors if instant.priors is None else instant.priors
-            check_priors(targets, priors)
-            if not solvers:
-                unit = start.time_unit or _guessed_unit(instant.timestamp)
-                solvers = [_solver(target, start, unit) for target in targets]
-            images = await self._look(targets, instant.images, start.options, priors)
-            added = await self._run(_add, solvers, instant, images, priors)
-            for answers, more in zip(held, added, strict=True):
-                answers += more
-            if len(targets) > 1 and any(solver.measured for solver in solvers):
-                best = max(range(len(targets)), key=lambda i: solvers[i].measured)
-                targets, solvers, held = [targets[best]], [solvers[best]], [held[best]]
-            if len(targets) == 1:
-                for answer in held[0]:
-                    yield _localization(targets[0], answer)
-                held = [[]]
-            before = instant
+            priors = run.check(index, instant)
+            images = await self._look(run.targets, instant.images, start.options, priors)
+            for answer in await self._run(run.add, instant, images, priors):
+                yield run.localization(answer)
             index += 1
-        if before is None:
-            raise InvalidInput("sequence.empty", "there is no instant", field="instants")
-        for answer in [*held[0], *await self._run(solvers[0].finish)]:
-            yield _localization(targets[0], answer)
+        for answer in await self._run(run.finish):
+            yield run.localization(answer)
 
     async def maps(self) -> Sequence[Map]:
         """All maps that can be opened, in the version that is served, by id."""
@@ -305,63 +283,6 @@ class Engine:
         )
 
 
-def _solver(target: Target, start: SequenceStart, unit: TimeUnit) -> SequenceSolver:
-    return SequenceSolver(
-        target.localizer.geometry,
-        metric=target.localizer.map.manifest.world.metric,
-        options=start.options,
-        time_unit=unit,
-        max_gap_s=start.max_gap_s,
-    )
-
-
-def _add(
-    solvers: Sequence[SequenceSolver],
-    instant: Instant,
-    images: Sequence[tuple[SeenImage, ...]],
-    priors: Priors,
-) -> list[list[InstantAnswer]]:
-    return [
-        solver.add(SeenInstant(instant.timestamp, seen, instant.odometry, priors))
-        for solver, seen in zip(solvers, images, strict=True)
-    ]
-
-
-def _localization(target: Target, answer: InstantAnswer) -> InstantLocalization:
-    manifest = target.localizer.map.manifest
-    return InstantLocalization(answer, manifest.id, manifest.version)
-
-
-def _worth(answer: InstantAnswer) -> tuple[bool, int]:
-    return answer.pose is not None, answer.num_inliers
-
-
-def _guessed_unit(timestamp: int) -> TimeUnit:
-    unit = guess_time_unit([timestamp])
-    if unit is None:
-        raise InvalidInput(
-            "sequence.time_unit",
-            "the unit of the timestamps cannot be told by their size",
-            field="time_unit",
-            expected=f"one of {', '.join(TimeUnit)}",
-        )
-    return unit
-
-
-def _not_later(where: str, before: int, timestamp: int) -> InvalidInput:
-    return InvalidInput(
-        "sequence.timestamps",
-        "instants come in the order of time, each once",
-        field=f"{where}.timestamp",
-        expected=f"more than {before}, that of the instant before",
-        got=timestamp,
-    )
-
-
-def _too_many_instants(most: int) -> TooLarge:
-    return TooLarge(
-        "sequence.too_many_instants",
-        "too many instants in one sequence; send it in parts",
-        field="instants",
-        expected=f"at most {most}",
-    )
+async def _one_by_one(instants: Sequence[Instant]) -> AsyncIterator[Instant]:
+    for instant in instants:
+        yield instant

@@ -7,7 +7,7 @@ import logging
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing, asynccontextmanager
 from time import perf_counter
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import grpc
 from google.protobuf.any_pb2 import Any as AnyMessage
@@ -27,7 +27,7 @@ from service.grpc_requests import (
     rig_job_of,
     sequence_start_of,
 )
-from service.jobs import Instant, InstantLocalization
+from service.jobs import Instant
 from service.schemas import (
     BatchLimits,
     InstantAnswer,
@@ -101,10 +101,7 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
             with self._engine.admit_batch():
                 start = await asyncio.to_thread(sequence_start_of, first)
                 instants = self._instants(request_iterator, has_rig=start.rig is not None)
-                answers = cast(
-                    AsyncGenerator[InstantLocalization],
-                    self._engine.localize_sequence(start, instants),
-                )
+                answers = self._engine.localize_sequence(start, instants)
                 async with aclosing(answers):
                     async for found in answers:
                         answer = InstantAnswer.from_localization(found, id_)

@@ -9,7 +9,6 @@ from contextlib import aclosing
 from functools import partial
 from http import HTTPStatus
 from time import perf_counter
-from typing import cast
 
 from fastapi import Depends, Request, Response
 from fastapi.exceptions import RequestValidationError
@@ -22,7 +21,7 @@ import visloc
 from service.engine import Engine
 from service.incoming import refusal_of
 from service.intake import read_localize_job, read_rig_job, read_sequence_jobs
-from service.jobs import Instant, InstantLocalization
+from service.jobs import InstantLocalization
 from service.openapi import App, problems
 from service.request_bodies import LOCALIZE_BODY, RIG_BODY, SEQUENCE_BODY
 from service.responses import (
@@ -113,10 +112,7 @@ def create_app(engine: Engine, settings: ServiceSettings) -> App:
         is final.
         """
         start, instants = await read_sequence_jobs(request, settings)
-        answers = cast(
-            AsyncGenerator[InstantLocalization],
-            engine.localize_sequence(start, _one_by_one(instants)),
-        )
+        answers = engine.localize_sequence(start, instants)
         id_ = request.state.request_id
         if _wants_lines(request):
             message = partial(InstantAnswer.from_localization, request_id=id_)
@@ -193,11 +189,6 @@ class RequestEnvelope:
                 *(scope["method"], scope["path"], status),
                 *((perf_counter() - started) * 1000, id_),
             )
-
-
-async def _one_by_one(instants: Sequence[Instant]) -> AsyncGenerator[Instant]:
-    for instant in instants:
-        yield instant
 
 
 async def _next_of(answers: AsyncGenerator[InstantLocalization]) -> InstantLocalization:

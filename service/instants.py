@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
 
-from service.jobs import ONLY_SENSOR, ImageJob, Rig, RigSensor
+from service.jobs import ONLY_SENSOR, ImageJob, InstantLocalization, Rig, RigSensor
 from visloc.archive import Map
 from visloc.constraints import Constraints
 from visloc.errors import InvalidInput, NotFound, TooLarge
@@ -16,7 +16,7 @@ from visloc.images import ImageLimits, Photo, read_photo
 from visloc.localizer import FeatureCache, Localizer
 from visloc.priors import Priors
 from visloc.solving import Look, SeenImage
-from visloc.types import LocalizeOptions, QueryFeatures
+from visloc.types import InstantAnswer, LocalizeOptions, QueryFeatures
 
 # What is wrong with all images is wrong with the request.
 _CODES_OF_ALL_IMAGES = ("features.required", "options.read_as")
@@ -28,6 +28,11 @@ class Target:
 
     localizer: Localizer
     rig: Mapping[str, RigSensor]
+
+    def localization(self, answer: InstantAnswer) -> InstantLocalization:
+        """Return an answer with the map that gave it."""
+        manifest = self.localizer.map.manifest
+        return InstantLocalization(answer, manifest.id, manifest.version)
 
 
 def rig_in_map(rig: Rig | None, opened: Map) -> Mapping[str, RigSensor]:

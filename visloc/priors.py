@@ -40,10 +40,10 @@ class PositionPrior:
     def __post_init__(self) -> None:
         if self.position.shape != (3,) or not _usable(self.position):
             expected = f"three finite numbers, none beyond {_MOST:g}"
-            raise _unusable("position.position", expected, self.position)
+            raise _unusable("position", "position", expected, self.position)
         if not 0 < self.radius <= _MOST:  # NaN fails too
             expected = f"a positive number, at most {_MOST:g}"
-            raise _unusable("position.radius", expected, self.radius)
+            raise _unusable("position", "radius", expected, self.radius)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class HeightBand:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.min) and math.isfinite(self.max) and self.min < self.max):
             got = f"{self.min} to {self.max}"
-            raise _unusable("height", "two finite numbers, min < max", got)
+            raise _unusable("height", None, "two finite numbers, min < max", got)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +84,7 @@ class PosePrior:
             _usable(self.device_from_world.rotation) and _usable(self.device_from_world.translation)
         ):
             expected = f"a rotation and a translation, no number beyond {_MOST:g}"
-            raise _unusable("pose.device_from_world", expected, self.device_from_world)
+            raise _unusable("pose", "device_from_world", expected, self.device_from_world)
         check_covariance(self.covariance, "priors.pose.covariance")
 
 
@@ -104,12 +104,12 @@ class GravityPrior:
     world: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "direction", unit_vector("gravity.direction", self.direction))
+        object.__setattr__(self, "direction", _unit_vector("direction", self.direction))
         if self.world is not None:
-            object.__setattr__(self, "world", unit_vector("gravity.world", self.world))
+            object.__setattr__(self, "world", _unit_vector("world", self.world))
         if not 0 < self.std <= MAX_GRAVITY_STD:  # NaN fails too
             most = f"more than 0 and at most {math.degrees(MAX_GRAVITY_STD):g} degrees"
-            raise _unusable("gravity.std_deg", most, math.degrees(self.std))
+            raise _unusable("gravity", "std_deg", most, math.degrees(self.std))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,18 +123,6 @@ class Priors:
 
 
 NO_PRIORS = Priors()
-
-
-def unit_vector(field: str, vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a direction (3,) at length 1.
-
-    Raises:
-        InvalidInput: ``priors.FIELD`` when it has none.
-    """
-    norm = math.hypot(*vector) if vector.shape == (3,) else math.nan
-    if not (math.isfinite(norm) and norm > 1e-6):
-        raise _unusable(field, "three finite numbers, not all zero", vector)
-    return np.asarray(vector / norm)
 
 
 def check_covariance(covariance: NDArray[np.float64], field: str) -> None:
@@ -165,11 +153,19 @@ def _usable(numbers: NDArray[np.float64]) -> bool:
     return bool((np.abs(numbers) <= _MOST).all())  # False for NaN
 
 
-def _unusable(field: str, expected: str, got: object) -> InvalidInput:
+def _unit_vector(part: str, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A direction (3,) of gravity at length 1."""
+    norm = math.hypot(*vector) if vector.shape == (3,) else math.nan
+    if not (math.isfinite(norm) and norm > 1e-6):
+        raise _unusable("gravity", part, "three finite numbers, not all zero", vector)
+    return np.asarray(vector / norm)
+
+
+def _unusable(prior: str, part: str | None, expected: str, got: object) -> InvalidInput:
     return InvalidInput(
-        f"priors.{field.partition('.')[0]}",
+        f"priors.{prior}",
         "not usable",
-        field=f"priors.{field}",
+        field=f"priors.{prior}" if part is None else f"priors.{prior}.{part}",
         expected=expected,
         got=str(got)[:100],
     )

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from visloc.constraints import Constraints, MapGeometry
 from visloc.errors import InvalidInput
-from visloc.geometry import Pose
+from visloc.geometry import Pose, rotation_angle
 from visloc.pose.covariance import with_origin
 from visloc.pose.motion import RelativeMotion, default_motion_covariance
-from visloc.pose.window import WindowInstant, solve_window
+from visloc.pose.window import WindowInstant, WindowPose, solve_window
 from visloc.priors import Priors
 from visloc.solving import (
     SeenImage,
@@ -31,13 +31,27 @@ from visloc.solving import (
     solve_instant,
 )
 from visloc.timing import timed
-from visloc.trajectory import PoseSource, TimeUnit, TracedPose, fill_sequence
+from visloc.trajectory import (
+    PoseSource,
+    TimeUnit,
+    TracedPose,
+    center_covariance,
+    covariance_from_center,
+    fill_sequence,
+)
 from visloc.types import InstantAnswer, LocalizeOptions, Reason, Refusal
 
 # At most so many instants wait, and as many answered ones are remembered, however long the gap
 # may be: what is further away in a fast sequence adds little and costs time.
 MAX_WAITING = 30
 MAX_GAP_S = 60.0
+# Standard deviation, as a share of the way, of motion that no measured pose can contradict.
+_UNCHECKED_SHARE = 0.05
+_CONTRADICTED = Refusal(
+    "gate",
+    Reason.CONTRADICTS_MOTION,
+    "the pose of its own images contradicts those of its neighbours and the motion between",
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,26 +228,36 @@ class SequenceSolver:
             registration=registration,
             seed=self._options.seed,
         )
-        times_s = np.array([entry.time_s for entry in self._entries])
-        measured_s = times_s[[pose is not None and pose.measured for pose in found]]
+        measured = [i for i, pose in enumerate(found) if pose is not None and pose.measured]
         answers = []
-        for entry, pose, is_linked in zip(self._entries, found, linked, strict=True):
+        for i, (entry, pose) in enumerate(zip(self._entries, found, strict=True)):
             alone = entry.solved.answer
-            near = np.abs(measured_s - entry.time_s) <= self._max_gap_s
-            if not is_linked or (pose is None and alone.pose is None) or not near.any():
+            if linked[i] and alone.pose is not None and (pose is None or not pose.measured):
+                alone = replace(alone, pose=None, refusal=_CONTRADICTED)
+            nearest = min(measured, key=lambda j: self._seconds_between(i, j), default=i)
+            if (
+                not linked[i]
+                or pose is None
+                or not measured
+                or self._seconds_between(i, nearest) > self._max_gap_s
+            ):
                 answers.append(alone)
-            elif pose is None or (alone.pose is not None and not pose.measured):
-                answers.append(_contradicted(alone))
-            else:
-                source = PoseSource.ESTIMATED if pose.measured else PoseSource.MOTION
-                answers.append(
-                    self._with_pose(
-                        replace(alone, images=image_answers(entry.seen.images, pose.inliers)),
-                        TracedPose(pose.rig_from_world, pose.covariance, source),
-                        entry.seen.priors,
-                    )
+                continue
+            covariance = pose.covariance
+            if not measured[0] <= i <= measured[-1]:
+                covariance = _with_unchecked_motion(pose, found[nearest])
+            source = PoseSource.ESTIMATED if pose.measured else PoseSource.MOTION
+            answers.append(
+                self._with_pose(
+                    replace(alone, images=image_answers(entry.seen.images, pose.inliers)),
+                    TracedPose(pose.rig_from_world, covariance, source),
+                    entry.seen.priors,
                 )
+            )
         return answers
+
+    def _seconds_between(self, i: int, j: int) -> float:
+        return abs(self._entries[j].time_s - self._entries[i].time_s)
 
     def _filled(
         self, answers: Sequence[InstantAnswer], linked: Sequence[bool]
@@ -296,10 +320,15 @@ def check_max_gap(max_gap_s: float) -> None:
         )
 
 
-def _contradicted(alone: InstantAnswer) -> InstantAnswer:
-    refusal = Refusal(
-        "gate",
-        Reason.CONTRADICTS_MOTION,
-        "the pose of its own images contradicts those of its neighbours and the motion between",
-    )
-    return replace(alone, pose=None, refusal=refusal)
+def _with_unchecked_motion(pose: WindowPose, nearest: WindowPose | None) -> NDArray[np.float64]:
+    """The covariance of a pose beyond all measured ones, where nothing can contradict the motion.
+
+    An error of its scale adds up along the way and is in no covariance that a tracker states.
+    """
+    assert nearest is not None  # it was measured
+    here, there = pose.rig_from_world, nearest.rig_from_world
+    distance = float(np.linalg.norm(here.center - there.center))
+    angle = rotation_angle(here.rotation @ there.rotation.T)
+    stds = [_UNCHECKED_SHARE * angle] * 3 + [_UNCHECKED_SHARE * distance] * 3
+    covariance = center_covariance(here, pose.covariance) + np.diag(np.square(stds))
+    return covariance_from_center(here, covariance)

@@ -376,9 +376,7 @@ class Building:
                 record.model_copy(
                     update={
                         "dim": 64,
-                        "fingerprint": record.fingerprint.model_copy(
-                            update={"name": "kapture:B"}
-                        ),
+                        "fingerprint": record.fingerprint.model_copy(update={"name": "kapture:B"}),
                     }
                 ),
             ),
@@ -422,7 +420,9 @@ class Building:
         pose = self.pose(floor, 2.2)
         pixels = project(place.camera, pose.apply(self.landmarks[floor]))
         seen = np.flatnonzero(
-            np.isfinite(pixels).all(axis=1) & (pixels > 0).all(axis=1) & (pixels < [640, 480]).all(1)
+            np.isfinite(pixels).all(axis=1)
+            & (pixels > 0).all(axis=1)
+            & (pixels < [640, 480]).all(1)
         )
         like = self.globals[floor, 2] + 0.2 * self._units(rng, 1, 64)[0]
         features = QueryFeatures(

@@ -176,9 +176,7 @@ def test_matches_in_a_line_are_refused(place: Any) -> None:
     points = line.points[0] + along
     seen = TRUTH.apply(points)
     fx, fy, cx, cy = place.camera.params
-    pixels = np.column_stack(
-        [fx * seen[:, 0] / seen[:, 2] + cx, fy * seen[:, 1] / seen[:, 2] + cy]
-    )
+    pixels = np.column_stack([fx * seen[:, 0] / seen[:, 2] + cx, fy * seen[:, 1] / seen[:, 2] + cy])
     solved = solve([place.image(Matches(pixels, points))], place)
     assert reason(solved) in (Reason.UNCERTAIN_POSE, Reason.NO_POSE, Reason.TOO_FEW_INLIERS)
 
@@ -414,7 +412,9 @@ def test_a_pose_prior_that_lies_costs_the_answer(
     turn = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
     center = world.center + [0.0, away, 0.0]
     lie = Pose(turn @ world.rotation, -turn @ world.rotation @ center)
-    solved = solve(rig_images(far_place, 30, 10), far_place, Priors(pose=pose_prior(lie, 0.02, 0.2)))
+    solved = solve(
+        rig_images(far_place, 30, 10), far_place, Priors(pose=pose_prior(lie, 0.02, 0.2))
+    )
     assert reason(solved) is Reason.CONTRADICTS_PRIOR
     assert solved.answer.refusal is not None
     assert "prior pose" in solved.answer.refusal.message

@@ -102,11 +102,10 @@ def error_scale(
     """The variance of the pixels' errors, pooled over the chain, for an M-estimator.
 
     Huber's estimate (Huber 1981, section 7.6), as in ``visloc.pose.covariance``: with psi the
-    weighted errors and k the mean slope of psi, poses from pixels alone have the covariance
-    sum(psi^2) / (n - p) / k^2 (J^T J)^-1. Dividing the loss by sum(psi^2) / (n - p) / k gives the
-    optimum just that curvature. p, the parameters that the pixels determine, is the trace of
-    their information times the covariance: where motions are good, that is far less than six per
-    instant.
+    weighted errors and k the mean slope of psi, a pose from pixels alone has the covariance
+    s / k^2 (J^T J)^-1, s = sum(psi^2) / (n - p). The loss divided by s / k has just that
+    curvature at its optimum. p, the parameters that the pixels determine, is the trace of their
+    information times the covariance: where motions are good, far less than six per instant.
 
     Args:
         chain: as solved.
@@ -126,7 +125,9 @@ def error_scale(
             used += float(np.sum(information * covariances[i]))
     if count == 0:
         return 1.0
-    spare = max(2 * count - (used if covariances is not None else 6.0), 1.0)
+    # Two less than there are: few errors may look small by chance, and an expected squared error,
+    # normalized by such an estimate, is spare / (spare - 2) times too large (as for Student's t).
+    spare = max(2 * count - (used if covariances is not None else 6.0) - 2.0, 1.0)
     return max(squares / spare / (slopes / count), _MIN_SCALE_PX2)
 
 

@@ -95,8 +95,8 @@ def solve_window(
        is not used, and nothing between them is filled; beyond the outermost measured poses of such
        a part nothing is filled either. A measured pose that contradicts both neighbours while
        these agree is taken for a look-alike place: it is not used, and its instant is filled.
-       Motion that agrees only within the map's own error, but not within its stated covariance
-       (0.99), counts with a covariance made larger accordingly.
+       Motion that agrees, but worse than its stated covariance lets expect, counts with a larger
+       one (``visloc.pose.agreement``).
     2. A part without measured poses is tried as one generalized camera, in groups small enough
        for the motion's drift.
     3. All poses of a part are solved together (``visloc.pose.pose_graph``): measured ones with
@@ -104,7 +104,8 @@ def solve_window(
        but agree with the pose that the others give them.
 
     A wrong motion that no measured pose contradicts, as beyond the last one, cannot be seen:
-    there, the covariance is as honest as that of the motion.
+    there, the covariance is as honest as that of the motion. A motion that claims to be exact and
+    is off by less than the measured poses are unsure pulls them along by that much.
 
     Args:
         instants: consecutive, N.
@@ -113,8 +114,7 @@ def solve_window(
         seed: of RANSAC; equal seeds give equal bits.
 
     Returns:
-        For each instant its pose, or None when nothing supports one. Measured poses move within
-        their uncertainty only.
+        For each instant its pose, or None when nothing supports one.
     """
     if len(motions) != max(len(instants) - 1, 0):
         raise ValueError(f"{len(instants)} instants with {len(motions)} motions")

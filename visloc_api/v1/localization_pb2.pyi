@@ -1170,11 +1170,11 @@ class ImageAnswer(_message.Message):
     inliers: _builtins.int
     @_builtins.property
     def error(self) -> Global___ImageError:
-        """why it could not be used; then the rest is empty"""
+        """why it could not be used; then what was seen is empty"""
 
     @_builtins.property
     def cam_from_world(self) -> Global___Transform:
-        """when there is a pose"""
+        """when the instant has a pose"""
 
     @_builtins.property
     def retrieved(self) -> _containers.RepeatedCompositeFieldContainer[Global___RetrievedImage]: ...

@@ -28,7 +28,7 @@ def some_pose(size: float = 1.0) -> Pose:
 
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1e-6, 0.1, 3.0])
 def test_difference_undoes_moved(size: float) -> None:
-    change = np.array([0.3, -0.5, 0.81, 1.0, 2.0, 3.0]) * [size] * 1
+    change = np.array([0.3, -0.5, 0.81, 1.0, 2.0, 3.0]) * size
     pose = some_pose()
     assert difference(moved(pose, change), pose) == pytest.approx(change, rel=1e-9, abs=1e-15)
 
@@ -87,7 +87,8 @@ def test_the_spread_of_a_chain_agrees_with_monte_carlo() -> None:
 
 def test_a_pose_between_two_measured_ones_is_their_weighted_mean() -> None:
     step = Pose(np.eye(3), np.array([0.0, 0.0, -1.0]))
-    links = [UncertainPose(step, np.eye(6) * 1e-4)] * 2
+    firm_in_rotation = np.diag([1e-12] * 3 + [1e-4] * 3)
+    links = [UncertainPose(step, firm_in_rotation)] * 2
     ends = {
         0: UncertainPose(Pose.identity(), np.eye(6) * 1e-8),
         2: UncertainPose(Pose(np.eye(3), np.array([0.02, 0.0, -2.0])), np.eye(6) * 1e-8),
@@ -96,9 +97,7 @@ def test_a_pose_between_two_measured_ones_is_their_weighted_mean() -> None:
     assert solved is not None
     poses, covariances = solved
     assert poses[1].center == pytest.approx([-0.01, 0.0, 1.0], abs=1e-4)
-    # Rotation about the two other axes could be told from the ends, had they been apart sideways.
-    assert covariances[1][3, 3] == pytest.approx(0.5e-4, rel=0.05)
-    assert covariances[1][2, 2] == pytest.approx(0.5e-4, rel=0.05)
+    assert covariances[1][3, 3] == pytest.approx(0.5e-4, rel=0.01)
 
 
 def test_motion_alone_leaves_the_poses_undetermined() -> None:
@@ -111,7 +110,6 @@ def test_motion_that_says_nothing_is_no_link() -> None:
     assert link_from_motion(motion) is not None
     assert link_from_motion(None) is None
     assert link_from_motion(RelativeMotion(Pose.identity(), np.eye(6))) is None
-    assert link_from_motion(RelativeMotion(Pose.identity(), np.eye(6) * np.inf)) is None
 
 
 def test_the_default_covariance_grows_with_the_motion() -> None:

@@ -1,7 +1,8 @@
-"""A stereo rig drives a bend between walls; all geometry is exact but for the noise that is added."""
+"""A stereo rig drives a bend between walls; the geometry is exact but for the noise added to it."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -33,6 +34,7 @@ CAMERA = Camera("PINHOLE", 1240, 376, (700.0, 700.0, 620.0, 188.0))
 STEREO = (Pose.identity(), Pose(np.eye(3), np.array([-0.54, 0.0, 0.0])))
 MONO = STEREO[:1]
 RADIUS = 40.0
+FORWARD = np.array([0.0, 0.0, 1.0])
 Lie = Callable[[int, Pose], Pose]
 
 
@@ -196,7 +198,7 @@ def test_many_weak_instants_localize_all() -> None:
     rng = np.random.default_rng(0)
     street, truth = make_street(rng), make_drive(8)
     instants = [WindowInstant(look(rng, street, pose, 12, 48, MONO), None) for pose in truth]
-    motions = [make_motion(rng, b @ a.inverse()) for a, b in zip(truth, truth[1:], strict=False)]
+    motions = [make_motion(rng, b @ a.inverse()) for a, b in itertools.pairwise(truth)]
     for pose, found in zip(truth, solve(instants, motions), strict=True):
         assert found is not None
         assert not found.measured
@@ -215,9 +217,7 @@ def test_weak_instants_correct_the_drift_from_the_only_good_one() -> None:
             WindowInstant(look(rng, street, pose, right, 60 - right, MONO), None)
             for pose in truth[1:]
         ]
-        motions = [
-            make_motion(rng, b @ a.inverse()) for a, b in zip(truth, truth[1:], strict=False)
-        ]
+        motions = [make_motion(rng, b @ a.inverse()) for a, b in itertools.pairwise(truth)]
         last = solve(instants, motions)[-1]
         assert last is not None
         assert normalized_error(last, truth[-1]) < chi2.ppf(0.9999, 6)
@@ -289,7 +289,7 @@ def test_one_lying_link_never_gives_a_wrong_pose_that_looks_sure(shift: float) -
     """Whether it is noticed, or too small for that: what is stated holds."""
 
     def lie(i: int, motion: Pose) -> Pose:
-        return Pose(motion.rotation, motion.translation + [0.0, 0.0, shift * (i == 4)])
+        return Pose(motion.rotation, motion.translation + (i == 4) * shift * FORWARD)
 
     for seed in range(3):
         truth, instants, motions = make_window(seed, 10, [0, 3, 6, 9], lie=lie)
@@ -305,7 +305,7 @@ def test_one_lying_link_never_gives_a_wrong_pose_that_looks_sure(shift: float) -
 
 def test_a_slight_lie_of_motion_that_claims_to_be_exact_widens_what_it_fills() -> None:
     def lie(i: int, motion: Pose) -> Pose:
-        return Pose(motion.rotation, motion.translation + [0.0, 0.0, 0.05 * (i == 1)])
+        return Pose(motion.rotation, motion.translation + (i == 1) * 0.05 * FORWARD)
 
     truth, instants, motions = make_window(0, 4, [0, 3], lie=lie, share=1e-4, degrees=1e-3)
     for pose, true in zip(solve(instants, motions), truth, strict=True):
@@ -397,7 +397,7 @@ def test_equal_seeds_give_equal_bits() -> None:
     rng = np.random.default_rng(3)
     street, truth = make_street(rng), make_drive(4)
     instants = [WindowInstant(look(rng, street, pose, 12, 30, MONO), None) for pose in truth]
-    motions = [make_motion(rng, b @ a.inverse()) for a, b in zip(truth, truth[1:], strict=False)]
+    motions = [make_motion(rng, b @ a.inverse()) for a, b in itertools.pairwise(truth)]
     bits = set()
     for _ in range(2):
         found = solve(instants, motions)

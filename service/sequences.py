@@ -1,0 +1,148 @@
+"""One sequence on its way through the engine. Runs in worker threads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from service.incoming import inside
+from service.instants import Target, check_images, check_priors
+from service.jobs import Instant, InstantLocalization, SequenceStart
+from visloc.errors import InvalidInput, TooLarge
+from visloc.priors import Priors
+from visloc.sequence import SeenInstant, SequenceSolver, check_max_gap
+from visloc.solving import SeenImage
+from visloc.trajectory import TimeUnit, guess_time_unit
+from visloc.types import InstantAnswer
+
+
+class SequenceRun:
+    """Solves a sequence in each of its maps until one of them is settled on.
+
+    Args:
+        start: what all instants share.
+        targets: the maps.
+        max_images: of one instant.
+        max_instants: of the sequence.
+
+    Attributes:
+        targets: the maps that are still searched.
+
+    Raises:
+        InvalidInput: ``sequence.max_gap``, ``priors.*``.
+    """
+
+    def __init__(
+        self, start: SequenceStart, targets: Sequence[Target], max_images: int, max_instants: int
+    ) -> None:
+        check_max_gap(start.max_gap_s)
+        check_priors(targets, start.priors)
+        self.targets = targets
+        self._start = start
+        self._max_images = max_images
+        self._max_instants = max_instants
+        self._last_checked: tuple[int, int] | None = None  # index, timestamp
+        self._num_added = 0
+        self._solvers: list[SequenceSolver] = []
+        self._held: list[list[InstantAnswer]] = [[] for _ in targets]
+
+    def check(self, index: int, instant: Instant) -> Priors:
+        """Refuse an instant that cannot be solved, and return what is known of the rig there.
+
+        Instants are checked in order; to begin again with the first is fine.
+
+        Raises:
+            InvalidInput: ``sequence.*``, ``rig.*``, ``priors.*``, with the instant in the field.
+            TooLarge: ``sequence.too_many_instants``, ``rig.too_many_images``.
+        """
+        if index >= self._max_instants:
+            raise TooLarge(
+                "sequence.too_many_instants",
+                "too many instants in one sequence; send it in parts",
+                field="instants",
+                expected=f"at most {self._max_instants}",
+            )
+        with inside(f"instants[{index}]"):
+            before = self._last_checked
+            if before is not None and before[0] < index and instant.timestamp <= before[1]:
+                raise InvalidInput(
+                    "sequence.timestamps",
+                    "instants come in the order of time, each once",
+                    field="timestamp",
+                    expected=f"more than {before[1]}, that of the instant before",
+                    got=instant.timestamp,
+                )
+            self._last_checked = index, instant.timestamp
+            for target in self.targets:
+                rig = None if self._start.rig is None else target.rig
+                check_images(instant.images, rig, self._max_images, "images")
+            if instant.priors is None:
+                return self._start.priors
+            check_priors(self.targets, instant.priors)
+            return instant.priors
+
+    def add(
+        self, instant: Instant, images: Sequence[tuple[SeenImage, ...]], priors: Priors
+    ) -> list[InstantAnswer]:
+        """Solve an instant; return the answers that are final now.
+
+        Args:
+            instant: the next one.
+            images: by target.
+            priors: what ``check`` returned.
+
+        Raises:
+            InvalidInput: ``sequence.time_unit`` when the first timestamp does not tell the unit,
+                ``sequence.odometry`` for a map that is not metric.
+        """
+        if not self._solvers:
+            unit = self._start.time_unit or _guessed_unit(instant.timestamp)
+            self._solvers = [self._solver(target, unit) for target in self.targets]
+        with inside(f"instants[{self._num_added}]"):
+            for solver, held, seen in zip(self._solvers, self._held, images, strict=True):
+                held += solver.add(SeenInstant(instant.timestamp, seen, instant.odometry, priors))
+        self._num_added += 1
+        if len(self.targets) > 1 and any(solver.measured for solver in self._solvers):
+            best = max(range(len(self.targets)), key=lambda i: self._solvers[i].measured)
+            self.targets = [self.targets[best]]
+            self._solvers = [self._solvers[best]]
+            self._held = [self._held[best]]
+        return self._released() if len(self.targets) == 1 else []
+
+    def finish(self) -> list[InstantAnswer]:
+        """Return the answers that waited for instants which will not come.
+
+        Raises:
+            InvalidInput: ``sequence.empty`` when there was no instant.
+        """
+        if not self._solvers:
+            raise InvalidInput("sequence.empty", "there is no instant", field="instants")
+        return [*self._released(), *self._solvers[0].finish()]
+
+    def localization(self, answer: InstantAnswer) -> InstantLocalization:
+        """Return an answer of ``add`` or ``finish`` with the map that gave it."""
+        return self.targets[0].localization(answer)
+
+    def _released(self) -> list[InstantAnswer]:
+        released, self._held[0] = self._held[0], []
+        return released
+
+    def _solver(self, target: Target, unit: TimeUnit) -> SequenceSolver:
+        return SequenceSolver(
+            target.localizer.geometry,
+            metric=target.localizer.map.manifest.world.metric,
+            options=self._start.options,
+            time_unit=unit,
+            max_gap_s=self._start.max_gap_s,
+        )
+
+
+def _guessed_unit(timestamp: int) -> TimeUnit:
+    unit = guess_time_unit([timestamp])
+    if unit is None:
+        raise InvalidInput(
+            "sequence.time_unit",
+            "the unit of the timestamps cannot be told by their size",
+            field="time_unit",
+            expected=f"one of {', '.join(TimeUnit)}",
+        )
+    return unit
