@@ -228,23 +228,23 @@ class SequenceSolver:
             registration=registration,
             seed=self._options.seed,
         )
-        measured = [i for i, pose in enumerate(found) if pose is not None and pose.measured]
+        supported = [i for i, pose in enumerate(found) if pose is not None and pose.supported]
         answers = []
         for i, (entry, pose) in enumerate(zip(self._entries, found, strict=True)):
             alone = entry.solved.answer
             if linked[i] and alone.pose is not None and (pose is None or not pose.measured):
                 alone = replace(alone, pose=None, refusal=_CONTRADICTED)
-            nearest = min(measured, key=lambda j: self._seconds_between(i, j), default=i)
+            nearest = min(supported, key=lambda j: self._seconds_between(i, j), default=i)
             if (
                 not linked[i]
                 or pose is None
-                or not measured
+                or not supported
                 or self._seconds_between(i, nearest) > self._max_gap_s
             ):
                 answers.append(alone)
                 continue
             covariance = pose.covariance
-            if not measured[0] <= i <= measured[-1]:
+            if not supported[0] <= i <= supported[-1]:
                 covariance = _with_unchecked_motion(pose, found[nearest])
             source = PoseSource.ESTIMATED if pose.measured else PoseSource.MOTION
             answers.append(
@@ -321,11 +321,11 @@ def check_max_gap(max_gap_s: float) -> None:
 
 
 def _with_unchecked_motion(pose: WindowPose, nearest: WindowPose | None) -> NDArray[np.float64]:
-    """The covariance of a pose beyond all measured ones, where nothing can contradict the motion.
+    """The covariance of a pose beyond all supported ones, where nothing can contradict motion.
 
     An error of its scale adds up along the way and is in no covariance that a tracker states.
     """
-    assert nearest is not None  # it was measured
+    assert nearest is not None  # it is supported
     here, there = pose.rig_from_world, nearest.rig_from_world
     distance = float(np.linalg.norm(here.center - there.center))
     angle = rotation_angle(here.rotation @ there.rotation.T)

@@ -73,12 +73,15 @@ class WindowPose:
         inliers: per view, (n,) bool, reprojection error within the threshold.
         measured: the instant's own images measured it: they support it as the gate demands.
             Otherwise it rests on other instants and the motion.
+        supported: its own images took part, be it with a few pixels. One that is not hangs on
+            the motion alone.
     """
 
     rig_from_world: Pose
     covariance: NDArray[np.float64]
     inliers: tuple[NDArray[np.bool_], ...]
     measured: bool
+    supported: bool
 
 
 def solve_window(
@@ -170,7 +173,9 @@ def _alone(instant: WindowInstant) -> WindowPose | None:
     pose = instant.alone
     if pose is None or pose.covariance is None:
         return None
-    return WindowPose(pose.rig_from_world, pose.covariance, pose.inliers, measured=True)
+    return WindowPose(
+        pose.rig_from_world, pose.covariance, pose.inliers, measured=True, supported=True
+    )
 
 
 def _propagated(known: dict[int, Pose], links: Sequence[UncertainPose]) -> list[Pose]:
@@ -253,7 +258,8 @@ def _solve_together(
     if covariances is None:
         return None
     found = []
-    for instant, pose, covariance in zip(instants, poses, covariances, strict=True):
+    taking_part = {*known.measured, *known.seen}
+    for i, (instant, pose, covariance) in enumerate(zip(instants, poses, covariances, strict=True)):
         masks = _inliers(instant.views, pose, registration)
         enough = max(registration.min_inliers, _MIN_OWN_INLIERS)
         found.append(
@@ -262,6 +268,7 @@ def _solve_together(
                 UncertainPose(pose, covariance).additive(),
                 masks,
                 measured=_supports(masks, enough, registration),
+                supported=i in taking_part,
             )
         )
     return found
