@@ -201,12 +201,19 @@ class Engine:
                 run.check(index, instant)
             instants = _one_by_one(instants)
         index = 0
-        async for instant in instants:
-            priors = run.check(index, instant)
-            images = await self._look(run.targets, instant.images, start.options, priors)
-            for answer in await self._run(run.add, instant, images, priors):
-                yield run.localization(answer)
-            index += 1
+        try:
+            async for instant in instants:
+                priors = run.check(index, instant)
+                images = await self._look(run.targets, instant.images, start.options, priors)
+                for answer in await self._run(run.add, instant, images, priors):
+                    yield run.localization(answer)
+                index += 1
+        except VislocError:
+            # What is wrong with one instant does not take the answers of those before it along.
+            if index > 0:
+                for answer in await self._run(run.finish):
+                    yield run.localization(answer)
+            raise
         for answer in await self._run(run.finish):
             yield run.localization(answer)
 
@@ -239,12 +246,17 @@ class Engine:
     ) -> list[tuple[SeenImage, ...]]:
         """Look at all images of an instant; the result is by target."""
         now = perf_counter()
-        looks = await asyncio.gather(
-            *(
+        tasks = [
+            asyncio.ensure_future(
                 self._run(look_at, image, targets, options, priors, self._limits, now)
-                for image in images
             )
-        )
+            for image in images
+        ]
+        try:
+            looks = await asyncio.gather(*tasks)
+        finally:
+            for task in tasks:
+                task.cancel()  # when one refuses the request, nobody waits for the others
         return [tuple(look[i] for look in looks) for i in range(len(targets))]
 
     def _targets(self, maps: Sequence[str], rig: Rig | None) -> list[Target]:

@@ -18,6 +18,7 @@ from visloc.priors import Priors
 from visloc.solving import Look, SeenImage
 from visloc.types import InstantAnswer, LocalizeOptions, QueryFeatures
 
+_MAX_LISTED = 500  # characters of names from outside
 # What is wrong with all images is wrong with the request.
 _CODES_OF_ALL_IMAGES = ("features.required", "options.read_as")
 
@@ -51,7 +52,9 @@ def rig_in_map(rig: Rig | None, opened: Map) -> Mapping[str, RigSensor]:
             "rig.unknown",
             f"map {opened.ref} knows no such rig",
             field="rig",
-            expected=f"one of {', '.join(opened.rigs)}" if opened.rigs else "a rig given inline",
+            expected=f"one of {', '.join(opened.rigs)[:_MAX_LISTED]}"
+            if opened.rigs
+            else "a rig given inline",
             got=rig,
         )
     return {
@@ -97,7 +100,7 @@ def check_images(
                 "rig.sensor",
                 "the rig has no such camera",
                 field=f"{where}[{index}].sensor",
-                expected=f"one of {', '.join(rig)}",
+                expected=f"one of {', '.join(rig)[:_MAX_LISTED]}",
                 got=image.sensor,
             )
     twice = [sensor for sensor, n in Counter(image.sensor for image in images).items() if n > 1]

@@ -41,6 +41,8 @@ _OWN_STDS = 3.0
 _MAX_MAHALANOBIS2 = 27.86
 # Poses of different sessions disagree by this much for reasons that no covariance tells.
 _MAP_STD_RAD, _MAP_STD = math.radians(0.1), 0.01
+# What is sent for down and what the map knows may differ by so much.
+_MAX_DOWN_DIFFERENCE = math.radians(5.0)
 _NUM_REACH_PHOTOS, _NUM_REACH_LANDMARKS = 100, 200
 
 
@@ -97,6 +99,14 @@ class Constraints:
         gravity = priors.gravity
         down = geometry.down
         if gravity is not None and gravity.world is not None:
+            if down is not None and gravity.world @ down < math.cos(_MAX_DOWN_DIFFERENCE):
+                raise InvalidInput(
+                    "priors.gravity",
+                    "the map knows another down",
+                    field="priors.gravity.world",
+                    expected=f"none, or {' '.join(f'{x:.3f}' for x in down)}",
+                    got=" ".join(f"{x:.3f}" for x in gravity.world),
+                )
             down = gravity.world
         if down is None and (gravity is not None or priors.height is not None):
             name = "gravity" if gravity is not None else "height"
@@ -104,7 +114,7 @@ class Constraints:
                 f"priors.{name}",
                 "this map does not know which way is down",
                 field=f"priors.{name}",
-                expected="priors.gravity.world, or a map that was built with --gravity",
+                expected="a map that was built with --gravity, or priors.gravity with its world",
             )
         self.gravity = (
             None

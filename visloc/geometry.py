@@ -129,6 +129,11 @@ class Pose:
         return Pose(self.rotation.T, -self.rotation.T @ self.translation)
 
 
+def cross_matrix(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the matrix (3, 3) with which v x u = matrix @ u."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
 def rotation_angle(rotation: NDArray[np.float64]) -> float:
     """Return the angle of a rotation matrix (3, 3) in radians, 0 to pi.
 

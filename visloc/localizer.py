@@ -49,8 +49,8 @@ from visloc.types import (
 
 # For global descriptors that do not look at the photo.
 _NO_PIXELS = np.empty((0, 0, 3), np.uint8)
-# Where priors narrow the search, so many photos elsewhere that look more like the query are asked
-# too: they may show that the priors are wrong.
+# Where priors narrow the search, photos elsewhere that would be among so many most similar ones are
+# asked too: they may show that the priors are wrong.
 _NUM_ELSEWHERE = 5
 
 # Of one photo: what an extractor found with a limit, and the pixels it looked at.
@@ -298,13 +298,18 @@ class Localizer:
         retrieved: Retrieved,
         weights: NDArray[np.float64] | None,
     ) -> NDArray[np.int64]:
-        """Photos that the priors exclude and that look more like the query than all others."""
+        """Photos that the priors exclude, though few others look as much like the query.
+
+        Where two floors look alike, which photo looks most like the query is chance: hence not only
+        those that look more like it than all others.
+        """
         if weights is None:
             return np.empty(0, dtype=np.int64)
         excluded = np.asarray(weights == 0, dtype=np.float64)
         others = retrieve(query, self.map.global_descriptors, _NUM_ELSEWHERE, excluded)
-        best = retrieved.scores.max() if len(retrieved.scores) else -np.inf
-        return others.images[others.scores > best]
+        best = np.sort(retrieved.scores)[::-1][:_NUM_ELSEWHERE]
+        close = others.scores > best.min(initial=np.inf)
+        return np.asarray(others.images[close])
 
     def _describe(
         self, name: str, rgb: NDArray[np.uint8], local: LocalFeatures

@@ -134,11 +134,16 @@ def check_covariance(covariance: NDArray[np.float64], field: str) -> None:
     fine = covariance.shape == (6, 6) and _usable(covariance)
     if fine:
         scale = np.sqrt(np.abs(np.diag(covariance)))
-        fine = bool((scale > 0).all()) and np.allclose(covariance, covariance.T, rtol=1e-6)
-        if fine:
-            with np.errstate(over="ignore", invalid="ignore"):
-                unitless = covariance / np.outer(scale, scale)
-            fine = _usable(unitless) and bool(np.linalg.eigvalsh(unitless)[0] > _LEAST_EIGENVALUE)
+        fine = bool((scale > 0).all())
+    if fine:
+        # Judged without units: variances of angles are small numbers.
+        with np.errstate(over="ignore", invalid="ignore"):
+            unitless = covariance / np.outer(scale, scale)
+        fine = (
+            _usable(unitless)
+            and np.allclose(unitless, unitless.T, rtol=0, atol=1e-6)
+            and bool(np.linalg.eigvalsh(unitless)[0] > _LEAST_EIGENVALUE)
+        )
     if not fine:
         raise InvalidInput(
             "pose.covariance",

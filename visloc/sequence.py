@@ -7,6 +7,7 @@ they are solved together (visloc.pose.window), without it the gap is interpolate
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -19,7 +20,7 @@ from visloc.constraints import Constraints, MapGeometry
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose, rotation_angle
 from visloc.pose.covariance import with_origin
-from visloc.pose.motion import RelativeMotion, default_motion_covariance
+from visloc.pose.motion import RelativeMotion, default_motion_covariance, link_from_motion
 from visloc.pose.window import WindowInstant, WindowPose, solve_window
 from visloc.priors import Priors
 from visloc.solving import (
@@ -47,6 +48,9 @@ MAX_WAITING = 30
 MAX_GAP_S = 60.0
 # Standard deviation, as a share of the way, of motion that no measured pose can contradict.
 _UNCHECKED_SHARE = 0.05
+# A window in which no instant has a pose of its own takes seconds to search; one in which nothing
+# was found is left alone until so many instants are new.
+_BLIND_REST = 10
 _CONTRADICTED = Refusal(
     "gate",
     Reason.CONTRADICTS_MOTION,
@@ -88,7 +92,7 @@ class SeenInstant:
 class _Entry(NamedTuple):
     seen: SeenInstant
     solved: Solved  # on its own
-    time_s: float
+    ticks: int  # of the time unit, since the first instant
 
 
 class SequenceSolver:
@@ -118,11 +122,14 @@ class SequenceSolver:
         self._geometry = geometry
         self._metric = metric
         self._options = options
-        self._time_unit = time_unit
+        self._tick_s = time_unit.seconds
         self._max_gap_s = max_gap_s
+        # Whole ticks compare exactly; the difference of two times in seconds does not.
+        self._max_gap = math.floor(max_gap_s / time_unit.seconds * (1.0 + 1e-9))
         self._first_timestamp: int | None = None
         self._entries: list[_Entry] = []  # answered ones that still help, then those that wait
         self._num_answered = 0
+        self._rest = 0  # instants to come before a window without any pose is searched again
 
     @property
     def measured(self) -> int:
@@ -146,15 +153,17 @@ class SequenceSolver:
             )
         if self._first_timestamp is None:
             self._first_timestamp = seen.timestamp
-        time_s = (seen.timestamp - self._first_timestamp) * self._time_unit.seconds
+        ticks = seen.timestamp - self._first_timestamp
         solved = solve_instant(
             seen.images, self._geometry, self._options, seen.priors, seen.timestamp
         )
-        self._entries.append(_Entry(seen, solved, time_s))
+        self._entries.append(_Entry(seen, solved, ticks))
+        self._rest = max(0, self._rest - 1)
         return self._answer(ended=False)
 
     def finish(self) -> list[InstantAnswer]:
         """Return the answers that waited for instants which will not come."""
+        self._rest = 0
         return self._answer(ended=True)
 
     def _answer(self, *, ended: bool) -> list[InstantAnswer]:
@@ -164,9 +173,9 @@ class SequenceSolver:
         if stop == self._num_answered:
             return []
         answers = self._answers(range(self._num_answered, stop))
-        oldest_s = self._entries[min(stop, len(self._entries) - 1)].time_s - self._max_gap_s
+        oldest = self._entries[min(stop, len(self._entries) - 1)].ticks - self._max_gap
         first = max(0, stop - MAX_WAITING)
-        while first < stop and self._entries[first].time_s < oldest_s:
+        while first < stop and self._entries[first].ticks < oldest:
             first += 1
         del self._entries[:first]
         self._num_answered = stop - first
@@ -175,10 +184,7 @@ class SequenceSolver:
     def _is_final(self, index: int) -> bool:
         """Whether nothing that may still come can change the answer to an instant that waits."""
         entry, newest = self._entries[index], self._entries[-1]
-        if (
-            newest.time_s - entry.time_s >= self._max_gap_s
-            or len(self._entries) - index > MAX_WAITING
-        ):
+        if newest.ticks - entry.ticks >= self._max_gap or len(self._entries) - index > MAX_WAITING:
             return True
         if entry.seen.odometry is not None:
             return False
@@ -206,12 +212,13 @@ class SequenceSolver:
         motions: list[RelativeMotion | None] = []
         for before, after in pairwise(self._entries):
             a, b = before.seen.odometry, after.seen.odometry
-            if a is None or b is None or after.time_s - before.time_s > self._max_gap_s:
+            if a is None or b is None or after.ticks - before.ticks > self._max_gap:
                 motions.append(None)
                 continue
             motion = b.rig_from_odometry @ a.rig_from_odometry.inverse()
             covariance = default_motion_covariance(motion) if b.covariance is None else b.covariance
-            motions.append(RelativeMotion(motion, covariance))
+            given = RelativeMotion(motion, covariance)
+            motions.append(given if link_from_motion(given) is not None else None)
         return motions
 
     def _solved_jointly(
@@ -222,30 +229,40 @@ class SequenceSolver:
         registration = (
             registration_for(self._options, cameras) if cameras else self._options.registration
         )
-        found = solve_window(
-            [WindowInstant(entry.solved.views, entry.solved.pose) for entry in self._entries],
-            motions,
-            registration=registration,
-            seed=self._options.seed,
-        )
-        supported = [i for i, pose in enumerate(found) if pose is not None and pose.supported]
+        blind = all(entry.solved.pose is None for entry in self._entries)
+        found: list[WindowPose | None] = [None] * len(self._entries)
+        if not blind or self._rest == 0:
+            found = solve_window(
+                [_window_instant(entry.solved) for entry in self._entries],
+                motions,
+                registration=registration,
+                seed=self._options.seed,
+            )
+            self._rest = _BLIND_REST if blind and not any(found) else 0
+        runs = np.cumsum([0, *(motion is None for motion in motions)])
         answers = []
         for i, (entry, pose) in enumerate(zip(self._entries, found, strict=True)):
             alone = entry.solved.answer
             if linked[i] and alone.pose is not None and (pose is None or not pose.measured):
                 alone = replace(alone, pose=None, refusal=_CONTRADICTED)
-            nearest = min(supported, key=lambda j: self._seconds_between(i, j), default=i)
+            supported = [
+                j
+                for j, other in enumerate(found)
+                if other is not None and other.supported and runs[j] == runs[i]
+            ]
+            nearest = min(supported, key=lambda j: self._ticks_between(i, j), default=i)
             if (
                 not linked[i]
                 or pose is None
                 or not supported
-                or self._seconds_between(i, nearest) > self._max_gap_s
+                or self._ticks_between(i, nearest) > self._max_gap
             ):
                 answers.append(alone)
                 continue
             covariance = pose.covariance
             if not supported[0] <= i <= supported[-1]:
-                covariance = _with_unchecked_motion(pose, found[nearest])
+                around = supported[:2] if i < supported[0] else supported[:-3:-1]
+                covariance = self._with_unchecked_motion(i, around, found)
             source = PoseSource.ESTIMATED if pose.measured else PoseSource.MOTION
             answers.append(
                 self._with_pose(
@@ -256,8 +273,33 @@ class SequenceSolver:
             )
         return answers
 
-    def _seconds_between(self, i: int, j: int) -> float:
-        return abs(self._entries[j].time_s - self._entries[i].time_s)
+    def _with_unchecked_motion(
+        self, i: int, around: Sequence[int], found: Sequence[WindowPose | None]
+    ) -> NDArray[np.float64]:
+        """The covariance of a pose beyond all supported ones, where nothing contradicts motion.
+
+        An error of its scale adds up along the way and is in no covariance that a tracker states;
+        and a tracker that stops, or jumps, is told from a rig that does only by its inertia.
+
+        Args:
+            i: the instant.
+            around: the nearest supported instant, and the next if there is one.
+            found: the poses of all.
+        """
+        pose = found[i]
+        assert pose is not None  # it hangs on the motion
+        (distance, angle), *earlier = [_way(found[a], found[b]) for a, b in pairwise([i, *around])]
+        stds = [_UNCHECKED_SHARE * angle, _UNCHECKED_SHARE * distance]
+        for before in earlier:
+            share = self._ticks_between(i, around[0]) / self._ticks_between(*around)
+            stds[0] = math.hypot(stds[0], angle - share * before[1])
+            stds[1] = math.hypot(stds[1], distance - share * before[0])
+        added = np.diag(np.repeat(np.square(stds), 3))
+        here = pose.rig_from_world
+        return covariance_from_center(here, center_covariance(here, pose.covariance) + added)
+
+    def _ticks_between(self, i: int, j: int) -> int:
+        return abs(self._entries[j].ticks - self._entries[i].ticks)
 
     def _filled(
         self, answers: Sequence[InstantAnswer], linked: Sequence[bool]
@@ -269,7 +311,7 @@ class SequenceSolver:
             else self._traced(answer)
             for answer in answers
         ]
-        times_s = [entry.time_s for entry in self._entries]
+        times_s = [entry.ticks * self._tick_s for entry in self._entries]
         filled = fill_sequence(times_s, poses, self._max_gap_s)
         return [
             answer
@@ -320,15 +362,18 @@ def check_max_gap(max_gap_s: float) -> None:
         )
 
 
-def _with_unchecked_motion(pose: WindowPose, nearest: WindowPose | None) -> NDArray[np.float64]:
-    """The covariance of a pose beyond all supported ones, where nothing can contradict motion.
+def _window_instant(solved: Solved) -> WindowInstant:
+    refusal = solved.answer.refusal
+    if refusal is not None and refusal.reason is Reason.CONTRADICTS_PRIOR:
+        # Matches that lying priors allowed would pass together the gate that refused each alone.
+        return WindowInstant((), None)
+    return WindowInstant(solved.views, solved.pose)
 
-    An error of its scale adds up along the way and is in no covariance that a tracker states.
-    """
-    assert nearest is not None  # it is supported
-    here, there = pose.rig_from_world, nearest.rig_from_world
+
+def _way(a: WindowPose | None, b: WindowPose | None) -> tuple[float, float]:
+    """Distance and angle (rad) between two poses."""
+    assert a is not None  # both are supported, or hang on the motion
+    assert b is not None
+    here, there = a.rig_from_world, b.rig_from_world
     distance = float(np.linalg.norm(here.center - there.center))
-    angle = rotation_angle(here.rotation @ there.rotation.T)
-    stds = [_UNCHECKED_SHARE * angle] * 3 + [_UNCHECKED_SHARE * distance] * 3
-    covariance = center_covariance(here, pose.covariance) + np.diag(np.square(stds))
-    return covariance_from_center(here, covariance)
+    return distance, rotation_angle(here.rotation @ there.rotation.T)

@@ -135,6 +135,9 @@ def solve_instant(
     seconds = _summed([look.evidence.seconds for look in looks])
     with timed(seconds, "pose"):
         found, refusal = _find_pose(images, views, options, constraints)
+        if refusal is None or refusal.reason is not Reason.CONTRADICTS_PRIOR:
+            elsewhere = views_of(images, [look.elsewhere for look in looks])
+            refusal = _better_elsewhere(elsewhere, found, options) or refusal
     pose = None
     if refusal is None and found is not None and found.covariance is not None:
         pose = rig_pose(found.rig_from_world, found.covariance, geometry, PoseSource.ESTIMATED)
@@ -227,9 +230,8 @@ def _find_pose(
         other = _near_pose_prior(views, found, registration, options, constraints)
         if other is not None and _gate(other, num_pairs, registration, constraints) is None:
             found, refusal = other, None
-    if refusal is None:
-        elsewhere = views_of(images, [look.elsewhere for look in looks])
-        refusal = _better_elsewhere(elsewhere, found, registration, options)
+    if refusal is None and constraints.gravity is not None:
+        refusal = _better_without_gravity(views, found, registration, options)
     return found, refusal
 
 
@@ -306,25 +308,55 @@ def _near_pose_prior(
     return found
 
 
-def _better_elsewhere(
-    elsewhere: Sequence[MatchedView],
+def _better_without_gravity(
+    views: Sequence[MatchedView],
     found: GeneralizedPose,
     registration: RegistrationPreset,
     options: LocalizeOptions,
 ) -> Refusal | None:
-    """Refuse a pose that priors allow when one that they forbid explains the images better."""
-    if sum(len(view) for view in elsewhere) < registration.min_inliers:
+    """Refuse a pose that was only looked for upright when another explains the images better."""
+    num_others = sum(len(view) for view in views) - found.num_inliers
+    if found.num_inliers >= _AMBIGUOUS_SHARE * num_others:  # it cannot
         return None
     other = estimate_generalized_pose(
-        elsewhere, max_error_px=registration.max_error_px, seed=options.seed
+        views, max_error_px=registration.max_error_px, seed=options.seed
     )
     if other is None or found.num_inliers >= _AMBIGUOUS_SHARE * other.num_inliers:
         return None
     return Refusal(
         "gate",
         Reason.CONTRADICTS_PRIOR,
+        f"a pose that the prior gravity excludes explains {other.num_inliers} matches, the one "
+        f"that it allows {found.num_inliers}: the gravity is wrong, or the place looks alike twice",
+    )
+
+
+def _better_elsewhere(
+    elsewhere: Sequence[MatchedView],
+    found: GeneralizedPose | None,
+    options: LocalizeOptions,
+) -> Refusal | None:
+    """Refuse what priors allow when a pose that they forbid explains the images better."""
+    num_pairs = sum(len(view) for view in elsewhere)
+    if num_pairs < options.registration.min_inliers:
+        return None
+    registration = registration_for(options, [view.camera for view in elsewhere])
+    other = estimate_generalized_pose(
+        elsewhere, max_error_px=registration.max_error_px, seed=options.seed
+    )
+    num_inliers = 0 if found is None else found.num_inliers
+    if (
+        other is None
+        or other.num_inliers < registration.min_inliers
+        or other.num_inliers < registration.min_inlier_ratio * num_pairs
+        or num_inliers >= _AMBIGUOUS_SHARE * other.num_inliers
+    ):
+        return None
+    return Refusal(
+        "gate",
+        Reason.CONTRADICTS_PRIOR,
         f"a place that the priors exclude explains {other.num_inliers} matches, the one that "
-        f"they allow {found.num_inliers}: the priors are wrong, or both places look alike",
+        f"they allow {num_inliers}: the priors are wrong, or both places look alike",
     )
 
 

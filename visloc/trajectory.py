@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.errors import InvalidInput
-from visloc.geometry import Pose, rotation_angle
+from visloc.geometry import Pose, cross_matrix, rotation_angle
 
 # Unix times of 2001-01-01 and of 2100-01-01, seconds: which timestamps can be told by their size.
 _FIRST_UNIX_S, _LAST_UNIX_S = 978_307_200, 4_102_444_800
@@ -201,7 +201,7 @@ def center_covariance(
     """
     inverse = -device_from_world.rotation.T
     jacobian = np.eye(6)
-    jacobian[3:, :3] = inverse @ _cross_matrix(device_from_world.translation)
+    jacobian[3:, :3] = inverse @ cross_matrix(device_from_world.translation)
     jacobian[3:, 3:] = inverse
     return _propagated(jacobian, covariance)
 
@@ -211,7 +211,7 @@ def covariance_from_center(
 ) -> NDArray[np.float64]:
     """Covariance (6, 6) of (w, dt) from that of (w, dc): the inverse of ``center_covariance``."""
     jacobian = np.eye(6)
-    jacobian[3:, :3] = -_cross_matrix(device_from_world.translation)
+    jacobian[3:, :3] = -cross_matrix(device_from_world.translation)
     jacobian[3:, 3:] = -device_from_world.rotation
     return _propagated(jacobian, covariance)
 
@@ -354,7 +354,3 @@ def _propagated(
 ) -> NDArray[np.float64]:
     product = jacobian @ covariance @ jacobian.T
     return np.asarray((product + product.T) / 2)
-
-
-def _cross_matrix(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

@@ -5,23 +5,48 @@ import json
 import logging
 import shutil
 import threading
-from collections.abc import Callable, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+import cv2
 import numpy as np
 import pytest
 
 from service import engine as engine_module
+from service import instants as instants_module
 from service import loaded_maps
 from service.engine import Engine
-from service.jobs import LocalizeJob
+from service.jobs import (
+    ImageJob,
+    Instant,
+    InstantLocalization,
+    LocalizeJob,
+    RigJob,
+    RigSensor,
+    SequenceStart,
+)
 from visloc.archive import MapStore
-from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound, Overloaded, Unavailable
-from visloc.geometry import Camera
+from visloc.errors import (
+    Conflict,
+    InvalidInput,
+    MapCorrupt,
+    NotFound,
+    Overloaded,
+    TooLarge,
+    Unavailable,
+)
+from visloc.evaluation import pose_error
+from visloc.features.sift import SiftExtractor
+from visloc.geometry import Camera, Pose
 from visloc.images import ImageLimits
+from visloc.kapture import read_dataset
 from visloc.localizer import Localizer
-from visloc.types import Localized, LocalizeOptions
+from visloc.priors import NO_PRIORS, GravityPrior, PositionPrior, Priors
+from visloc.sequence import Odometry
+from visloc.trajectory import PoseSource, TimeUnit
+from visloc.types import Localized, LocalizeOptions, Reason
 
 T = TypeVar("T")
 
@@ -333,10 +358,10 @@ def test_a_map_that_is_not_there_is_refused(
 class Gate:
     """Holds back the work of the engine until it is opened."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, module: Any = engine_module) -> None:
         self.opened, self.entered = threading.Event(), threading.Semaphore(0)
         self.count = 0
-        read_photo = engine_module.read_photo
+        read_photo = module.read_photo
 
         def waiting(*arguments: Any) -> Any:
             self.count += 1
@@ -344,7 +369,7 @@ class Gate:
             assert self.opened.wait(30)
             return read_photo(*arguments)
 
-        monkeypatch.setattr(engine_module, "read_photo", waiting)
+        monkeypatch.setattr(module, "read_photo", waiting)
 
 
 def test_one_photo_too_many_is_refused_at_once(
@@ -443,3 +468,434 @@ def test_no_maps_at_all_is_a_state_to_be_ready_in(tmp_path: Path) -> None:
         engine.close()
 
     run(play())
+
+
+# Several maps, rigs and sequences
+
+FAST = LocalizeOptions(top_k=4)
+
+
+@dataclass(frozen=True)
+class RigPhotos:
+    """One instant of the sample's rig."""
+
+    photos: dict[str, bytes]
+    sensors: dict[str, RigSensor]
+    rig_from_world: Pose
+
+
+@pytest.fixture(scope="module")
+def rig_photos(sample: Path) -> RigPhotos:
+    dataset = read_dataset(sample / "query")
+    first = dataset.images[0].timestamp
+    records = {r.sensor_id: r for r in dataset.images if r.timestamp == first}
+    sensors = {
+        name: RigSensor(dataset.rigs["rig"][name], dataset.sensors[name].camera) for name in records
+    }
+    pose = dataset.pose(records["left"])
+    assert pose is not None
+    return RigPhotos(
+        {name: dataset.path_of(record).read_bytes() for name, record in records.items()},
+        sensors,
+        sensors["left"].cam_from_rig.inverse() @ pose,
+    )
+
+
+def blank() -> bytes:
+    return cv2.imencode(".png", np.full((192, 256), 128, np.uint8))[1].tobytes()
+
+
+def scramble(maps_dir: Path, map_id: str) -> None:
+    """Mix up the landmarks of a map: nothing is localized in it."""
+    path = MapStore(maps_dir).folder(map_id) / "landmarks.npy"
+    np.save(path, np.random.default_rng(0).permutation(np.load(path)))
+
+
+def rig_job(rig_photos: RigPhotos, **changes: Any) -> RigJob:
+    images = tuple(ImageJob(name, photo, None) for name, photo in rig_photos.photos.items())
+    job = RigJob(("room",), rig_photos.sensors, images, 5, FAST)
+    return replace(job, **changes)
+
+
+def with_engine(
+    maps_dir: Path, play: Callable[[Engine], Coroutine[Any, Any, T]], **settings: Any
+) -> T:
+    async def playing() -> T:
+        engine = make(maps_dir, **settings)
+        await engine.start()
+        try:
+            return await play(engine)
+        finally:
+            engine.close()
+
+    return run(playing())
+
+
+@pytest.fixture
+def two_maps(maps_dir: Path) -> Path:
+    """``room``, and ``hall`` with its landmarks mixed up."""
+    publish(maps_dir, "v1", map_id="hall")
+    scramble(maps_dir, "hall")
+    return maps_dir
+
+
+def test_of_several_maps_the_one_with_the_best_answer_is_named_and_features_are_found_once(
+    two_maps: Path, query: Query, rig_photos: RigPhotos, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    extract, calls = SiftExtractor.extract, []
+
+    def counting(self: SiftExtractor, rgb: Any, **options: Any) -> Any:
+        calls.append(rgb.shape)
+        return extract(self, rgb, **options)
+
+    async def play(engine: Engine) -> None:
+        monkeypatch.setattr(SiftExtractor, "extract", counting)
+        alone = await engine.localize(replace(job_for(query), options=FAST))
+        calls.clear()
+        for maps in (("hall", "room"), ("room", "hall")):
+            found = await engine.localize(replace(job_for(query), maps=maps, options=FAST))
+            assert found.map_id == "room"
+            assert isinstance(found.answer, Localized)
+            assert isinstance(alone.answer, Localized)
+            assert np.array_equal(found.answer.covariance, alone.answer.covariance)
+        assert len(calls) == 2
+
+        calls.clear()
+        both = await engine.localize_rig(rig_job(rig_photos, maps=("hall", "room")))
+        assert (both.map_id, both.answer.timestamp) == ("room", 5)
+        assert both.answer.pose is not None
+        assert len(calls) == 2
+
+        lost = await engine.localize(replace(job_for(query), maps=("hall",), options=FAST))
+        assert lost.map_id == "hall"
+        assert not isinstance(lost.answer, Localized)
+
+    with_engine(two_maps, play)
+
+
+def test_the_rig_of_the_sample_is_localized_within_a_few_millimetres(
+    built_maps: Path, rig_photos: RigPhotos
+) -> None:
+    # 256 x 192 pixels and 8 mapping photos: measured 1.1 mm and 0.037 degrees.
+    async def play(engine: Engine) -> None:
+        inline = await engine.localize_rig(rig_job(rig_photos))
+        named = await engine.localize_rig(rig_job(rig_photos, rig="rig"))
+        for found in (inline, named):
+            pose = found.answer.pose
+            assert pose is not None
+            position_m, orientation_deg = pose_error(pose.rig_from_world, rig_photos.rig_from_world)
+            assert position_m < 0.003
+            assert orientation_deg < 0.05
+            assert pose.source is PoseSource.ESTIMATED
+            used = [image.evidence.camera for image in found.answer.images if image.evidence]
+            assert used == [sensor.camera for sensor in rig_photos.sensors.values()]
+
+    with_engine(built_maps, play, workers=2)
+
+
+def test_an_image_that_cannot_be_read_fails_alone(built_maps: Path, rig_photos: RigPhotos) -> None:
+    left, right = (ImageJob(name, photo, None) for name, photo in rig_photos.photos.items())
+    too_large = ImageLimits(max_bytes=len(rig_photos.photos["left"]) + 20_000)
+
+    async def play(engine: Engine) -> None:
+        engine._limits = too_large
+        other_size = Camera("SIMPLE_PINHOLE", 640, 300, (500.0, 320.0, 150.0))
+        for broken, code in (
+            (replace(right, query=b""), "image.empty"),
+            (replace(right, query=b"no photo"), "image.format"),
+            (replace(right, query=b"\xff\xd8\xff" + bytes(10**6)), "image.too_large"),
+            (replace(right, camera=other_size), "camera.size_mismatch"),
+        ):
+            found = await engine.localize_rig(rig_job(rig_photos, images=(left, broken)))
+            assert found.answer.pose is not None
+            errors = [image.error for image in found.answer.images]
+            assert errors[0] is None
+            assert errors[1] is not None
+            assert errors[1].code == code
+        assert errors[1] is not None
+        found = await engine.localize_rig(
+            rig_job(rig_photos, images=(replace(left, query=b""), replace(right, query=b"x")))
+        )
+        assert found.answer.refusal is not None
+        assert found.answer.refusal.reason is Reason.NO_USABLE_IMAGE
+
+    with_engine(built_maps, play)
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "code", "field"),
+    [
+        (lambda _: {"images": ()}, InvalidInput, "rig.empty", "images"),
+        (lambda _: {"rig": "car"}, NotFound, "rig.unknown", "rig"),
+        (lambda _: {"rig": {}}, InvalidInput, "rig.sensor", "images[0].sensor"),
+        (lambda r: {"rig": {"left": r.sensors["left"]}}, InvalidInput, "rig.sensor", None),
+        (
+            lambda r: {"images": (ImageJob("left", r.photos["left"], None),) * 2},
+            *(InvalidInput, "rig.duplicate", "images"),
+        ),
+        (
+            lambda _: {"images": tuple(ImageJob(str(i), b"", None) for i in range(17))},
+            *(TooLarge, "rig.too_many_images", "images"),
+        ),
+        (lambda _: {"maps": ("room", "cellar")}, NotFound, "map.unknown", None),
+        (
+            lambda _: {"priors": Priors(gravity=GravityPrior(np.array([0.0, 1.0, 0.0]), 0.02))},
+            *(InvalidInput, "priors.gravity", "priors.gravity"),
+        ),
+    ],
+)
+def test_a_rig_that_does_not_fit_is_refused_before_any_photo_is_read(
+    change: Callable[[RigPhotos], dict[str, Any]],
+    kind: type[Exception],
+    code: str,
+    field: str | None,
+    maps_dir: Path,
+    rig_photos: RigPhotos,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # A map that does not know which way is down.
+    manifest = MapStore(maps_dir).folder("room") / "manifest.json"
+    record = json.loads(manifest.read_text())
+    record["world"].pop("gravity", None)
+    record["world"].pop("anchor", None)
+    manifest.write_text(json.dumps(record))
+    monkeypatch.setattr(Localizer, "warm_up", lambda _: None)
+    monkeypatch.setattr(instants_module, "read_photo", None)
+
+    async def play(engine: Engine) -> None:
+        with pytest.raises(kind) as caught:
+            await engine.localize_rig(rig_job(rig_photos, **change(rig_photos)))
+        error: Any = caught.value
+        assert error.code == code
+        assert field is None or error.field == field
+        assert error.expected or error.message
+
+    with_engine(maps_dir, play)
+
+
+def instants_of(
+    photos: Sequence[bytes], camera: Camera, *, start: int = 1_700_000_000_000
+) -> list[Instant]:
+    return [
+        Instant(start + 100 * i, (ImageJob("camera", photo, camera),), None, None)
+        for i, photo in enumerate(photos)
+    ]
+
+
+START = SequenceStart(("room",), None, None, 1.0, FAST)
+
+
+async def answers_of(
+    engine: Engine, start: SequenceStart, instants: Sequence[Instant]
+) -> list[InstantLocalization]:
+    """Sent one by one, as a stream is."""
+
+    async def sent() -> AsyncIterator[Instant]:
+        for instant in instants:
+            yield instant
+
+    return [answer async for answer in engine.localize_sequence(start, sent())]
+
+
+def test_a_sequence_in_several_maps_keeps_the_first_that_localizes_and_all_its_answers(
+    two_maps: Path, query: Query
+) -> None:
+    instants = instants_of([blank(), b"broken", query.image, blank()], query.camera)
+    start = replace(START, maps=("hall", "room"))
+
+    async def play(engine: Engine) -> None:
+        found = await answers_of(engine, start, instants)
+        assert [each.map_id for each in found] == ["room"] * 4
+        assert [each.answer.timestamp for each in found] == [i.timestamp for i in instants]
+        sources = [each.answer.pose and each.answer.pose.source for each in found]
+        nearest = PoseSource.NEAREST
+        assert sources == [nearest, nearest, PoseSource.ESTIMATED, nearest]
+        # Those that are all there are checked first, and answered the same.
+        at_once = [each async for each in engine.localize_sequence(start, instants)]
+        assert [each.answer.num_inliers for each in at_once] == [
+            each.answer.num_inliers for each in found
+        ]
+        # Where none is localized, the first map answers for all.
+        lost = await answers_of(engine, start, instants[:2])
+        assert [each.map_id for each in lost] == ["hall", "hall"]
+        assert [each.answer.pose for each in lost] == [None, None]
+
+    with_engine(two_maps, play)
+
+
+def test_a_sequence_is_answered_as_it_comes(built_maps: Path, query: Query) -> None:
+    first, second, third = instants_of([query.image, blank(), query.image], query.camera)
+    taken: list[int] = []
+
+    async def sent() -> AsyncIterator[Instant]:
+        for instant in (first, second, third):
+            taken.append(instant.timestamp)
+            yield instant
+
+    async def play(engine: Engine) -> None:
+        answers = engine.localize_sequence(START, sent())
+        assert (await anext(answers)).answer.timestamp == first.timestamp
+        # The next is not taken before this one has been.
+        assert taken == [first.timestamp]
+        assert (await anext(answers)).answer.timestamp == second.timestamp
+        assert len(taken) == 3
+        assert [a.answer.timestamp async for a in answers] == [third.timestamp]
+
+    with_engine(built_maps, play)
+
+
+def odometry() -> Odometry:
+    return Odometry(Pose.identity(), None)
+
+
+@pytest.mark.parametrize(
+    ("change", "start", "kind", "code", "field"),
+    [
+        (lambda _: [], {}, InvalidInput, "sequence.empty", "instants"),
+        (
+            lambda i: [i[0], replace(i[1], timestamp=i[0].timestamp)],
+            *({}, InvalidInput, "sequence.timestamps", "instants[1].timestamp"),
+        ),
+        (
+            lambda i: [i[1], i[0]],
+            *({}, InvalidInput, "sequence.timestamps", "instants[1].timestamp"),
+        ),
+        (
+            lambda i: [replace(i[0], timestamp=0)],
+            *({}, InvalidInput, "sequence.time_unit", "time_unit"),
+        ),
+        (
+            lambda i: [replace(i[0], timestamp=-5)],
+            *({}, InvalidInput, "sequence.time_unit", None),
+        ),
+        (
+            lambda i: [replace(i[0], timestamp=t) for t in range(10_000)],
+            *({"time_unit": TimeUnit.S}, TooLarge, "sequence.too_many_instants", "instants"),
+        ),
+        (
+            lambda i: [replace(i[0], images=i[0].images * 2)],
+            *({}, InvalidInput, "sequence.rig", "instants[0].images"),
+        ),
+        (
+            lambda i: [i[0], replace(i[1], images=i[0].images)],
+            *({"rig": "car"}, NotFound, "rig.unknown", "rig"),
+        ),
+        (
+            lambda i: i,
+            *({"rig": "rig"}, InvalidInput, "rig.sensor", "instants[0].images[0].sensor"),
+        ),
+        (lambda i: i, {"max_gap_s": 61.0}, InvalidInput, "sequence.max_gap", "max_gap_s"),
+        (lambda i: i, {"maps": ("room", "attic")}, NotFound, "map.unknown", None),
+    ],
+)
+def test_a_sequence_that_cannot_be_is_refused_by_name(
+    change: Callable[[list[Instant]], list[Instant]],
+    start: dict[str, Any],
+    kind: type[Exception],
+    code: str,
+    field: str | None,
+    built_maps: Path,
+    query: Query,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Localizer, "warm_up", lambda _: None)
+    instants = change(instants_of([b"x", b"y"], query.camera))
+
+    async def play(engine: Engine) -> None:
+        # One by one, and all at once: then nothing is answered before.
+        changed = replace(START, **start)
+        for asked in (
+            answers_of(engine, changed, instants),
+            anext(engine.localize_sequence(changed, instants)),
+        ):
+            with pytest.raises(kind) as caught:
+                await asked
+            error: Any = caught.value
+            assert error.code == code
+            assert field is None or error.field == field
+
+    with_engine(built_maps, play, max_instants=20)
+
+
+def test_priors_of_an_instant_replace_those_of_the_sequence(built_maps: Path, query: Query) -> None:
+    lie = Priors(PositionPrior(np.array([900.0, 0.0, 0.0]), 1.0))
+    one, two = instants_of([query.image, query.image], query.camera)
+
+    async def play(engine: Engine) -> None:
+        start = replace(START, priors=lie, max_gap_s=0.0)
+        found = await answers_of(engine, start, [one, replace(two, priors=NO_PRIORS)])
+        refusals = [each.answer.refusal for each in found]
+        assert refusals[0] is not None
+        assert refusals[0].reason is Reason.NO_PHOTO_NEAR
+        assert refusals[1] is None
+
+    with_engine(built_maps, play)
+
+
+def test_instants_without_images_live_on_odometry(built_maps: Path, query: Query) -> None:
+    seen, *unseen = instants_of([query.image, b"", b""], query.camera)
+    instants = [replace(seen, odometry=odometry())]
+    instants += [replace(instant, images=(), odometry=odometry()) for instant in unseen]
+
+    async def play(engine: Engine) -> None:
+        found = await answers_of(engine, START, instants)
+        poses = [each.answer.pose for each in found]
+        assert [pose and pose.source for pose in poses] == [
+            PoseSource.ESTIMATED,
+            PoseSource.MOTION,
+            PoseSource.MOTION,
+        ]
+
+    with_engine(built_maps, play)
+
+
+def test_batches_have_places_of_their_own(built_maps: Path) -> None:
+    engine = make(built_maps, max_batches=2)
+    with pytest.raises(Unavailable) as early, engine.admit_batch():
+        pass
+    assert early.value.code == "server.starting"
+    engine._ready = True
+    with engine.admit_batch():
+        with engine.admit_batch(), pytest.raises(Overloaded) as caught, engine.admit_batch():
+            pass
+        assert caught.value.code == "server.busy"
+        # A place is given back whatever happened in it.
+        with pytest.raises(ZeroDivisionError), engine.admit_batch():
+            raise ZeroDivisionError
+        with engine.admit_batch():
+            pass
+    with engine.admit_batch(), engine.admit_batch():
+        pass
+    engine.close()
+
+
+def test_a_sequence_that_is_given_up_frees_everything(
+    built_maps: Path, query: Query, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def play(engine: Engine) -> None:
+        gate = Gate(monkeypatch, instants_module)
+        instants = instants_of([query.image] * 50, query.camera)
+
+        async def ask() -> None:
+            with engine.admit_batch():
+                await answers_of(engine, START, instants)
+
+        asking = asyncio.create_task(ask())
+        await asyncio.to_thread(gate.entered.acquire)
+        with pytest.raises(Overloaded), engine.admit_batch():
+            pass
+        asking.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await asking
+        with engine.admit_batch():  # at once, not when the photo is done
+            pass
+        gate.opened.set()
+        # Closed between two answers instead.
+        answers = engine.localize_sequence(START, instants)
+        await anext(answers)
+        await answers.aclose()
+        assert gate.count == 2
+        await engine.localize(replace(job_for(query), options=FAST))
+        assert engine._pool._work_queue.qsize() == 0
+
+    with_engine(built_maps, play, max_batches=1, workers=1)

@@ -50,7 +50,7 @@ class Place:
             manifest=SimpleNamespace(world=SimpleNamespace(origin=tuple(self.origin))),
             gravity=self.down,
             image_poses=np.hstack([identity, -(local + self.origin)]),
-            landmarks=(local + [0.0, 0.0, 5.0]).astype(np.float32),
+            landmarks=(local + np.array([0.0, 0.0, 5.0])).astype(np.float32),
             observation_offsets=np.arange(len(local) + 1),
             observation_landmarks=np.arange(len(local)),
         )

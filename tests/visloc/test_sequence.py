@@ -253,7 +253,13 @@ def test_whatever_the_pattern_every_instant_is_answered_once_in_order_and_in_tim
                     assert source is not PoseSource.ESTIMATED
                 assert moving or source is not PoseSource.MOTION
                 away = [e - time for e in estimated]
-                assert any(abs(a) <= 1000 * max_gap_s for a in away)
+                # What agrees with the pose that the others give it supports motion, too.
+                weak = [
+                    t - time
+                    for t, (k, m, _) in zip(times, steps, strict=True)
+                    if k == "weak" and m and source is PoseSource.MOTION
+                ]
+                assert any(abs(a) <= 1000 * max_gap_s for a in away + weak)
                 if source is PoseSource.INTERPOLATED:
                     before = max(a for a in away if a < 0)
                     after = min(a for a in away if a > 0)
@@ -408,7 +414,6 @@ def test_many_weak_frames_localize_all(here: Any) -> None:
     alone = answers_to(solver(here, 1.0), instants_of(here, "wwwww"))
     assert sources(alone) == "-----"
     answers = answers_to(solver(here, 1.0), instants_of(here, "wwwww", moving=True))
-    print(sources(answers), [a.num_inliers for a in answers])
     check_answers(answers, here, [rig_at(i) for i in range(5)])
     assert all(answer.pose is not None for answer in answers)
 
@@ -427,12 +432,50 @@ def test_the_uncertainty_grows_with_the_way_since_the_last_look(here: Any) -> No
     assert (np.diff(spread) > 0).all()
 
 
+@pytest.mark.parametrize("right_inside", [40, 14])
+def test_a_floor_that_lies_is_refused_however_many_instants_agree_on_it(
+    here: Any, right_inside: int
+) -> None:
+    # All instants look most like a floor that the priors exclude; on the one that they allow,
+    # fewer matches fit, of a path of the same shape.
+    instants = []
+    for i in range(6):
+        right = rig_at(i)
+        wrong = right @ Pose(np.eye(3), np.array([0.0, 0.0, -3.0]))
+        image = here.image(
+            here.matches(wrong, right_inside, 20, seed=i),
+            elsewhere=here.matches(right, 80, 20, seed=50 + i),
+        )
+        priors = Priors(PositionPrior(wrong.center, 2.0))
+        instants.append(SeenInstant(100 * i, (image,), odometry(i), priors))
+    answers = answers_to(solver(here, 1.0), instants)
+    assert sources(answers) == "------"
+    assert {a.refusal.reason for a in answers if a.refusal is not None} == {
+        Reason.CONTRADICTS_PRIOR
+    }
+
+
 def test_odometry_of_a_few_instants_only_helps_those(here: Any) -> None:
     instants = instants_of(here, "g.bgb.", moving=True)
     instants[3:] = [replace(instant, odometry=None) for instant in instants[3:]]
     answers = answers_to(solver(here, 1.0), instants)
     assert sources(answers) == "EMMENN"
     check_answers(answers, here, [rig_at(i) for i in range(6)])
+
+
+def test_beyond_the_last_look_that_motion_links_to_it_a_pose_is_less_sure(here: Any) -> None:
+    # A look before the odometry began says nothing of where it leads.
+    linked = instants_of(here, "..g", moving=True)
+    (before,) = instants_of(here, "g", start=-300)
+    (cut,) = instants_of(here, ".", start=-100)
+    alone = answers_to(solver(here, 1.0), linked)
+    after = answers_to(solver(here, 1.0), [before, cut, *linked])
+    assert sources(alone) == "MME"
+    assert sources(after)[2:] == "MME"
+    for a, b in zip(alone, after[2:], strict=True):
+        assert a.pose is not None
+        assert b.pose is not None
+        assert b.pose.position_std == pytest.approx(a.pose.position_std, rel=1e-6)
 
 
 def test_odometry_that_jumps_between_two_looks_fills_nothing_there(here: Any) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.geometry import Camera, Pose
+from visloc.geometry import Camera, Pose, cross_matrix
 from visloc.pose.colmap import project
 from visloc.pose.views import MatchedView
 
@@ -83,7 +83,7 @@ def position_covariance(
     the matrix of the cross product.
     """
     jacobian = -cam_from_world.rotation.T @ np.hstack(
-        [_cross_matrix(cam_from_world.translation), np.eye(3)]
+        [cross_matrix(cam_from_world.translation), np.eye(3)]
     )
     return np.asarray(jacobian @ covariance @ jacobian.T)
 
@@ -99,12 +99,8 @@ def with_origin(
     offset = cam_from_local.rotation @ origin
     pose = Pose(cam_from_local.rotation, cam_from_local.translation - offset)
     jacobian = np.eye(6)
-    jacobian[3:, :3] = _cross_matrix(offset)
+    jacobian[3:, :3] = cross_matrix(offset)
     return pose, jacobian @ covariance @ jacobian.T
-
-
-def _cross_matrix(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def _linearize(

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.geometry import Pose, rotation_angle
+from visloc.geometry import Pose, cross_matrix, rotation_angle
 
 # What is assumed of a motion that came without a covariance: a wheel's or a phone's odometry.
 DEFAULT_ROTATION_STD = math.radians(0.2)
@@ -139,8 +139,3 @@ def adjoint(pose: Pose) -> NDArray[np.float64]:
     matrix[:3, :3] = matrix[3:, 3:] = pose.rotation
     matrix[3:, :3] = cross_matrix(pose.translation) @ pose.rotation
     return matrix
-
-
-def cross_matrix(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The matrix (3, 3) with which v x u = matrix @ u."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

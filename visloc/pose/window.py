@@ -1,7 +1,7 @@
 """The instants of a sequence solved together, with relative motion as the rig that holds them.
 
-Measured poses are joined by the motion between them, and instants whose own images do not do get
-the pose that their neighbours and the motion give. Where no instant was measured, the images of
+Instants whose own images do not do get the pose that measured neighbours and the motion between
+them give; measured poses stay as they are. Where no instant was measured, the images of
 many are one generalized camera, as Humenberger et al. 2020 have it for the cameras of a rig.
 
 Motion is believed only as far as measured poses do not contradict it: between two that do, nothing
@@ -21,6 +21,7 @@ from visloc.pose.agreement import agreeing_pieces
 from visloc.pose.generalized import (
     LOSS_SCALE_PX,
     GeneralizedPose,
+    refine_generalized_pose,
     reprojection_errors,
 )
 from visloc.pose.group import carried, find_groups, selected
@@ -162,8 +163,7 @@ def _solve_segment(
         solved = _solve_together(some, between, known, start, {}, registration)
         if solved is not None:
             for i, pose in zip(inside, solved, strict=True):
-                # What passed on its own is not lost when an inlier or two leave the threshold.
-                if pose.measured or i not in counted:
+                if i not in counted:
                     found[i] = pose
     return found
 
@@ -260,18 +260,33 @@ def _solve_together(
     found = []
     taking_part = {*known.measured, *known.seen}
     for i, (instant, pose, covariance) in enumerate(zip(instants, poses, covariances, strict=True)):
-        masks = _inliers(instant.views, pose, registration)
-        enough = max(registration.min_inliers, _MIN_OWN_INLIERS)
+        own = _measured_from(instant.views, pose, registration)
         found.append(
-            WindowPose(
+            own
+            or WindowPose(
                 pose,
                 UncertainPose(pose, covariance).additive(),
-                masks,
-                measured=_supports(masks, enough, registration),
+                _inliers(instant.views, pose, registration),
+                measured=False,
                 supported=i in taking_part,
             )
         )
     return found
+
+
+def _measured_from(
+    views: Sequence[MatchedView], start: Pose, registration: RegistrationPreset
+) -> WindowPose | None:
+    """The pose that an instant's own images give near ``start``, if they support it."""
+    enough = max(registration.min_inliers, _MIN_OWN_INLIERS)
+    if not _supports(_inliers(views, start, registration), enough, registration):
+        return None
+    own = refine_generalized_pose(views, start, max_error_px=registration.max_error_px)
+    if own is None or own.covariance is None or not _supports(own.inliers, enough, registration):
+        return None
+    return WindowPose(
+        own.rig_from_world, own.covariance, own.inliers, measured=True, supported=True
+    )
 
 
 def _inliers(

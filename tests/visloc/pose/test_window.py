@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -167,17 +166,21 @@ def test_every_second_instant_may_be_destroyed() -> None:
     assert angle < 0.15
 
 
-def test_exact_motion_lets_measured_poses_help_each_other() -> None:
-    joint, alone = [], []
-    for seed in range(4):
-        truth, instants, motions = make_window(seed, 12, range(12), share=1e-4, degrees=1e-3)
-        for pose, instant, found in zip(truth, instants, solve(instants, motions), strict=True):
-            assert found is not None
-            assert instant.alone is not None
-            assert found.measured
-            joint.append(pose_error(found.rig_from_world, pose)[0])
-            alone.append(pose_error(instant.alone.rig_from_world, pose)[0])
-    assert np.median(joint) < 0.6 * np.median(alone)
+@pytest.mark.parametrize(("share", "degrees"), [(1e-6, 1e-5), (0.01, 0.1)])
+def test_motion_never_moves_a_measured_pose(share: float, degrees: float) -> None:
+    """A bias that adds up: no comparison of neighbours sees it, and no statement covers it."""
+
+    def bias(i: int, motion: Pose) -> Pose:
+        del i
+        return Pose(motion.rotation, 1.002 * motion.translation)
+
+    _, instants, motions = make_window(0, 8, range(8), lie=bias, share=share, degrees=degrees)
+    for instant, pose in zip(instants, solve(instants, motions), strict=True):
+        assert instant.alone is not None
+        assert pose is not None
+        assert pose.measured
+        assert pose.rig_from_world is instant.alone.rig_from_world
+        assert pose.covariance is instant.alone.covariance
 
 
 def test_one_good_frame_localizes_its_neighbours_less_surely_with_distance() -> None:
@@ -369,7 +372,7 @@ def test_an_instant_that_only_its_neighbours_make_findable_counts_as_measured() 
         LOSS_SCALE_PX,
     )
     assert alone is not None
-    assert np.linalg.det(found.covariance) < np.linalg.det(alone)
+    assert found.covariance == pytest.approx(alone, rel=1e-6)  # motion adds nothing to it
 
 
 def test_covariances_agree_with_monte_carlo() -> None:
@@ -404,17 +407,6 @@ def test_equal_seeds_give_equal_bits() -> None:
         assert all(pose is not None for pose in found)
         bits.add(b"".join(p.rig_from_world.translation.tobytes() for p in found if p is not None))
     assert len(bits) == 1
-
-
-def test_a_window_takes_a_fraction_of_a_second() -> None:
-    """20 instants, two images each, 300 correspondences in each; some 20 ms on a free core."""
-    _, instants, motions = make_window(0, 20, range(0, 20, 2), matches=300)
-    taken = []
-    for _ in range(3):
-        start = time.perf_counter()
-        solve(instants, motions)
-        taken.append(time.perf_counter() - start)
-    assert min(taken) < 0.3
 
 
 def test_a_wrong_number_of_motions_is_refused() -> None:
