@@ -19,11 +19,11 @@ from visloc.errors import InvalidInput
 from visloc.geometry import Pose
 from visloc.pose.colmap import normalized_rays
 from visloc.pose.covariance import position_covariance, with_origin
+from visloc.pose.distance import mahalanobis2
 from visloc.pose.generalized import KnownGravity
 from visloc.pose.gravity import gravity_deviation
 from visloc.pose.views import MatchedView
 from visloc.priors import Priors
-from visloc.trajectory import center_covariance
 
 # How far beyond an area a photo may have been taken and still show it, in units of how far the
 # map's photos see; within that, photos further away count less.
@@ -39,8 +39,6 @@ _POSE_PRIOR_STDS = 3.0
 _OWN_STDS = 3.0
 # Chi-square with six degrees of freedom is above this once in 10 000 times.
 _MAX_MAHALANOBIS2 = 27.86
-# Poses of different sessions disagree by this much for reasons that no covariance tells.
-_MAP_STD_RAD, _MAP_STD = math.radians(0.1), 0.01
 # What is sent for down and what the map knows may differ by so much.
 _MAX_DOWN_DIFFERENCE = math.radians(5.0)
 _NUM_REACH_PHOTOS, _NUM_REACH_LANDMARKS = 100, 200
@@ -182,7 +180,7 @@ class Constraints:
                     f"most {math.degrees(allowed):.1f}"
                 )
         if self._pose is not None:
-            excess = _mahalanobis2(pose, covariance, *self._pose)
+            excess = mahalanobis2(pose, covariance, *self._pose)
             if excess > _MAX_MAHALANOBIS2:
                 away = float(np.linalg.norm(pose.center - self._pose[0].center))
                 turned = Rotation.from_matrix(pose.rotation @ self._pose[0].rotation.T).magnitude()
@@ -222,24 +220,6 @@ class Constraints:
 def _largest_std(pose: Pose, covariance: NDArray[np.float64]) -> float:
     """Standard deviation of a device's position along its worst axis."""
     return math.sqrt(max(float(np.linalg.eigvalsh(position_covariance(pose, covariance))[-1]), 0.0))
-
-
-def _mahalanobis2(
-    a: Pose, covariance_a: NDArray[np.float64], b: Pose, covariance_b: NDArray[np.float64]
-) -> float:
-    """Squared distance of two poses in units of what both leave open; infinite when in doubt."""
-    # In terms of rotation and centre: far from the origin, t is not linear in the rotation.
-    difference = np.concatenate(
-        [Rotation.from_matrix(a.rotation @ b.rotation.T).as_rotvec(), a.center - b.center]
-    )
-    floor = np.diag([_MAP_STD_RAD**2] * 3 + [_MAP_STD**2] * 3)
-    total = center_covariance(a, covariance_a) + center_covariance(b, covariance_b) + floor
-    try:
-        squared = float(difference @ np.linalg.solve(total, difference))
-    except np.linalg.LinAlgError:
-        return math.inf
-    # So far from the origin that rounding left no digits, it may be negative or no number.
-    return squared if squared >= 0 else math.inf
 
 
 def _angles(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,6 +12,7 @@ from visloc.constraints import Constraints, MapGeometry
 from visloc.errors import VislocError
 from visloc.geometry import Camera, Pose
 from visloc.pose.covariance import position_covariance, with_origin
+from visloc.pose.distance import mahalanobis2
 from visloc.pose.generalized import (
     GeneralizedPose,
     estimate_generalized_pose,
@@ -40,6 +41,10 @@ FULL_ERROR_FROM_PX = 640
 # A prior decides between two poses when the photo leaves them open: when the one that it allows
 # has at least this share of the inliers of the one that it forbids.
 _AMBIGUOUS_SHARE = 0.7
+# A pose with fewer inliers must be confirmed by two halves of the matches: their distance is
+# chi-square with six degrees of freedom, above this once in a thousand times.
+_SURE_INLIERS = 100
+_MAX_HALVES_MAHALANOBIS2 = 22.46
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,6 +237,8 @@ def _find_pose(
             found, refusal = other, None
     if refusal is None and constraints.gravity is not None:
         refusal = _better_without_gravity(views, found, registration, options)
+    if refusal is None:
+        refusal = _halves_disagree(views, found, registration, options, constraints)
     return found, refusal
 
 
@@ -284,6 +291,47 @@ def _gate(
             f"the best pose contradicts what is known: {contradiction}",
         )
     return None
+
+
+def _halves_disagree(
+    views: Sequence[MatchedView],
+    found: GeneralizedPose,
+    registration: RegistrationPreset,
+    options: LocalizeOptions,
+    constraints: Constraints,
+) -> Refusal | None:
+    """Refuse a pose of few inliers when two halves of the matches give poses that differ.
+
+    Matches of a blurred photo agree within 12 pixels by the dozen and with a pose metres off, whose
+    covariance cannot know (docs/decisions/0012-halves-must-agree.md).
+    """
+    if (
+        found.num_inliers >= _SURE_INLIERS
+        or options.preset != DEFAULT_PRESET
+        or options.min_inliers is not None
+    ):
+        return None
+    # Of two places that explain the photo, a pose prior may have decided for one.
+    views = constraints.near_pose_prior(views, registration.max_error_px) or views
+    random = np.random.default_rng(options.seed)
+    first = [random.permutation(len(view)) < len(view) // 2 for view in views]
+    halves = []
+    for masks in (first, [~mask for mask in first]):
+        half = [
+            replace(view, pixels=view.pixels[mask], points=view.points[mask])
+            for view, mask in zip(views, masks, strict=True)
+        ]
+        pose = _estimate(half, registration, options, constraints)
+        if pose is not None and pose.covariance is not None:
+            halves.append((pose.rig_from_world, pose.covariance))
+    if len(halves) == 2 and mahalanobis2(*halves[0], *halves[1]) <= _MAX_HALVES_MAHALANOBIS2:
+        return None
+    return Refusal(
+        "gate",
+        Reason.UNCERTAIN_POSE,
+        f"the best pose explains only {found.num_inliers} matches, and two halves of the matches "
+        "give poses that contradict each other: the photo is blurred, or of another place",
+    )
 
 
 def _near_pose_prior(

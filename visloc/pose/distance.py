@@ -1,0 +1,40 @@
+"""How far two poses are apart, in units of what both leave open."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from visloc.geometry import Pose
+from visloc.trajectory import center_covariance
+
+# Poses of different photos disagree by this much for reasons that no covariance tells.
+_MAP_STD_RAD, _MAP_STD = math.radians(0.1), 0.01
+
+
+def mahalanobis2(
+    a: Pose, covariance_a: NDArray[np.float64], b: Pose, covariance_b: NDArray[np.float64]
+) -> float:
+    """Return the squared distance, chi-square with six degrees of freedom; infinite when in doubt.
+
+    Args:
+        a: ``device_from_world``.
+        covariance_a: (6, 6) of rotation (rad) then translation, for R <- Exp(w) R and t <- t + dt.
+        b: as ``a``.
+        covariance_b: of ``b``; its errors are independent of those of ``a``.
+    """
+    # In terms of rotation and centre: far from the origin, t is not linear in the rotation.
+    difference = np.concatenate(
+        [Rotation.from_matrix(a.rotation @ b.rotation.T).as_rotvec(), a.center - b.center]
+    )
+    floor = np.diag([_MAP_STD_RAD**2] * 3 + [_MAP_STD**2] * 3)
+    total = center_covariance(a, covariance_a) + center_covariance(b, covariance_b) + floor
+    try:
+        squared = float(difference @ np.linalg.solve(total, difference))
+    except np.linalg.LinAlgError:
+        return math.inf
+    # So far from the origin that rounding left no digits, it may be negative or no number.
+    return squared if squared >= 0 else math.inf
