@@ -275,6 +275,15 @@ def test_an_area_has_a_size(radius: float) -> None:
     assert (caught.value.code, caught.value.field) == ("priors.position", "priors.position.radius")
 
 
+def test_down_as_sent_must_be_down_as_the_map_knows_it(hall: Any) -> None:
+    forward = np.array([0.0, 0.0, 1.0])
+    tilted = np.array([np.sin(np.radians(4.0)), 0.0, -np.cos(np.radians(4.0))])
+    assert Constraints(hall.geometry, Priors(gravity=GravityPrior(forward, 0.02, tilted))).gravity
+    with pytest.raises(InvalidInput) as caught:
+        Constraints(hall.geometry, Priors(gravity=GravityPrior(forward, 0.02, forward)))
+    assert caught.value.field == "priors.gravity.world"
+
+
 @pytest.mark.parametrize(("low", "high"), [(1.0, 1.0), (2.0, 1.0)])
 def test_a_height_band_has_a_size(low: float, high: float) -> None:
     with pytest.raises(InvalidInput) as caught:
@@ -310,6 +319,7 @@ def test_gravity_is_known_to_some_degrees(std: float) -> None:
         np.diag([1.0, 1, 1, 1, 1, 0]),
         np.diag([1.0, 1, 1, 1, 1, -1]),
         np.eye(6) + np.diag([0.5], 5),
+        1e-9 * (np.eye(6) + np.diag([0.5], 5)),
         np.eye(6) + 2 * np.diag([1.0], 5) + 2 * np.diag([1.0], -5),
         np.eye(5),
         np.full((6, 6), np.nan),

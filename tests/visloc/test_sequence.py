@@ -580,3 +580,57 @@ def test_matches_may_be_none(here: Any) -> None:
     instants = instants_of(here, "gg", moving=True)
     answers = answers_to(solver(here, 1.0), [*instants, empty])
     assert sources(answers) == "EEM"
+
+
+# Trackers that cannot be checked
+
+
+def with_motion(
+    place: Any, kinds: str, at: Any, covariances: list[Any] | None = None
+) -> list[SeenInstant]:
+    """Instants whose odometry says ``at(i)`` steps after i."""
+    return [
+        replace(
+            instant,
+            odometry=odometry(at(i), covariance=None if covariances is None else covariances[i]),
+        )
+        for i, instant in enumerate(instants_of(place, kinds))
+    ]
+
+
+SURE = 1e-8 * np.eye(6)
+
+
+def test_a_tracker_that_freezes_after_the_last_photo_fills_nothing_surely(here: Any) -> None:
+    instants = with_motion(here, "gggbbbbb", lambda i: min(i, 2), [SURE] * 8)
+    answers = answers_to(solver(here, 1.0), instants)
+    assert sources(answers).startswith("EEE")
+    check_answers(answers, here, [rig_at(i) for i in range(8)])
+    assert answers[-1].pose is not None
+    assert (answers[-1].pose.position_std > 1.0).all()
+
+
+def test_motion_that_says_nothing_cuts_a_sequence_as_missing_motion_does(here: Any) -> None:
+    covariances = [SURE] * 6 + [1e4 * np.eye(6)]
+    instants = with_motion(here, "gbbbbbg", lambda i: 1.3 * i, covariances)
+    answers = answers_to(solver(here, 1.0), instants)
+    for i in range(1, 6):
+        pose = answers[i].pose
+        if pose is not None and pose.source is PoseSource.MOTION:
+            assert pose.position_std.max() > 0.04 * 0.5 * i
+
+
+def test_a_window_without_any_pose_is_not_searched_again_for_every_instant(
+    here: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searched = []
+
+    def counting(*args: Any, **settings: Any) -> Any:
+        searched.append(len(args[0]))
+        return solve_window(*args, **settings)
+
+    solve_window = sequence_module.solve_window
+    monkeypatch.setattr(sequence_module, "solve_window", counting)
+    answers = answers_to(solver(here, 1.0), instants_of(here, "b" * 45, moving=True))
+    assert sources(answers) == "-" * 45
+    assert len(searched) <= 6

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
+from visloc.pose.colmap import normalized_rays
 from visloc.pose.covariance import with_origin
 from visloc.priors import (
     NO_PRIORS,
@@ -625,3 +626,37 @@ def test_with_a_twin_a_lying_prior_never_makes_its_minority_an_answer(hall: Any)
         solved = solve([image], hall, priors)
         if solved.answer.pose is not None:
             assert error_of(solved, hall, majority) < (0.1, 0.5)
+
+
+# Few inliers
+
+
+def street(place: Any, seed: int, noise: float) -> Matches:
+    """45 right and 300 wrong matches in a narrow band of the photo, of a camera at the origin."""
+    rng = np.random.default_rng(seed)
+    band = np.column_stack([rng.uniform(5, 635, 345), rng.normal(240, 15, 345)])
+    other = np.column_stack([rng.uniform(5, 635, 345), rng.normal(240, 15, 345)])
+    pixels = np.where(np.arange(345)[:, None] < 45, band, other)
+    points = normalized_rays(place.camera, pixels) * rng.uniform(20, 60, (345, 1))
+    return Matches(band + noise * rng.normal(size=band.shape), points)
+
+
+def test_of_blurred_photos_a_pose_that_halves_do_not_confirm_is_refused(place: Any) -> None:
+    refused, worst = 0, 0.0
+    for seed in range(12):
+        images = [place.image(street(place, seed, noise=6.0))]
+        solved = solve(images, place)
+        insisted = solve(images, place, min_inliers=30)
+        if solved.answer.pose is None:
+            assert reason(solved) is Reason.UNCERTAIN_POSE
+            refused += 1
+            if insisted.answer.pose is not None:
+                worst = max(worst, error_of(insisted, place, Pose.identity())[0])
+    assert refused >= 4
+    assert worst > 1.0
+
+
+def test_of_sharp_photos_the_same_few_inliers_are_enough(place: Any) -> None:
+    for seed in range(12):
+        images = [place.image(street(place, seed, noise=0.5))]
+        assert error_of(solve(images, place), place, Pose.identity()) < (0.5, 1.0)
