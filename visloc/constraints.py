@@ -126,6 +126,11 @@ class Constraints:
                 priors.pose.device_from_world, priors.pose.covariance, -geometry.origin
             )
 
+    @property
+    def narrow(self) -> bool:
+        """Whether the priors leave out photos, or poses, before any is judged."""
+        return self.gravity is not None or self.photo_weights is not None
+
     @cached_property
     def photo_weights(self) -> NDArray[np.float64] | None:
         """(n,) how much each photo of the map counts, 0 to 1; None when all count the same."""
@@ -176,8 +181,8 @@ class Constraints:
             )
             if angle > allowed:
                 return (
-                    f"its down is {math.degrees(angle):.1f} degrees from the prior gravity, at "
-                    f"most {math.degrees(allowed):.1f}"
+                    f"its down is {math.degrees(angle):.2g} degrees from the prior gravity, at "
+                    f"most {math.degrees(allowed):.2g}"
                 )
         if self._pose is not None:
             excess = mahalanobis2(pose, covariance, *self._pose)

@@ -257,7 +257,7 @@ class SequenceSolver:
                 or not supported
                 or self._ticks_between(i, nearest) > self._max_gap
             ):
-                answers.append(alone)
+                answers.append(_unfilled(alone) if linked[i] and supported else alone)
                 continue
             covariance = pose.covariance
             if not supported[0] <= i <= supported[-1]:
@@ -377,3 +377,11 @@ def _way(a: WindowPose | None, b: WindowPose | None) -> tuple[float, float]:
     here, there = a.rig_from_world, b.rig_from_world
     distance = float(np.linalg.norm(here.center - there.center))
     return distance, rotation_angle(here.rotation @ there.rotation.T)
+
+
+def _unfilled(alone: InstantAnswer) -> InstantAnswer:
+    """Say why neighbours with poses, and the motion from them, did not give this instant one."""
+    if alone.pose is not None or alone.refusal is None:
+        return alone
+    more = "; the neighbours have poses, but the motion contradicts them or comes from too far"
+    return replace(alone, refusal=replace(alone.refusal, message=alone.refusal.message + more))

@@ -263,19 +263,22 @@ def _gate(
     constraints: Constraints,
 ) -> Refusal | None:
     """Why a pose is not believed, or None (docs/decisions/0002-refuse-instead-of-guess.md)."""
+    doubt = "is this photo of the mapped place?"
+    if constraints.narrow:
+        doubt = "only what the priors allow was searched: are they right?"
     if found.num_inliers < registration.min_inliers:
         return Refusal(
             "gate",
             Reason.TOO_FEW_INLIERS,
             f"the best pose explains {found.num_inliers} matches, "
-            f"{registration.min_inliers} are needed; is this photo of the mapped place?",
+            f"{registration.min_inliers} are needed; {doubt}",
         )
     if found.num_inliers / num_pairs < registration.min_inlier_ratio:
         return Refusal(
             "gate",
             Reason.LOW_INLIER_RATIO,
             f"the best pose explains {found.num_inliers / num_pairs:.1%} of the matches, "
-            f"{registration.min_inlier_ratio:.1%} are needed; is this photo of the mapped place?",
+            f"{registration.min_inlier_ratio:.1%} are needed; {doubt}",
         )
     if found.covariance is None:
         return Refusal(

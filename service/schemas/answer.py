@@ -78,7 +78,7 @@ class LocalizeResponse(BaseModel):
             correspondences=evidence.num_correspondences,
             inliers=evidence.num_inliers,
             inlier_ratio=evidence.inlier_ratio,
-            retrieved=RetrievedImage.all_of(evidence),
+            retrieved=RetrievedImage.best_of(evidence),
             camera=CameraUsed.of(evidence),
             orientation=Orientation.of(evidence),
             map=MapRef(id=found.map_id, version=found.map_version),

@@ -25,11 +25,11 @@ class RetrievedImage(BaseModel):
     similarities: Annotated[dict[str, float], Field(description="cosine by global descriptor")]
 
     @staticmethod
-    def all_of(evidence: visloc.types.Evidence) -> list[RetrievedImage]:
-        """Say it in the API's words."""
+    def best_of(evidence: visloc.types.Evidence, num: int | None = None) -> list[RetrievedImage]:
+        """Say the best so many, or all, in the API's words."""
         return [
             RetrievedImage(image=r.name, score=r.score, similarities=dict(r.similarities))
-            for r in evidence.retrieved
+            for r in evidence.retrieved[:num]
         ]
 
 

@@ -14,6 +14,9 @@ from service.schemas.geometry import Transform
 from visloc.errors import VislocError
 from visloc.trajectory import PoseSource
 
+# A sequence has thousands of images, and each may have been matched against a thousand photos.
+MAX_RETRIEVED = 20
+
 
 class RigPose(BaseModel):
     """Where the rig was, and how sure that is."""
@@ -72,7 +75,8 @@ class ImageAnswer(BaseModel):
     correspondences: Annotated[int, Field(description="2D-3D matches given to the solver")]
     inliers: Annotated[int, Field(description="of them, those that agree with the rig's pose")]
     retrieved: Annotated[
-        list[RetrievedImage], Field(description="mapping photos matched against, best first")
+        list[RetrievedImage],
+        Field(description=f"the best {MAX_RETRIEVED} mapping photos matched against, best first"),
     ]
     camera: Annotated[CameraUsed | None, Field(description="null when there is an error")]
     orientation: Annotated[Orientation | None, Field(description="null when there is an error")]
@@ -105,7 +109,10 @@ class InstantAnswer(BaseModel):
     ]
     inlier_ratio: Annotated[float, Field(description="inliers / correspondences; 0 without any")]
     map: MapRef
-    seconds: Annotated[dict[str, float], Field(description="wall time by stage that was reached")]
+    seconds: Annotated[
+        dict[str, float],
+        Field(description="wall time by stage that was reached, summed over the images"),
+    ]
 
     @staticmethod
     def from_localization(found: InstantLocalization, request_id: str) -> InstantAnswer:
@@ -169,7 +176,7 @@ def _image_answer(
         keypoints=0 if seen is None else seen.num_keypoints,
         correspondences=0 if seen is None else seen.num_correspondences,
         inliers=0 if seen is None else seen.num_inliers,
-        retrieved=[] if seen is None else RetrievedImage.all_of(seen),
+        retrieved=[] if seen is None else RetrievedImage.best_of(seen, MAX_RETRIEVED),
         camera=None if seen is None else CameraUsed.of(seen),
         orientation=None if seen is None else Orientation.of(seen),
     )

@@ -20,6 +20,7 @@ from visloc.errors import InvalidInput, TooLarge
 
 # More than any rig has: it bounds what a request can make the server look at.
 MAX_SENSORS = 256
+MAX_ID = 100
 
 Timestamp = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 
@@ -91,15 +92,35 @@ class RigSensor(IncomingMessage):
     ] = None
 
 
-def _few_sensors(value: object) -> object:
-    if isinstance(value, dict) and len(value) > MAX_SENSORS:
-        raise TooLarge(
-            "rig.too_many_sensors",
-            "the rig has too many sensors",
-            field="sensors",
-            expected=f"at most {MAX_SENSORS}",
-            got=len(value),
+def _check_id(value: object, field: str) -> None:
+    """Refuse the id of a rig or a sensor that no answer or error could name."""
+    if isinstance(value, str) and len(value) > MAX_ID:
+        raise InvalidInput(
+            "rig.id",
+            "the id of a rig or a sensor is too long",
+            field=field,
+            expected=f"at most {MAX_ID} characters",
+            got=f"{len(value)} characters",
         )
+
+
+def _few_sensors(value: object) -> object:
+    if isinstance(value, dict):
+        if len(value) > MAX_SENSORS:
+            raise TooLarge(
+                "rig.too_many_sensors",
+                "the rig has too many sensors",
+                field="sensors",
+                expected=f"at most {MAX_SENSORS}",
+                got=len(value),
+            )
+        for name in value:
+            _check_id(name, "sensors")
+    return value
+
+
+def _sensor_id(value: object) -> object:
+    _check_id(value, "sensor")
     return value
 
 
@@ -126,7 +147,7 @@ class RigCalibration(IncomingMessage):
 
 
 def _sensor_to_core(name: str, sensor: RigSensor) -> service.jobs.RigSensor:
-    with inside(f"rig.sensors.{name[:100]}"):
+    with inside(f"rig.sensors.{name}"):
         return service.jobs.RigSensor(
             sensor.cam_from_rig.to_core("cam_from_rig", "rig.rotation"),
             None if sensor.camera is None else sensor.camera.to_core(),
@@ -134,6 +155,7 @@ def _sensor_to_core(name: str, sensor: RigSensor) -> service.jobs.RigSensor:
 
 
 def _rig_from_object(value: object) -> object:
+    _check_id(value, "rig")
     if value is None or isinstance(value, str | RigCalibration):
         return value
     return RigCalibration.read(value)
@@ -156,7 +178,9 @@ class RigImage(IncomingMessage):
     """One image of an instant."""
 
     sensor: Annotated[
-        str | None, Field(description="a camera of the rig; may be left out without a rig")
+        str | None,
+        converted(_sensor_id),
+        Field(description="a camera of the rig; may be left out without a rig"),
     ] = None
     image: Annotated[
         GivenImage, Field(description="the encoded photo: JPEG, PNG, WebP, TIFF or BMP")
@@ -167,7 +191,10 @@ class RigImage(IncomingMessage):
     ] = None
     camera: Annotated[
         GivenCamera,
-        Field(description="left out: the rig's for this sensor, else the map's, else EXIF"),
+        Field(
+            description="left out: the rig's for this sensor; of a rig given by its id, the map's "
+            "for this sensor; else EXIF, else a guess that the answer marks"
+        ),
     ] = None
     timestamp: Annotated[
         Timestamp | None, Field(description="equal for all images of an instant")

@@ -204,7 +204,7 @@ def test_what_contradicts_is_said_with_numbers(hall: Any) -> None:
     down = Rotation.from_euler("x", 20, degrees=True).apply(pose.rotation @ hall.down)
     words = said(Priors(gravity=GravityPrior(down, np.radians(2.0))))
     assert words.startswith("its down is ")
-    assert words.endswith("degrees from the prior gravity, at most 6.0")
+    assert words.endswith("degrees from the prior gravity, at most 6")
     turned = Pose(np.eye(3), -world.center)
     words = said(Priors(pose=PosePrior(turned, np.diag([1e-4] * 3 + [1e14] * 3))))
     assert "degrees from the prior pose" in words

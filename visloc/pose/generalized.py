@@ -41,8 +41,12 @@ _CONFIDENCE = 0.99999
 _MIN_TRIALS = 100
 _MIN_POINTS = 4
 # The solver's inliers are measured on average over a rig's focal lengths, and are few when few are
-# right: those of the refined pose are better.
-_MAX_ROUNDS = 2
+# right, and those of a pose found by gravity lean as gravity was wrong: inliers are chosen again
+# under the refined pose, to compare poses this often,
+_ROUNDS = 2
+# and of the best pose until they settle: until so small a share of them changes.
+_MAX_ROUNDS = 10
+_SETTLED = 0.005
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,11 +105,12 @@ def estimate_generalized_pose(
         starts = _search(stacked, max_error_px, seed)
     else:
         starts = find_upright_poses(stacked.views, gravity, max_error_px=max_error_px, seed=seed)
-    refined = [_refine(stacked, start, max_error_px) for start in starts]
-    poses = [pose for pose in refined if pose is not None]
-    if not poses:
-        return None
-    return _judged(views, max(poses, key=lambda pose: pose[1].sum()))
+    if len(starts) > 1:
+        refined = [_refine(stacked, start, max_error_px, _ROUNDS) for start in starts]
+        poses = [pose for pose in refined if pose is not None]
+        starts = [max(poses, key=lambda pose: pose[1].sum())[0]] if poses else []
+    settled = _refine(stacked, starts[0], max_error_px, _MAX_ROUNDS) if starts else None
+    return None if settled is None else _judged(views, settled)
 
 
 def refine_generalized_pose(
@@ -125,7 +130,7 @@ def refine_generalized_pose(
     Raises:
         ValueError: a view has not as many pixels as points.
     """
-    refined = _refine(_stack(views), rig_from_world, max_error_px)
+    refined = _refine(_stack(views), rig_from_world, max_error_px, _MAX_ROUNDS)
     return None if refined is None else _judged(views, refined)
 
 
@@ -200,14 +205,14 @@ def _search(stacked: _Stacked, max_error_px: float, seed: int) -> list[Pose]:
 
 
 def _refine(
-    stacked: _Stacked, start: Pose, max_error_px: float
+    stacked: _Stacked, start: Pose, max_error_px: float, max_rounds: int
 ) -> tuple[Pose, NDArray[np.bool_]] | None:
     """The refined pose and its inliers (n,)."""
     options = pycolmap.AbsolutePoseRefinementOptions()
     options.loss_function_scale = LOSS_SCALE_PX
     pose = start
     inliers = stacked.inliers(pose, max_error_px)
-    for _ in range(_MAX_ROUNDS):
+    for _ in range(max_rounds):
         if np.count_nonzero(inliers) < _MIN_POINTS:
             return None
         solved = pycolmap.refine_generalized_absolute_pose(
@@ -224,7 +229,7 @@ def _refine(
             return None
         pose = pose_from_colmap(solved["rig_from_world"])
         before, inliers = inliers, stacked.inliers(pose, max_error_px)
-        if np.array_equal(inliers, before):
+        if np.count_nonzero(inliers != before) <= _SETTLED * np.count_nonzero(inliers):
             break
     return (pose, inliers) if np.count_nonzero(inliers) >= _MIN_POINTS else None
 
