@@ -177,16 +177,20 @@ class Bench:
 def noisy_odometry(
     moments: Sequence[Moment], share: float, degrees: float, seed: int
 ) -> list[Odometry]:
-    """The true motion between instants, with noise on each step, as a tracker would add it up."""
+    """The true motion between instants, with noise on each step, as a tracker would add it up.
+
+    ``degrees`` is the standard deviation about each axis, ``share`` that along each axis as a share
+    of the distance.
+    """
     random = np.random.default_rng(seed)
     poses = [Pose.identity()]
     for before, after in itertools.pairwise(moments):
         motion = after.rig_from_world @ before.rig_from_world.inverse()
         distance = float(np.linalg.norm(motion.translation))
-        turn = Rotation.from_rotvec(np.radians(degrees) * random.normal(size=3) / np.sqrt(3))
+        turn = Rotation.from_rotvec(np.radians(degrees) * random.normal(size=3))
         noisy = Pose(
             turn.as_matrix() @ motion.rotation,
-            motion.translation + share * distance * random.normal(size=3) / np.sqrt(3),
+            motion.translation + share * distance * random.normal(size=3),
         )
         poses.append(noisy @ poses[-1])
     return [Odometry(pose, None) for pose in poses]

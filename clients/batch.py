@@ -15,6 +15,7 @@ from clients.instants import QueryInstant
 from clients.modes import Arrangement, Mode
 from clients.queries import Query
 from clients.results import (
+    StoredResult,
     copy_lines,
     drop_torn_line,
     read_results,
@@ -27,6 +28,7 @@ from clients.traced import estimate_of, measured
 from clients.types import LocalizeOptions
 from visloc.errors import Conflict
 from visloc.geometry import PixelOrigin
+from visloc.trajectory import TracedPose
 
 _FORMAT = 1
 
@@ -36,7 +38,7 @@ class Batch:
     """A folder of results and what they are results of.
 
     Attributes:
-        output: holds ``results.jsonl``, ``poses.txt`` and ``run.json``.
+        output: holds ``results.jsonl``, ``poses.txt``, ``poses_filled.txt`` and ``run.json``.
         source: the dataset or list.
         features_dir: where the features of the photos are, when not in the dataset.
         pixel_origin: where its cameras and keypoints count from.
@@ -62,8 +64,13 @@ class Batch:
 
     @property
     def poses(self) -> Path:
-        """The poses of the localized and filled photos, written when all are done."""
+        """The poses that were measured, written when all are done."""
         return self.output / "poses.txt"
+
+    @property
+    def poses_filled(self) -> Path:
+        """The poses from other photos, apart, so that nobody takes them for measured ones."""
+        return self.output / "poses_filled.txt"
 
     @property
     def description(self) -> Path:
@@ -83,7 +90,7 @@ def open_batch(batch: Batch, *, restart: bool) -> set[str]:
     """
     batch.output.mkdir(parents=True, exist_ok=True)
     if restart:
-        for path in (batch.results, batch.poses, batch.description):
+        for path in (batch.results, batch.poses, batch.poses_filled, batch.description):
             path.unlink(missing_ok=True)
     described = {
         "format": _FORMAT,
@@ -153,9 +160,10 @@ async def run_instants(
 
 
 def finish_batch(batch: Batch, arrangement: Arrangement) -> Counter[str]:
-    """Bring ``results.jsonl`` into the order of the dataset, fill, and write ``poses.txt``.
+    """Bring ``results.jsonl`` into the order of the dataset, fill, and write the poses.
 
-    Of a photo that was asked about again the newest result is kept.
+    Of a photo that was asked about again the newest result is kept. ``poses_filled.txt`` is
+    written in the modes that fill, and in gp3p when any pose was filled.
 
     Returns:
         How many photos are localized, filled, not_localized, and error; and how many were filled
@@ -163,20 +171,27 @@ def finish_batch(batch: Batch, arrangement: Arrangement) -> Counter[str]:
     """
     by_name = {result.name: result for result in read_results(batch.results)}
     ordered = [by_name[query.name] for query in arrangement.photos]
-    own = [None if r.pose is None else measured(r.pose, r.num_inliers) for r in ordered]
-    poses = arrangement.fill(batch.mode, own)
+    poses = arrangement.fill(batch.mode, [_known(result, batch.mode) for result in ordered])
     filled = {
         result.name: pose
         for result, pose in zip(ordered, poses, strict=True)
         if result.pose is None and pose is not None
     }
     copy_lines(batch.results, ordered, batch.results, filled)
-    estimates = {result.name: result.pose for result in ordered} | {
-        name: estimate_of(pose) for name, pose in filled.items()
-    }
-    write_poses(batch.poses, ((name, p) for name, p in estimates.items() if p is not None))
+    write_poses(batch.poses, ((r.name, r.pose) for r in ordered if r.pose is not None))
+    if batch.mode.fills or filled:
+        write_poses(batch.poses_filled, ((name, estimate_of(p)) for name, p in filled.items()))
+    else:
+        batch.poses_filled.unlink(missing_ok=True)
     statuses = ("filled" if r.name in filled else r.status for r in ordered)
     return Counter(statuses) + Counter(pose.source.value for pose in filled.values())
+
+
+def _known(result: StoredResult, mode: Mode) -> TracedPose | None:
+    if result.pose is not None:
+        return measured(result.pose, result.num_inliers)
+    # What the other modes have filled is filled anew, but in gp3p it came with the answer.
+    return result.filled if mode is Mode.GP3P else None
 
 
 def _check_same_run(path: Path, described: dict[str, Any]) -> None:

@@ -31,7 +31,7 @@ from clients.queries import read_queries
 from clients.results import check_can_be_written, write_poses, write_whole
 from clients.running import InstantOutcome, Outcome
 from clients.sending import choose_reader
-from clients.traced import estimate_of, measured
+from clients.traced import measured
 from clients.types import LocalizeOptions, PoseEstimate
 from visloc.errors import VislocError
 from visloc.evaluation import DEFAULT_THRESHOLDS
@@ -99,7 +99,8 @@ Origin = Annotated[
 _MODES = (
     "single: each photo on its own. rig: a photo without a pose gets that of the best camera of "
     "its rig and instant. seq: ... that between the instants before and after, or of the nearest. "
-    "rig+seq: both. gp3p: the photos of a rig and instant solve one pose."
+    "rig+seq: both. gp3p: the photos of a rig and instant solve one pose, which also fills the "
+    "photos that did not contribute to it."
 )
 MaxGap = Annotated[
     float,
@@ -184,7 +185,7 @@ def image(
 def localize_batch(
     source: Source,
     map_ref: MapRef,
-    output: Annotated[Path, typer.Option(help="Folder for poses.txt and results.jsonl.")],
+    output: Annotated[Path, typer.Option(help="Folder for results.jsonl and poses.")],
     server: Server = DEFAULT_SERVER,
     option: Options = None,
     seed: Seed = None,
@@ -205,8 +206,10 @@ def localize_batch(
     Writes results.jsonl, one answer per line, and at the end poses.txt with lines
     'name qw qx qy qz tx ty tz' (cam_from_world) of the localized photos. The same command takes
     up a stopped run where it was. A photo that cannot be answered is recorded and passed over;
-    where that was the server's fault, the same command asks again. The modes rig, seq and rig+seq
-    fill photos without a pose at the end: their status is filled, and source says from what.
+    where that was the server's fault, the same command asks again.
+
+    All modes but single fill photos without a pose of their own: their status is filled, source
+    says from what, and their poses are in poses_filled.txt. poses.txt has measured poses only.
 
     Exits with 0 when every photo has its line, 1 on an error, 130 when stopped.
     """
@@ -254,7 +257,7 @@ def localize_batch(
     run_with_progress(_err, run, what, total, "the same command takes the run up where it was")
     counts = finish_batch(batch, arrangement)
     print_failed(_err, failed)
-    print_batch(_out, counts, len(photos), mode.fills)
+    print_batch(_out, counts, len(photos), mode is not Mode.SINGLE)
 
 
 @app.command()
@@ -288,7 +291,11 @@ def benchmark(
     ] = None,
     poses: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write poses as localize batch does, of the first mode."),
+        typer.Option(
+            metavar="FILE",
+            help="Write the measured poses of the first mode, as localize batch does in "
+            "poses.txt; filled ones are in no file.",
+        ),
     ] = None,
     timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
 ) -> None:
@@ -314,11 +321,11 @@ def benchmark(
     of_instants = ask.instants(arrangement) if Mode.GP3P in modes else None
     runs = {m: of_instants if m is Mode.GP3P else of_photos for m in modes}
     figures_of = {m: run for m, run in runs.items() if run is not None}
-    poses_of = {m: arrangement.fill(m, _measured(run)) for m, run in figures_of.items()}
+    poses_of = {m: arrangement.fill(m, _known(run)) for m, run in figures_of.items()}
     figures = make_report(figures_of, poses_of, thresholds, about, info)
     write_whole(report, [json.dumps(figures, indent=2, allow_nan=False).encode() + b"\n"])
     if poses is not None:
-        write_poses(poses, _estimates(figures_of[modes[0]], poses_of[modes[0]]))
+        write_poses(poses, _measured_poses(figures_of[modes[0]]))
     asked = [run for run in (of_photos, of_instants) if run is not None]
     # A photo that fails on its own mostly fails in its rig as well: told once.
     outcomes = (outcome for run in asked for outcome in run.outcomes)
@@ -328,18 +335,20 @@ def benchmark(
     print_failed(_err, list(failed.values()))
 
 
-def _measured(run: Run) -> list[TracedPose | None]:
-    results = [outcome.result for outcome in run.outcomes]
-    return [None if r is None or r.pose is None else measured(r.pose, r.inliers) for r in results]
+def _known(run: Run) -> list[TracedPose | None]:
+    """Return what the answers themselves tell: measured poses, and those filled from a rig's."""
+    return [
+        o.filled
+        if o.result is None or o.result.pose is None
+        else measured(o.result.pose, o.result.inliers)
+        for o in run.outcomes
+    ]
 
 
-def _estimates(run: Run, poses: Sequence[TracedPose | None]) -> Iterator[tuple[str, PoseEstimate]]:
-    """Give the poses of the photos that have one; measured ones with every digit as received."""
-    for outcome, pose in zip(run.outcomes, poses, strict=True):
+def _measured_poses(run: Run) -> Iterator[tuple[str, PoseEstimate]]:
+    for outcome in run.outcomes:
         if outcome.result is not None and outcome.result.pose is not None:
             yield outcome.query.name, outcome.result.pose
-        elif pose is not None:
-            yield outcome.query.name, estimate_of(pose)
 
 
 def _arranged(mode: Mode, arrangement: Arrangement, rig_id: str | None) -> dict[str, object]:

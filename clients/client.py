@@ -38,6 +38,7 @@ from clients.rig_requests import (
     AnyRequest,
     SentInstant,
     SequenceStart,
+    check_time_unit,
     rig_request,
     sent_instant,
     sequence_start,
@@ -150,15 +151,23 @@ class Client:
     ) -> Iterator[InstantResult]:
         """Estimate the poses of a sequence, each answered as soon as its answer is final.
 
-        Over gRPC, instants are taken from ``instants`` as the server asks for them, in another
-        thread; over HTTP all of them go into one request. What ``instants`` raises is raised here.
+        Over gRPC, the first instant is taken from ``instants`` before anything is sent, and the
+        others as the server asks for them, in another thread. Over HTTP all instants are read
+        before anything is sent: they go into one request. What ``instants`` raises is raised
+        here, over gRPC after the answers to the instants before.
+
+        With odometry an instant is answered when instants ``max_gap_s`` later, or 30 instants,
+        have come, also when its own photos localize it: its neighbours may contradict it. Whoever
+        waits for every answer before sending the next instant must use ``max_gap_s`` 0 or no
+        odometry.
 
         Args:
             instants: in the order of time.
             map: ``id`` or ``id@version``; of several, that of the first pose is kept.
             rig: how the cameras sit, or the id of a rig that the map knows; None when every
                 instant is one photo of one camera.
-            time_unit: of the timestamps, s, ms, us or ns; None tells it by their size.
+            time_unit: of the timestamps, s, ms, us or ns; None tells it by their size, which must
+                be that of Unix times.
             max_gap_s: longest time between measured instants across which poses are filled; None
                 leaves it to the server, 0 fills none.
             options: choices for all instants.
@@ -194,7 +203,7 @@ class Client:
         self._transport.close()
 
     def _stream(self, start: SequenceStart, instants: Iterable[Instant]) -> Iterator[InstantResult]:
-        count = _Count(self.server)
+        count = _Count(self.server, start.time_unit)
         for raw in self._transport.stream(start, map(count.sent, instants)):
             count.answers += 1
             yield answers.parse_answer(self.server, answers.parse_instant, raw)
@@ -295,7 +304,7 @@ class AsyncClient:
     async def _stream(
         self, start: SequenceStart, instants: AsyncIterable[Instant] | Iterable[Instant]
     ) -> AsyncIterator[InstantResult]:
-        count = _Count(self.server)
+        count = _Count(self.server, start.time_unit)
 
         async def sent() -> AsyncIterator[SentInstant]:
             if isinstance(instants, AsyncIterable):
@@ -324,16 +333,19 @@ class AsyncClient:
 
 
 class _Count:
-    """Holds a server to one answer per instant."""
+    """Checks the instants one after the other, and holds a server to one answer for each."""
 
-    def __init__(self, server: str) -> None:
-        self._server = server
+    def __init__(self, server: str, time_unit: str | None) -> None:
+        self._server, self._time_unit = server, time_unit
         self._instants = 0
         self.answers = 0
 
     def sent(self, instant: Instant) -> SentInstant:
+        sent = sent_instant(instant, self._instants)
+        if self._instants == 0:
+            check_time_unit(self._time_unit, sent.timestamp)
         self._instants += 1
-        return sent_instant(instant)
+        return sent
 
     def check(self) -> None:
         if self.answers != self._instants:

@@ -36,20 +36,24 @@ def stream_answers(
 ) -> Iterator[JsonObject]:
     """Give the answers of a sequence as plain JSON.
 
-    What ``instants`` raises is raised after the answers to the instants before.
+    What ``instants`` raises is raised after the answers to the instants before, whatever the
+    server says of a sequence that ends there.
 
     Args:
         make_call: of LocalizeSequence.
         server: for errors.
         timeout_s: longest time without an answer, while the server has an instant to work on.
         start: what is sent first.
-        instants: taken in another thread, as the server takes them.
+        instants: the first is taken before anything is sent, the others in another thread, as the
+            server takes them.
 
     Raises:
         VislocError: what the server refused, or ``server.*``.
     """
+    waiting = iter(instants)
+    head = _head(start, next(waiting, None))
     feed = _Feed()
-    call: Any = make_call(feed.messages(start, instants))  # the stubs do not know all of it
+    call: Any = make_call(feed.messages(head, waiting))  # the stubs do not know all of it
     has_timed_out = threading.Event()
 
     def give_up() -> None:
@@ -64,9 +68,10 @@ def stream_answers(
                 break
             yield _read(server, answer)
     except grpc.RpcError as error:
-        if has_timed_out.is_set():
-            raise errors.timed_out(server, timeout_s) from error
-        raise grpc_failure(server, timeout_s, error) from error
+        if feed.failure is None:
+            if has_timed_out.is_set():
+                raise errors.timed_out(server, timeout_s) from error
+            raise grpc_failure(server, timeout_s, error) from error
     finally:
         call.cancel()
     if feed.failure is not None:
@@ -81,9 +86,11 @@ async def stream_answers_async(
     instants: AsyncIterable[SentInstant],
 ) -> AsyncGenerator[JsonObject, None]:
     """As ``stream_answers``, in an event loop."""
+    waiting = aiter(instants)
+    head = _head(start, await anext(waiting, None))
     feed = _Feed()
     call: Any = make_call()
-    feeding = asyncio.create_task(feed.write(call, start, instants))
+    feeding = asyncio.create_task(feed.write(call, head, waiting))
     try:
         while True:
             answer = await _read_patiently(call, feed, server, timeout_s)
@@ -91,7 +98,8 @@ async def stream_answers_async(
                 break
             yield _read(server, answer)
     except grpc.aio.AioRpcError as error:
-        raise grpc_failure(server, timeout_s, error) from error
+        if feed.failure is None:
+            raise grpc_failure(server, timeout_s, error) from error
     finally:
         call.cancel()
         feeding.cancel()
@@ -113,9 +121,9 @@ class _Feed:
         self.waits_since: float | None = time.monotonic()
         self.failure: Exception | None = None
 
-    def messages(self, start: SequenceStart, instants: Iterable[SentInstant]) -> Iterator[bytes]:
+    def messages(self, head: Iterable[bytes], instants: Iterable[SentInstant]) -> Iterator[bytes]:
         """Give the messages of a call, in the thread that gRPC takes them in."""
-        yield start_message(start).SerializeToString()
+        yield from head
         self.waits_since = None
         try:
             for instant in instants:
@@ -127,11 +135,12 @@ class _Feed:
         self.waits_since = time.monotonic()
 
     async def write(
-        self, call: Any, start: SequenceStart, instants: AsyncIterable[SentInstant]
+        self, call: Any, head: Iterable[bytes], instants: AsyncIterable[SentInstant]
     ) -> None:
         """Write the messages of a call."""
         try:
-            await call.write(start_message(start).SerializeToString())
+            for message in head:
+                await call.write(message)
             async for message in self._messages_async(instants):
                 await call.write(message)
             await call.done_writing()
@@ -154,6 +163,14 @@ class _Feed:
         if self.waits_since is None:
             return timeout_s
         return max(self.waits_since, asked_at) + timeout_s - time.monotonic()
+
+
+def _head(start: SequenceStart, first: SentInstant | None) -> list[bytes]:
+    """Return the messages that are known before a call is made."""
+    messages = [start_message(start)]
+    if first is not None:
+        messages.append(instant_message(first))
+    return [message.SerializeToString() for message in messages]
 
 
 @contextmanager
@@ -187,7 +204,7 @@ async def _read_patiently(call: Any, feed: _Feed, server: str, timeout_s: float)
                 return reading.result()
     finally:
         reading.cancel()
-    raise errors.timed_out(server, timeout_s)
+    raise feed.failure or errors.timed_out(server, timeout_s)
 
 
 def _read(server: str, answer: bytes) -> JsonObject:

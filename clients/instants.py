@@ -26,10 +26,14 @@ class QueryInstant:
     photos: tuple[Query, ...]
 
 
-def instants_of_dataset(queries: QuerySet) -> list[QueryInstant]:
+def instants_of_dataset(queries: QuerySet, *, or_else: str = "") -> list[QueryInstant]:
     """Put photos of one rig and one timestamp together, in the order of their first ones.
 
     The rig of a camera is the outermost one that carries it.
+
+    Args:
+        queries: the photos and the rigs.
+        or_else: what would do instead of rigs, for errors.
 
     Raises:
         DatasetError: ``queries.no_rigs`` when no photo was taken by a rig;
@@ -57,7 +61,7 @@ def instants_of_dataset(queries: QuerySet) -> list[QueryInstant]:
             )
         sensors.setdefault(rig_id, {})[sensor_id] = RigSensor(cam_from_rig)
     if not sensors:
-        raise _no_rigs(queries, "a kapture folder with sensors/rigs.txt")
+        raise _no_rigs(queries, f"a kapture folder with sensors/rigs.txt{or_else}")
     return _grouped(queries.photos, rig_of, sensors)
 
 

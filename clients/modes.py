@@ -25,7 +25,7 @@ class Mode(StrEnum):
     RIG = "rig"  # ... then from the best camera of the same rig and instant
     SEQ = "seq"  # ... or from the instants before and after
     RIG_SEQ = "rig+seq"  # ... or from both, in this order
-    GP3P = "gp3p"  # the photos of a rig and instant solve one pose
+    GP3P = "gp3p"  # the photos of a rig and instant solve one pose, which fills those it ignores
 
     @property
     def fills_rigs(self) -> bool:
@@ -39,7 +39,7 @@ class Mode(StrEnum):
 
     @property
     def fills(self) -> bool:
-        """Whether there are poses that were not measured."""
+        """Whether poses are filled from the answers; in gp3p the answers themselves fill."""
         return self.fills_rigs or self.fills_sequences
 
 
@@ -130,7 +130,9 @@ def arrange(
         filled = instants_of_dataset(queries)
     if Mode.GP3P in modes:
         asked = (
-            instants_of_dataset(queries)
+            instants_of_dataset(
+                queries, or_else=", or one of cameras of a rig that the map knows, with --rig ID"
+            )
             if rig_id is None
             else instants_of_map_rig(queries, info, rig_id)
         )

@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose
-from visloc.priors import GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
+from visloc.priors import (
+    GravityPrior,
+    HeightBand,
+    PosePrior,
+    PositionPrior,
+    Priors,
+    check_covariance,
+)
 
 _DEFAULT_GRAVITY_STD_DEG = 1.0  # the server's
 _MAX_LENGTH_ERROR = 1e-3  # of a unit quaternion
@@ -104,6 +111,29 @@ def priors_from_json(raw: object) -> Priors:
     )
 
 
+def checked_covariance(given: object, field: str) -> NDArray[np.float64]:
+    """Return the covariance (6, 6) of a pose.
+
+    Raises:
+        InvalidInput: ``pose.covariance``, with the shape that came where that is wrong.
+    """
+    try:
+        covariance = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        covariance, got = np.empty(0), given
+    else:
+        got = covariance.tolist()
+        if covariance.shape != (6, 6):
+            got = f"{covariance.size} numbers, of shape {covariance.shape}"
+    try:
+        check_covariance(covariance, field)
+    except InvalidInput as error:
+        raise InvalidInput(
+            error.code, error.message, field=error.field, expected=error.expected, got=got
+        ) from None
+    return covariance
+
+
 def _pose_prior(raw: Mapping[str, Any]) -> PosePrior:
     where = "pose.device_from_world"
     transform = _given(
@@ -119,8 +149,9 @@ def _pose_prior(raw: Mapping[str, Any]) -> PosePrior:
             got=rotation_wxyz.tolist(),
         )
     pose = Pose.from_quaternion(rotation_wxyz, _numbers(f"{where}.translation", transform))
-    covariance = _numbers("pose.covariance", raw)
-    return PosePrior(pose, covariance.reshape(6, 6) if covariance.size == 36 else covariance)
+    numbers = _numbers("pose.covariance", raw)
+    covariance = numbers.reshape(6, 6) if numbers.size == 36 else numbers
+    return PosePrior(pose, checked_covariance(covariance, "priors.pose.covariance"))
 
 
 def _gravity_prior(raw: Mapping[str, Any]) -> GravityPrior:

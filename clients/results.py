@@ -1,4 +1,4 @@
-"""Results on disk: ``results.jsonl``, ``poses.txt``, and files that are written whole or not."""
+"""Results on disk: ``results.jsonl``, poses, and files that are written whole or not."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class StoredResult:
         status: localized, not_localized or error; of a filled one, what it was before.
         pose: when localized.
         num_inliers: of the pose.
-        was_filled: whether the line has a pose from other photos.
+        filled: the pose from other photos that the line has.
         is_final: whether asking again is pointless; False for errors of the server.
         offset: where the line begins in the file, bytes.
         length: of the line with its end, bytes.
@@ -41,7 +41,7 @@ class StoredResult:
     status: str
     pose: PoseEstimate | None
     num_inliers: int
-    was_filled: bool
+    filled: TracedPose | None
     is_final: bool
     offset: int
     length: int
@@ -50,9 +50,9 @@ class StoredResult:
 def result_line(outcome: Outcome) -> str:
     """Write an outcome as one line of JSON: the name, then the answer as received.
 
-    ``source`` tells what the pose rests on, null without one; here nothing is filled yet.
-    A photo without an answer has ``"status": "error"`` and an object ``error`` with kind, code,
-    message, field, expected and got.
+    ``source`` tells what the pose rests on, null without one. A photo without an answer has
+    ``"status": "error"`` and an object ``error`` with kind, code, message, field, expected and
+    got. One that is filled has status filled, a ``pose``, and the rest as without it.
     """
     entry: dict[str, Any] = {"name": outcome.query.name}
     if outcome.result is not None:
@@ -66,6 +66,8 @@ def result_line(outcome: Outcome) -> str:
         }
         entry |= {"status": _ERROR, "error": {"kind": type(error).__name__} | details}
         entry["source"] = None
+    if outcome.filled is not None:
+        _fill(entry, outcome.filled)
     return json.dumps(entry) + "\n"
 
 
@@ -124,7 +126,8 @@ def copy_lines(
         source: what ``results`` were read from.
         results: the lines.
         target: written whole.
-        filled: poses from other photos, by the photo's name; other lines lose theirs.
+        filled: poses from other photos, by the photo's name; other lines lose theirs, and lines
+            that have it already stay as they are.
     """
     filled = filled or {}
     with source.open("rb") as file:
@@ -134,7 +137,7 @@ def copy_lines(
                 file.seek(result.offset)
                 line = file.read(result.length)
                 pose = filled.get(result.name)
-                yield line if pose is None and not result.was_filled else _refilled(line, pose)
+                yield line if pose is result.filled else _refilled(line, pose)
 
         write_whole(target, lines())
 
@@ -171,12 +174,15 @@ def check_can_be_written(paths: Sequence[Path]) -> None:
             )
 
 
-def _parse_line(line: bytes) -> tuple[str, str, PoseEstimate | None, int, bool, bool]:
+def _parse_line(
+    line: bytes,
+) -> tuple[str, str, PoseEstimate | None, int, TracedPose | None, bool]:
     entry = json.loads(line)
     name, status = entry["name"], entry["status"]
-    was_filled = status == _FILLED
-    if was_filled:
-        status = _before_filling(entry)
+    filled = None
+    if status == _FILLED:
+        status, other = _before_filling(entry), parse_pose(entry["pose"])
+        filled = TracedPose(other.cam_from_world, other.covariance, PoseSource(entry["source"]))
     if not isinstance(name, str) or status not in (_LOCALIZED, _NOT_LOCALIZED, _ERROR):
         raise ValueError(f"name {name!r}, status {status!r}")
     pose, num_inliers = None, 0
@@ -185,7 +191,7 @@ def _parse_line(line: bytes) -> tuple[str, str, PoseEstimate | None, int, bool, 
     is_final = status != _ERROR or not (
         entry["error"]["code"] in _PASSING_CODES or entry["error"]["kind"] in _PASSING_KINDS
     )
-    return name, status, pose, num_inliers, was_filled, is_final
+    return name, status, pose, num_inliers, filled, is_final
 
 
 def _before_filling(entry: Mapping[str, Any]) -> str:
@@ -201,9 +207,13 @@ def _refilled(line: bytes, pose: TracedPose | None) -> bytes:
     else:
         entry["pose"] = None
     if pose is not None:
-        entry["status"], entry["source"] = _FILLED, pose.source.value
-        entry["pose"] = pose_as_json(pose)
+        _fill(entry, pose)
     return json.dumps(entry).encode() + b"\n"
+
+
+def _fill(entry: dict[str, Any], pose: TracedPose) -> None:
+    entry["status"], entry["source"] = _FILLED, pose.source.value
+    entry["pose"] = pose_as_json(pose)
 
 
 def _pose_line(name: str, pose: PoseEstimate) -> str:

@@ -11,16 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clients.features import Features
-from clients.priors import priors_as_json, transform_as_json
+from clients.priors import checked_covariance, priors_as_json, transform_as_json
 from clients.requests import Request, Search, read_query
-from clients.rigs import Instant, Odometry, Rig, RigImage
+from clients.rigs import Instant, Odometry, Rig, RigImage, RigSensor
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
-from visloc.priors import Priors, check_covariance
-from visloc.trajectory import TimeUnit
+from visloc.priors import Priors
+from visloc.trajectory import TimeUnit, guess_time_unit
 
 _MAX_SCALE_ERROR = 1e-3  # of a rotation, as the server has it
 _MAX_TIMESTAMP = 2**63
+_A_RIG = "the id of a rig that the map knows, or its cameras as RigSensor by name"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,11 +70,16 @@ def rig_request(search: Search, rig: Rig, images: Iterable[RigImage]) -> Localiz
     """Check and complete what ``localize_rig`` was called with; paths are read here.
 
     Raises:
-        InvalidInput: ``rig.rotation``, ``rig.timestamps``, ``pose.translation`` or
+        InvalidInput: ``request.missing_field`` or ``request.invalid`` for what is no rig or are
+            no photos, ``rig.rotation``, ``rig.timestamps``, ``pose.translation`` or
             ``image.unreadable``.
     """
+    if rig is None:  # from callers without a type checker
+        raise InvalidInput(
+            "request.missing_field", "this field is needed", field="rig", expected=_A_RIG
+        )
     _check_rig(rig)
-    return LocalizeRig(search, rig, tuple(map(_sent_image, images)))
+    return LocalizeRig(search, rig, _sent_images(images))
 
 
 def sequence_start(
@@ -82,8 +88,8 @@ def sequence_start(
     """Check what ``localize_sequence`` was called with.
 
     Raises:
-        InvalidInput: ``rig.rotation``, ``pose.translation``, ``sequence.time_unit`` or
-            ``sequence.max_gap``.
+        InvalidInput: ``request.invalid`` for what is no rig, ``rig.rotation``,
+            ``pose.translation``, ``sequence.time_unit`` or ``sequence.max_gap``.
     """
     if rig is not None:
         _check_rig(rig)
@@ -107,21 +113,43 @@ def sequence_start(
     return SequenceStart(search, rig, time_unit, max_gap_s)
 
 
-def sent_instant(instant: Instant) -> SentInstant:
-    """Check an instant and read its photos.
+def sent_instant(instant: Instant, index: int) -> SentInstant:
+    """Check an instant of a sequence and read its photos.
+
+    Args:
+        instant: to send.
+        index: of it in the sequence, for errors.
 
     Raises:
         InvalidInput: ``sequence.timestamps``, ``pose.rotation``, ``pose.translation``,
-            ``pose.covariance`` or ``image.unreadable``.
+            ``pose.covariance``, ``request.invalid`` for what are no photos, or
+            ``image.unreadable``.
     """
-    _check_timestamp(instant.timestamp, "sequence.timestamps")
+    where = f"instants[{index}]"
+    _check_timestamp(instant.timestamp, "sequence.timestamps", f"{where}.timestamp")
     odometry = instant.odometry
     if odometry is not None:
-        _check_rigid(odometry.rig_from_odometry, "odometry.rig_from_odometry", "pose.rotation")
+        field = f"{where}.odometry"
+        _check_rigid(odometry.rig_from_odometry, f"{field}.rig_from_odometry", "pose.rotation")
         if odometry.covariance is not None:
-            check_covariance(np.asarray(odometry.covariance), "odometry.covariance")
-    images = tuple(map(_sent_image, instant.images))
+            checked_covariance(odometry.covariance, f"{field}.covariance")
+    images = _sent_images(instant.images, f"{where}.")
     return SentInstant(instant.timestamp, images, odometry, instant.priors)
+
+
+def check_time_unit(time_unit: str | None, first_timestamp: int) -> None:
+    """Refuse a sequence whose unit of time is neither said nor told by its first timestamp.
+
+    Raises:
+        InvalidInput: ``sequence.time_unit``, as the server raises it.
+    """
+    if time_unit is None and guess_time_unit([first_timestamp]) is None:
+        raise InvalidInput(
+            "sequence.time_unit",
+            "the unit of the timestamps cannot be told by their size",
+            field="time_unit",
+            expected=f"one of {', '.join(TimeUnit)}",
+        )
 
 
 def search_as_json(search: Search) -> dict[str, Any]:
@@ -167,13 +195,22 @@ def odometry_as_json(odometry: Odometry) -> dict[str, Any]:
     return given
 
 
-def _sent_image(image: RigImage) -> SentImage:
+def _sent_images(images: Iterable[RigImage], where: str = "") -> tuple[SentImage, ...]:
+    field = f"{where}images"
+    if isinstance(images, Mapping) or not isinstance(images, Iterable):
+        raise _unusable(field, "a list of RigImage", images)
+    return tuple(_sent_image(image, f"{field}[{i}]") for i, image in enumerate(images))
+
+
+def _sent_image(image: RigImage, field: str) -> SentImage:
+    if not isinstance(image, RigImage):
+        raise _unusable(field, "a RigImage", image)
     if image.timestamp is not None:
-        _check_timestamp(image.timestamp, "rig.timestamps")
+        _check_timestamp(image.timestamp, "rig.timestamps", f"{field}.timestamp")
     return SentImage(image.sensor, read_query(image.query), image.camera, image.timestamp)
 
 
-def _check_timestamp(timestamp: int, code: str) -> None:
+def _check_timestamp(timestamp: int, code: str, field: str) -> None:
     if isinstance(timestamp, bool) or not isinstance(timestamp, int):
         whole = False
     else:
@@ -182,16 +219,32 @@ def _check_timestamp(timestamp: int, code: str) -> None:
         raise InvalidInput(
             code,
             "not a timestamp",
-            field="timestamp",
+            field=field,
             expected="a whole number of 64 bits",
             got=timestamp,
         )
 
 
 def _check_rig(rig: Rig) -> None:
-    if isinstance(rig, Mapping):
-        for name, sensor in rig.items():
-            _check_rigid(sensor.cam_from_rig, f"rig.sensors.{name}.cam_from_rig", "rig.rotation")
+    if isinstance(rig, str):
+        return
+    if not isinstance(rig, Mapping):
+        raise _unusable("rig", _A_RIG, rig)
+    for name, sensor in rig.items():
+        field = f"rig.sensors.{name}"
+        if not isinstance(sensor, RigSensor):
+            raise _unusable(field, "a RigSensor", sensor)
+        _check_rigid(sensor.cam_from_rig, f"{field}.cam_from_rig", "rig.rotation")
+
+
+def _unusable(field: str, expected: str, got: object) -> InvalidInput:
+    return InvalidInput(
+        "request.invalid",  # as the server says it
+        "cannot be used",
+        field=field,
+        expected=expected,
+        got=type(got).__name__,
+    )
 
 
 def _check_rigid(pose: Pose, field: str, code: str) -> None:

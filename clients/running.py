@@ -15,9 +15,10 @@ from clients.features import Features
 from clients.instants import QueryInstant
 from clients.queries import Query
 from clients.rigs import InstantResult, RigImage
-from clients.traced import photo_result
+from clients.traced import photo_result, poses_from_rig
 from clients.types import LocalizeOptions, LocalizeResult
 from visloc.errors import InvalidInput, Overloaded, VislocError, WeightsError
+from visloc.trajectory import TracedPose
 
 _T = TypeVar("_T")
 
@@ -39,12 +40,14 @@ class Outcome:
         error: why there is no answer.
         seconds: from sending to the parsed answer, as the caller sees it, including waits for an
             overloaded server.
+        filled: the pose that the other cameras of its rig give a photo without one of its own.
     """
 
     query: Query
     result: LocalizeResult | None
     error: VislocError | None
     seconds: float
+    filled: TracedPose | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,7 +115,8 @@ async def localize_instants(
 ) -> None:
     """Localize instants as ``localize_all`` does photos.
 
-    Of an instant, photos that cannot be read fail alone, and the others are asked about.
+    Of an instant, photos that cannot be read fail alone, and the others are asked about. Those
+    that contributed nothing to the pose of their rig, by an error or without one, are filled.
 
     Raises:
         VislocError: what makes going on pointless, such as a server that is gone.
@@ -141,10 +145,15 @@ async def localize_instants(
             errors |= dict.fromkeys(images, error)
         seconds = time.perf_counter() - started
         results: dict[str, LocalizeResult] = {}
+        filled: dict[str, TracedPose] = {}
         if result is not None:
             _take_answer(client.server, result, images, results, errors)
+            filled = parse_answer(client.server, poses_from_rig, result, instant.rig)
         photos = tuple(
-            Outcome(query, results.get(query.name), errors.get(query.name), seconds)
+            Outcome(
+                *(query, results.get(query.name), errors.get(query.name), seconds),
+                filled.get(query.sensor),
+            )
             for query in instant.photos
         )
         localized = result is not None and result.localized

@@ -6,9 +6,10 @@ import numpy as np
 
 from clients.answers import parse_pose, parse_result
 from clients.requests import JsonObject
-from clients.rigs import InstantResult
+from clients.rigs import ImageResult, InstantResult, Rig
 from clients.types import LocalizeResult, PoseEstimate
-from visloc.trajectory import PoseSource, TracedPose, center_covariance
+from visloc.geometry import Pose
+from visloc.trajectory import PoseSource, TracedPose, center_covariance, fill_rig
 
 
 def measured(pose: PoseEstimate, num_inliers: int) -> TracedPose:
@@ -42,31 +43,30 @@ def estimate_of(traced: TracedPose) -> PoseEstimate:
 def photo_result(result: InstantResult, index: int) -> LocalizeResult:
     """Return what the answer to an instant says of one of its photos, which could be used.
 
-    The pose is the rig's, seen from the camera; correspondences, inliers and what was retrieved
-    are the photo's own; the seconds are those of the whole instant.
+    The pose is the rig's, seen from the camera, and none when the photo has no inlier of it: it
+    then rests on the other cameras. Correspondences, inliers and what was retrieved are the
+    photo's own; the seconds are those of the whole instant.
 
     Raises:
         KeyError, TypeError, ValueError, InvalidInput: for answers that contradict themselves.
     """
     image, raw = result.images[index], result.raw["images"][index]
-    pose = None
-    if result.localized:
-        assert result.pose is not None
-        if image.cam_from_world is None:
-            raise ValueError("a photo without a pose in an instant with one")
-        # (w, dt) of the rig arrive at the camera turned: R = R_c R_rig, t = R_c t_rig + t_c.
-        turn = np.zeros((6, 6))
-        cam_from_rig = image.cam_from_world.rotation @ result.pose.rig_from_world.rotation.T
-        turn[:3, :3] = turn[3:, 3:] = cam_from_rig
-        covariance = turn @ result.pose.covariance @ turn.T
-        traced = TracedPose(image.cam_from_world, covariance, PoseSource.ESTIMATED, image.inliers)
+    pose, status, refusal = None, result.status, result.raw["refusal"]
+    if (traced := _measured_by(result, image)) is not None:
         pose = pose_as_json(traced) | {"cam_from_world": raw["cam_from_world"]}
+    elif result.localized:
+        status = "not_localized"
+        refusal = {
+            "stage": "pose",
+            "reason": "no_inliers",
+            "message": "no match of this photo agrees with the pose of its rig",
+        }
     return parse_result(
         {
             "request_id": result.request_id,
-            "status": result.status,
+            "status": status,
             "pose": pose,
-            "refusal": result.raw["refusal"],
+            "refusal": refusal,
             "keypoints": image.keypoints,
             "correspondences": image.correspondences,
             "inliers": image.inliers,
@@ -78,3 +78,52 @@ def photo_result(result: InstantResult, index: int) -> LocalizeResult:
             "seconds": result.raw["seconds"],
         }
     )
+
+
+def poses_from_rig(result: InstantResult, rig: Rig) -> dict[str, TracedPose]:
+    """Return the poses, by sensor, of cameras whose photos contributed nothing to their rig's.
+
+    They rest on the other cameras: of source RIG, and as wide as ``fill_rig`` makes them.
+
+    Args:
+        result: the answer to an instant.
+        rig: whose it is. Of one that the map knows, only the answer tells where the cameras sit.
+
+    Raises:
+        ValueError: for a pose that rests on no photo at all.
+    """
+    if not result.localized:
+        return {}
+    assert result.pose is not None
+    world_from_rig = result.pose.rig_from_world.inverse()
+    cam_from_rig: dict[str, Pose] = {
+        image.sensor: image.cam_from_world @ world_from_rig
+        for image in result.images
+        if image.cam_from_world is not None
+    }
+    if not isinstance(rig, str):
+        cam_from_rig = {name: sensor.cam_from_rig for name, sensor in rig.items()}
+    measured_by = {image.sensor: _measured_by(result, image) for image in result.images}
+    if not any(measured_by.values()):
+        raise ValueError("a pose with no inlier in any photo")
+    poses = fill_rig(dict.fromkeys(cam_from_rig) | measured_by, cam_from_rig)
+    return {
+        sensor: pose
+        for sensor, pose in poses.items()
+        if pose is not None and pose.source is PoseSource.RIG
+    }
+
+
+def _measured_by(result: InstantResult, image: ImageResult) -> TracedPose | None:
+    """Return the pose of a camera whose photo contributed to that of its rig."""
+    if not result.localized or image.error is not None or image.inliers == 0:
+        return None
+    assert result.pose is not None
+    if image.cam_from_world is None:
+        raise ValueError("a photo without a pose in an instant with one")
+    # (w, dt) of the rig arrive at the camera turned: R = R_c R_rig, t = R_c t_rig + t_c.
+    turn = np.zeros((6, 6))
+    cam_from_rig = image.cam_from_world.rotation @ result.pose.rig_from_world.rotation.T
+    turn[:3, :3] = turn[3:, 3:] = cam_from_rig
+    covariance = turn @ result.pose.covariance @ turn.T
+    return TracedPose(image.cam_from_world, covariance, PoseSource.ESTIMATED, image.inliers)

@@ -27,7 +27,7 @@ from service.grpc_requests import (
     rig_job_of,
     sequence_start_of,
 )
-from service.jobs import Instant
+from service.jobs import Instant, SequenceStart
 from service.schemas import (
     BatchLimits,
     InstantAnswer,
@@ -100,17 +100,18 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
         async with _envelope("LocalizeSequence", id_, context):
             with self._engine.admit_batch():
                 start = await asyncio.to_thread(sequence_start_of, first)
-                instants = self._instants(request_iterator, has_rig=start.rig is not None)
-                answers = self._engine.localize_sequence(start, instants)
-                async with aclosing(answers):
+                async with (
+                    aclosing(self._instants(request_iterator, start)) as instants,
+                    aclosing(self._engine.localize_sequence(start, instants)) as answers,
+                ):
                     async for found in answers:
                         answer = InstantAnswer.from_localization(found, id_)
                         await context.write(_message(answer, pb2.InstantAnswer()))
 
     async def _instants(
-        self, messages: AsyncIterator[pb2.LocalizeSequenceRequest], *, has_rig: bool
+        self, messages: AsyncIterator[pb2.LocalizeSequenceRequest], start: SequenceStart
     ) -> AsyncGenerator[Instant]:
-        number = 0
+        number, has_rig = 0, start.rig is not None
         async for message in messages:
             yield await asyncio.to_thread(
                 instant_of, message, self._limits, number, has_rig=has_rig

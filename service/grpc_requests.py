@@ -22,6 +22,14 @@ from visloc_api.v1 import localization_pb2 as pb2
 
 # A rig has one name in JSON.
 _RIG_NAMES = {"rig_id": "rig", "calibration": "rig"}
+# Lists that may be left out: protobuf cannot tell that from an empty one.
+_OPTIONAL_LISTS = {
+    "visloc.v1.LocalizeRequest.maps",
+    "visloc.v1.LocalizeRigRequest.maps",
+    "visloc.v1.SequenceStart.maps",
+    "visloc.v1.GravityPrior.world",
+    "visloc.v1.Odometry.covariance",
+}
 
 
 def localize_job_of(request: pb2.LocalizeRequest, max_bytes: int) -> LocalizeJob:
@@ -101,17 +109,24 @@ def _wrong_message(name: str, expected: str, got: str | None) -> InvalidInput:
 def _plain(message: Message) -> dict[str, Any]:
     """Return a message's fields as JSON would have them; fields that are not there are left out.
 
-    Numbers and texts without presence are there when they are zero or empty.
+    Numbers, texts and lists without presence are there when they are zero or empty.
     """
     plain = {
         _RIG_NAMES.get(field.name, field.name): _plain_value(getattr(message, field.name))
         for field in message.DESCRIPTOR.fields
-        if not field.has_presence or message.HasField(field.name)
+        if _is_there(message, field.name)
     }
     plain.pop("request_id", None)  # of the envelope
-    if plain.get("maps") and not plain.get("map"):
+    if "maps" in plain and not plain["map"]:
         del plain["map"]
     return plain
+
+
+def _is_there(message: Message, name: str) -> bool:
+    field = message.DESCRIPTOR.fields_by_name[name]
+    if field.full_name in _OPTIONAL_LISTS:
+        return len(getattr(message, name)) > 0
+    return not field.has_presence or message.HasField(name)
 
 
 def _plain_value(value: Any) -> object:

@@ -43,6 +43,19 @@ _PROBLEMS = {
     503: "the maps are being loaded; try again",
 }
 
+_EXAMPLE_PROBLEM = {
+    "type": "about:blank",
+    "title": "Unprocessable Entity",
+    "status": 422,
+    "detail": "wrong number of parameters for PINHOLE",
+    "code": "camera.param_count",
+    "field": "camera.params",
+    "expected": "4: fx, fy, cx, cy",
+    "got": "3",
+    "kind": "InvalidInput",
+    "request_id": "3f1d5c0b8a7e4e1f9d2c6b5a49382716",
+}
+
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Describe the errors of a route."""
@@ -76,18 +89,7 @@ class App(FastAPI):
                 ref_template=_REF,
             )
             schema["components"]["schemas"].update(ours["$defs"])
-            schema["components"]["schemas"]["Problem"]["example"] = {
-                "type": "about:blank",
-                "title": "Unprocessable Entity",
-                "status": 422,
-                "detail": "wrong number of parameters for PINHOLE",
-                "code": "camera.param_count",
-                "field": "camera.params",
-                "expected": "4: fx, fy, cx, cy",
-                "got": "3",
-                "kind": "InvalidInput",
-                "request_id": "3f1d5c0b8a7e4e1f9d2c6b5a49382716",
-            }
+            schema["components"]["schemas"]["Problem"]["example"] = _EXAMPLE_PROBLEM
             # Not given to the routes: FastAPI would drop their nulls.
             for (path, method, status), shown in _ANSWERS.items():
                 response = schema["paths"][path][method]["responses"][status]
@@ -96,7 +98,23 @@ class App(FastAPI):
                 }
             lines = schema["paths"]["/localize/sequence"]["post"]["responses"]["200"]["content"]
             lines[NDJSON] = {
-                "schema": {"$ref": _REF.format(model="InstantAnswer")},
-                "example": batch_examples.RIG,
+                "schema": {
+                    "description": "with Accept: application/x-ndjson, lines of this JSON: one per "
+                    "instant, in order, each sent as soon as it is final; after an error, a last "
+                    "one with the problem",
+                    "oneOf": [
+                        {"$ref": _REF.format(model="InstantAnswer")},
+                        {
+                            "type": "object",
+                            "required": ["problem"],
+                            "properties": {"problem": {"$ref": _REF.format(model="Problem")}},
+                            "additionalProperties": False,
+                        },
+                    ],
+                },
+                "examples": {
+                    "answer": {"value": batch_examples.RIG},
+                    "error": {"value": {"problem": _EXAMPLE_PROBLEM}},
+                },
             }
         return super().openapi()

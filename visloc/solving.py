@@ -215,7 +215,8 @@ def _find_pose(
     """Return the best pose, if any, and why it is not believed, if it is not."""
     looks = [image.look for image in images if image.look is not None]
     if not looks:
-        return None, Refusal("features", Reason.NO_USABLE_IMAGE, "none of the images could be used")
+        why = "none of the images could be used" if images else "there is no image"
+        return None, Refusal("features", Reason.NO_USABLE_IMAGE, why)
     refusals = [look.refusal for look in looks if look.refusal is not None]
     if len(refusals) == len(looks):
         return None, refusals[0]

@@ -47,7 +47,7 @@ def maps_to_core(map_ref: str | None, maps: list[str] | None) -> tuple[str, ...]
     Raises:
         InvalidInput: ``request.map`` for neither or both, for one map twice, and for too many.
     """
-    if (map_ref is None) == (not maps):
+    if (map_ref is None) == (maps is None) or maps == []:
         got = "neither" if map_ref is None else "both"
         raise InvalidInput(
             "request.map",
@@ -56,7 +56,7 @@ def maps_to_core(map_ref: str | None, maps: list[str] | None) -> tuple[str, ...]
             expected="one of map, maps",
             got=got,
         )
-    if not maps:
+    if maps is None:
         assert map_ref is not None
         return (map_ref,)
     if len(maps) > MAX_MAPS or len(set(maps)) != len(maps):

@@ -78,7 +78,10 @@ class GravityPrior(IncomingMessage):
     ] = None
     world: Annotated[
         Numbers | None,
-        Field(description="x, y, z of down in the world, for maps that do not know it"),
+        Field(
+            description="x, y, z of down in the world, for maps that do not know it; of another "
+            "map, within 5 degrees of what it knows"
+        ),
     ] = None
 
     def to_core(self) -> visloc.priors.GravityPrior:
@@ -87,7 +90,7 @@ class GravityPrior(IncomingMessage):
         return visloc.priors.GravityPrior(
             np.array(self.direction),
             math.radians(std_deg),
-            np.array(self.world) if self.world else None,
+            None if self.world is None else np.array(self.world),
         )
 
 

@@ -104,7 +104,7 @@ def _check_id(value: object, field: str) -> None:
         )
 
 
-def _few_sensors(value: object) -> object:
+def _sensors_in_bounds(value: object) -> object:
     if isinstance(value, dict):
         if len(value) > MAX_SENSORS:
             raise TooLarge(
@@ -130,7 +130,7 @@ class RigCalibration(IncomingMessage):
     path: ClassVar[str] = "rig."
 
     sensors: Annotated[
-        dict[str, RigSensor], converted(_few_sensors), Field(description="by the sensor's id")
+        dict[str, RigSensor], converted(_sensors_in_bounds), Field(description="by the sensor's id")
     ]
 
     def to_core(self) -> Mapping[str, service.jobs.RigSensor]:

@@ -48,7 +48,9 @@ class Odometry(IncomingMessage):
         """Return the odometry, checked."""
         return visloc.sequence.Odometry(
             self.rig_from_odometry.to_core("odometry.rig_from_odometry"),
-            covariance_to_core(self.covariance, "odometry.covariance") if self.covariance else None,
+            None
+            if self.covariance is None
+            else covariance_to_core(self.covariance, "odometry.covariance"),
         )
 
 

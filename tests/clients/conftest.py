@@ -78,6 +78,7 @@ class CannedService:
     busy: Counter[bytes] = field(default_factory=Counter)
     local_features: str = "xfeat"
     global_features: tuple[str, ...] = ("densevlad", "localvlad")
+    fails_at_the_end: bool = False
 
     def localize(
         self, image: bytes, asked: dict[str, Any], features: dict[str, Any] | None = None
@@ -140,7 +141,8 @@ class CannedService:
     ) -> dict[str, Any]:
         """Take the pose of the first photo that is one in JSON; see ``localize`` for others.
 
-        A rig whose first photo is ``filled`` is between two others.
+        A rig whose first photo is ``filled`` is between two others; a photo that is ``blank`` has
+        no inlier.
         """
         self.seen.append(asked | {"images": images, "timestamp": timestamp})
         self.map_info(asked["map"])
@@ -186,11 +188,14 @@ class CannedService:
         is_filled = bool(images) and images[0]["image"].startswith(b"filled")
         if rig_from_world is not None:
             for answer in answers:
+                answer["cam_from_world"] = _transform(
+                    cam_from_rig[answer["sensor"]] @ rig_from_world
+                )
                 if answer["error"] is None:
-                    answer["cam_from_world"] = _transform(
-                        cam_from_rig[answer["sensor"]] @ rig_from_world
-                    )
                     answer["inliers"] = 311
+            for answer, image in zip(answers, images, strict=True):
+                if image["image"].startswith(b"blank"):
+                    answer["inliers"] = 0
         refusal = {"stage": "matching", "reason": "too_few_matches", "message": "3 [matches]"}
         num_inliers = sum(answer["inliers"] for answer in answers)
         num_correspondences = sum(answer["correspondences"] for answer in answers)
@@ -225,6 +230,12 @@ class CannedService:
             "map": {"id": "room", "version": self.version},
             "seconds": {"features": 0.5, "pose": 0.25},
         }
+
+    def finish_sequence(self, num_instants: int) -> None:
+        if num_instants == 0:
+            raise InvalidInput("sequence.empty", "there is no instant", field="instants")
+        if self.fails_at_the_end:
+            raise VislocError("server.internal", "the server made a mistake")
 
     def map_info(self, ref: str) -> dict[str, Any]:
         if ref not in ("room", f"room@{self.version}"):
@@ -380,6 +391,7 @@ def _http_app(canned: CannedService) -> Starlette:
                 yield text[100:]
 
         canned.map_info(asked["map"])
+        canned.finish_sequence(len(asked["instants"]))
         return StreamingResponse(lines(), media_type="application/x-ndjson")
 
     async def maps(_: Request) -> Response:
@@ -461,6 +473,7 @@ class _Servicer(pb2_grpc.LocalizationServicer):
 
     def LocalizeSequence(self, requests: Any, context: Any) -> Any:  # noqa: N802
         asked: dict[str, Any] = {}
+        num_instants = 0
         for request in requests:
             if request.WhichOneof("message") == "start":
                 asked = _asked_of_rig(request.start)
@@ -473,6 +486,7 @@ class _Servicer(pb2_grpc.LocalizationServicer):
                         asked[name] = getattr(request.start, name)
                 continue
             instant = request.instant
+            num_instants += 1
             extra = {
                 name: MessageToDict(getattr(instant, name), preserving_proto_field_name=True)
                 for name in ("odometry", "priors")
@@ -489,6 +503,12 @@ class _Servicer(pb2_grpc.LocalizationServicer):
                 ),
                 pb2.InstantAnswer(),
             )
+
+        def finish() -> Any:
+            self._canned.finish_sequence(num_instants)
+            return {}
+
+        self._answer(context, finish, pb2.InstantAnswer())
 
     def ListMaps(self, request: Any, context: Any) -> Any:  # noqa: ARG002, N802
         return self._answer(

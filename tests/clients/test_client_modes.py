@@ -141,6 +141,7 @@ def test_rigs_that_cannot_be_used_are_told(
         arrange(queries, [mode], INFO)
     assert caught.value.code == code
     assert said in str(caught.value)
+    assert ("--rig" in str(caught.value)) is (mode is Mode.GP3P and code == "queries.no_rigs")
     assert arrange(queries, [Mode.SINGLE, Mode.SEQ], INFO).time_unit is TimeUnit.MS
 
 
@@ -223,9 +224,10 @@ def test_mode_rig_fills_a_camera_from_the_other_one_exactly(
     for axis in range(3):
         assert lines[4]["pose"]["orientation_std_deg"][axis] > 0
         assert lines[1]["pose"]["covariance"][7 * (3 + axis)] > 0
-    poses = poses_of(output / "poses.txt")
-    assert list(poses) == [lines[i]["name"] for i in (0, 1, 4, 5)]
-    for name, pose in poses.items():
+    poses, filled = (poses_of(output / f"{file}.txt") for file in ("poses", "poses_filled"))
+    assert list(poses) == [lines[i]["name"] for i in (0, 5)]
+    assert list(filled) == [lines[i]["name"] for i in (1, 4)]
+    for name, pose in (poses | filled).items():
         assert pose_error(pose, truth[name]) == pytest.approx((0.0, 0.0), abs=1e-6)
     said = capsys.readouterr().out
     assert "2 of 6 localized, 2 filled (2 from another camera of the rig), 2 not localized" in said
@@ -243,8 +245,9 @@ def test_mode_seq_fills_between_instants_and_never_beyond_the_gap(
     # 0.4 s and 0.8 s after the last one; 1.2 s are beyond one second.
     sources = ["estimated", "interpolated", "estimated", "nearest", "nearest", None, None]
     assert [line["source"] for line in lines] == sources
-    truth, poses = truth_of(dataset), poses_of(output / "poses.txt")
-    assert len(poses) == 5
+    assert list(poses_of(output / "poses.txt")) == [lines[i]["name"] for i in (0, 2)]
+    truth, poses = truth_of(dataset), poses_of(output / "poses_filled.txt")
+    assert list(poses) == [lines[i]["name"] for i in (1, 3, 4)]
     name = lines[1]["name"]
     metres, degrees = pose_error(poses[name], truth[name])
     # Straight on, at an even pace, evenly turning: interpolation is exact.
@@ -282,7 +285,9 @@ def test_mode_rig_seq_fills_from_the_rig_first(
         *("estimated", "rig", "interpolated", "interpolated", "rig", "estimated")
     ]
     truth = truth_of(dataset)
-    for name, pose in poses_of(output / "poses.txt").items():
+    poses = poses_of(output / "poses_filled.txt")
+    assert len(poses) == 4
+    for name, pose in poses.items():
         # The right camera sits half a metre off the turning point: a chord instead of an arc.
         assert pose_error(pose, truth[name])[0] < 2e-3
 
@@ -298,19 +303,79 @@ def test_mode_gp3p_gives_each_photo_the_pose_of_the_rig(
     lines = list(lines_of(output).values())
     assert [line["status"] for line in lines] == [
         *("localized", "localized", "localized", "localized", "not_localized", "not_localized"),
-        *("error", "localized", "localized"),
+        *("filled", "localized", "localized"),
     ]
-    assert {line["source"] for line in lines} == {"estimated", None}
+    assert [line["source"] for line in lines[4:7]] == [None, None, "rig"]
+    assert lines[6]["error"]["code"] == "image.undecodable"
     assert [line["name"] for line in lines] == [q.name for q in read_queries(dataset).photos]
-    poses, truth = poses_of(output / "poses.txt"), truth_of(dataset)
+    poses, filled = (poses_of(output / f"{file}.txt") for file in ("poses", "poses_filled"))
+    truth = truth_of(dataset)
     assert len(poses) == 6
-    for name, pose in poses.items():
+    assert list(filled) == [lines[6]["name"]]
+    for name, pose in (poses | filled).items():
         assert pose_error(pose, truth[name]) == pytest.approx((0.0, 0.0), abs=1e-6)
     assert len(service.seen) == 5
     first = next(r for r in service.seen if r["timestamp"] == START)
     assert [image["sensor"] for image in first["images"]] == ["left", "right"]
     assert first["images"][0]["camera"]["params"] == [60.0, 32.0, 24.0]
     assert {image["timestamp"] for image in first["images"]} == {START}
+
+
+def test_in_gp3p_a_photo_that_contributed_nothing_has_a_pose_that_is_filled(
+    url: str, make_rig_dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photos = instants((HERE, b"blank"), (BROKEN, HERE), (HERE, HERE))
+    dataset, output = make_rig_dataset(photos), tmp_path / "out"
+    assert run_batch(dataset, output, url, "gp3p") == 0
+
+    lines, truth = list(lines_of(output).values()), truth_of(dataset)
+    assert [(line["status"], line["source"]) for line in lines] == [
+        *(("localized", "estimated"), ("filled", "rig"), ("filled", "rig")),
+        *[("localized", "estimated")] * 3,
+    ]
+    blank, broken = lines[1], lines[2]
+    assert (blank["inliers"], blank["correspondences"]) == (0, 700)
+    assert blank["refusal"]["reason"] == "no_inliers"
+    assert broken["error"]["code"] == "image.undecodable"
+    for line, own in ((blank, lines[0]), (broken, lines[3])):
+        assert min(np.subtract(line["pose"]["position_std"], own["pose"]["position_std"])) > 0.002
+    poses, filled = (poses_of(output / f"{file}.txt") for file in ("poses", "poses_filled"))
+    assert list(poses) == [lines[i]["name"] for i in (0, 3, 4, 5)]
+    assert list(filled) == [blank["name"], broken["name"]]
+    for name, pose in (poses | filled).items():
+        assert pose_error(pose, truth[name]) == pytest.approx((0.0, 0.0), abs=1e-6)
+    said = capsys.readouterr().out
+    assert "4 of 6 localized, 2 filled (2 from another camera of the rig), 0 not" in said
+    # The same command changes nothing.
+    files = [output / name for name in ("results.jsonl", "poses.txt", "poses_filled.txt")]
+    before = [file.read_bytes() for file in files]
+    assert run_batch(dataset, output, url, "gp3p") == 0
+    assert [file.read_bytes() for file in files] == before
+
+
+def test_filled_poses_have_a_file_where_there_can_be_some(
+    http_url: str, make_rig_dataset: Dataset, tmp_path: Path
+) -> None:
+    dataset = make_rig_dataset(instants((HERE, HERE)))
+    for mode, has_file in (("single", False), ("rig", True), ("seq", True), ("gp3p", False)):
+        output = tmp_path / mode
+        assert run_batch(dataset, output, http_url, mode) == 0
+        assert len(poses_of(output / "poses.txt")) == 2
+        assert (output / "poses_filled.txt").exists() is has_file
+
+
+def test_a_pose_of_a_rig_that_rests_on_no_photo_is_the_servers_fault(
+    url: str, make_rig_dataset: Dataset, tmp_path: Path, service: Any, monkeypatch: Any
+) -> None:
+    answer = service.localize_instant
+
+    def without_inliers(*asked: Any) -> Any:
+        raw = answer(*asked)
+        return raw | {"images": [image | {"inliers": 0} for image in raw["images"]]}
+
+    monkeypatch.setattr(service, "localize_instant", without_inliers)
+    dataset = make_rig_dataset(instants((HERE, HERE)))
+    assert run_batch(dataset, tmp_path / "out", url, "gp3p") == 1
 
 
 def test_a_photo_of_the_rig_that_is_missing_does_not_hinder_the_others(
@@ -323,21 +388,26 @@ def test_a_photo_of_the_rig_that_is_missing_does_not_hinder_the_others(
         (dataset / "sensors" / "records_data" / name).unlink()
     assert run_batch(dataset, output, url, "gp3p") == 0
     lines = list(lines_of(output).values())
-    assert [line["status"] for line in lines] == ["localized", "error", "localized"]
+    assert [line["status"] for line in lines] == ["localized", "filled", "localized"]
     assert lines[1]["error"]["code"] == "image.unreadable"
+    # Where a camera of a rig of the map sits is told with the answers to its photos only.
+    output = tmp_path / "named"
+    assert run_batch(dataset, output, url, "gp3p", "--rig", "stereo") == 0
+    lines = list(lines_of(output).values())
+    assert [line["status"] for line in lines] == ["localized", "error", "localized"]
 
 
 def test_a_rig_of_the_map_stands_in_for_one_of_the_dataset(
     url: str, make_rig_dataset: Dataset, tmp_path: Path, service: Any
 ) -> None:
-    dataset = make_rig_dataset(instants((HERE, b"dark")), rigs="")
+    dataset = make_rig_dataset(instants((HERE, b"blank")), rigs="")
     output = tmp_path / "out"
     assert run_batch(dataset, output, url, "gp3p", "--rig", "stereo") == 0
     assert [request["rig"] for request in service.seen] == ["stereo"]
     truth = truth_of(dataset)
-    poses = poses_of(output / "poses.txt")
-    assert len(poses) == 2
-    for name, pose in poses.items():
+    poses, filled = (poses_of(output / f"{file}.txt") for file in ("poses", "poses_filled"))
+    assert (len(poses), len(filled)) == (1, 1)
+    for name, pose in (poses | filled).items():
         assert pose_error(pose, truth[name]) == pytest.approx((0.0, 0.0), abs=1e-6)
 
 
@@ -384,6 +454,7 @@ def test_a_rerun_fills_anew_from_what_was_measured(
     assert (again["status"], again["source"], again["pose"]) == ("not_localized", None, None)
     assert again["refusal"] == json.loads(second)["refusal"]
     assert (output / "poses.txt").read_bytes() == b""
+    assert (output / "poses_filled.txt").read_bytes() == b""
 
 
 def test_results_of_another_mode_are_not_mixed(
@@ -473,6 +544,24 @@ def test_only_what_is_needed_is_asked_about(
     )
     assert len(service.seen) == 2
     assert len(poses_of(poses)) == 2
+
+
+def test_the_poses_of_a_benchmark_are_those_that_were_measured(
+    url: str, make_rig_dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dataset = make_rig_dataset(instants((HERE, b"blank"), (BROKEN, HERE), (LOST, LOST)))
+    poses = tmp_path / "poses.txt"
+    for mode in ("gp3p", "seq"):
+        more = ("--mode", f"{mode},rig", "--poses", poses)
+        figures = run_benchmark(dataset, tmp_path / "r.json", url, *more)["modes"][mode]
+        assert len(poses_of(poses)) == figures["localized"]
+        assert figures["filled"] > 0
+        if mode == "gp3p":
+            counts = {source: of["poses"] for source, of in figures["sources"].items()}
+            assert counts == {"estimated": 2, "rig": 2}
+            assert figures["instants"] == {"asked": 3, "localized": 2}
+            assert figures["recall"][0]["fraction"] == pytest.approx(4 / 6)
+            assert "filled, rig" in capsys.readouterr().out
 
 
 def test_no_answer_at_all_is_no_figure(

@@ -200,6 +200,25 @@ NOWHERE = {"left": RigSensor(Pose(np.eye(3), np.array([0.0, np.nan, 0.0])))}
         (lambda c: c.localize_rig([], "room", SCALED), InvalidInput, "rig.rotation"),
         (lambda c: c.localize_rig([], "room", MIRRORED), InvalidInput, "rig.rotation"),
         (lambda c: c.localize_rig([], "room", NOWHERE), InvalidInput, "pose.translation"),
+        (lambda c: c.localize_rig([], "room", None), InvalidInput, "request.missing_field"),
+        (lambda c: c.localize_rig([], "room", ["left"]), InvalidInput, "request.invalid"),
+        (
+            lambda c: c.localize_rig([], "room", {"left": Pose.identity()}),
+            InvalidInput,
+            "request.invalid",
+        ),
+        (lambda c: c.localize_rig({"left": b""}, "room", RIG), InvalidInput, "request.invalid"),
+        (lambda c: c.localize_rig(["a.jpg"], "room", RIG), InvalidInput, "request.invalid"),
+        (
+            lambda c: c.localize_rig(RigImage("left", b""), "room", RIG),
+            InvalidInput,
+            "request.invalid",
+        ),
+        (
+            lambda c: c.localize_sequence([Instant(1, {"left": b""})], "room", RIG, "ms"),
+            InvalidInput,
+            "request.invalid",
+        ),
         (lambda c: c.localize_rig([], [], "stereo"), InvalidInput, "request.map"),
         (lambda c: c.localize_rig([], ["room", "a/b"], "stereo"), InvalidInput, "map.id"),
         (
@@ -218,11 +237,15 @@ NOWHERE = {"left": RigSensor(Pose(np.eye(3), np.array([0.0, np.nan, 0.0])))}
             "server.internal",
         ),
         (
-            lambda c: c.localize_sequence([instant(1, b"crash")], "room", RIG),
+            lambda c: c.localize_sequence([instant(1, b"crash")], "room", RIG, "ms"),
             VislocError,
             "server.internal",
         ),
-        (lambda c: c.localize_sequence([instant(1, b"")], "hall"), NotFound, "map.unknown"),
+        (
+            lambda c: c.localize_sequence([instant(1, b"")], "hall", None, "ms"),
+            NotFound,
+            "map.unknown",
+        ),
         (
             lambda c: c.localize_sequence([instant(1.5, b"")], "room"),
             InvalidInput,
@@ -283,7 +306,7 @@ def test_a_sequence_is_answered_in_order_with_a_status_per_instant(
         instant(2**53 + 1, b"filled", b"dark"),
         instant(2**53 + 2, b"dark", b"broken"),
     ]
-    lists = ask_all(http_url, grpc_url, lambda c: c.localize_sequence(instants, "room", RIG))
+    lists = ask_all(http_url, grpc_url, lambda c: c.localize_sequence(instants, "room", RIG, "ms"))
 
     for answers in lists:
         assert [answer.timestamp for answer in answers] == [100, 2**53 + 1, 2**53 + 2]
@@ -328,8 +351,32 @@ def test_all_clients_send_the_same_sequence(http_url: str, grpc_url: str, servic
         assert request["request_id"] == "id-1"
 
 
-def test_an_empty_sequence_has_no_answers(http_url: str, grpc_url: str) -> None:
-    assert ask_all(http_url, grpc_url, lambda c: c.localize_sequence([], "room")) == [[]] * 4
+def test_an_empty_sequence_is_refused_by_the_server(http_url: str, grpc_url: str) -> None:
+    errors = ask_all(http_url, grpc_url, lambda c: c.localize_sequence([], "room"))
+    assert [error.code for error in errors] == ["sequence.empty"] * 4
+
+
+def test_an_unknown_unit_of_time_is_refused_before_anything_is_sent(
+    http_url: str, grpc_url: str, service: Any
+) -> None:
+    def instants() -> Iterator[Instant]:
+        yield instant(5, b"photo")
+        pytest.fail("the first timestamp is enough")
+
+    errors = ask_all(
+        http_url, grpc_url, lambda c: c.localize_sequence([instant(5, b"photo")], "room")
+    )
+    assert [error.code for error in errors] == ["sequence.time_unit"] * 4
+    assert "one of s, ms, us, ns" in str(errors[0])
+    errors = ask_all(grpc_url, grpc_url, lambda c: c.localize_sequence(instants(), "hall"))
+    assert [error.code for error in errors] == ["sequence.time_unit"] * 4
+    assert service.seen == []
+    for unix in (1_700_000_000, 1_700_000_000_000_000_000):
+        lists = ask_all(
+            *(http_url, grpc_url),
+            lambda c, t=unix: c.localize_sequence([instant(t, b"photo")], "room", RIG),
+        )
+        assert [len(answers) for answers in lists] == [1] * 4
 
 
 def test_an_error_within_a_sequence_comes_after_the_answers_before_it(
@@ -338,7 +385,7 @@ def test_an_error_within_a_sequence_comes_after_the_answers_before_it(
     instants = [instant(1, b"photo"), instant(2, b"photo"), instant(3, b"crash")]
     for url in (http_url, grpc_url):
         with Client(url) as client:
-            answers = client.localize_sequence(instants, "room", RIG)
+            answers = client.localize_sequence(instants, "room", RIG, "ms")
             assert [next(answers).timestamp, next(answers).timestamp] == [1, 2]
             with pytest.raises(VislocError) as caught:
                 next(answers)
@@ -355,7 +402,7 @@ def test_over_grpc_an_answer_comes_before_the_next_instant_is_known(grpc_url: st
             is_answered.clear()
 
     with Client(grpc_url) as client:
-        for answer in client.localize_sequence(instants(), "room", RIG):
+        for answer in client.localize_sequence(instants(), "room", RIG, "ms"):
             assert answer.localized
             is_answered.set()
 
@@ -370,7 +417,7 @@ def test_over_grpc_an_answer_comes_before_the_next_instant_is_known(grpc_url: st
 
         count = 0
         async with AsyncClient(grpc_url) as client:
-            async for _ in client.localize_sequence(instants(), "room", RIG):
+            async for _ in client.localize_sequence(instants(), "room", RIG, "ms"):
                 count += 1
                 is_known.set()
         return count
@@ -378,24 +425,116 @@ def test_over_grpc_an_answer_comes_before_the_next_instant_is_known(grpc_url: st
     assert asyncio.run(ask()) == 3
 
 
-def test_what_the_callers_iterable_raises_reaches_the_caller(http_url: str, grpc_url: str) -> None:
-    class CameraLostError(Exception):
-        pass
+class CameraLostError(Exception):
+    pass
 
+
+@pytest.mark.parametrize("num_before", [0, 1])
+def test_what_the_callers_iterable_raises_reaches_the_caller(
+    num_before: int, http_url: str, grpc_url: str
+) -> None:
     def instants() -> Iterator[Instant]:
-        yield instant(1, b"photo")
+        for timestamp in range(num_before):
+            yield instant(timestamp, b"photo")
         raise CameraLostError
 
     async def ask(url: str) -> None:
         async with AsyncClient(url) as client:
-            async for _ in client.localize_sequence(instants(), "room", RIG):
+            async for _ in client.localize_sequence(instants(), "room", RIG, "ms"):
                 pass
 
     for url in (http_url, grpc_url):
         with Client(url) as client, pytest.raises(CameraLostError):
-            list(client.localize_sequence(instants(), "room", RIG))
+            list(client.localize_sequence(instants(), "room", RIG, "ms"))
         with pytest.raises(CameraLostError):
             asyncio.run(ask(url))
+
+
+def failing(num_before: int) -> Iterator[Instant]:
+    for timestamp in range(num_before):
+        yield instant(timestamp, b"photo")
+    raise CameraLostError
+
+
+def ending_in(num_before: int, last: Instant) -> Iterator[Instant]:
+    for timestamp in range(num_before):
+        yield instant(timestamp, b"photo")
+    yield last
+
+
+UNREADABLE = Instant(9, (RigImage("left", "/none.png"),))
+
+
+@pytest.mark.parametrize("num_before", [0, 2])
+@pytest.mark.parametrize("is_sound_to_the_end", [True, False])
+@pytest.mark.parametrize(
+    ("instants", "code"),
+    [
+        (failing, None),
+        (lambda n: ending_in(n, UNREADABLE), "image.unreadable"),
+        (
+            lambda n: ending_in(
+                n, instant(9, odometry=Odometry(Pose.identity(), np.zeros((6, 6))))
+            ),
+            "pose.covariance",
+        ),
+        # What only the building of the message finds.
+        (lambda n: ending_in(n, Instant(9, (RigImage(7, b""),))), None),  # type: ignore[arg-type]
+    ],
+)
+def test_over_grpc_a_bad_instant_wins_over_the_server_after_the_answers_before_it(
+    instants: Callable[[int], Iterator[Instant]],
+    code: str | None,
+    num_before: int,
+    is_sound_to_the_end: bool,
+    grpc_url: str,
+    service: Any,
+) -> None:
+    service.fails_at_the_end = not is_sound_to_the_end
+    answers: list[int | None] = []
+
+    def ask() -> None:
+        with Client(grpc_url, timeout_s=5) as client:
+            for answer in client.localize_sequence(instants(num_before), "room", RIG, "ms"):
+                answers.append(answer.timestamp)
+
+    async def ask_async() -> None:
+        async with AsyncClient(grpc_url, timeout_s=5) as client:
+            async for answer in client.localize_sequence(instants(num_before), "room", RIG, "ms"):
+                answers.append(answer.timestamp)
+
+    for call in (ask, lambda: asyncio.run(ask_async())):
+        answers.clear()
+        with pytest.raises((VislocError, CameraLostError, TypeError)) as caught:
+            call()
+        assert getattr(caught.value, "code", None) == code
+        assert answers == list(range(num_before))
+
+
+@pytest.mark.parametrize(
+    ("covariance", "got"),
+    [
+        (np.zeros((6, 6)), "[[0.0,"),
+        (-np.eye(6), "[[-1.0,"),
+        (np.ones(35), "35 numbers, of shape (35,)"),
+        (np.eye(5), "25 numbers, of shape (5, 5)"),
+        ([[1.0], [1.0, 2.0]], "[[1.0], [1.0, 2.0]]"),
+        ("wide", "wide"),
+    ],
+)
+def test_a_bad_covariance_is_told_with_its_instant_and_what_came(
+    covariance: Any, got: str, http_url: str, grpc_url: str
+) -> None:
+    def instants() -> Iterator[Instant]:
+        return ending_in(3, instant(9, odometry=Odometry(Pose.identity(), covariance)))
+
+    errors = ask_all(
+        http_url, grpc_url, lambda c: c.localize_sequence(instants(), "room", RIG, "ms")
+    )
+    for error in errors:
+        assert error.code == "pose.covariance"
+        assert error.field == "instants[3].odometry.covariance"
+        assert error.got.startswith(got)
 
 
 def test_a_sequence_can_be_left_early(http_url: str, grpc_url: str) -> None:
@@ -404,13 +543,13 @@ def test_a_sequence_can_be_left_early(http_url: str, grpc_url: str) -> None:
 
     async def first(url: str) -> int | None:
         async with AsyncClient(url) as client:
-            async for answer in client.localize_sequence(instants(), "room", RIG):
+            async for answer in client.localize_sequence(instants(), "room", RIG, "ms"):
                 return answer.timestamp
         return None
 
     for url in (http_url, grpc_url):
         with Client(url) as client:
-            for answer in client.localize_sequence(instants(), "room", RIG):
+            for answer in client.localize_sequence(instants(), "room", RIG, "ms"):
                 assert answer.timestamp == 0
                 break
             assert client.localize(b"photo", "room").localized
@@ -429,15 +568,15 @@ def test_a_slow_instant_is_a_timeout_but_a_slow_sender_is_none(
 
     async def ask(url: str, instants: Iterable[Instant]) -> int:
         async with AsyncClient(url, timeout_s=0.2) as client:
-            return len([a async for a in client.localize_sequence(instants, "room", RIG)])
+            return len([a async for a in client.localize_sequence(instants, "room", RIG, "ms")])
 
     for url in (http_url, grpc_url):
         slow = [instant(1, b"photo"), instant(2, b"slow")]
         with Client(url, timeout_s=0.2) as client:
             with pytest.raises(Unavailable) as caught:
-                list(client.localize_sequence(slow, "room", RIG))
+                list(client.localize_sequence(slow, "room", RIG, "ms"))
             assert caught.value.code == "server.timeout"
-            assert len(list(client.localize_sequence(unhurried(), "room", RIG))) == 2
+            assert len(list(client.localize_sequence(unhurried(), "room", RIG, "ms"))) == 2
         with pytest.raises(Unavailable) as caught:
             asyncio.run(ask(url, slow))
         assert caught.value.code == "server.timeout"
@@ -448,11 +587,11 @@ def test_a_slow_instant_is_a_timeout_but_a_slow_sender_is_none(
 def test_a_sequence_to_nobody_is_unreachable(url: str) -> None:
     async def ask() -> None:
         async with AsyncClient(url) as client:
-            async for _ in client.localize_sequence([instant(1, b"photo")], "room", RIG):
+            async for _ in client.localize_sequence([instant(1, b"photo")], "room", RIG, "ms"):
                 pass
 
     with Client(url) as client, pytest.raises(Unavailable) as caught:
-        list(client.localize_sequence([instant(1, b"photo")], "room", RIG))
+        list(client.localize_sequence([instant(1, b"photo")], "room", RIG, "ms"))
     assert caught.value.code == "server.unreachable"
     with pytest.raises(Unavailable) as caught:
         asyncio.run(ask())
@@ -486,12 +625,12 @@ def test_lines_are_cut_at_line_feeds_only(
 ) -> None:
     service.map_info("room")
     with Client(http_url) as client:
-        (answer,) = client.localize_sequence([instant(1, b"dark")], "room", RIG)
+        (answer,) = client.localize_sequence([instant(1, b"dark")], "room", RIG, "ms")
     refusal = {**answer.raw["refusal"], "message": "a\u2028b\x85c"}
     line = json.dumps(dict(answer.raw) | {"refusal": refusal}, ensure_ascii=False).encode() + b"\n"
     answering([line[:7], line[7:-1], line[-1:] + b"\r\n"], monkeypatch)
     with Client("http://server") as client:
-        (again,) = client.localize_sequence([instant(1, b"dark")], "room", RIG)
+        (again,) = client.localize_sequence([instant(1, b"dark")], "room", RIG, "ms")
     assert again.refusal is not None
     assert again.refusal.message == "a\u2028b\x85c"
 
@@ -514,7 +653,7 @@ def test_lines_that_are_no_answers_are_told(
 ) -> None:
     answering(lines, monkeypatch)
     with Client("http://server") as client, pytest.raises(VislocError) as caught:
-        list(client.localize_sequence([instant(1, b"dark")], "room", RIG))
+        list(client.localize_sequence([instant(1, b"dark")], "room", RIG, "ms"))
     assert caught.value.code == code
 
 

@@ -10,18 +10,29 @@ import numpy as np
 import pytest
 
 from service.grpc_requests import instant_of, rig_job_of, sequence_start_of
-from service.jobs import ONLY_SENSOR, RigJob
+from service.jobs import ONLY_SENSOR, InstantLocalization, RigJob
 from service.schemas import (
     MAX_SENSORS,
     BatchLimits,
     LocalizeRigRequest,
     LocalizeSequenceRequest,
 )
+from service.schemas import InstantAnswer as AnswerWords
 from visloc.errors import InvalidInput, TooLarge
+from visloc.geometry import Camera, Pose
 from visloc.trajectory import TimeUnit
+from visloc.types import (
+    CameraSource,
+    Evidence,
+    ImageAnswer,
+    InstantAnswer,
+    ReadAs,
+    RetrievedImage,
+)
 from visloc_api.v1 import localization_pb2 as pb2
 
 NAN = float("nan")
+LONG = "x" * 101
 IDENTITY = {"rotation_wxyz": [1, 0, 0, 0], "translation": [0, 0, 0]}
 TURNED = {"rotation_wxyz": [0, 0, 1, 0], "translation": [0.5, 0, 0]}
 CAMERA = {"model": "PINHOLE", "width": 64, "height": 48, "params": [50, 50, 32, 24]}
@@ -184,7 +195,14 @@ AT_RIGHT = "rig.sensors.right.cam_from_rig"
             {"rig": {"sensors": dict.fromkeys(map(str, range(MAX_SENSORS + 1)), 0)}},
             *("rig.too_many_sensors", "rig.sensors"),
         ),
+        (
+            {"rig": {"sensors": {LONG: {"cam_from_rig": IDENTITY}}}},
+            *("rig.id", "rig.sensors"),
+        ),
+        ({"rig": LONG}, "rig.id", "rig"),
+        ({"images": [image(), image(LONG)]}, "rig.id", "images[1].sensor"),
         ({"images": {}}, "request.invalid", "images"),
+        ({"maps": []}, "request.map", "map"),
         ({"images": [image()] * 3}, "rig.too_many_images", "images"),
         ({"images": [image(), 3]}, "request.invalid", "images[1]"),
         ({"images": [image(None)]}, "request.missing_field", "images[0].sensor"),
@@ -261,6 +279,15 @@ def test_every_file_is_one_image(
     assert (error.code, error.field, error.got) == ("request.part", field, got)
 
 
+def test_ids_of_a_hundred_characters_are_fine() -> None:
+    sensors = {LONG[1:]: {"cam_from_rig": IDENTITY}}
+
+    job = read_rig(rig_request(rig={"sensors": sensors}, images=[image(LONG[1:])]))
+
+    assert job.images[0].sensor == LONG[1:]
+    assert read_rig(rig_request(rig=LONG[1:])).rig == LONG[1:]
+
+
 def instant(**changes: object) -> dict[str, Any]:
     return {"timestamp": 5, "images": [image(None)], **changes}
 
@@ -307,6 +334,15 @@ def instant(**changes: object) -> dict[str, Any]:
             },
             *("pose.covariance", "instants[0].odometry.covariance"),
         ),
+        (  # not the same as left out
+            {"instants": [instant(odometry={"rig_from_odometry": IDENTITY, "covariance": []})]},
+            *("pose.covariance", "instants[0].odometry.covariance"),
+        ),
+        (
+            {"instants": [instant(priors={"gravity": {"direction": [0, 1, 0], "world": []}})]},
+            *("priors.gravity", "instants[0].priors.gravity.world"),
+        ),
+        ({"instants": [instant(images=[image(LONG)])]}, "rig.id", "instants[0].images[0].sensor"),
         (
             {"instants": [instant(), instant(priors={"position": {"position": [], "radius": 1}})]},
             *("priors.position", "instants[1].priors.position.position"),
@@ -334,6 +370,22 @@ def test_a_million_wrong_values_are_one_complaint() -> None:
         with pytest.raises(TooLarge) as caught:
             LocalizeSequenceRequest.read_json(message, LIMITS, 2_000_000)
         assert caught.value.code == "rig.too_many_images"
+
+
+# What is answered
+
+
+def test_an_image_of_an_instant_lists_the_best_twenty_photos() -> None:
+    camera = Camera("SIMPLE_PINHOLE", 64, 48, (50.0, 32.0, 24.0))
+    retrieved = tuple(RetrievedImage(f"{i}.jpg", 1.0 - i / 100, {}) for i in range(30))
+    evidence = Evidence(camera, CameraSource.GIVEN, 1, ReadAs.STORED, retrieved=retrieved)
+    seen = ImageAnswer("camera", Pose.identity(), evidence, None)
+    answer = InstantAnswer(None, (seen,), None, None, {})
+
+    message = AnswerWords.from_localization(InstantLocalization(answer, "room", "1"), "id")
+
+    names = [photo.image for photo in message.images[0].retrieved]
+    assert names == [f"{i}.jpg" for i in range(20)]
 
 
 # Over gRPC the same
@@ -373,7 +425,8 @@ def test_messages_say_the_same_as_json() -> None:
 def test_instants_of_a_stream_say_the_same_as_json() -> None:
     start = pb2.SequenceStart(map="room", request_id="x")
     odometry = pb2.Odometry(rig_from_odometry=pb2.Transform(**IDENTITY))
-    instant = pb2.Instant(images=[pb2.RigImage(image=b"")], odometry=odometry)
+    priors = pb2.Priors(gravity=pb2.GravityPrior(direction=[0, 1, 0]))
+    instant = pb2.Instant(images=[pb2.RigImage(image=b"")], odometry=odometry, priors=priors)
 
     begun = sequence_start_of(pb2.LocalizeSequenceRequest(start=start))
     job = instant_of(pb2.LocalizeSequenceRequest(instant=instant), LIMITS, 0, has_rig=False)
@@ -382,6 +435,9 @@ def test_instants_of_a_stream_say_the_same_as_json() -> None:
     assert (job.timestamp, job.images[0].sensor, job.images[0].query) == (0, ONLY_SENSOR, b"")
     assert job.odometry is not None
     assert job.odometry.covariance is None
+    assert job.priors is not None
+    assert job.priors.gravity is not None
+    assert job.priors.gravity.world is None
 
 
 @pytest.mark.parametrize(

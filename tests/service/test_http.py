@@ -445,6 +445,12 @@ def test_openapi_describes_both_kinds_of_bodies_and_every_reference_resolves(doo
         assert all(content["examples"] for content in body.values())
     answers = schema["paths"]["/localize/sequence"]["post"]["responses"]["200"]["content"]
     assert set(answers) == {"application/json", "application/x-ndjson"}
+    line = answers["application/x-ndjson"]
+    answer, problem = line["schema"]["oneOf"]
+    assert answer == {"$ref": "#/components/schemas/InstantAnswer"}
+    assert problem["properties"] == {"problem": {"$ref": "#/components/schemas/Problem"}}
+    schemas.InstantAnswer.model_validate(line["examples"]["answer"]["value"])
+    schemas.Problem.model_validate(line["examples"]["error"]["value"]["problem"])
 
     def references(part: Any) -> Iterator[str]:
         if isinstance(part, dict):

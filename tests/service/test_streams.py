@@ -12,7 +12,7 @@ import queue
 import socket
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,6 +23,7 @@ from google.rpc.error_details_pb2 import ErrorInfo
 from grpc_status import rpc_status
 
 from service.jobs import Instant, InstantLocalization, SequenceStart
+from service.schemas import LocalizeSequenceResponse
 from visloc.errors import InvalidInput
 from visloc.types import InstantAnswer, Reason, Refusal
 from visloc_api.v1 import localization_pb2 as pb2
@@ -50,11 +51,11 @@ class Pretender:
     ended: threading.Event = field(default_factory=threading.Event)
 
     async def localize_sequence(
-        self, start: SequenceStart, instants: AsyncIterator[Instant]
+        self, start: SequenceStart, instants: AsyncIterator[Instant] | Sequence[Instant]
     ) -> AsyncIterator[InstantLocalization]:
         """Stand in for the engine's."""
         try:
-            async for instant in instants:
+            async for instant in one_by_one(instants):
                 if self.taken == self.fail_at:
                     raise self.error
                 while self.taken and not self.gate.is_set():
@@ -65,6 +66,17 @@ class Pretender:
                 yield InstantLocalization(answer, start.maps[0], "1")
         finally:
             self.ended.set()
+
+
+async def one_by_one(
+    instants: AsyncIterator[Instant] | Sequence[Instant],
+) -> AsyncIterator[Instant]:
+    if isinstance(instants, Sequence):
+        for instant in instants:
+            yield instant
+    else:
+        async for instant in instants:
+            yield instant
 
 
 @pytest.fixture
@@ -117,6 +129,7 @@ def test_answers_come_in_order_as_one_json_or_as_lines(one: Any, pretend: Any) -
     lines = post(one, 3, **{"X-Request-Id": "run-1"}, **LINES)
 
     assert whole.headers["content-type"] == "application/json"
+    LocalizeSequenceResponse.model_validate_json(whole.content)
     answers = whole.json()["answers"]
     assert [answer["timestamp"] for answer in answers] == [0, 1, 2]
     assert whole.json()["request_id"] == answers[0]["request_id"] == "run-1"

@@ -247,7 +247,9 @@ Global___PositionPrior: _TypeAlias = PositionPrior  # noqa: Y015
 
 @_typing.final
 class HeightBand(_message.Message):
-    """The device is between two heights, measured along the world's up from its (0, 0, 0)."""
+    """The device is between two heights, measured along the world's up from its (0, 0, 0). Needs a map
+    that knows which way is down, or gravity with world.
+    """
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -281,7 +283,10 @@ class PosePrior(_message.Message):
 
     @_builtins.property
     def covariance(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """6 x 6, row by row: rotation (rad), then translation, for R <- Exp(w) R and t <- t + dt."""
+        """6 x 6, row by row: rotation (rad), then translation, for R <- Exp(w) R and t <- t + dt. This is
+        about the world's (0, 0, 0): far from there a diagonal one means kilometres. Send back that of
+        an answer, or build it from that of the centre (docs/api.md).
+        """
 
     def __init__(
         self,
@@ -314,7 +319,9 @@ class GravityPrior(_message.Message):
 
     @_builtins.property
     def world(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """down in the world, for maps that do not know it"""
+        """Down in the world, for maps that do not know it; of another map, within 5 degrees of what it
+        knows.
+        """
 
     def __init__(
         self,
@@ -336,7 +343,8 @@ Global___GravityPrior: _TypeAlias = GravityPrior  # noqa: Y015
 @_typing.final
 class Priors(_message.Message):
     """What is known before any photo is looked at. A prior narrows the search, and a pose that
-    contradicts it is refused; it never bends a pose.
+    contradicts it is refused; it never bends a pose. With several maps it is applied in each: they
+    must share a world.
     """
 
     DESCRIPTOR: _descriptor.Descriptor
@@ -493,7 +501,9 @@ class RigCalibration(_message.Message):
 
     SENSORS_FIELD_NUMBER: _builtins.int
     @_builtins.property
-    def sensors(self) -> _containers.MessageMap[_builtins.str, Global___RigSensor]: ...
+    def sensors(self) -> _containers.MessageMap[_builtins.str, Global___RigSensor]:
+        """by id, of at most 100 characters"""
+
     def __init__(
         self,
         *,
@@ -525,7 +535,9 @@ class RigImage(_message.Message):
     def features(self) -> Global___Features: ...
     @_builtins.property
     def camera(self) -> Global___Camera:
-        """left out: the rig's for this sensor, else the map's, else EXIF"""
+        """Left out: the rig's for this sensor; of a rig_id, the map's for this sensor; else EXIF, else a
+        guess that the answer marks.
+        """
 
     def __init__(
         self,
@@ -602,7 +614,8 @@ Global___LocalizeRigRequest: _TypeAlias = LocalizeRigRequest  # noqa: Y015
 @_typing.final
 class Odometry(_message.Message):
     """Where a tracker (visual-inertial, wheel odometry, ARKit, ARCore) has the rig, in a world of its
-    own whose unit is the metre. Only the motion from one instant to the next is used.
+    own whose unit is the metre. Only the motion from one instant to the next is used. It never moves
+    or narrows a pose that an instant's own photos measured.
     """
 
     DESCRIPTOR: _descriptor.Descriptor
@@ -1177,7 +1190,9 @@ class ImageAnswer(_message.Message):
         """when the instant has a pose"""
 
     @_builtins.property
-    def retrieved(self) -> _containers.RepeatedCompositeFieldContainer[Global___RetrievedImage]: ...
+    def retrieved(self) -> _containers.RepeatedCompositeFieldContainer[Global___RetrievedImage]:
+        """the best 20"""
+
     @_builtins.property
     def camera(self) -> Global___CameraUsed: ...
     @_builtins.property
@@ -1274,7 +1289,9 @@ class InstantAnswer(_message.Message):
     @_builtins.property
     def map(self) -> Global___MapRef: ...
     @_builtins.property
-    def seconds(self) -> _containers.ScalarMap[_builtins.str, _builtins.float]: ...
+    def seconds(self) -> _containers.ScalarMap[_builtins.str, _builtins.float]:
+        """by stage, summed over the images"""
+
     def __init__(
         self,
         *,

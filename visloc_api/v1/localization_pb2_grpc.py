@@ -73,7 +73,8 @@ class LocalizationServicer:
         raise NotImplementedError('Method not implemented!')
 
     def LocalizeRig(self, request, context):
-        """Estimates one pose from the photos that the cameras of a rig took at one instant.
+        """Estimates one pose from the photos that the cameras of a rig took at one instant. Its message
+        is read, however large, before it is known whether there is a place for it.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -82,6 +83,15 @@ class LocalizationServicer:
     def LocalizeSequence(self, request_iterator, context):
         """Takes the instants of a sequence one by one and answers each as soon as its answer is final, in
         order. The first message is a start, all others are instants.
+
+        Without odometry, an instant that its photos localize is answered at once, together with those
+        that waited for it. With odometry it waits until instants max_gap_s later, or 30 more, have
+        come, also when its own photos localize it, because its neighbours may contradict it. One that
+        is not localized waits as long for an instant that is; with several maps, all wait for the
+        first that is. So a client that waits for each answer before it sends the next instant must
+        send max_gap_s 0, and one map.
+
+        When an instant is refused, those before it are answered first; then the status comes.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

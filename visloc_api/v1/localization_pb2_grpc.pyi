@@ -38,10 +38,21 @@ class LocalizationStub:
     that cannot be localized is an answer (status "not_localized"), not an error.
     """
     LocalizeRig: _grpc.UnaryUnaryMultiCallable[_localization_pb2.LocalizeRigRequest, _localization_pb2.InstantAnswer]
-    """Estimates one pose from the photos that the cameras of a rig took at one instant."""
+    """Estimates one pose from the photos that the cameras of a rig took at one instant. Its message
+    is read, however large, before it is known whether there is a place for it.
+    """
     LocalizeSequence: _grpc.StreamStreamMultiCallable[_localization_pb2.LocalizeSequenceRequest, _localization_pb2.InstantAnswer]
     """Takes the instants of a sequence one by one and answers each as soon as its answer is final, in
     order. The first message is a start, all others are instants.
+
+    Without odometry, an instant that its photos localize is answered at once, together with those
+    that waited for it. With odometry it waits until instants max_gap_s later, or 30 more, have
+    come, also when its own photos localize it, because its neighbours may contradict it. One that
+    is not localized waits as long for an instant that is; with several maps, all wait for the
+    first that is. So a client that waits for each answer before it sends the next instant must
+    send max_gap_s 0, and one map.
+
+    When an instant is refused, those before it are answered first; then the status comes.
     """
     ListMaps: _grpc.UnaryUnaryMultiCallable[_localization_pb2.ListMapsRequest, _localization_pb2.ListMapsResponse]
     GetMap: _grpc.UnaryUnaryMultiCallable[_localization_pb2.GetMapRequest, _localization_pb2.MapInfo]
@@ -54,10 +65,21 @@ class LocalizationAsyncStub(LocalizationStub):
     that cannot be localized is an answer (status "not_localized"), not an error.
     """
     LocalizeRig: _aio.UnaryUnaryMultiCallable[_localization_pb2.LocalizeRigRequest, _localization_pb2.InstantAnswer]  # type: ignore[assignment]
-    """Estimates one pose from the photos that the cameras of a rig took at one instant."""
+    """Estimates one pose from the photos that the cameras of a rig took at one instant. Its message
+    is read, however large, before it is known whether there is a place for it.
+    """
     LocalizeSequence: _aio.StreamStreamMultiCallable[_localization_pb2.LocalizeSequenceRequest, _localization_pb2.InstantAnswer]  # type: ignore[assignment]
     """Takes the instants of a sequence one by one and answers each as soon as its answer is final, in
     order. The first message is a start, all others are instants.
+
+    Without odometry, an instant that its photos localize is answered at once, together with those
+    that waited for it. With odometry it waits until instants max_gap_s later, or 30 more, have
+    come, also when its own photos localize it, because its neighbours may contradict it. One that
+    is not localized waits as long for an instant that is; with several maps, all wait for the
+    first that is. So a client that waits for each answer before it sends the next instant must
+    send max_gap_s 0, and one map.
+
+    When an instant is refused, those before it are answered first; then the status comes.
     """
     ListMaps: _aio.UnaryUnaryMultiCallable[_localization_pb2.ListMapsRequest, _localization_pb2.ListMapsResponse]  # type: ignore[assignment]
     GetMap: _aio.UnaryUnaryMultiCallable[_localization_pb2.GetMapRequest, _localization_pb2.MapInfo]  # type: ignore[assignment]
@@ -79,7 +101,9 @@ class LocalizationServicer(metaclass=_abc_1.ABCMeta):
         request: _localization_pb2.LocalizeRigRequest,
         context: _ServicerContext,
     ) -> _typing.Union[_localization_pb2.InstantAnswer, _abc.Awaitable[_localization_pb2.InstantAnswer]]:
-        """Estimates one pose from the photos that the cameras of a rig took at one instant."""
+        """Estimates one pose from the photos that the cameras of a rig took at one instant. Its message
+        is read, however large, before it is known whether there is a place for it.
+        """
 
     @_abc_1.abstractmethod
     def LocalizeSequence(
@@ -89,6 +113,15 @@ class LocalizationServicer(metaclass=_abc_1.ABCMeta):
     ) -> _typing.Union[_abc.Iterator[_localization_pb2.InstantAnswer], _abc.AsyncIterator[_localization_pb2.InstantAnswer]]:
         """Takes the instants of a sequence one by one and answers each as soon as its answer is final, in
         order. The first message is a start, all others are instants.
+
+        Without odometry, an instant that its photos localize is answered at once, together with those
+        that waited for it. With odometry it waits until instants max_gap_s later, or 30 more, have
+        come, also when its own photos localize it, because its neighbours may contradict it. One that
+        is not localized waits as long for an instant that is; with several maps, all wait for the
+        first that is. So a client that waits for each answer before it sends the next instant must
+        send max_gap_s 0, and one map.
+
+        When an instant is refused, those before it are answered first; then the status comes.
         """
 
     @_abc_1.abstractmethod
