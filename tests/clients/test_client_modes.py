@@ -338,7 +338,9 @@ def test_in_gp3p_a_photo_that_contributed_nothing_has_a_pose_that_is_filled(
     assert blank["refusal"]["reason"] == "no_inliers"
     assert broken["error"]["code"] == "image.undecodable"
     for line, own in ((blank, lines[0]), (broken, lines[3])):
-        assert min(np.subtract(line["pose"]["position_std"], own["pose"]["position_std"])) > 0.002
+        stds = (np.array(of["pose"]["orientation_std_deg"]) for of in (line, own))
+        # 0.2 degrees for the calibration.
+        np.testing.assert_allclose(next(stds) ** 2 - next(stds) ** 2, 0.04, rtol=1e-6)
     poses, filled = (poses_of(output / f"{file}.txt") for file in ("poses", "poses_filled"))
     assert list(poses) == [lines[i]["name"] for i in (0, 3, 4, 5)]
     assert list(filled) == [blank["name"], broken["name"]]

@@ -160,7 +160,7 @@ def test_all_modes_of_a_benchmark(
         )
     assert caught.value.code == 0
     modes = json.loads(report.read_bytes())["modes"]
-    assert [m["localized"] + m["filled"] for m in modes.values()] == [5, 6, 6, 6, 5]
+    assert [m["localized"] + m["filled"] for m in modes.values()] == [5, 6, 6, 6, 6]
     assert modes["gp3p"]["instants"] == {"asked": 2, "localized": 2}
     for m in modes.values():
         assert m["position_error_m"]["max"] < 0.01
