@@ -133,8 +133,9 @@ def test_the_report_holds_what_it_promises(service: Service, sample: Path, tmp_p
     report, _, printed = benchmark(service, sample, tmp_path, "http")
     assert set(report) == {
         *("queries", "localized", "median_position_error_m", "median_orientation_error_deg"),
-        *("recall", "latency_s", "throughput_qps", "stage_seconds", "server"),
+        *("recall", "latency_s", "throughput_qps", "stage_seconds", "server", "modes"),
     }
+    assert list(report["modes"]) == ["single"]
     assert report["queries"] == report["localized"] == 3
     assert 0 < report["median_position_error_m"] < 0.003
     assert 0 < report["median_orientation_error_deg"] < 0.1
