@@ -662,7 +662,7 @@ def test_the_camera_with_most_inliers_gives(inliers: dict[str, int], giver: str)
     np.testing.assert_array_equal(given_pose.pose.center, best.pose.center)
 
 
-@pytest.mark.parametrize("source", set(PoseSource) - {PoseSource.ESTIMATED})
+@pytest.mark.parametrize("source", sorted(set(PoseSource) - {PoseSource.ESTIMATED}))
 def test_only_measured_poses_are_given_on(source: PoseSource) -> None:
     instant = {"left": replace(seen_by("left"), source=source), "right": None}
     assert fill_rig(instant, RIG) == instant
