@@ -23,7 +23,7 @@ demo: install ## the main job on a synthetic sample: build, serve, localize, pic
 	$(BIN)/python examples/demo.py
 
 test: install ## the tests, in under ten minutes on two cores
-	$(BIN)/pytest -m 'not slow'
+	$(BIN)/pytest -m 'not slow' --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 test-all: install ## the slow tests too
 	$(BIN)/pytest
