@@ -20,8 +20,7 @@ from visloc.geometry import Pose
 from visloc.pose.colmap import normalized_rays
 from visloc.pose.covariance import position_covariance, with_origin
 from visloc.pose.distance import mahalanobis2
-from visloc.pose.generalized import KnownGravity
-from visloc.pose.gravity import gravity_deviation
+from visloc.pose.gravity import KnownGravity, gravity_deviation
 from visloc.pose.views import MatchedView
 from visloc.priors import Priors
 
@@ -129,7 +128,8 @@ class Constraints:
     @property
     def narrow(self) -> bool:
         """Whether the priors leave out photos, or poses, before any is judged."""
-        return self.gravity is not None or self.photo_weights is not None
+        priors = self._priors
+        return any((priors.position, priors.height, priors.pose, priors.gravity))
 
     @cached_property
     def photo_weights(self) -> NDArray[np.float64] | None:

@@ -20,16 +20,6 @@ from visloc.pose.covariance import pose_covariance
 from visloc.pose.gravity import KnownGravity, find_upright_poses
 from visloc.pose.views import MatchedView
 
-__all__ = [
-    "LOSS_SCALE_PX",
-    "MAX_TRIALS",
-    "GeneralizedPose",
-    "KnownGravity",
-    "estimate_generalized_pose",
-    "refine_generalized_pose",
-    "reprojection_errors",
-]
-
 # Beyond this many trials a pose with 8 % inliers has been found with 99 % probability; a photo
 # of another place should not cost seconds.
 MAX_TRIALS = 10_000

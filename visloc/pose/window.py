@@ -28,20 +28,11 @@ from visloc.pose.group import carried, find_groups, selected
 from visloc.pose.motion import (
     RelativeMotion,
     UncertainPose,
-    default_motion_covariance,
     link_from_motion,
 )
 from visloc.pose.pose_graph import Chain, error_scale, solve_chain
 from visloc.pose.views import MatchedView
 from visloc.types import RegistrationPreset
-
-__all__ = [
-    "RelativeMotion",
-    "WindowInstant",
-    "WindowPose",
-    "default_motion_covariance",
-    "solve_window",
-]
 
 # Fewer inliers under a pose that others gave are chance: blurred images have such, too.
 _MIN_OWN_INLIERS = 8

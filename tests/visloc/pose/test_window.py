@@ -18,14 +18,9 @@ from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import project
 from visloc.pose.covariance import pose_covariance
 from visloc.pose.generalized import LOSS_SCALE_PX, GeneralizedPose, refine_generalized_pose
+from visloc.pose.motion import RelativeMotion, default_motion_covariance
 from visloc.pose.views import MatchedView
-from visloc.pose.window import (
-    RelativeMotion,
-    WindowInstant,
-    WindowPose,
-    default_motion_covariance,
-    solve_window,
-)
+from visloc.pose.window import WindowInstant, WindowPose, solve_window
 from visloc.types import PRESETS, RegistrationPreset
 
 GATE = PRESETS["default"]
