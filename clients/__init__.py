@@ -2,6 +2,7 @@
 
 from clients.client import AsyncClient, Client
 from clients.features import Features
+from clients.geopose import GeoPose, GeoPoseYpr
 from clients.rigs import (
     ImageResult,
     Instant,
@@ -13,26 +14,38 @@ from clients.rigs import (
     RigSensor,
 )
 from clients.types import (
+    Anchor,
     CameraUsed,
+    Debug,
+    GeoCircle,
+    Geodetic,
     LocalizeOptions,
     LocalizeResult,
     MapInfo,
     MapVersion,
+    Near,
     Orientation,
     PoseEstimate,
     Refusal,
     RetrievedImage,
     RigInfo,
     ServerInfo,
+    VersionInfo,
 )
 from visloc.priors import GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
 from visloc.trajectory import PoseSource
 
 __all__ = [
+    "Anchor",
     "AsyncClient",
     "CameraUsed",
     "Client",
+    "Debug",
     "Features",
+    "GeoCircle",
+    "GeoPose",
+    "GeoPoseYpr",
+    "Geodetic",
     "GravityPrior",
     "HeightBand",
     "ImageResult",
@@ -42,6 +55,7 @@ __all__ = [
     "LocalizeResult",
     "MapInfo",
     "MapVersion",
+    "Near",
     "Odometry",
     "Orientation",
     "PoseEstimate",
@@ -57,4 +71,5 @@ __all__ = [
     "RigPose",
     "RigSensor",
     "ServerInfo",
+    "VersionInfo",
 ]

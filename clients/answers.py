@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ParamSpec, TypeVar
 
@@ -9,10 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clients.errors import INTERNAL, not_understood, received
+from clients.geopose import parse_geopose, parse_geopose_ypr
 from clients.requests import JsonObject
 from clients.rigs import ImageResult, InstantResult, RigPose
 from clients.types import (
+    Anchor,
     CameraUsed,
+    Debug,
+    GeoCircle,
+    Geodetic,
     LocalizeResult,
     MapInfo,
     MapVersion,
@@ -22,6 +28,7 @@ from clients.types import (
     RetrievedImage,
     RigInfo,
     ServerInfo,
+    VersionInfo,
 )
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
@@ -66,6 +73,10 @@ def parse_result(raw: JsonObject) -> LocalizeResult:
         map=MapVersion(raw["map"]["id"], raw["map"]["version"]),
         seconds=_numbers_by_name(raw["seconds"]),
         raw=raw,
+        # A server that does not know them leaves them out.
+        geopose=parse_geopose(raw.get("geopose")),
+        geopose_ypr=parse_geopose_ypr(raw.get("geopose_ypr")),
+        debug=_parse_debug(raw.get("debug")),
     )
 
 
@@ -107,6 +118,9 @@ def parse_instant(raw: JsonObject) -> InstantResult:
         map=MapVersion(raw["map"]["id"], raw["map"]["version"]),
         seconds=_numbers_by_name(raw["seconds"]),
         raw=raw,
+        # A server that does not know them leaves them out.
+        geopose=parse_geopose(raw.get("geopose")),
+        geopose_ypr=parse_geopose_ypr(raw.get("geopose_ypr")),
     )
 
 
@@ -133,6 +147,11 @@ def parse_map(raw: JsonObject) -> MapInfo:
         size_bytes=int(raw["size_bytes"]),
         down=_numbers(raw["down"]) if raw["down"] else None,
         rigs=tuple(RigInfo(rig["id"], tuple(rig["sensors"])) for rig in raw["rigs"]),
+        anchor=None if raw["anchor"] is None else _parse_anchor(raw["anchor"]),
+        place=None if raw["place"] is None else GeoCircle(**_numbers_by_name(raw["place"])),
+        current=bool(raw["current"]),
+        versions=tuple(VersionInfo(v["version"], bool(v["current"])) for v in raw["versions"]),
+        content_hash=raw["content_hash"],
     )
 
 
@@ -144,6 +163,39 @@ def parse_server(raw: JsonObject) -> ServerInfo:
 def parse_ready(raw: JsonObject) -> bool:
     """Parse whether a server can answer now."""
     return bool(raw["ready"])
+
+
+def _parse_debug(raw: JsonObject | None) -> Debug | None:
+    if raw is None:  # not asked for, or a server that does not know it
+        return None
+    inliers = np.array(raw["inliers"], dtype=np.bool_)
+    return Debug(
+        keypoints=_array(raw["keypoints"], len(inliers), 2),
+        points=_array(raw["points"], len(inliers), 3),
+        inliers=inliers,
+        overlay=base64.b64decode(raw["overlay"], validate=True),
+    )
+
+
+def _parse_anchor(raw: JsonObject) -> Anchor:
+    geodetic = raw["geodetic"]
+    return Anchor(
+        raw["kind"],
+        int(raw["images"]),
+        None if raw["rms"] is None else float(raw["rms"]),
+        None if geodetic is None else _parse_geodetic(geodetic),
+    )
+
+
+def _parse_geodetic(raw: JsonObject) -> Geodetic:
+    return Geodetic(
+        latitude_deg=float(raw["latitude_deg"]),
+        longitude_deg=float(raw["longitude_deg"]),
+        altitude_m=float(raw["altitude_m"]),
+        scale=float(raw["scale"]),
+        rotation_wxyz=_numbers(raw["rotation_wxyz"]),
+        translation=_numbers(raw["translation"]),
+    )
 
 
 def _parse_rig_pose(raw: JsonObject) -> RigPose:

@@ -23,8 +23,7 @@ class Asking:
     """What does not change while a dataset is asked about.
 
     Attributes:
-        server: its address.
-        timeout_s: longest wait for an answer.
+        connect: makes a client of the server.
         map_ref: ``id@version``.
         options: for every answer.
         concurrency: how many requests run at once.
@@ -32,8 +31,7 @@ class Asking:
         console: for the progress bar.
     """
 
-    server: str
-    timeout_s: float
+    connect: Callable[[], AsyncClient]
     map_ref: str
     options: LocalizeOptions
     concurrency: int
@@ -84,7 +82,7 @@ class Asking:
 
         async def run(advance: Callable[[], None]) -> None:
             nonlocal seconds
-            async with AsyncClient(self.server, timeout_s=self.timeout_s) as client:
+            async with self.connect() as client:
                 started = time.perf_counter()
                 await work(client, advance)
                 seconds = time.perf_counter() - started

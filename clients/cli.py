@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -15,6 +16,7 @@ from clients.asking import Asking
 from clients.batch import Batch, finish_batch, open_batch, run_batch, run_instants
 from clients.benchmark import Run, make_report, parse_threshold
 from clients.client import DEFAULT_TIMEOUT_S, AsyncClient, Client
+from clients.connection_options import DEFAULT_SERVER, ApiKeyFile, Ca, Server, TimeoutS, api_key_of
 from clients.display import (
     UNKNOWN_UNIT,
     print_batch,
@@ -24,6 +26,8 @@ from clients.display import (
     print_result,
     unit_of,
 )
+from clients.errors import not_understood
+from clients.maps_cli import maps_app
 from clients.modes import DEFAULT_MAX_GAP_S, Arrangement, Mode, arrange, parse_modes
 from clients.priors import priors_from_text
 from clients.progress import run_with_progress
@@ -52,10 +56,6 @@ _out = Console()
 _err = Console(stderr=True)
 
 MapRef = Annotated[str, typer.Option("--map", metavar="ID", help="id, or id@version.")]
-Server = Annotated[
-    str,
-    typer.Option("--server", metavar="URL", help="http://host:port or grpc://host:port."),
-]
 Options = Annotated[
     list[str] | None,
     typer.Option(
@@ -66,9 +66,6 @@ Options = Annotated[
     ),
 ]
 Seed = Annotated[int | None, typer.Option("--seed", min=0, help="The same as --option seed=...")]
-TimeoutS = Annotated[
-    float, typer.Option("--timeout", min=0.001, help="Longest wait for an answer, seconds.")
-]
 Concurrency = Annotated[
     int, typer.Option("--concurrency", min=1, max=1024, help="Photos asked about at once.")
 ]
@@ -126,7 +123,7 @@ RigOption = Annotated[
         help="For gp3p: a rig that the map knows, instead of the dataset's own rigs.txt.",
     ),
 ]
-DEFAULT_SERVER = "http://127.0.0.1:8000"
+app.add_typer(maps_app, name="maps")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -162,6 +159,14 @@ def image(
             help="What is known of the pose: position, height, pose or gravity, as in the API.",
         ),
     ] = None,
+    debug: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.jpg", help="Write a picture of the matches and their mapping photos."
+        ),
+    ] = None,
+    api_key_file: ApiKeyFile = None,
+    ca: Ca = None,
     timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
 ) -> None:
     """Localize one photo.
@@ -171,12 +176,19 @@ def image(
     options = _options(option, seed)
     intrinsics = None if camera is None else Camera.from_text(camera)
     known = None if priors is None else priors_from_text(priors)
-    with Client(server, timeout_s=timeout_s) as client:
-        result = client.localize(photo, map_ref, intrinsics, options, priors=known)
+    check_can_be_written([] if debug is None else [debug])
+    with Client(server, api_key=api_key_of(api_key_file), ca=ca, timeout_s=timeout_s) as client:
+        result = client.localize(
+            photo, map_ref, intrinsics, options, priors=known, debug=debug is not None
+        )
         if as_json:
             typer.echo(json.dumps(result.raw, indent=2))
         else:
             print_result(_out, result, _unit(client, f"{result.map.id}@{result.map.version}"))
+    if debug is not None:
+        if result.debug is None:
+            raise not_understood(server, "an answer without the picture that was asked for")
+        write_whole(debug, [result.debug.overlay])
     if not result.localized:
         raise typer.Exit(EXIT_NOT_LOCALIZED)
 
@@ -199,6 +211,8 @@ def localize_batch(
     restart: Annotated[
         bool, typer.Option("--restart", help="Remove the results in the folder and begin again.")
     ] = False,
+    api_key_file: ApiKeyFile = None,
+    ca: Ca = None,
     timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
 ) -> None:
     """Localize all photos of a dataset or list, or their features for a map of ready-made ones.
@@ -215,7 +229,8 @@ def localize_batch(
     """
     options = _options(option, seed)
     queries = read_queries(source, pixel_origin)
-    with Client(server, timeout_s=timeout_s) as client:
+    key = api_key_of(api_key_file)
+    with Client(server, api_key=key, ca=ca, timeout_s=timeout_s) as client:
         info = client.map(map_ref)
     arrangement = arrange(queries, [mode], info, rig_id=rig, time_unit=time_unit, max_gap_s=max_gap)
     read = choose_reader(source, info, features_dir, pixel_origin)
@@ -244,7 +259,7 @@ def localize_batch(
             for photo in outcome.photos:
                 count(photo)
 
-        async with AsyncClient(server, timeout_s=timeout_s) as client:
+        async with AsyncClient(server, api_key=key, ca=ca, timeout_s=timeout_s) as client:
             if mode is Mode.GP3P:
                 await run_instants(batch, client, instants, concurrency, count_instant, read)
             else:
@@ -297,6 +312,8 @@ def benchmark(
             "poses.txt; filled ones are in no file.",
         ),
     ] = None,
+    api_key_file: ApiKeyFile = None,
+    ca: Ca = None,
     timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
 ) -> None:
     """Measure how fast and, where the dataset has true poses, how well photos are localized.
@@ -312,11 +329,13 @@ def benchmark(
     thresholds = [parse_threshold(text) for text in threshold or ()] or DEFAULT_THRESHOLDS
     check_can_be_written([report] if poses is None else [report, poses])
     queries = read_queries(source, pixel_origin)
-    with Client(server, timeout_s=timeout_s) as client:
+    key = api_key_of(api_key_file)
+    with Client(server, api_key=key, ca=ca, timeout_s=timeout_s) as client:
         info, about = client.map(map_ref), client.server_info()
     arrangement = arrange(queries, modes, info, rig_id=rig, time_unit=time_unit, max_gap_s=max_gap)
     read = choose_reader(source, info, features_dir, pixel_origin)
-    ask = Asking(server, timeout_s, info.ref, options, concurrency, read, _err)
+    connect = partial(AsyncClient, server, api_key=key, ca=ca, timeout_s=timeout_s)
+    ask = Asking(connect, info.ref, options, concurrency, read, _err)
     of_photos = ask.photos(arrangement) if set(modes) != {Mode.GP3P} else None
     of_instants = ask.instants(arrangement) if Mode.GP3P in modes else None
     runs = {m: of_instants if m is Mode.GP3P else of_photos for m in modes}

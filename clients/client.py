@@ -6,6 +6,7 @@ Requests are built and answers are parsed in one place (``requests``, ``answers`
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import (
     AsyncGenerator,
     AsyncIterable,
@@ -13,24 +14,29 @@ from collections.abc import (
     Iterable,
     Iterator,
     Mapping,
-    Sequence,
 )
 from contextlib import aclosing
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
 
 from clients import answers
+from clients.connection import checked_connection
 from clients.errors import not_understood
 from clients.features import PhotoOrFeatures
 from clients.grpc import AsyncGrpcTransport, GrpcTransport
 from clients.http import AsyncHttpTransport, HttpTransport
 from clients.requests import (
     CheckReady,
+    DeleteVersion,
     GetServer,
+    GetVersion,
     JsonObject,
     ListMaps,
+    UseVersion,
+    Where,
     checked_search,
-    checked_server,
+    checked_version,
     get_map_request,
     localize_request,
 )
@@ -44,7 +50,8 @@ from clients.rig_requests import (
     sequence_start,
 )
 from clients.rigs import Instant, InstantResult, Rig, RigImage
-from clients.types import LocalizeOptions, LocalizeResult, MapInfo, ServerInfo
+from clients.types import LocalizeOptions, LocalizeResult, MapInfo, Near, ServerInfo
+from clients.uploads import OnProgress, Upload, upload_request
 from visloc.geometry import Camera
 from visloc.priors import Priors
 
@@ -56,6 +63,7 @@ class _Transport(Protocol):
     def stream(
         self, start: SequenceStart, instants: Iterable[SentInstant]
     ) -> Iterator[JsonObject]: ...
+    def upload(self, upload: Upload, on_progress: OnProgress) -> JsonObject: ...
     def close(self) -> None: ...
 
 
@@ -64,6 +72,7 @@ class _AsyncTransport(Protocol):
     def stream(
         self, start: SequenceStart, instants: AsyncIterable[SentInstant]
     ) -> AsyncGenerator[JsonObject, None]: ...
+    async def upload(self, upload: Upload, on_progress: OnProgress) -> JsonObject: ...
     async def close(self) -> None: ...
 
 
@@ -74,24 +83,38 @@ class Client:
     raised it, and ``Unavailable`` with a code ``server.*`` when no usable answer came.
 
     Args:
-        server: ``http://host:port``, ``https://host:port`` or ``grpc://host:port``.
-        timeout_s: longest wait for an answer, seconds.
+        server: ``http://host:port`` or ``grpc://host:port``; with TLS ``https://`` or
+            ``grpcs://``.
+        api_key: as the server's operator gave it; needed unless the server is on this machine and
+            has no keys. Only TLS keeps it from being read on the way.
+        ca: PEM file of the certificate authorities to trust, instead of the usual ones.
+        timeout_s: longest wait for an answer, seconds. The server is told, and gives up then too.
     """
 
-    def __init__(self, server: str, *, timeout_s: float = DEFAULT_TIMEOUT_S) -> None:
-        self.server = checked_server(server)
-        transport = GrpcTransport if server.startswith("grpc:") else HttpTransport
-        self._transport: _Transport = transport(server, timeout_s)
+    def __init__(
+        self,
+        server: str,
+        *,
+        api_key: str | None = None,
+        ca: str | Path | None = None,
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+    ) -> None:
+        connection = checked_connection(server, timeout_s, api_key, ca)
+        self.server = server
+        transport = GrpcTransport if connection.is_grpc else HttpTransport
+        self._transport: _Transport = transport(connection)
 
     def localize(
         self,
         query: PhotoOrFeatures,
-        map: str | Sequence[str],
+        map: Where,
         camera: Camera | None = None,
         options: LocalizeOptions | Mapping[str, Any] | None = None,
         request_id: str | None = None,
         *,
         priors: Priors | Mapping[str, Any] | None = None,
+        ypr: bool = False,
+        debug: bool = False,
     ) -> LocalizeResult:
         """Estimate the camera pose of one photo, or of its features.
 
@@ -100,26 +123,31 @@ class Client:
         Args:
             query: the encoded photo (JPEG, PNG, ...), the path of the file that holds it, or
                 the features that were found in it, which need a camera.
-            map: ``id`` or ``id@version``; of several, the best answer counts.
+            map: ``id`` or ``id@version``; of several, the best answer counts; or those that
+                are anchored around a place, as ``Near``.
             camera: intrinsics; without them the server uses EXIF or guesses, and says so.
             options: choices for this photo.
             request_id: names the request in the server's logs; made up there when None.
             priors: what is known of the camera, also as the API's JSON.
+            ypr: also say the GeoPose in yaw, pitch and roll.
+            debug: also return the matches and a picture of them (``LocalizeResult.debug``); needs a
+                photo.
         """
-        search = checked_search(map, options, priors, request_id)
-        request = localize_request(search, query, camera)
+        search = checked_search(map, options, priors, request_id, ypr=ypr)
+        request = localize_request(search, query, camera, debug=debug)
         raw = self._transport.send(request)
         return answers.parse_answer(self.server, answers.parse_result, raw)
 
     def localize_rig(
         self,
         images: Iterable[RigImage],
-        map: str | Sequence[str],
+        map: Where,
         rig: Rig,
         options: LocalizeOptions | Mapping[str, Any] | None = None,
         request_id: str | None = None,
         *,
         priors: Priors | Mapping[str, Any] | None = None,
+        ypr: bool = False,
     ) -> InstantResult:
         """Estimate one pose from the photos that the cameras of a rig took at one instant.
 
@@ -127,20 +155,22 @@ class Client:
 
         Args:
             images: the photos, each of another camera; some may be missing.
-            map: ``id`` or ``id@version``; of several, the best answer counts.
+            map: ``id`` or ``id@version``; of several, the best answer counts; or those that
+                are anchored around a place, as ``Near``.
             rig: how the cameras sit, or the id of a rig that the map knows (``MapInfo.rigs``).
             options: choices for this instant.
             request_id: names the request in the server's logs; made up there when None.
             priors: what is known of the rig, also as the API's JSON.
+            ypr: also say the GeoPose in yaw, pitch and roll.
         """
-        search = checked_search(map, options, priors, request_id)
+        search = checked_search(map, options, priors, request_id, ypr=ypr)
         raw = self._transport.send(rig_request(search, rig, images))
         return answers.parse_answer(self.server, answers.parse_instant, raw)
 
     def localize_sequence(
         self,
         instants: Iterable[Instant],
-        map: str | Sequence[str],
+        map: Where,
         rig: Rig | None = None,
         time_unit: str | None = None,
         max_gap_s: float | None = None,
@@ -148,6 +178,7 @@ class Client:
         request_id: str | None = None,
         *,
         priors: Priors | Mapping[str, Any] | None = None,
+        ypr: bool = False,
     ) -> Iterator[InstantResult]:
         """Estimate the poses of a sequence, each answered as soon as its answer is final.
 
@@ -163,7 +194,8 @@ class Client:
 
         Args:
             instants: in the order of time.
-            map: ``id`` or ``id@version``; of several, that of the first pose is kept.
+            map: ``id`` or ``id@version``; of several, that of the first pose is kept; or, as
+                ``Near``, those that are anchored around a place.
             rig: how the cameras sit, or the id of a rig that the map knows; None when every
                 instant is one photo of one camera.
             time_unit: of the timestamps, s, ms, us or ns; None tells it by their size, which must
@@ -173,20 +205,64 @@ class Client:
             options: choices for all instants.
             request_id: names the request in the server's logs; made up there when None.
             priors: what is known at every instant that has none of its own.
+            ypr: also say the GeoPose in yaw, pitch and roll.
         """
-        search = checked_search(map, options, priors, request_id)
+        search = checked_search(map, options, priors, request_id, ypr=ypr)
         start = sequence_start(search, rig, time_unit, max_gap_s)
         return self._stream(start, instants)
 
-    def maps(self) -> list[MapInfo]:
-        """List the maps that the server has."""
-        raw = self._transport.send(ListMaps())
+    def maps(self, near: Near | None = None) -> list[MapInfo]:
+        """List the maps that the server has: all, or the anchored ones that reach into a circle."""
+        raw = self._transport.send(ListMaps(near))
         return answers.parse_answer(self.server, answers.parse_maps, raw)
 
     def map(self, map: str) -> MapInfo:
         """Describe one map, ``id`` or ``id@version``."""
         raw = self._transport.send(get_map_request(map))
         return answers.parse_answer(self.server, answers.parse_map, raw)
+
+    def map_version(self, map_id: str, version: str) -> MapInfo:
+        """Describe a version of a map, in use or not."""
+        raw = self._transport.send(GetVersion(*checked_version(map_id, version)))
+        return answers.parse_answer(self.server, answers.parse_map, raw)
+
+    def upload_map(
+        self,
+        packed: str | Path,
+        map_id: str | None = None,
+        version: str | None = None,
+        *,
+        on_progress: OnProgress | None = None,
+    ) -> MapInfo:
+        """Publish a version of a map, which is not in use until ``use_version`` names it.
+
+        The server reads and checks every byte before anyone can see it. When this is stopped or
+        fails, nothing is left there. When the answer is lost, so that it is not known whether
+        the map came through, ``map_version`` tells, or trying again: ``map.version_exists``.
+
+        Args:
+            packed: the file that ``mapping pack`` wrote.
+            map_id: the map's id; None reads it from the file.
+            version: the version's name; None reads it from the file.
+            on_progress: is called with the number of bytes that were sent since the last call,
+                over gRPC in another thread.
+        """
+        upload = upload_request(Path(packed), map_id, version)
+        raw = self._transport.upload(upload, on_progress or _ignore)
+        return answers.parse_answer(self.server, answers.parse_map, raw)
+
+    def use_version(self, map_id: str, version: str) -> MapInfo:
+        """Put a version of a map into use, a newer or an older one.
+
+        Returns once the server answers with it. Requests that are under way are answered by the
+        version that they began with.
+        """
+        raw = self._transport.send(UseVersion(*checked_version(map_id, version)))
+        return answers.parse_answer(self.server, answers.parse_map, raw)
+
+    def delete_version(self, map_id: str, version: str) -> None:
+        """Delete a version of a map that is not in use, or the last one there is."""
+        self._transport.send(DeleteVersion(*checked_version(map_id, version)))
 
     def server_info(self) -> ServerInfo:
         """Describe the server."""
@@ -224,46 +300,57 @@ class Client:
 class AsyncClient:
     """``Client`` for an event loop: the same methods, awaited; use it with ``async with``."""
 
-    def __init__(self, server: str, *, timeout_s: float = DEFAULT_TIMEOUT_S) -> None:
-        self.server = checked_server(server)
-        transport = AsyncGrpcTransport if server.startswith("grpc:") else AsyncHttpTransport
-        self._transport: _AsyncTransport = transport(server, timeout_s)
+    def __init__(
+        self,
+        server: str,
+        *,
+        api_key: str | None = None,
+        ca: str | Path | None = None,
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+    ) -> None:
+        connection = checked_connection(server, timeout_s, api_key, ca)
+        self.server = server
+        transport = AsyncGrpcTransport if connection.is_grpc else AsyncHttpTransport
+        self._transport: _AsyncTransport = transport(connection)
 
     async def localize(
         self,
         query: PhotoOrFeatures,
-        map: str | Sequence[str],
+        map: Where,
         camera: Camera | None = None,
         options: LocalizeOptions | Mapping[str, Any] | None = None,
         request_id: str | None = None,
         *,
         priors: Priors | Mapping[str, Any] | None = None,
+        ypr: bool = False,
+        debug: bool = False,
     ) -> LocalizeResult:
         """As ``Client.localize``. A path is read in the loop; give bytes where that matters."""
-        search = checked_search(map, options, priors, request_id)
-        request = localize_request(search, query, camera)
+        search = checked_search(map, options, priors, request_id, ypr=ypr)
+        request = localize_request(search, query, camera, debug=debug)
         raw = await self._transport.send(request)
         return answers.parse_answer(self.server, answers.parse_result, raw)
 
     async def localize_rig(
         self,
         images: Iterable[RigImage],
-        map: str | Sequence[str],
+        map: Where,
         rig: Rig,
         options: LocalizeOptions | Mapping[str, Any] | None = None,
         request_id: str | None = None,
         *,
         priors: Priors | Mapping[str, Any] | None = None,
+        ypr: bool = False,
     ) -> InstantResult:
         """As ``Client.localize_rig``."""
-        search = checked_search(map, options, priors, request_id)
+        search = checked_search(map, options, priors, request_id, ypr=ypr)
         raw = await self._transport.send(rig_request(search, rig, images))
         return answers.parse_answer(self.server, answers.parse_instant, raw)
 
     def localize_sequence(
         self,
         instants: AsyncIterable[Instant] | Iterable[Instant],
-        map: str | Sequence[str],
+        map: Where,
         rig: Rig | None = None,
         time_unit: str | None = None,
         max_gap_s: float | None = None,
@@ -271,21 +358,49 @@ class AsyncClient:
         request_id: str | None = None,
         *,
         priors: Priors | Mapping[str, Any] | None = None,
+        ypr: bool = False,
     ) -> AsyncIterator[InstantResult]:
         """As ``Client.localize_sequence``, for ``async for``."""
-        search = checked_search(map, options, priors, request_id)
+        search = checked_search(map, options, priors, request_id, ypr=ypr)
         start = sequence_start(search, rig, time_unit, max_gap_s)
         return self._stream(start, instants)
 
-    async def maps(self) -> list[MapInfo]:
+    async def maps(self, near: Near | None = None) -> list[MapInfo]:
         """As ``Client.maps``."""
-        raw = await self._transport.send(ListMaps())
+        raw = await self._transport.send(ListMaps(near))
         return answers.parse_answer(self.server, answers.parse_maps, raw)
 
     async def map(self, map: str) -> MapInfo:
         """As ``Client.map``."""
         raw = await self._transport.send(get_map_request(map))
         return answers.parse_answer(self.server, answers.parse_map, raw)
+
+    async def map_version(self, map_id: str, version: str) -> MapInfo:
+        """As ``Client.map_version``."""
+        raw = await self._transport.send(GetVersion(*checked_version(map_id, version)))
+        return answers.parse_answer(self.server, answers.parse_map, raw)
+
+    async def upload_map(
+        self,
+        packed: str | Path,
+        map_id: str | None = None,
+        version: str | None = None,
+        *,
+        on_progress: OnProgress | None = None,
+    ) -> MapInfo:
+        """As ``Client.upload_map``."""
+        upload = await asyncio.to_thread(upload_request, Path(packed), map_id, version)
+        raw = await self._transport.upload(upload, on_progress or _ignore)
+        return answers.parse_answer(self.server, answers.parse_map, raw)
+
+    async def use_version(self, map_id: str, version: str) -> MapInfo:
+        """As ``Client.use_version``."""
+        raw = await self._transport.send(UseVersion(*checked_version(map_id, version)))
+        return answers.parse_answer(self.server, answers.parse_map, raw)
+
+    async def delete_version(self, map_id: str, version: str) -> None:
+        """As ``Client.delete_version``."""
+        await self._transport.send(DeleteVersion(*checked_version(map_id, version)))
 
     async def server_info(self) -> ServerInfo:
         """As ``Client.server_info``."""
@@ -351,3 +466,7 @@ class _Count:
         if self.answers != self._instants:
             got = f"{self.answers} answers to {self._instants} instants"
             raise not_understood(self._server, got)
+
+
+def _ignore(_: int) -> None:
+    pass

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from visloc import errors
-from visloc.errors import Unavailable, VislocError
+from visloc.errors import TimedOut, Unavailable, VislocError
 
 # By the name that the server sends.
 _KINDS = {
@@ -25,6 +25,8 @@ class Fallback:
 
 
 INVALID = Fallback(errors.InvalidInput, "request.invalid")
+UNAUTHENTICATED = Fallback(errors.Unauthenticated, "request.unauthenticated")
+FORBIDDEN = Fallback(errors.Forbidden, "request.forbidden")
 NOT_FOUND = Fallback(errors.NotFound, "request.not_found")
 CONFLICT = Fallback(errors.Conflict, "request.conflict")
 TOO_LARGE = Fallback(errors.TooLarge, "request.too_large")
@@ -62,9 +64,9 @@ def unreachable(server: str, why: str) -> Unavailable:
     )
 
 
-def timed_out(server: str, timeout_s: float) -> Unavailable:
+def timed_out(server: str, timeout_s: float) -> TimedOut:
     """Make the exception for an answer that did not come in time."""
-    return Unavailable(
+    return TimedOut(
         "server.timeout",
         "no answer in time; the server may be busy, or allow it more time",
         field=server,

@@ -2,22 +2,45 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncGenerator, AsyncIterable, Callable, Iterable, Iterator
 from contextlib import aclosing
-from typing import assert_never
+from functools import partial
+from typing import Any, assert_never
 
 import grpc
 from google.protobuf.message import DecodeError
 
 from clients import errors
+from clients.connection import Connection
 from clients.grpc_errors import Metadata, grpc_failure
 from clients.grpc_streams import stream_answers, stream_answers_async
-from clients.messages import localize_message, plain, rig_message
-from clients.requests import CheckReady, GetMap, GetServer, JsonObject, ListMaps, Localize
+from clients.grpc_uploads import UploadFeed
+from clients.messages import (
+    list_maps_message,
+    localize_message,
+    plain,
+    rig_message,
+    version_message,
+)
+from clients.requests import (
+    CheckReady,
+    DeleteVersion,
+    GetMap,
+    GetServer,
+    GetVersion,
+    JsonObject,
+    ListMaps,
+    Localize,
+    UseVersion,
+)
 from clients.rig_requests import AnyRequest, LocalizeRig, SentInstant, SequenceStart
+from clients.uploads import OnProgress, Upload
 from visloc_api.v1 import localization_pb2 as wire
 
 _SERVICE = f"/{wire.DESCRIPTOR.services_by_name['Localization'].full_name}"
+_MAPS = f"/{wire.DESCRIPTOR.services_by_name['Maps'].full_name}"
+_PUT_VERSION = f"{_MAPS}/PutVersion"
 _SEQUENCE = f"{_SERVICE}/LocalizeSequence"
 # Sent by the service with every answer; the protocol has no other place for it.
 _VERSION_KEY = "visloc-version"
@@ -28,9 +51,14 @@ _SERVING = b"\x08\x01"
 class GrpcTransport:
     """Sends requests and waits for the answers; safe to share between threads."""
 
-    def __init__(self, server: str, timeout_s: float) -> None:
-        self._server, self._timeout_s = server, timeout_s
-        self._channel = grpc.insecure_channel(_target(server))
+    def __init__(self, connection: Connection) -> None:
+        self._server, self._timeout_s = connection.server, connection.timeout_s
+        self._metadata = _metadata(connection)
+        target, credentials = _target(connection), _credentials(connection)
+        if credentials is None:
+            self._channel = grpc.insecure_channel(target)
+        else:
+            self._channel = grpc.secure_channel(target, credentials)
 
     def send(self, request: AnyRequest) -> JsonObject:
         """Return the answer as plain JSON, the same as over HTTP.
@@ -41,7 +69,9 @@ class GrpcTransport:
         path, message, decode = _encode(request)
         call = self._channel.unary_unary(path, None, None)
         try:
-            answer, context = call.with_call(message, timeout=self._timeout_s)
+            answer, context = call.with_call(
+                message, timeout=self._timeout_s, metadata=self._metadata
+            )
         except grpc.RpcError as error:
             raise grpc_failure(self._server, self._timeout_s, error) from error
         return _decoded(self._server, decode, answer, context.initial_metadata())
@@ -52,8 +82,25 @@ class GrpcTransport:
         Raises:
             VislocError: as ``send``.
         """
-        call = self._channel.stream_stream(_SEQUENCE, None, None)
+        call = partial(self._channel.stream_stream(_SEQUENCE, None, None), metadata=self._metadata)
         yield from stream_answers(call, self._server, self._timeout_s, start, instants)
+
+    def upload(self, upload: Upload, on_progress: OnProgress) -> JsonObject:
+        """Send a packed map, and return what it is.
+
+        Raises:
+            VislocError: as ``send``, and what the file raises.
+        """
+        feed = UploadFeed(upload, on_progress)
+        call = self._channel.stream_unary(_PUT_VERSION, None, None)
+        within_s = upload.done_within_s(self._timeout_s)
+        try:
+            answer, context = call.with_call(
+                feed.messages(), timeout=within_s, metadata=self._metadata
+            )
+        except grpc.RpcError as error:
+            raise feed.failure or grpc_failure(self._server, within_s, error) from error
+        return _decoded(self._server, _read_map, answer, context.initial_metadata())
 
     def close(self) -> None:
         """Close the connection."""
@@ -63,14 +110,17 @@ class GrpcTransport:
 class AsyncGrpcTransport:
     """``GrpcTransport`` for the event loop in which it is first used."""
 
-    def __init__(self, server: str, timeout_s: float) -> None:
-        self._server, self._timeout_s = server, timeout_s
+    def __init__(self, connection: Connection) -> None:
+        self._server, self._timeout_s = connection.server, connection.timeout_s
+        self._metadata = _metadata(connection)
+        self._connection = connection
         self._channel: grpc.aio.Channel | None = None
 
     async def send(self, request: AnyRequest) -> JsonObject:
         """As ``GrpcTransport.send``."""
         path, message, decode = _encode(request)
-        call = self._opened().unary_unary(path, None, None)(message, timeout=self._timeout_s)
+        make_call = self._opened().unary_unary(path, None, None)
+        call = make_call(message, timeout=self._timeout_s, metadata=self._metadata)
         try:
             answer = await call
             metadata = await call.initial_metadata()
@@ -82,11 +132,21 @@ class AsyncGrpcTransport:
         self, start: SequenceStart, instants: AsyncIterable[SentInstant]
     ) -> AsyncGenerator[JsonObject, None]:
         """As ``GrpcTransport.stream``."""
-        call = self._opened().stream_stream(_SEQUENCE, None, None)
+        make_call: Any = self._opened().stream_stream(_SEQUENCE, None, None)
+        call = partial(make_call, metadata=self._metadata)
         answers = stream_answers_async(call, self._server, self._timeout_s, start, instants)
         async with aclosing(answers):
             async for answer in answers:
                 yield answer
+
+    async def upload(self, upload: Upload, on_progress: OnProgress) -> JsonObject:
+        """As ``GrpcTransport.upload``; ``on_progress`` is called in another thread."""
+        # Not grpc.aio, which loses what the server says to a call that is still being written.
+        sending = GrpcTransport(self._connection)
+        try:
+            return await asyncio.to_thread(sending.upload, upload, on_progress)
+        finally:
+            sending.close()  # when this is cancelled, the call is
 
     async def close(self) -> None:
         """Close the connection."""
@@ -95,15 +155,31 @@ class AsyncGrpcTransport:
 
     def _opened(self) -> grpc.aio.Channel:
         if self._channel is None:  # not in the constructor: it binds to the running loop
-            self._channel = grpc.aio.insecure_channel(_target(self._server))
+            target, credentials = _target(self._connection), _credentials(self._connection)
+            if credentials is None:
+                self._channel = grpc.aio.insecure_channel(target)
+            else:
+                self._channel = grpc.aio.secure_channel(target, credentials)
         return self._channel
 
 
 _Decode = Callable[[bytes, Metadata], JsonObject]
 
 
-def _target(server: str) -> str:
-    return server.removeprefix("grpc://").rstrip("/")
+def _target(connection: Connection) -> str:
+    return connection.server.partition("://")[2].rstrip("/")
+
+
+def _credentials(connection: Connection) -> grpc.ChannelCredentials | None:
+    if not connection.is_encrypted:
+        return None
+    authorities = connection.authorities
+    return grpc.ssl_channel_credentials(None if authorities is None else authorities.encode())
+
+
+def _metadata(connection: Connection) -> tuple[tuple[str, str], ...]:
+    key = connection.api_key
+    return () if key is None else (("authorization", f"Bearer {key}"),)
 
 
 def _encode(request: AnyRequest) -> tuple[str, bytes, _Decode]:
@@ -116,15 +192,26 @@ def _encode(request: AnyRequest) -> tuple[str, bytes, _Decode]:
             message = rig_message(request).SerializeToString()
             return f"{_SERVICE}/LocalizeRig", message, _read_instant
         case ListMaps():
-            return f"{_SERVICE}/ListMaps", b"", _read_maps
+            message = list_maps_message(request).SerializeToString()
+            return f"{_SERVICE}/ListMaps", message, _read_maps
         case GetMap():
             message = wire.GetMapRequest(map=request.map).SerializeToString()
             return f"{_SERVICE}/GetMap", message, _read_map
+        case GetVersion():
+            return f"{_MAPS}/GetVersion", _version_message(request), _read_map
+        case UseVersion():
+            return f"{_MAPS}/SetCurrent", _version_message(request), _read_map
+        case DeleteVersion():
+            return f"{_MAPS}/DeleteVersion", _version_message(request), _read_nothing
         case GetServer():
             return f"{_SERVICE}/ListMaps", b"", _read_server
         case CheckReady():
             return "/grpc.health.v1.Health/Check", b"", _read_ready
     assert_never(request)
+
+
+def _version_message(request: GetVersion | UseVersion | DeleteVersion) -> bytes:
+    return version_message(request.map_id, request.version).SerializeToString()
 
 
 def _decoded(server: str, decode: _Decode, answer: bytes, metadata: Metadata) -> JsonObject:
@@ -148,6 +235,10 @@ def _read_maps(answer: bytes, _: Metadata) -> JsonObject:
 
 def _read_map(answer: bytes, _: Metadata) -> JsonObject:
     return plain(wire.MapInfo.FromString(answer))
+
+
+def _read_nothing(answer: bytes, _: Metadata) -> JsonObject:
+    return plain(wire.DeleteVersionResponse.FromString(answer))
 
 
 def _read_server(_: bytes, metadata: Metadata) -> JsonObject:

@@ -19,6 +19,8 @@ _STATUS_KEY = "grpc-status-details-bin"
 _FALLBACKS: Mapping[grpc.StatusCode, errors.Fallback] = {
     grpc.StatusCode.INVALID_ARGUMENT: errors.INVALID,
     grpc.StatusCode.OUT_OF_RANGE: errors.INVALID,
+    grpc.StatusCode.UNAUTHENTICATED: errors.UNAUTHENTICATED,
+    grpc.StatusCode.PERMISSION_DENIED: errors.FORBIDDEN,
     grpc.StatusCode.NOT_FOUND: errors.NOT_FOUND,
     grpc.StatusCode.ALREADY_EXISTS: errors.CONFLICT,
     grpc.StatusCode.FAILED_PRECONDITION: errors.CONFLICT,

@@ -28,7 +28,7 @@ from visloc_api.v1 import localization_pb2 as wire
 
 
 def stream_answers(
-    make_call: grpc.StreamStreamMultiCallable[bytes, bytes],
+    make_call: Callable[[Iterator[bytes]], Any],  # the stubs do not know all of what it gives
     server: str,
     timeout_s: float,
     start: SequenceStart,
@@ -53,7 +53,7 @@ def stream_answers(
     waiting = iter(instants)
     head = _head(start, next(waiting, None))
     feed = _Feed()
-    call: Any = make_call(feed.messages(head, waiting))  # the stubs do not know all of it
+    call = make_call(feed.messages(head, waiting))
     has_timed_out = threading.Event()
 
     def give_up() -> None:

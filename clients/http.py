@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+import ssl
 from collections.abc import AsyncGenerator, AsyncIterable, Iterable, Iterator, Mapping
+from typing import Any
 
 import httpx
 
 from clients import errors
-from clients.http_requests import NDJSON, encode_request, encode_sequence
+from clients.connection import Connection
+from clients.http_requests import NDJSON, encode_request, encode_sequence, encode_upload
 from clients.requests import CheckReady, JsonObject
 from clients.rig_requests import AnyRequest, SentInstant, SequenceStart
-from visloc.errors import Unavailable, VislocError
+from clients.uploads import OnProgress, Upload, pieces, pieces_async
+from visloc.errors import Conflict, Unavailable, VislocError
 
 _CONNECT_TIMEOUT_S = 10.0
 _LIMITS = httpx.Limits(
@@ -23,6 +27,8 @@ _LIMITS = httpx.Limits(
 )
 _FALLBACKS = {
     400: errors.INVALID,
+    401: errors.UNAUTHENTICATED,
+    403: errors.FORBIDDEN,
     404: errors.NOT_FOUND,
     409: errors.CONFLICT,
     413: errors.TOO_LARGE,
@@ -37,9 +43,9 @@ _FALLBACKS = {
 class HttpTransport:
     """Sends requests and waits for the answers; safe to share between threads."""
 
-    def __init__(self, server: str, timeout_s: float) -> None:
-        self._server, self._timeout_s = server, timeout_s
-        self._http = httpx.Client(base_url=server, timeout=_timeout(timeout_s), limits=_LIMITS)
+    def __init__(self, connection: Connection) -> None:
+        self._server, self._timeout_s = connection.server, connection.timeout_s
+        self._http = httpx.Client(**_options(connection))
 
     def send(self, request: AnyRequest) -> JsonObject:
         """Return the answer as plain JSON.
@@ -47,7 +53,7 @@ class HttpTransport:
         Raises:
             VislocError: what the server refused, or ``server.*``.
         """
-        method, path, parts = encode_request(request)
+        method, path, parts = encode_request(request, self._timeout_s)
         try:
             response = self._http.request(method, path, **parts)
         except httpx.HTTPError as error:
@@ -60,7 +66,7 @@ class HttpTransport:
         Raises:
             VislocError: as ``send``.
         """
-        method, path, parts = encode_sequence(start, list(instants))
+        method, path, parts = encode_sequence(start, list(instants), self._timeout_s)
         try:
             with self._http.stream(method, path, **parts) as response:
                 if response.status_code != 200:
@@ -73,6 +79,22 @@ class HttpTransport:
         except httpx.HTTPError as error:
             raise _failure(self._server, self._timeout_s, error) from error
 
+    def upload(self, upload: Upload, on_progress: OnProgress) -> JsonObject:
+        """Send a packed map, and return what it is.
+
+        Raises:
+            VislocError: as ``send``, and what the file raises.
+        """
+        method, path, parts = encode_upload(upload, self._timeout_s)
+        try:
+            _refuse_published(upload, self._http.get(path))
+            response = self._http.request(
+                method, path, content=pieces(upload, on_progress), **parts
+            )
+        except httpx.HTTPError as error:
+            raise _failure(self._server, self._timeout_s, error) from error
+        return _decode(self._server, None, response)
+
     def close(self) -> None:
         """Close the connections."""
         self._http.close()
@@ -81,13 +103,13 @@ class HttpTransport:
 class AsyncHttpTransport:
     """``HttpTransport`` for an event loop."""
 
-    def __init__(self, server: str, timeout_s: float) -> None:
-        self._server, self._timeout_s = server, timeout_s
-        self._http = httpx.AsyncClient(base_url=server, timeout=_timeout(timeout_s), limits=_LIMITS)
+    def __init__(self, connection: Connection) -> None:
+        self._server, self._timeout_s = connection.server, connection.timeout_s
+        self._http = httpx.AsyncClient(**_options(connection))
 
     async def send(self, request: AnyRequest) -> JsonObject:
         """As ``HttpTransport.send``."""
-        method, path, parts = encode_request(request)
+        method, path, parts = encode_request(request, self._timeout_s)
         try:
             response = await self._http.request(method, path, **parts)
         except httpx.HTTPError as error:
@@ -98,7 +120,8 @@ class AsyncHttpTransport:
         self, start: SequenceStart, instants: AsyncIterable[SentInstant]
     ) -> AsyncGenerator[JsonObject, None]:
         """As ``HttpTransport.stream``."""
-        method, path, parts = encode_sequence(start, [instant async for instant in instants])
+        sent = [instant async for instant in instants]
+        method, path, parts = encode_sequence(start, sent, self._timeout_s)
         try:
             async with self._http.stream(method, path, **parts) as response:
                 if response.status_code != 200:
@@ -112,29 +135,69 @@ class AsyncHttpTransport:
         except httpx.HTTPError as error:
             raise _failure(self._server, self._timeout_s, error) from error
 
+    async def upload(self, upload: Upload, on_progress: OnProgress) -> JsonObject:
+        """As ``HttpTransport.upload``."""
+        method, path, parts = encode_upload(upload, self._timeout_s)
+        try:
+            _refuse_published(upload, await self._http.get(path))
+            response = await self._http.request(
+                method, path, content=pieces_async(upload, on_progress), **parts
+            )
+        except httpx.HTTPError as error:
+            raise _failure(self._server, self._timeout_s, error) from error
+        return _decode(self._server, None, response)
+
     async def close(self) -> None:
         """Close the connections."""
         await self._http.aclose()
 
 
-def _timeout(timeout_s: float) -> httpx.Timeout:
-    return httpx.Timeout(timeout_s, connect=min(_CONNECT_TIMEOUT_S, timeout_s))
+def _options(connection: Connection) -> dict[str, Any]:
+    """Return what httpx wants to know, for its client of either kind."""
+    timeout_s, key = connection.timeout_s, connection.api_key
+    options: dict[str, Any] = {
+        "base_url": connection.server,
+        "timeout": httpx.Timeout(timeout_s, connect=min(_CONNECT_TIMEOUT_S, timeout_s)),
+        "limits": _LIMITS,
+        "headers": {} if key is None else {"Authorization": f"Bearer {key}"},
+    }
+    if connection.authorities is not None:
+        options["verify"] = ssl.create_default_context(cadata=connection.authorities)
+    return options
 
 
 def _decode(server: str, request: AnyRequest | None, response: httpx.Response) -> JsonObject:
     if isinstance(request, CheckReady) and response.status_code in (200, 503):
         return {"ready": response.status_code == 200}
+    if response.status_code == 204:
+        return {}
     try:
         body = response.json()
     except ValueError:
         body = None
-    if response.status_code == 200 and isinstance(body, dict):
+    if response.status_code in (200, 201) and isinstance(body, dict):
         return body
     if response.status_code < 400:
         content_type = response.headers.get("content-type", "nothing")
         raise errors.not_understood(server, f"{response.status_code} with {content_type}")
     message = f"the server answered {response.status_code} {response.reason_phrase}"
     raise _refusal(response.status_code, message, body if isinstance(body, dict) else {})
+
+
+def _refuse_published(upload: Upload, described: httpx.Response) -> None:
+    """Refuse what the server would refuse, which over HTTP is heard only when all is sent.
+
+    Raises:
+        Conflict: ``map.version_exists``.
+    """
+    if described.status_code == 200:
+        raise Conflict(
+            "map.version_exists",
+            "the version exists already; versions never change",
+            field="version",
+            expected="a version that is not there",
+            got=f"{upload.map_id}@{upload.version}",
+        )
 
 
 def _check_lines(server: str, response: httpx.Response) -> None:

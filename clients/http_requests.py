@@ -6,16 +6,21 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, assert_never
 
+import httpx
+
 from clients.features import Features
 from clients.priors import priors_as_json
 from clients.requests import (
     CheckReady,
+    DeleteVersion,
     GetMap,
     GetServer,
+    GetVersion,
     JsonObject,
     ListMaps,
     Localize,
     Search,
+    UseVersion,
 )
 from clients.rig_requests import (
     AnyRequest,
@@ -28,15 +33,17 @@ from clients.rig_requests import (
     rig_as_json,
     search_as_json,
 )
+from clients.types import Near
+from clients.uploads import Upload
 
 NDJSON = "application/x-ndjson"
 
 
-def encode_request(request: AnyRequest) -> tuple[str, str, dict[str, Any]]:
+def encode_request(request: AnyRequest, timeout_s: float) -> tuple[str, str, dict[str, Any]]:
     """Return method, path and the rest of what httpx wants."""
     match request:
         case Localize():
-            headers = _id_header(request.search)
+            headers = _headers(request.search, timeout_s)
             fields = _fields(request)
             parts = {"data": fields, "files": _file(request.query), "headers": headers}
             return "POST", "/localize", parts
@@ -46,11 +53,17 @@ def encode_request(request: AnyRequest) -> tuple[str, str, dict[str, Any]]:
                 "rig": rig_as_json(request.rig),
                 "images": files.images(request.images),
             }
-            return "POST", "/localize/rig", files.form(asked, _id_header(request.search))
+            return "POST", "/localize/rig", files.form(asked, _headers(request.search, timeout_s))
         case ListMaps():
-            return "GET", "/maps", {}
+            return "GET", "/maps", {} if request.near is None else {"params": _near(request.near)}
         case GetMap():
             return "GET", f"/maps/{request.map}", {}
+        case GetVersion():
+            return "GET", version_path(request.map_id, request.version), {}
+        case UseVersion():
+            return "POST", f"/maps/{request.map_id}/current", {"json": {"version": request.version}}
+        case DeleteVersion():
+            return "DELETE", version_path(request.map_id, request.version), {}
         case GetServer():
             return "GET", "/healthz", {}
         case CheckReady():
@@ -58,8 +71,13 @@ def encode_request(request: AnyRequest) -> tuple[str, str, dict[str, Any]]:
     assert_never(request)
 
 
+def version_path(map_id: str, version: str) -> str:
+    """Return the path of a version of a map."""
+    return f"/maps/{map_id}/versions/{version}"
+
+
 def encode_sequence(
-    start: SequenceStart, instants: Sequence[SentInstant]
+    start: SequenceStart, instants: Sequence[SentInstant], timeout_s: float
 ) -> tuple[str, str, dict[str, Any]]:
     """As ``encode_request``, for a sequence."""
     files = _Files()
@@ -70,8 +88,16 @@ def encode_sequence(
         asked["time_unit"] = start.time_unit
     if start.max_gap_s is not None:
         asked["max_gap_s"] = start.max_gap_s
-    headers = _id_header(start.search) | {"Accept": NDJSON}
+    headers = _headers(start.search, timeout_s) | {"Accept": NDJSON}
     return "POST", "/localize/sequence", files.form(asked, headers)
+
+
+def encode_upload(upload: Upload, timeout_s: float) -> tuple[str, str, dict[str, Any]]:
+    """As ``encode_request``, for a packed map, whose bytes are the caller's to add."""
+    headers = {"Content-Type": "application/zip", "Content-Length": str(upload.size_bytes)}
+    timeout = httpx.Timeout(timeout_s, read=upload.verified_within_s(timeout_s))
+    path = version_path(upload.map_id, upload.version)
+    return "PUT", path, {"headers": headers, "timeout": timeout}
 
 
 class _Files:
@@ -126,11 +152,22 @@ def _fields(request: Localize) -> dict[str, str]:
         fields["map"] = said["map"]
     if request.camera is not None:
         fields["camera"] = json.dumps(camera_as_json(request.camera))
+    if request.debug:
+        fields["debug"] = "true"
     return fields
 
 
-def _id_header(search: Search) -> dict[str, str]:
-    return {} if search.request_id is None else {"X-Request-ID": search.request_id}
+def _near(near: Near) -> dict[str, str]:
+    # The shortest text of each number that reads back the same.
+    return {"near": f"{float(near.latitude)!r},{float(near.longitude)!r},{float(near.radius)!r}"}
+
+
+def _headers(search: Search, timeout_s: float) -> dict[str, str]:
+    # So that the server does not work for a caller that waits no longer.
+    headers = {"X-Request-Timeout": f"{timeout_s:g}"}
+    if search.request_id is not None:
+        headers["X-Request-ID"] = search.request_id
+    return headers
 
 
 def _file(query: bytes | Features) -> dict[str, tuple[str, bytes, str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,17 +12,19 @@ from numpy.typing import NDArray
 
 from clients.features import Features
 from clients.priors import priors_as_json
-from clients.requests import Localize, Search
+from clients.requests import ListMaps, Localize, Search
 from clients.rig_requests import (
     LocalizeRig,
     SentImage,
     SentInstant,
     SequenceStart,
     camera_as_json,
+    near_as_json,
     odometry_as_json,
     rig_as_json,
 )
 from clients.rigs import Rig
+from clients.types import Near
 from visloc.geometry import Camera
 from visloc_api.v1 import localization_pb2 as wire
 
@@ -31,6 +34,8 @@ def localize_message(request: Localize) -> wire.LocalizeRequest:
     message = wire.LocalizeRequest()
     _set_search(message, request.search)
     _set_query(message, request.query, request.camera)
+    if request.debug:
+        message.debug = True
     return message
 
 
@@ -71,6 +76,21 @@ def instant_message(instant: SentInstant) -> wire.LocalizeSequenceRequest:
     return message
 
 
+def list_maps_message(request: ListMaps) -> wire.ListMapsRequest:
+    """Write a ListMapsRequest."""
+    if request.near is None:
+        return wire.ListMapsRequest()
+    near = request.near
+    return wire.ListMapsRequest(
+        near=wire.Near(latitude=near.latitude, longitude=near.longitude, radius=near.radius)
+    )
+
+
+def version_message(map_id: str, version: str) -> wire.VersionRef:
+    """Write a VersionRef."""
+    return wire.VersionRef(map=map_id, version=version)
+
+
 def plain(message: Message) -> dict[str, Any]:
     """Return a message as JSON has it: every field in its place, null for what is absent."""
     return {field.name: _plain_field(message, field) for field in message.DESCRIPTOR.fields}
@@ -85,16 +105,24 @@ def _plain_field(message: Message, field: Any) -> Any:  # a FieldDescriptor
         if kind is not None and kind.GetOptions().map_entry:
             return dict(value)  # of numbers, wherever an answer has one
         return [plain(item) for item in value] if kind is not None else list(value)
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode()
     return plain(value) if isinstance(value, Message) else value
 
 
 def _set_search(
     message: wire.LocalizeRequest | wire.LocalizeRigRequest | wire.SequenceStart, search: Search
 ) -> None:
-    if len(search.maps) == 1:
-        message.map = search.maps[0]
+    maps = search.maps
+    if isinstance(maps, Near):
+        message.near.SetInParent()
+        ParseDict(near_as_json(maps), message.near)
+    elif len(maps) == 1:
+        message.map = maps[0]
     else:
-        message.maps.extend(search.maps)
+        message.maps.extend(maps)
+    if search.ypr:
+        message.ypr = True
     for name, value in search.options.given().items():
         setattr(message.options, name, value)
     if priors := priors_as_json(search.priors):

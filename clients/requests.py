@@ -12,18 +12,21 @@ import httpx
 
 from clients.features import Features, PhotoOrFeatures
 from clients.priors import priors_from_json
-from clients.types import LocalizeOptions
+from clients.types import LocalizeOptions, Near
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera
 from visloc.priors import NO_PRIORS, Priors
 
 JsonObject = dict[str, Any]
+# A map, several, or the anchored ones around a place.
+Where = str | Sequence[str] | Near
 
 # The first character keeps ``.`` and ``..`` out of the path of a URL; the server has the rest.
 _MAP = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]*")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _REQUEST_ID = re.compile(r"[\x21-\x7e]{1,128}")
 _SERVER = re.compile(
-    r"(?:(?P<scheme>https?)|grpc)://"
+    r"(?:(?P<scheme>https?)|grpcs?)://"
     r"(?:(?:[A-Za-z0-9_-]{1,63}\.)*[A-Za-z0-9_-]{1,63}\.?|\[[0-9A-Fa-f:.]+\])"
     r"(?::(?P<port>\d{1,5}))?(?(scheme)(?:/[^\s?#]*)?|/?)"
 )
@@ -33,10 +36,11 @@ _SERVER = re.compile(
 class Search:
     """Where to search, and how; see ``checked_search``."""
 
-    maps: tuple[str, ...]
+    maps: tuple[str, ...] | Near
     options: LocalizeOptions
     priors: Priors
     request_id: str | None
+    ypr: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +50,14 @@ class Localize:
     search: Search
     query: bytes | Features
     camera: Camera | None
+    debug: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class ListMaps:
-    """List the maps."""
+    """List the maps: all, or the anchored ones that reach into a circle."""
+
+    near: Near | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +65,30 @@ class GetMap:
     """Describe the map ``id`` or ``id@version``."""
 
     map: str
+
+
+@dataclass(frozen=True, slots=True)
+class GetVersion:
+    """Describe a version of a map, in use or not; see ``checked_version``."""
+
+    map_id: str
+    version: str
+
+
+@dataclass(frozen=True, slots=True)
+class UseVersion:
+    """Put a version of a map into use."""
+
+    map_id: str
+    version: str
+
+
+@dataclass(frozen=True, slots=True)
+class DeleteVersion:
+    """Delete a version of a map that is not in use."""
+
+    map_id: str
+    version: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,23 +101,29 @@ class CheckReady:
     """Tell whether the server can answer now."""
 
 
-Request = Localize | ListMaps | GetMap | GetServer | CheckReady
+Request = (
+    Localize | ListMaps | GetMap | GetVersion | UseVersion | DeleteVersion | GetServer | CheckReady
+)
 
 
-def localize_request(search: Search, query: PhotoOrFeatures, camera: Camera | None) -> Localize:
+def localize_request(
+    search: Search, query: PhotoOrFeatures, camera: Camera | None, *, debug: bool = False
+) -> Localize:
     """Complete what ``localize`` was called with; a path is read here.
 
     Raises:
         InvalidInput: ``image.unreadable``.
     """
-    return Localize(search, read_query(query), camera)
+    return Localize(search, read_query(query), camera, debug)
 
 
 def checked_search(
-    map_refs: str | Sequence[str],
+    where: Where,
     options: LocalizeOptions | Mapping[str, Any] | None,
     priors: Priors | Mapping[str, Any] | None,
     request_id: str | None,
+    *,
+    ypr: bool = False,
 ) -> Search:
     """Check what all that localizes has in common.
 
@@ -106,12 +143,14 @@ def checked_search(
         options = LocalizeOptions.from_mapping(options or {})
     if not isinstance(priors, Priors):
         priors = NO_PRIORS if priors is None else priors_from_json(priors)
-    maps = (map_refs,) if isinstance(map_refs, str) else tuple(map_refs)
+    if isinstance(where, Near):
+        return Search(where, options, priors, request_id, ypr)
+    maps = (where,) if isinstance(where, str) else tuple(where)
     if not maps:
         raise InvalidInput(
             "request.map", "no map to search", field="map", expected="a map, or several"
         )
-    return Search(tuple(map(_checked, maps)), options, priors, request_id)
+    return Search(tuple(map(_checked, maps)), options, priors, request_id, ypr)
 
 
 def get_map_request(map_ref: str) -> GetMap:
@@ -121,6 +160,24 @@ def get_map_request(map_ref: str) -> GetMap:
         InvalidInput: ``map.id``.
     """
     return GetMap(_checked(map_ref))
+
+
+def checked_version(map_id: str, version: str) -> tuple[str, str]:
+    """Check the names of a map and its version, and return them.
+
+    Raises:
+        InvalidInput: ``map.id``.
+    """
+    for name, what in ((map_id, "map"), (version, "map version")):
+        if not _NAME.fullmatch(name):
+            raise InvalidInput(
+                "map.id",
+                f"not a {what} name",
+                field="map",
+                expected="letters, digits, '.', '_' and '-', beginning with a letter or digit",
+                got=name,
+            )
+    return map_id, version
 
 
 def read_query(query: PhotoOrFeatures) -> bytes | Features:
@@ -161,7 +218,7 @@ def checked_server(server: str) -> str:
             "server.url",
             "not the address of a server",
             field="server",
-            expected="http://host:port, https://host:port or grpc://host:port",
+            expected="http://host:port or grpc://host:port; with TLS https:// or grpcs://",
             got=server,
         )
     return server

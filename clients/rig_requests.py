@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from clients.features import Features
 from clients.priors import checked_covariance, priors_as_json, transform_as_json
 from clients.requests import Request, Search, read_query
 from clients.rigs import Instant, Odometry, Rig, RigImage, RigSensor
+from clients.types import Near
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.priors import Priors
@@ -154,14 +155,26 @@ def check_time_unit(time_unit: str | None, first_timestamp: int) -> None:
 
 def search_as_json(search: Search) -> dict[str, Any]:
     """Return what is searched as the API has it in JSON, without what is not given."""
+    maps = search.maps
     given: dict[str, Any] = (
-        {"map": search.maps[0]} if len(search.maps) == 1 else {"maps": list(search.maps)}
+        {"near": near_as_json(maps)}
+        if isinstance(maps, Near)
+        else {"map": maps[0]}
+        if len(maps) == 1
+        else {"maps": list(maps)}
     )
     if options := search.options.given():
         given["options"] = options
     if priors := priors_as_json(search.priors):
         given["priors"] = priors
+    if search.ypr:
+        given["ypr"] = True
     return given
+
+
+def near_as_json(near: Near) -> dict[str, float]:
+    """Return a place as the API has it in JSON."""
+    return {name: float(value) for name, value in asdict(near).items()}
 
 
 def rig_as_json(rig: Rig) -> str | dict[str, Any]:

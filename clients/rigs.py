@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clients.features import PhotoOrFeatures
+from clients.geopose import GeoPose, GeoPoseYpr
 from clients.types import CameraUsed, MapVersion, Orientation, Refusal, RetrievedImage
 from visloc.errors import VislocError
 from visloc.geometry import Camera, Pose
@@ -154,6 +155,9 @@ class InstantResult:
         map: the map that answered.
         seconds: wall time on the server by stage.
         raw: the answer as received; the same over HTTP and gRPC.
+        geopose: of the rig, whose frame is read like a camera's (x right, y down, z forward); None
+            without a pose, or when the map is not anchored to the Earth.
+        geopose_ypr: the same in angles, when asked for.
     """
 
     request_id: str
@@ -169,6 +173,8 @@ class InstantResult:
     map: MapVersion
     seconds: Mapping[str, float]
     raw: Mapping[str, Any]
+    geopose: GeoPose | None = None
+    geopose_ypr: GeoPoseYpr | None = None
 
     @property
     def localized(self) -> bool:

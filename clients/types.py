@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clients.geopose import GeoPose, GeoPoseYpr
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 
@@ -193,6 +194,23 @@ class MapVersion:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Debug:
+    """The correspondences behind an answer, and a picture of them.
+
+    Attributes:
+        keypoints: (n, 2) pixels of the photo as stored.
+        points: (n, 3) in the world.
+        inliers: (n,) whether the best pose explains the correspondence, refused or not.
+        overlay: JPEG of the photo with its matches, beside the photos that it was found in.
+    """
+
+    keypoints: NDArray[np.float64]
+    points: NDArray[np.float64]
+    inliers: NDArray[np.bool_]
+    overlay: bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class LocalizeResult:
     """The answer to one photo.
 
@@ -210,6 +228,9 @@ class LocalizeResult:
         map: the map that answered.
         seconds: wall time on the server by stage.
         raw: the answer as received; the same over HTTP and gRPC.
+        geopose: of the camera; None without a pose, or when the map is not anchored to the Earth.
+        geopose_ypr: the same in angles, when asked for.
+        debug: the matches; None when they were not asked for.
     """
 
     request_id: str
@@ -225,11 +246,44 @@ class LocalizeResult:
     map: MapVersion
     seconds: Mapping[str, float]
     raw: Mapping[str, Any]
+    geopose: GeoPose | None = None
+    geopose_ypr: GeoPoseYpr | None = None
+    debug: Debug | None = None
 
     @property
     def localized(self) -> bool:
         """Whether there is a pose."""
         return self.pose is not None
+
+
+@dataclass(frozen=True, slots=True)
+class Near:
+    """A circle on the Earth, WGS84; it stands for the anchored maps that reach into it.
+
+    Attributes:
+        latitude: degrees.
+        longitude: degrees.
+        radius: metres.
+
+    Raises:
+        InvalidInput: ``near.NAME`` for what is not a finite number.
+    """
+
+    latitude: float
+    longitude: float
+    radius: float
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not _can_be_sent(value, float):
+                raise InvalidInput(
+                    f"near.{field.name}",
+                    "not usable",
+                    field=f"near.{field.name}",
+                    expected=_EXPECTED[float],
+                    got=value,
+                )
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,6 +297,70 @@ class RigInfo:
 
     id: str
     sensors: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Geodetic:
+    """Where a map's world lies on Earth.
+
+    ``enu = scale R x + translation`` gives metres east, north and up of the position.
+
+    Attributes:
+        latitude_deg: WGS84.
+        longitude_deg: WGS84.
+        altitude_m: above the ellipsoid.
+        scale: metres per unit of the world.
+        rotation_wxyz: R as a unit quaternion (w, x, y, z).
+        translation: metres.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    scale: float
+    rotation_wxyz: tuple[float, ...]
+    translation: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """What a map's position, orientation and scale rest on.
+
+    Attributes:
+        kind: dataset, model, gnss, positions, correspondences or none.
+        images: photos, or given points, that it rests on.
+        rms: how far they are from where they were said to be, in units of the world; None where
+            nothing was fitted.
+        geodetic: None when the map is not anchored to the Earth.
+    """
+
+    kind: str
+    images: int
+    rms: float | None
+    geodetic: Geodetic | None
+
+
+@dataclass(frozen=True, slots=True)
+class GeoCircle:
+    """A circle on Earth that holds a map.
+
+    Attributes:
+        latitude: degrees, WGS84.
+        longitude: degrees.
+        radius: metres.
+    """
+
+    latitude: float
+    longitude: float
+    radius: float
+
+
+@dataclass(frozen=True, slots=True)
+class VersionInfo:
+    """A published version of a map, and whether it is in use."""
+
+    version: str
+    current: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,6 +382,11 @@ class MapInfo:
         size_bytes: on the server's disk.
         down: unit vector that points down in the world; None when the map does not know it.
         rigs: the rigs of the mapping photos, for requests that name one.
+        anchor: what its world rests on; None for old maps, which do not tell.
+        place: where it lies on Earth; None when it is not anchored there.
+        current: whether this version is in use.
+        versions: all published ones of the map, oldest first.
+        content_hash: equal maps have equal ones, whatever they are called.
     """
 
     id: str
@@ -280,6 +403,11 @@ class MapInfo:
     size_bytes: int
     down: tuple[float, ...] | None
     rigs: tuple[RigInfo, ...]
+    anchor: Anchor | None
+    place: GeoCircle | None
+    current: bool
+    versions: tuple[VersionInfo, ...]
+    content_hash: str
 
     @property
     def ref(self) -> str:

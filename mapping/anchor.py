@@ -49,7 +49,7 @@ MAX_DIRECTION_ERROR_DEG = 5.0
 _LINE = 0.05
 _EPSG_WGS84 = "EPSG:4326"
 # Longitude and latitude in degrees, and height in metres. 4326 has no height by the letter.
-_EPSG_GEODETIC = (_EPSG_WGS84, "EPSG:4979")
+EPSG_GEODETIC = (_EPSG_WGS84, "EPSG:4979")
 # Universal Transverse Mercator on WGS84, north and south: metres.
 _EPSG_UTM = tuple(f"EPSG:32{half}{zone:02}" for half in (6, 7) for zone in range(1, 61))
 
@@ -123,7 +123,7 @@ def known_positions(dataset: Dataset, photos: Sequence[MappingPhoto]) -> KnownPo
         return None
     chosen = [fixes[photos[row].record.timestamp] for row in rows]
     xyz = np.array([[fix.x, fix.y, fix.z] for fix in chosen])
-    if _coordinate_system(dataset, {fix.sensor_id for fix in chosen}) not in _EPSG_GEODETIC:
+    if coordinate_system(dataset, {fix.sensor_id for fix in chosen}) not in EPSG_GEODETIC:
         return KnownPositions(
             Anchor(kind="gnss", images=len(rows)), np.array(rows), xyz, GNSS_ERROR_M
         )
@@ -137,9 +137,14 @@ def known_positions(dataset: Dataset, photos: Sequence[MappingPhoto]) -> KnownPo
     return KnownPositions(anchor, np.array(rows), enu_from_geodetic(geodetic, origin), GNSS_ERROR_M)
 
 
-def _coordinate_system(dataset: Dataset, receivers: set[str]) -> str:
+def coordinate_system(dataset: Dataset, receivers: set[str]) -> str:
+    """Return the coordinate system that all of these receivers' fixes are in.
+
+    Raises:
+        DatasetError: ``gnss.epsg`` for one that is not known, or for several.
+    """
     systems = {(dataset.sensors[one].params or (_EPSG_WGS84,))[0]: one for one in receivers}
-    known = (*_EPSG_GEODETIC, *_EPSG_UTM)
+    known = (*EPSG_GEODETIC, *_EPSG_UTM)
     for system, receiver in sorted(systems.items()):
         if len(systems) > 1 or system not in known:
             raise DatasetError(
@@ -148,7 +153,7 @@ def _coordinate_system(dataset: Dataset, receivers: set[str]) -> str:
                 if system not in known
                 else "the fixes are in several coordinate systems; convert them to one",
                 field=str(dataset.root / "sensors" / "sensors.txt"),
-                expected=f"{' or '.join(_EPSG_GEODETIC)} (degrees), or WGS84 / UTM in metres, "
+                expected=f"{' or '.join(EPSG_GEODETIC)} (degrees), or WGS84 / UTM in metres, "
                 "EPSG:32601 to 32660 and 32701 to 32760",
                 got=", ".join(sorted(systems)),
             )

@@ -28,6 +28,7 @@ from mapping.landmarks import MadeLandmarks
 from mapping.outputs import refuse_existing
 from mapping.pairing import PAIRINGS, write_pairs
 from mapping.photos import MappingPhoto, collect_photos
+from mapping.previews import keep_photos
 from mapping.rgbd import DepthSettings, landmarks_from_depth, refuse_without_depth
 from mapping.sfm import (
     SfmSettings,
@@ -90,6 +91,7 @@ class BuildSettings:
         sfm: settings of ``sfm``.
         gravity: a vector of any length that points down in the map's world; None where that is
             not known. A map that is anchored on Earth knows it without.
+        keep_photos: whether the map keeps a small picture of each photo, for a person's eyes.
         workers: processes that work on photos and pairs.
         force: publish a new version of a map that exists.
     """
@@ -109,6 +111,7 @@ class BuildSettings:
     depth_sensor: str | None = None
     sfm: SfmSettings = field(default_factory=SfmSettings)
     gravity: tuple[float, float, float] | None = None
+    keep_photos: bool = False
     workers: int = 1
     force: bool = False
 
@@ -298,7 +301,7 @@ def _build(
     photos, notes = collect_photos(
         dataset,
         posed=not settings.sfm.estimate_poses,
-        with_files=isinstance(features, ExtractedFeatures),
+        with_files=isinstance(features, ExtractedFeatures) or settings.keep_photos,
         has_features=features.has if isinstance(features, ReadyMadeFeatures) else None,
         with_depth=settings.method == "rgbd",
         depth_sensor=settings.depth_sensor,
@@ -321,13 +324,11 @@ def _build(
     made = _make_landmarks(
         settings, dataset, work, photos, features, global_features, workers, progress
     )
-    progress("archive", 0, 1)
     content = _content(
         settings, dataset, photos, features, global_features, made, (*dataset.notes, *notes)
     )
-    folder = _publish(settings, content, made, store, work_root)
-    progress("archive", 1, 1)
-    return folder
+    kept = [photos[row] for row in made.photos] if settings.keep_photos else []
+    return _publish(settings, content, made, kept, store, work_root, workers, progress)
 
 
 def _refuse_early(
@@ -496,14 +497,20 @@ def _publish(
     settings: BuildSettings,
     content: MapContent,
     made: MadeLandmarks,
+    kept: Sequence[MappingPhoto],
     store: MapStore,
     work_root: Path,
+    workers: Workers,
+    progress: Progress,
 ) -> Path:
     now = datetime.now(UTC)
     incoming = work_root / "incoming"
     shutil.rmtree(incoming, ignore_errors=True)  # of a build that was killed here
     incoming.mkdir(parents=True)
     try:
+        if kept:
+            keep_photos(incoming, kept, workers, progress)
+        progress("archive", 0, 1)
         if made.pairs is not None:
             write_pairs(incoming / "pairs.txt", *made.pairs)
         if made.imported is not None:
@@ -515,6 +522,8 @@ def _publish(
             version=now.strftime("%Y%m%dT%H%M%S.%f")[:-3] + "Z-",
             created=now.isoformat(timespec="seconds"),
         )
-        return store.publish(incoming, settings.map_id, version)
+        folder = store.publish(incoming, settings.map_id, version)
+        progress("archive", 1, 1)
+        return folder
     finally:
         shutil.rmtree(incoming, ignore_errors=True)

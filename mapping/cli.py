@@ -12,9 +12,23 @@ import typer
 from rich.console import Console
 
 from mapping.build import METHODS, BuildSettings, build_map, write_pairs_of
-from mapping.display import peak_memory_bytes, print_import, print_map, print_rig, summary_of
+from mapping.display import (
+    peak_memory_bytes,
+    print_georeference,
+    print_import,
+    print_map,
+    print_rig,
+    summary_of,
+)
 from mapping.export import EXPORTERS, export_map
 from mapping.export_features import export_features
+from mapping.georeference import (
+    correspondences_from_fixes,
+    georeference,
+    given_place,
+    publish_anchored,
+    read_correspondences,
+)
 from mapping.imported_points import read_imported_points
 from mapping.importers import IMPORTERS, ImportSummary, import_dataset, imported
 from mapping.options import (
@@ -41,6 +55,7 @@ from mapping.options import (
     WeightsDirOption,
     WorkersOption,
 )
+from mapping.packing import write_packed
 from mapping.pairing import PairSettings
 from mapping.progress import StageProgress
 from mapping.rgbd import DepthSettings
@@ -99,6 +114,14 @@ def build(
             "up. A map anchored to GNSS knows it.",
         ),
     ] = None,
+    keep_photos: Annotated[
+        bool,
+        typer.Option(
+            "--keep-photos",
+            help="Keep a small picture of each photo in the map (at most 640 pixels), for "
+            "localize --debug. Left out, nobody can see the photos in the map.",
+        ),
+    ] = False,
     workers: WorkersOption = DEFAULT_WORKERS,
     force: Annotated[
         bool, typer.Option("--force", help="Publish a new version of a map that exists.")
@@ -194,6 +217,7 @@ def build(
             estimate_poses=poses == "estimate",
         ),
         gravity=None if gravity is None else _parse_vector("--gravity", gravity),
+        keep_photos=keep_photos,
         workers=workers,
         force=force,
     )
@@ -364,6 +388,89 @@ def import_command(
 
 
 @app.command()
+def anchor(
+    map_ref: MapArgument,
+    dataset: Annotated[
+        Path | None,
+        typer.Option(
+            "--dataset",
+            help="A kapture folder with GNSS fixes (records_gnss.txt) of the map's photos.",
+        ),
+    ] = None,
+    correspondences: Annotated[
+        Path | None,
+        typer.Option(
+            help="Or a CSV file of points, x,y,z,latitude,longitude,altitude, or of photos, "
+            "image,latitude,longitude,altitude; the first line names the columns."
+        ),
+    ] = None,
+    latitude: Annotated[
+        float | None,
+        typer.Option(help="Or say it: degrees (WGS84) of the world's (0, 0, 0).", min=-90, max=90),
+    ] = None,
+    longitude: Annotated[
+        float | None, typer.Option(help="With --latitude: degrees.", min=-180, max=180)
+    ] = None,
+    altitude: Annotated[
+        float | None,
+        typer.Option(help="With --latitude: metres above the ellipsoid, not above the sea."),
+    ] = None,
+    yaw: Annotated[
+        float | None,
+        typer.Option(
+            help="With --latitude: where the world's x axis points on the ground; 0 is east, 90 "
+            "north, degrees."
+        ),
+    ] = None,
+    scale: Annotated[
+        float | None,
+        typer.Option(help="With --latitude, for a map that is not metric: metres per unit."),
+    ] = None,
+    gravity: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z",
+            help="With --latitude, for a map that does not know it: what points down in its world.",
+        ),
+    ] = None,
+    maps_dir: MapsDirOption = Path("maps"),
+    force: Annotated[
+        bool, typer.Option("--force", help="Publish a new version of a map that is anchored.")
+    ] = False,
+) -> None:
+    """Tie a map to the Earth, so that answers carry GeoPoses. A new version is published.
+
+    Its photos and landmarks stay where they are in its world.
+    """
+    said = (latitude, longitude, altitude, yaw)
+    ways = (dataset is not None, correspondences is not None, any(v is not None for v in said))
+    details = scale is not None or gravity is not None
+    if sum(ways) != 1 or (ways[2] and None in said) or (details and not ways[2]):
+        raise InvalidInput(
+            "anchor.source",
+            "say in one way where the map lies",
+            expected="--dataset; or --correspondences; or all of --latitude, --longitude, "
+            "--altitude, --yaw, and where needed --scale and --gravity",
+        )
+    opened = open_map(_folder(map_ref, maps_dir))
+    if dataset is not None:
+        found = georeference(opened, correspondences_from_fixes(opened, read_dataset(dataset)))
+    elif correspondences is not None:
+        found = georeference(opened, read_correspondences(opened, correspondences))
+    else:
+        assert latitude is not None
+        assert longitude is not None
+        assert altitude is not None
+        assert yaw is not None
+        down = None if gravity is None else _parse_vector("--gravity", gravity)
+        position = (latitude, longitude, altitude)
+        found = given_place(opened, position, yaw, scale=scale, gravity=down)
+    print_georeference(_out, found)
+    folder = publish_anchored(opened, found, maps_dir, force=force)
+    _out.print(f"map {open_map(folder).ref}", highlight=False, soft_wrap=True)
+
+
+@app.command()
 def export(
     map_ref: MapArgument,
     output: Annotated[Path, typer.Option("--output", help="What to make; it must not exist.")],
@@ -375,6 +482,22 @@ def export(
     """Write a map for other tools: a COLMAP model, a kapture dataset, or a PLY point cloud."""
     export_map(open_map(_folder(map_ref, maps_dir)), output, format_name)
     _out.print(f"{format_name}: {output}", soft_wrap=True)
+
+
+@app.command()
+def pack(
+    map_ref: MapArgument,
+    output: Annotated[Path, typer.Option("--output", help="The file to make, such as room.zip.")],
+    maps_dir: MapsDirOption = Path("maps"),
+) -> None:
+    """Write a map into one file, for localize maps push; every byte is checked first."""
+    manifest = write_packed(_folder(map_ref, maps_dir), output)
+    size = output.stat().st_size / 2**20
+    _out.print(
+        f"{manifest.id}@{manifest.version}: {output}, {size:.1f} MiB",
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def _method_for(summary: ImportSummary) -> tuple[str, SfmSettings]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import resource
 from typing import Any
 
@@ -9,9 +10,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from mapping.georeference import Georeference
 from mapping.importers import ImportSummary
 from mapping.rig_calibration import OUTLIER_MULTIPLE, RigCalibration, Spread
 from visloc.archive import Map
+
+# More lines than anyone reads.
+_SHOWN_RESIDUALS = 20
 
 
 def summary_of(opened: Map) -> dict[str, Any]:
@@ -56,6 +61,7 @@ def print_map(out: Console, opened: Map) -> None:
         "gravity": "not known"
         if opened.gravity is None
         else f"down is ({', '.join(f'{value:.6g}' for value in opened.gravity)})",
+        "place": _place(opened),
         "method": summary["method"]["name"],
         "size": f"{summary['size_bytes'] / 2**20:.1f} MiB, "
         f"{summary['bytes_per_observation']:.0f} bytes per observation",
@@ -81,10 +87,54 @@ def _world(opened: Map) -> str:
         "model": "the imported reconstruction",
         "gnss": f"GNSS fixes of {anchor.images} photos",
         "positions": f"known positions of {anchor.images} photos",
+        "correspondences": f"{anchor.images} given points" if anchor.images else "a given place",
         "none": "nothing: the frame is arbitrary",
     }[anchor.kind]
     off = "" if anchor.rms is None else f", which agree within {anchor.rms:.2g} (RMS)"
     return f"{unit}, fixed by {fixed_by}{off}"
+
+
+def _place(opened: Map) -> str:
+    place, geodetic = opened.place, opened.geodetic
+    if place is None or geodetic is None:
+        return "not anchored to the Earth"
+    scale = "" if geodetic.scale == 1 else f", {geodetic.scale:.6g} m per unit"
+    return (
+        f"latitude {place.latitude:.7f}, longitude {place.longitude:.7f}, "
+        f"within {place.radius:.0f} m{scale}"
+    )
+
+
+def print_georeference(out: Console, found: Georeference) -> None:
+    """Show how well what was known agrees with where a map was put."""
+    geodetic = found.anchor.geodetic
+    assert geodetic is not None  # what a georeference is
+    if found.names:
+        table = Table(box=None, title="metres from where it was said to be", title_justify="left")
+        for name in ("place", "east", "north", "up", ""):
+            table.add_column(name, justify="left" if name in ("place", "") else "right")
+        off = found.residuals_m
+        # The worst tell most.
+        order = sorted(range(len(off)), key=lambda row: -float((off[row] ** 2).sum()))
+        for row in order[:_SHOWN_RESIDUALS]:
+            numbers = (f"{value:.2f}" for value in off[row])
+            table.add_row(
+                escape(found.names[row]), *numbers, "" if found.agrees[row] else "left out"
+            )
+        out.print(table)
+        if len(order) > _SHOWN_RESIDUALS:
+            out.print(f"and {len(order) - _SHOWN_RESIDUALS} that are nearer", highlight=False)
+        rms = math.sqrt((off[found.agrees] ** 2).sum(axis=1).mean())
+        out.print(
+            f"{found.agrees.sum()} of {len(off)} agree, within {rms:.3g} m (RMS)",
+            highlight=False,
+        )
+    out.print(
+        f"place: latitude {geodetic.latitude_deg:.9f}, longitude {geodetic.longitude_deg:.9f}, "
+        f"altitude {geodetic.altitude_m:.3f} m; {geodetic.scale:.6g} m per unit",
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def peak_memory_bytes() -> int:

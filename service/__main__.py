@@ -8,12 +8,10 @@ import os
 import signal
 import sys
 
+from service.logs import configure_logging
 from service.settings import ServiceSettings, SettingsError, read_settings
 
 logger = logging.getLogger("service")
-
-# How long running requests may take after SIGTERM.
-GRACE_S = 30.0
 
 
 def main() -> None:
@@ -22,11 +20,7 @@ def main() -> None:
         settings = read_settings(sys.argv[1:], os.environ)
     except SettingsError as error:
         sys.exit(f"visloc-service: {error}")
-    logging.basicConfig(
-        level=settings.log_level.upper(),
-        format="%(asctime)s %(levelname)s %(name)s: %(message)s",
-    )
-    logging.getLogger("python_multipart").setLevel("ERROR")  # malformed forms are answered
+    configure_logging(settings)
     # What libraries read once, when they are loaded: hence the late import below.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, str(settings.threads_per_worker))
@@ -34,7 +28,7 @@ def main() -> None:
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # damaged photos are answered, not logged
     try:
         asyncio.run(_serve(settings))
-    except OSError as error:
+    except (OSError, SettingsError) as error:
         sys.exit(f"visloc-service: {error}")
 
 
@@ -60,7 +54,7 @@ async def _serve(settings: ServiceSettings) -> None:
         )
         await stopping
     logger.info("stopping")
-    await server.close(GRACE_S)
+    await server.close(settings.drain_timeout_s)
 
 
 if __name__ == "__main__":

@@ -1,51 +1,43 @@
-"""Maps loaded, work queued, warm workers. Knows neither HTTP nor gRPC."""
+"""Maps served, work queued, warm workers. Knows neither HTTP nor gRPC."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import threading
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import AsyncGenerator, AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
-from time import perf_counter
-from typing import ParamSpec, TypeVar
+from time import time
 
-import cv2
-import torch
-
-from service.instants import Target, check_images, check_priors, look_at, rig_in_map
+from service import worker
+from service.catalog import Catalog, ServedMap
 from service.jobs import (
     ImageJob,
     Instant,
     InstantLocalization,
     Localization,
     LocalizeJob,
+    Near,
     Rig,
     RigJob,
     SequenceStart,
 )
-from service.loaded_maps import LoadedMaps
-from service.sequences import SequenceRun
-from visloc.archive import Map, MapStore
+from service.metrics import Metrics
+from service.stores import Store
+from service.uploads import Uploads
+from service.worker import MapFolder, WorkerSettings
+from service.workers import Workers
 from visloc.errors import (
     InvalidInput,
     Overloaded,
     Unavailable,
     VislocError,
 )
-from visloc.images import ImageLimits, read_photo
-from visloc.localizer import FeatureCache
 from visloc.priors import Priors
 from visloc.solving import SeenImage
-from visloc.types import Answer, Localized, LocalizeOptions, QueryFeatures
+from visloc.types import LocalizeOptions
 
 logger = logging.getLogger(__name__)
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +45,8 @@ class Status:
     """What the engine has loaded.
 
     Attributes:
-        ready: whether the maps that were there at the start are open and warm.
+        ready: whether photos are accepted: the maps that were there at the start are open and
+            warm, a worker process is alive, and the server is not being stopped.
         maps: ``id@version`` of what is loaded.
         not_loaded: why the current version of a map cannot be served, by map id. An older
             version of it may be in ``maps``.
@@ -65,90 +58,132 @@ class Status:
 
 
 class Engine:
-    """Localizes photos in the maps of a store, in a bounded pool of threads.
+    """Localizes photos in the maps of a store, in a bounded number of worker processes.
+
+    Used from one event loop.
 
     Args:
         store: where the maps are.
-        weights_dir: network weights, for maps whose features need them.
+        settings: of the worker processes.
         workers: photos worked on at the same time.
-        threads_per_worker: processor threads for one photo. This is set for the whole process.
         max_queue: photos that may wait; one more is refused with ``server.busy``.
         max_batches: rigs and sequences that are served at once.
-        max_rig_images: images of one instant.
-        max_instants: instants of one sequence.
-        limits: of photos.
+        max_upload_bytes: largest packed map.
+        limit_s: longest time that a worker may take for one step of a request.
+        metrics: count what happens to maps and workers.
+
+    Attributes:
+        workers: the processes.
     """
 
     def __init__(
         self,
-        store: MapStore,
+        store: Store,
+        settings: WorkerSettings,
         *,
-        weights_dir: Path | None = None,
         workers: int = 1,
-        threads_per_worker: int = 1,
         max_queue: int = 64,
         max_batches: int = 8,
-        max_rig_images: int = 16,
-        max_instants: int = 1000,
-        limits: ImageLimits,
+        max_upload_bytes: int = 2**34,
+        limit_s: float = 60.0,
+        metrics: Metrics,
     ) -> None:
-        torch.set_num_threads(threads_per_worker)
-        cv2.setNumThreads(threads_per_worker)
-        self._maps = LoadedMaps(store, weights_dir)
-        self._limits = limits
-        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="vision")
-        self._places = threading.BoundedSemaphore(workers + max_queue)
-        self._batches = threading.BoundedSemaphore(max_batches)
-        self._max_rig_images = max_rig_images
-        self._max_instants = max_instants
-        self._ready = False
+        self._store = store
+        self._metrics = metrics
+        self._catalog = Catalog(store)
+        self.workers = Workers(
+            workers,
+            settings,
+            limit_s=limit_s,
+            warm=lambda: self._catalog.serving,
+            on_death=metrics.observe_worker_death,
+        )
+        self._max_photos = workers + max_queue
+        self._photos = 0
+        self._max_batches = max_batches
+        self._batches = 0
+        self._uploads = Uploads(store, max_upload_bytes)
+        self._following: asyncio.Task[None] | None = None
+        self._started = False
+        self._draining = False
 
     async def start(self) -> None:
         """Open and warm up all current maps. One that is broken does not keep back the others."""
-        await asyncio.get_running_loop().run_in_executor(self._pool, self._maps.load_all)
-        self._ready = True
+        await asyncio.to_thread(self._store.sweep)
+        await self.workers.start()
+        await self._catalog.load_all(self.workers)
+        self._following = asyncio.create_task(self._catalog.follow(self.workers))
+        self._started = True
 
-    def close(self) -> None:
-        """Finish the photos that are being worked on and forget those that wait."""
-        self._ready = False
-        self._pool.shutdown(wait=True, cancel_futures=True)
+    def drain(self) -> None:
+        """Say that the server is not ready any more, so that nobody sends it new work."""
+        self._draining = True
+
+    async def close(self) -> None:
+        """End the worker processes; what they work on is given up."""
+        self._draining = True
+        if self._following is not None:
+            self._following.cancel()
+        await self.workers.close()
 
     @property
     def status(self) -> Status:
-        """What is loaded now, of the maps that are still there."""
-        return Status(self._ready, self._maps.refs, self._maps.not_loaded)
+        """What is loaded now."""
+        return Status(
+            self._started and not self._draining and self.workers.alive > 0,
+            tuple(sorted(self.workers.loaded)),
+            self._catalog.not_loaded,
+        )
+
+    @property
+    def draining(self) -> bool:
+        """Whether the server is being stopped."""
+        return self._draining
+
+    @property
+    def photos(self) -> int:
+        """Single photos that wait or are worked on."""
+        return self._photos
+
+    @property
+    def batches(self) -> int:
+        """Rigs and sequences that are served."""
+        return self._batches
 
     async def localize(self, job: LocalizeJob) -> Localization:
-        """Localize a photo, decoded first, or its features, in a worker thread.
+        """Localize a photo, or its features, in a worker process.
 
         Raises:
             Overloaded: ``server.busy`` when too many photos are waiting.
-            Unavailable: ``server.starting`` before ``start`` is done.
+            Unavailable: ``server.starting`` before ``start`` is done, ``server.worker_died``.
             VislocError: what the store, ``read_photo`` and the ``Localizer`` raise.
         """
         self._check_ready()
-        if not self._places.acquire(blocking=False):
+        if self._photos >= self._max_photos:
             raise Overloaded("server.busy", "too many photos are waiting; try again shortly")
-        work = self._pool.submit(self._localize, job, perf_counter())
-        # The place is free when the work is done or dropped, not when the caller stops waiting.
-        work.add_done_callback(lambda _: self._places.release())
-        return await asyncio.wrap_future(work)
+        self._photos += 1
+        try:
+            maps = await self._catalog.resolve(job.maps, self.workers)
+            return await self.workers.run(worker.localize, job, maps, time())
+        finally:
+            self._photos -= 1
 
     @contextmanager
     def admit_batch(self) -> Iterator[None]:
-        """Hold one of the places for rigs and sequences, from before their images are read.
+        """Hold one of the places for rigs and sequences.
 
         Raises:
             Overloaded: ``server.busy`` when all are taken.
             Unavailable: ``server.starting`` before ``start`` is done.
         """
         self._check_ready()
-        if not self._batches.acquire(blocking=False):
+        if self._batches >= self._max_batches:
             raise Overloaded("server.busy", "too many rigs and sequences; try again shortly")
+        self._batches += 1
         try:
             yield
         finally:
-            self._batches.release()
+            self._batches -= 1
 
     async def localize_rig(self, job: RigJob) -> InstantLocalization:
         """Localize the images of one instant together; one that cannot be used fails alone.
@@ -157,28 +192,16 @@ class Engine:
 
         Raises:
             InvalidInput: ``rig.*``, ``priors.*``.
+            Unavailable: ``server.worker_died``.
             VislocError: what the store raises.
         """
         if not job.images:
             raise InvalidInput("rig.empty", "there is no image", field="images")
-        targets = await self._run(self._targets, job.maps, job.rig)
-        for target in targets:
-            check_images(job.images, target.rig, self._max_rig_images, "images")
-        check_priors(targets, job.priors)
-        seen = await self._look(targets, job.images, job.options, job.priors)
-
-        def solve() -> InstantLocalization:
-            answers = [
-                target.localizer.solve(images, job.options, job.priors, job.timestamp).answer
-                for target, images in zip(targets, seen, strict=True)
-            ]
-            best = max(
-                range(len(answers)),
-                key=lambda i: (answers[i].pose is not None, answers[i].num_inliers),
-            )
-            return targets[best].localization(answers[best])
-
-        return await self._run(solve)
+        maps = await self._catalog.resolve(job.maps, self.workers)
+        bare = replace(job, images=tuple(_without_photo(image) for image in job.images))
+        await self.workers.run(worker.check_rig, bare, maps)
+        seen = await self._look(maps, job.rig, job.images, job.options, job.priors)
+        return await self.workers.run(worker.solve_rig, bare, maps, seen)
 
     async def localize_sequence(
         self, start: SequenceStart, instants: AsyncIterator[Instant] | Sequence[Instant]
@@ -192,63 +215,124 @@ class Engine:
         Raises:
             InvalidInput: ``sequence.*``, ``rig.*``, ``priors.*``.
             TooLarge: ``sequence.too_many_instants``, ``rig.too_many_images``.
+            Unavailable: ``server.worker_died``.
             VislocError: what the store raises.
         """
-        targets = await self._run(self._targets, start.maps, start.rig)
-        run = SequenceRun(start, targets, self._max_rig_images, self._max_instants)
+        run = self.workers.run
+        maps = await self._catalog.resolve(start.maps, self.workers)
+        state = await run(worker.open_sequence, start, maps)
         if isinstance(instants, Sequence):
-            for index, instant in enumerate(instants):
-                run.check(index, instant)
+            bare = [_without_photos(instant) for instant in instants]
+            state, _ = await run(worker.check_instants, state, maps, 0, bare)
             instants = _one_by_one(instants)
         index = 0
         try:
             async for instant in instants:
-                priors = run.check(index, instant)
-                images = await self._look(run.targets, instant.images, start.options, priors)
-                for answer in await self._run(run.add, instant, images, priors):
-                    yield run.localization(answer)
+                bare = [_without_photos(instant)]
+                state, (priors,) = await run(worker.check_instants, state, maps, index, bare)
+                seen = await self._look(maps, start.rig, instant.images, start.options, priors)
+                state, kept, answers = await run(
+                    worker.add_instant, state, maps, bare[0], seen, priors
+                )
+                maps = tuple(of for of in maps if of.ref in kept)
+                for answer in answers:
+                    yield answer
                 index += 1
         except VislocError:
             # What is wrong with one instant does not take the answers of those before it along.
             if index > 0:
-                for answer in await self._run(run.finish):
-                    yield run.localization(answer)
+                for answer in await run(worker.finish_sequence, state, maps):
+                    yield answer
             raise
-        for answer in await self._run(run.finish):
-            yield run.localization(answer)
+        for answer in await run(worker.finish_sequence, state, maps):
+            yield answer
 
-    async def maps(self) -> Sequence[Map]:
-        """All maps that can be opened, in the version that is served, by id."""
-        return await asyncio.to_thread(self._maps.list)
+    async def maps(self, near: Near | None = None) -> Sequence[ServedMap]:
+        """All maps that can be opened, in the version that is served, by id.
 
-    async def map(self, ref: str) -> Map:
+        Args:
+            near: only those that reach into this circle.
+        """
+        return await self._catalog.list(near)
+
+    async def map(self, ref: str) -> ServedMap:
         """One map: ``id``, or ``id@version``.
 
         Raises:
             VislocError: what the store raises.
         """
-        return await asyncio.to_thread(self._maps.find, ref)
+        return await self._catalog.describe(ref)
+
+    async def upload(self, map_id: str, version: str, chunks: AsyncIterator[bytes]) -> ServedMap:
+        """Publish a packed map, verified byte by byte; it is not put into use.
+
+        Args:
+            map_id: of the map that is packed.
+            version: its version.
+            chunks: the packed file.
+
+        Raises:
+            VislocError: what ``Uploads.publish`` raises.
+        """
+        with self._noted("upload"):
+            await self._uploads.publish(map_id, version, chunks)
+        logger.info("map %s@%s was uploaded", map_id, version)
+        return await self.map(f"{map_id}@{version}")
+
+    async def set_current(self, map_id: str, version: str) -> ServedMap:
+        """Put a version into use, once a worker process has it open and warm.
+
+        Raises:
+            NotFound: ``map.unknown``, ``map.version``.
+            Conflict: ``map.features``, when its features are not here.
+            VislocError: what the store raises; then the version before stays in use.
+        """
+        self._check_ready()
+        with self._noted("activate"):
+            await self._catalog.activate(map_id, version, self.workers)
+        return await self.map(f"{map_id}@{version}")
+
+    async def delete(self, map_id: str, version: str) -> None:
+        """Delete a version that is not in use.
+
+        Raises:
+            NotFound: ``map.unknown``, ``map.version``.
+            Conflict: ``map.version_in_use``.
+        """
+        with self._noted("delete"):
+            await asyncio.to_thread(self._store.remove, map_id, version)
+        await self._catalog.forget(f"{map_id}@{version}", self.workers)
+
+    @contextmanager
+    def _noted(self, change: str) -> Iterator[None]:
+        done = False
+        try:
+            yield
+            done = True
+        finally:
+            self._metrics.observe_map_change(change, done=done)
 
     def _check_ready(self) -> None:
-        if not self._ready:
+        if self._draining:
+            raise Unavailable(
+                "server.stopping", "the server is being stopped; ask another, or later"
+            )
+        if not self._started:
             raise Unavailable("server.starting", "the maps are being loaded; try again shortly")
-
-    async def _run(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Work in a thread of the pool."""
-        return await asyncio.wrap_future(self._pool.submit(work, *args, **kwargs))
 
     async def _look(
         self,
-        targets: Sequence[Target],
+        maps: Sequence[MapFolder],
+        rig: Rig | None,
         images: Sequence[ImageJob],
         options: LocalizeOptions,
         priors: Priors,
     ) -> list[tuple[SeenImage, ...]]:
-        """Look at all images of an instant; the result is by target."""
-        now = perf_counter()
+        """Look at all images of an instant; the result is by map."""
+        now = time()
         tasks = [
             asyncio.ensure_future(
-                self._run(look_at, image, targets, options, priors, self._limits, now)
+                self.workers.run(worker.look_at_image, image, maps, rig, options, priors, now)
             )
             for image in images
         ]
@@ -257,42 +341,15 @@ class Engine:
         finally:
             for task in tasks:
                 task.cancel()  # when one refuses the request, nobody waits for the others
-        return [tuple(look[i] for look in looks) for i in range(len(targets))]
+        return [tuple(look[i] for look in looks) for i in range(len(maps))]
 
-    def _targets(self, maps: Sequence[str], rig: Rig | None) -> list[Target]:
-        localizers = [self._maps.localizer(ref) for ref in maps]
-        return [Target(found, rig_in_map(rig, found.map)) for found in localizers]
 
-    def _localize(self, job: LocalizeJob, submitted: float) -> Localization:
-        started = perf_counter()
-        localizers = [self._maps.localizer(ref) for ref in job.maps]
-        loaded = perf_counter()
-        before = {"queued": started - submitted, "open_map": loaded - started}
-        answers: list[Answer] = []
-        if isinstance(job.query, QueryFeatures):
-            answers = [
-                localizer.localize_features(job.query, job.camera, job.options, job.priors)
-                for localizer in localizers
-            ]
-        else:
-            photo = read_photo(job.query, self._limits)
-            before["decode"] = perf_counter() - loaded
-            found: FeatureCache = {}
-            answers = [
-                localizer.localize(photo, job.camera, job.options, job.priors, found)
-                for localizer in localizers
-            ]
-        best = max(
-            range(len(answers)),
-            key=lambda i: (isinstance(answers[i], Localized), answers[i].evidence.num_inliers),
-        )
-        answer, manifest = answers[best], localizers[best].map.manifest
-        seconds = {**before, **answer.evidence.seconds}
-        return Localization(
-            replace(answer, evidence=replace(answer.evidence, seconds=seconds)),
-            manifest.id,
-            manifest.version,
-        )
+def _without_photo(image: ImageJob) -> ImageJob:
+    return replace(image, query=b"")
+
+
+def _without_photos(instant: Instant) -> Instant:
+    return replace(instant, images=tuple(_without_photo(image) for image in instant.images))
 
 
 async def _one_by_one(instants: Sequence[Instant]) -> AsyncIterator[Instant]:

@@ -61,6 +61,9 @@ LOCALIZED: dict[str, Any] = {
         "matching": 0.41,
         "pose": 0.13,
     },
+    "geopose": None,
+    "geopose_ypr": None,
+    "debug": None,
 }
 NOT_LOCALIZED: dict[str, Any] = {
     "request_id": "0a6d0ac8ef994eeeab1467fce2531da0",
@@ -107,6 +110,9 @@ NOT_LOCALIZED: dict[str, Any] = {
         "matching": 0.54,
         "pose": 0.43,
     },
+    "geopose": None,
+    "geopose_ypr": None,
+    "debug": None,
 }
 MAP: dict[str, Any] = {
     "id": "sample",
@@ -123,6 +129,21 @@ MAP: dict[str, Any] = {
     "size_bytes": 33037821,
     "down": [],
     "rigs": [{"id": "rig", "sensors": ["left", "right"]}],
+    "current": True,
+    "versions": [{"version": "20261121T111436.881Z-7f9cafe0", "current": True}],
+    "content_hash": "7f9cafe0f2a3c1d54d0d8f3a5f3be7cf13a3f0a4e6c8b5d90b1c2d3e4f506172",
+    "anchor": {"kind": "dataset", "images": 60, "rms": None, "geodetic": None},
+    "place": None,
+}
+NEW_MAP: dict[str, Any] = MAP | {
+    "version": "20261122T090500.120Z-51c09f3e",
+    "created": "2026-11-22T09:05:00+00:00",
+    "current": False,
+    "versions": [
+        {"version": "20261121T111436.881Z-7f9cafe0", "current": True},
+        {"version": "20261122T090500.120Z-51c09f3e", "current": False},
+    ],
+    "content_hash": "51c09f3e8d7b6a594837261504f3e2d1c0bfae9d8c7b6a5948372615f4e3d2c1",
 }
 READY: dict[str, Any] = {
     "ready": True,

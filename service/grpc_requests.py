@@ -8,7 +8,7 @@ from typing import Any
 from google.protobuf.message import Message
 
 from service.incoming import inside
-from service.jobs import Instant, LocalizeJob, RigJob, SequenceStart
+from service.jobs import Instant, LocalizeJob, Near, RigJob, SequenceStart
 from service.schemas import (
     BatchLimits,
     LocalizeRequest,
@@ -17,6 +17,7 @@ from service.schemas import (
 )
 from service.schemas import Instant as InstantWords
 from service.schemas import SequenceStart as SequenceStartWords
+from service.schemas.geopose import Near as NearWords
 from visloc.errors import InvalidInput, TooLarge
 from visloc_api.v1 import localization_pb2 as pb2
 
@@ -30,6 +31,15 @@ _OPTIONAL_LISTS = {
     "visloc.v1.GravityPrior.world",
     "visloc.v1.Odometry.covariance",
 }
+
+
+def near_of(request: pb2.ListMapsRequest) -> Near | None:
+    """Return the circle into which the maps must reach, if any.
+
+    Raises:
+        InvalidInput: ``near...``.
+    """
+    return NearWords.read(_plain(request.near)).to_core() if request.HasField("near") else None
 
 
 def localize_job_of(request: pb2.LocalizeRequest, max_bytes: int) -> LocalizeJob:
@@ -117,7 +127,7 @@ def _plain(message: Message) -> dict[str, Any]:
         if _is_there(message, field.name)
     }
     plain.pop("request_id", None)  # of the envelope
-    if "maps" in plain and not plain["map"]:
+    if ("maps" in plain or "near" in plain) and not plain["map"]:
         del plain["map"]
     return plain
 

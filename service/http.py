@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Sequence
+from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import aclosing
 from functools import partial
 from http import HTTPStatus
-from time import perf_counter
 
-from fastapi import Depends, Request, Response
+from fastapi import Request, Response
 from fastapi.exceptions import RequestValidationError
+from fastapi.responses import PlainTextResponse
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import visloc
+from service.access import Access
+from service.access_http import add_access
+from service.connections import Arrivals
+from service.deadlines import TIMEOUT_HEADER, each_within, timeout_of, within
 from service.engine import Engine
+from service.geopose import add_geopose_routes
 from service.incoming import refusal_of
 from service.intake import read_localize_job, read_rig_job, read_sequence_jobs
-from service.jobs import InstantLocalization
+from service.jobs import Instant, InstantLocalization, SequenceStart
+from service.maps_http import add_map_routes
+from service.metrics import ServiceState
+from service.metrics_http import metrics_response
+from service.observation import Observer, route_of
 from service.openapi import App, problems
 from service.request_bodies import LOCALIZE_BODY, RIG_BODY, SEQUENCE_BODY
 from service.responses import (
@@ -34,10 +44,8 @@ from service.responses import (
 from service.schemas import (
     Health,
     InstantAnswer,
-    ListMapsResponse,
     LocalizeResponse,
     LocalizeSequenceResponse,
-    MapInfo,
     MapNotLoaded,
     Readiness,
 )
@@ -47,9 +55,32 @@ from visloc.errors import InvalidInput, NotFound, VislocError
 
 logger = logging.getLogger(__name__)
 
+_LOCALIZE_PROBLEMS = (404, 409, 413, 422, 429, 500, 503, 504)
 
-def create_app(engine: Engine, settings: ServiceSettings) -> App:
-    """Make the ASGI application. Starting and closing the engine is the caller's."""
+
+def create_app(
+    engine: Engine,
+    settings: ServiceSettings,
+    *,
+    observer: Observer,
+    access: Access,
+    arrivals: Arrivals,
+    state: Callable[[], ServiceState],
+) -> App:
+    """Make the ASGI application. Starting and closing the engine is the caller's.
+
+    Args:
+        engine: answers.
+        settings: limits.
+        observer: is told what becomes of every request.
+        access: who may ask for what.
+        arrivals: bodies of requests while they arrive.
+        state: how the service is doing, for /metrics.
+    """
+
+    def timeout(request: Request) -> float:
+        return timeout_of(request.headers.get(TIMEOUT_HEADER), settings.request_timeout_s)
+
     app = App(
         title="visloc",
         version=visloc.__version__,
@@ -57,7 +88,9 @@ def create_app(engine: Engine, settings: ServiceSettings) -> App:
         docs_url=None,  # its page loads scripts from another host
         redoc_url=None,
     )
-    app.add_middleware(RequestEnvelope)
+    app.state.observer, app.state.arrivals = observer, arrivals
+    add_access(app, access, observer)
+    app.add_middleware(RequestEnvelope, observer=observer)
     app.add_exception_handler(VislocError, _on_error)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(HTTPException, _on_http_exception)
@@ -65,7 +98,7 @@ def create_app(engine: Engine, settings: ServiceSettings) -> App:
     @app.post(
         "/localize",
         response_model=LocalizeResponse,
-        responses=problems(404, 409, 413, 422, 429, 500, 503),
+        responses=problems(*_LOCALIZE_PROBLEMS),
         openapi_extra={"requestBody": LOCALIZE_BODY},
     )
     async def localize(request: Request) -> Response:
@@ -73,37 +106,37 @@ def create_app(engine: Engine, settings: ServiceSettings) -> App:
 
         A photo that cannot be localized is an answer (`status: not_localized`), not an error.
         """
+        timeout_s = timeout(request)
         job = await read_localize_job(request, settings)
-        found = await while_connected(request.receive, engine.localize(job))
+        async with within(timeout_s):
+            found = await while_connected(request.receive, engine.localize(job))
+        observer.localization(found)
         return json_response(LocalizeResponse.from_localization(found, request.state.request_id))
-
-    async def admitted() -> AsyncIterator[None]:
-        # FastAPI ends this when the answer has been sent, its last line included: since 0.118.
-        with engine.admit_batch():
-            yield
 
     @app.post(
         "/localize/rig",
         response_model=InstantAnswer,
-        responses=problems(404, 409, 413, 422, 429, 500, 503),
+        responses=problems(*_LOCALIZE_PROBLEMS),
         openapi_extra={"requestBody": RIG_BODY},
-        dependencies=[Depends(admitted)],
     )
     async def localize_rig(request: Request) -> Response:
         """Estimate one pose from the photos that the cameras of a rig took at one instant.
 
         A photo that cannot be used fails alone: the others are answered.
         """
+        timeout_s = timeout(request)
         job = await read_rig_job(request, settings)
-        found = await while_connected(request.receive, engine.localize_rig(job))
+        with engine.admit_batch():
+            async with within(timeout_s):
+                found = await while_connected(request.receive, engine.localize_rig(job))
+        observer.instant(found)
         return json_response(InstantAnswer.from_localization(found, request.state.request_id))
 
     @app.post(
         "/localize/sequence",
         response_model=LocalizeSequenceResponse,
-        responses=problems(404, 409, 413, 422, 429, 500, 503),
+        responses=problems(*_LOCALIZE_PROBLEMS),
         openapi_extra={"requestBody": SEQUENCE_BODY},
-        dependencies=[Depends(admitted)],
     )
     async def localize_sequence(request: Request) -> Response:
         """Estimate the poses of a rig, or of one camera, at the instants of a sequence.
@@ -111,26 +144,16 @@ def create_app(engine: Engine, settings: ServiceSettings) -> App:
         With `Accept: application/x-ndjson` every answer is a line of its own, sent as soon as it
         is final.
         """
+        timeout_s = timeout(request)
         start, instants = await read_sequence_jobs(request, settings)
-        answers = engine.localize_sequence(start, instants)
+        answers = _observed(_admitted(engine, start, instants), timeout_s, observer)
         id_ = request.state.request_id
         message = partial(InstantAnswer.from_localization, request_id=id_)
         if _wants_lines(request):
             first = await while_connected(request.receive, _next_of(answers))
-            return Lines(first, answers, message, id_)
+            return Lines(first, answers, message, id_, settings.arrival_timeout_s)
         texts = await while_connected(request.receive, _texts_of(answers, message))
         return _sequence_response(texts, id_)
-
-    @app.get("/maps", response_model=ListMapsResponse)
-    async def list_maps() -> Response:
-        """List the maps that can be opened, in the version that is served."""
-        maps = [MapInfo.from_map(opened) for opened in await engine.maps()]
-        return json_response(ListMapsResponse(maps=maps))
-
-    @app.get("/maps/{ref}", response_model=MapInfo, responses=problems(404, 422, 500))
-    async def get_map(ref: str) -> Response:
-        """Describe one map: `id`, or `id@version`."""
-        return json_response(MapInfo.from_map(await engine.map(ref)))
 
     @app.get("/healthz", response_model=Health)
     async def healthz() -> Response:
@@ -148,47 +171,62 @@ def create_app(engine: Engine, settings: ServiceSettings) -> App:
         readiness = Readiness(ready=status.ready, maps=list(status.maps), not_loaded=not_loaded)
         return json_response(readiness, 200 if status.ready else 503)
 
+    async def render() -> tuple[bytes, str]:
+        return await asyncio.to_thread(observer.metrics.render, state())
+
+    @app.get(
+        "/metrics",
+        response_class=PlainTextResponse,
+        responses={200: {"content": {"text/plain": {}}, "description": "Prometheus metrics"}},
+    )
+    async def metrics() -> Response:
+        """Say how the service is doing, for Prometheus."""
+        return await metrics_response(render)
+
+    add_map_routes(app, engine, settings)
+    add_geopose_routes(app, engine, settings)
     return app
 
 
 class RequestEnvelope:
     """Gives every request an id, a line in the log, and an answer even when something broke."""
 
-    def __init__(self, app: ASGIApp) -> None:
+    def __init__(self, app: ASGIApp, observer: Observer) -> None:
         self._app = app
+        self._observer = observer
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        started = perf_counter()
-        id_ = request_id(Headers(scope=scope).get("x-request-id"))
+        headers = Headers(scope=scope)
+        id_ = request_id(headers.get("x-request-id"))
         scope.setdefault("state", {})["request_id"] = id_
-        status = 0
+        with self._observer.request("http", id_, traceparent=headers.get("traceparent")) as record:
 
-        async def send_with_id(message: Message) -> None:
-            nonlocal status
-            if message["type"] == "http.response.start":
-                status = message["status"]
-                MutableHeaders(scope=message)["X-Request-Id"] = id_
-            await send(message)
+            async def send_with_id(message: Message) -> None:
+                if message["type"] == "http.response.start":
+                    record.status = str(message["status"])
+                    ours = MutableHeaders(scope=message)
+                    ours["X-Request-Id"] = id_
+                    if record.trace is not None:
+                        ours["traceresponse"] = record.trace.traceparent
+                await send(message)
 
-        try:
-            await self._app(scope, receive, send_with_id)
-        except ClientDisconnect:
-            logger.info("the client of request %s left before it was answered", id_)
-        except Exception:  # the last line of defence: whatever it is, the caller gets an answer
-            logger.exception("request %s broke", id_)
-            if status:
-                raise  # too late to answer: the server closes the connection
-            await problem_response(internal_error(), id_)(scope, receive, send_with_id)
-        finally:
-            logger.info(
-                "%s %r %d %.1f ms request_id=%s",
-                *(scope["method"], scope["path"], status),
-                *((perf_counter() - started) * 1000, id_),
-            )
+            try:
+                await self._app(scope, receive, send_with_id)
+            except ClientDisconnect:
+                logger.info("the client of request %s left before it was answered", id_)
+            except Exception:  # the last line of defence: whatever it is, the caller gets an answer
+                logger.exception("request %s broke", id_)
+                if record.status:
+                    raise  # too late to answer: the server closes the connection
+                error = internal_error()
+                self._observer.error(error)
+                await problem_response(error, id_)(scope, receive, send_with_id)
+            finally:
+                record.route = route_of(scope)
 
 
 async def _next_of(answers: AsyncGenerator[InstantLocalization]) -> InstantLocalization:
@@ -214,15 +252,39 @@ def _wants_lines(request: Request) -> bool:
     return any(kind.partition(";")[0].strip() == NDJSON for kind in accepted)
 
 
+async def _admitted(
+    engine: Engine, start: SequenceStart, instants: Sequence[Instant]
+) -> AsyncGenerator[InstantLocalization]:
+    with engine.admit_batch():
+        async with aclosing(engine.localize_sequence(start, instants)) as answers:
+            async for answer in answers:
+                yield answer
+
+
+async def _observed(
+    answers: AsyncGenerator[InstantLocalization], timeout_s: float, observer: Observer
+) -> AsyncGenerator[InstantLocalization]:
+    """Give answers on, each within its time, and take note of them."""
+    async with aclosing(answers), aclosing(each_within(timeout_s, answers)) as timed:
+        async for answer in timed:
+            observer.instant(answer)
+            yield answer
+
+
+def _refused(request: Request, error: VislocError, status: HTTPStatus | None = None) -> Response:
+    request.app.state.observer.error(error)
+    return problem_response(error, request.state.request_id, status)
+
+
 async def _on_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, VislocError)  # it is registered for these
-    return problem_response(error, request.state.request_id)
+    return _refused(request, error)
 
 
 async def _on_validation_error(request: Request, error: Exception) -> Response:
     """Say what FastAPI finds wrong in a path or a query in our words."""
     assert isinstance(error, RequestValidationError)
-    return problem_response(refusal_of(error.errors()[0]), request.state.request_id)
+    return _refused(request, refusal_of(error.errors()[0]))
 
 
 async def _on_http_exception(request: Request, error: Exception) -> Response:
@@ -232,6 +294,6 @@ async def _on_http_exception(request: Request, error: Exception) -> Response:
     kind = NotFound if status == HTTPStatus.NOT_FOUND else InvalidInput
     code = "http." + status.phrase.lower().replace(" ", "_").replace("-", "_")
     refused = kind(code, status.phrase, got=f"{request.method} {request.url.path}")
-    response = problem_response(refused, request.state.request_id, status)
+    response = _refused(request, refused, status)
     response.headers.update(error.headers or {})
     return response

@@ -1,4 +1,4 @@
-"""The images of one instant: checked, looked at, solved. Runs in worker threads."""
+"""The images of one instant: checked, looked at, solved. Runs in worker processes."""
 
 from __future__ import annotations
 
@@ -30,10 +30,12 @@ class Target:
     localizer: Localizer
     rig: Mapping[str, RigSensor]
 
-    def localization(self, answer: InstantAnswer) -> InstantLocalization:
+    def localization(self, answer: InstantAnswer, *, ypr: bool) -> InstantLocalization:
         """Return an answer with the map that gave it."""
-        manifest = self.localizer.map.manifest
-        return InstantLocalization(answer, manifest.id, manifest.version)
+        opened = self.localizer.map
+        return InstantLocalization(
+            answer, opened.manifest.id, opened.manifest.version, opened.geodetic, ypr
+        )
 
 
 def rig_in_map(rig: Rig | None, opened: Map) -> Mapping[str, RigSensor]:
@@ -130,14 +132,14 @@ def look_at(
     options: LocalizeOptions,
     priors: Priors,
     limits: ImageLimits,
-    submitted: float,
+    queued_s: float,
 ) -> list[SeenImage]:
-    """Look at one image for every target. An image that cannot be used fails alone.
+    """Look at one image, that waited so long, for every target. One that is unusable fails alone.
 
     Raises:
         VislocError: what concerns more than this image.
     """
-    seconds = {"queued": perf_counter() - submitted}
+    seconds = {"queued": queued_s}
     photo: Photo | QueryFeatures | InvalidInput
     if isinstance(image.query, QueryFeatures):
         photo = image.query

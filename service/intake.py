@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Callable, Mapping
+from collections.abc import AsyncGenerator, Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -11,15 +11,17 @@ from starlette.datastructures import Headers, UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import Request
 
+from service.connections import arrivals_of
 from service.jobs import Instant, LocalizeJob, RigJob, SequenceStart
 from service.schemas import (
     BatchLimits,
     LocalizeRequest,
     LocalizeRigRequest,
     LocalizeSequenceRequest,
+    UseVersionRequest,
 )
 from service.settings import REQUEST_OVERHEAD_BYTES, ServiceSettings
-from visloc.errors import InvalidInput, TooLarge
+from visloc.errors import InvalidInput
 
 _CHUNK_BYTES = 64 * 1024
 # The parts of the form of one photo that are files, and how curl sends them.
@@ -100,6 +102,36 @@ async def read_sequence_jobs(
     return await _read_batch(request, settings, jobs, max_files=max_files)
 
 
+async def read_use_version(request: Request) -> UseVersionRequest:
+    """Read the body of ``POST /maps/{map_id}/current``.
+
+    Raises:
+        TooLarge: ``request.too_large``.
+        InvalidInput: ``request...``.
+    """
+    checked_media_type(request, ("application/json",))
+    async with arrivals_of(request).body(request, REQUEST_OVERHEAD_BYTES) as body:
+        return UseVersionRequest.read_json(body)
+
+
+def checked_media_type(request: Request, kinds: Collection[str]) -> str:
+    """Return what kind of body it is.
+
+    Raises:
+        InvalidInput: ``request.content_type`` when it is none of ``kinds``.
+    """
+    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if media_type not in kinds:
+        raise InvalidInput(
+            "request.content_type",
+            "this kind of body is not read here",
+            field="Content-Type",
+            expected=" or ".join(kinds),
+            got=media_type or "none",
+        )
+    return media_type
+
+
 def _limits(settings: ServiceSettings) -> BatchLimits:
     return BatchLimits(settings.max_rig_images, settings.max_instants)
 
@@ -148,42 +180,11 @@ async def _read(
     from_json: tuple[Callable[[bytes], JobT], int],
 ) -> JobT:
     """Read a body of either kind, each with its largest number of bytes."""
-    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     kinds = {"multipart/form-data": from_form, "application/json": from_json}
-    if media_type not in kinds:
-        raise InvalidInput(
-            "request.content_type",
-            "this kind of body is not read here",
-            field="Content-Type",
-            expected=" or ".join(kinds),
-            got=media_type or "none",
-        )
-    parse, limit = kinds[media_type]
-    body = await _read_body(request, limit)
-    # Photos and features take milliseconds to parse and decode: off the event loop with them.
-    return await asyncio.to_thread(parse, body)
-
-
-async def _read_body(request: Request, limit: int) -> bytes:
-    declared = request.headers.get("content-length", "")
-    size = int(declared) if declared.isdecimal() and len(declared) < 20 else 0
-    if size > limit:
-        raise _too_large(limit, f"{size} bytes")
-    body = bytearray()
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > limit:
-            raise _too_large(limit, "more")
-    return bytes(body)
-
-
-def _too_large(limit: int, got: str) -> TooLarge:
-    return TooLarge(
-        "request.too_large",
-        "the request has too many bytes",
-        expected=f"at most {limit} bytes",
-        got=got,
-    )
+    parse, limit = kinds[checked_media_type(request, kinds)]
+    async with arrivals_of(request).body(request, limit) as body:
+        # Photos and features take milliseconds to parse and decode: off the event loop with them.
+        return await asyncio.to_thread(parse, body)
 
 
 def _parse_form(

@@ -5,6 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.archive import Geodetic
 from visloc.geometry import Camera, Pose
 from visloc.priors import NO_PRIORS, Priors
 from visloc.sequence import Odometry
@@ -17,24 +21,47 @@ DEFAULT_MAX_GAP_S = 1.0
 ONLY_SENSOR = "camera"
 
 
+@dataclass(frozen=True, slots=True)
+class Near:
+    """A circle on the Earth, WGS84.
+
+    Attributes:
+        latitude: degrees.
+        longitude: degrees.
+        radius: metres.
+    """
+
+    latitude: float
+    longitude: float
+    radius: float
+
+
+# Where to search: one or several maps, each ``id``, for its current version, or ``id@version``; or
+# the anchored maps that reach into a circle.
+Where = tuple[str, ...] | Near
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalizeJob:
     """One photo to localize.
 
     Attributes:
-        maps: where to search, one or several; each ``id``, for its current version, or
-            ``id@version``.
+        maps: where to search.
         query: the encoded photo, or the features that were found in it.
         camera: its intrinsics for the pixels as stored; None when unknown.
         options: thresholds and the like.
         priors: what is known of the camera.
+        ypr: whether to say its GeoPose in angles too.
+        debug: whether to show what was matched; needs a photo.
     """
 
-    maps: tuple[str, ...]
+    maps: Where
     query: bytes | QueryFeatures
     camera: Camera | None
     options: LocalizeOptions
     priors: Priors = NO_PRIORS
+    ypr: bool = False
+    debug: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,20 +101,22 @@ class RigJob:
     """The images of one instant.
 
     Attributes:
-        maps: where to search, one or several.
+        maps: where to search.
         rig: how the cameras sit.
         images: each of another sensor.
         timestamp: of all of them; None when unknown.
         options: thresholds and the like.
         priors: what is known of the rig.
+        ypr: whether to say its GeoPose in angles too.
     """
 
-    maps: tuple[str, ...]
+    maps: Where
     rig: Rig
     images: tuple[ImageJob, ...]
     timestamp: int | None
     options: LocalizeOptions
     priors: Priors = NO_PRIORS
+    ypr: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,35 +141,65 @@ class SequenceStart:
     """What all instants of a sequence share.
 
     Attributes:
-        maps: where to search; with several, the map of the first localized instant is kept.
+        maps: where to search; of several maps, that of the first localized instant is kept.
         rig: how the cameras sit; None when every instant is one image of one camera.
         time_unit: of the timestamps; None to tell by their size.
         max_gap_s: longest time between measured instants across which gaps are filled; 0: none.
         options: thresholds and the like.
         priors: what is known of the rig at every instant.
+        ypr: whether to say its GeoPose in angles too.
     """
 
-    maps: tuple[str, ...]
+    maps: Where
     rig: Rig | None
     time_unit: TimeUnit | None
     max_gap_s: float
     options: LocalizeOptions
     priors: Priors = NO_PRIORS
+    ypr: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MatchPicture:
+    """What the solver was given for a photo, and what it made of it.
+
+    Attributes:
+        keypoints: (n, 2) pixels of the photo as stored.
+        points: (n, 3) in the world.
+        inliers: (n,) whether the pose agrees.
+        overlay: JPEG of the photo with its matches, beside the retrieved photos.
+    """
+
+    keypoints: NDArray[np.float64]
+    points: NDArray[np.float64]
+    inliers: NDArray[np.bool_]
+    overlay: bytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Localization:
-    """An answer and the map that gave it."""
+    """An answer and the map that gave it.
+
+    Attributes:
+        geodetic: where that map lies on Earth, when it is known.
+        ypr: whether the caller wants the GeoPose in angles too.
+        debug: when the caller wants it.
+    """
 
     answer: Answer
     map_id: str
     map_version: str
+    geodetic: Geodetic | None = None
+    ypr: bool = False
+    debug: MatchPicture | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstantLocalization:
-    """The answer to an instant and the map that gave it."""
+    """The answer to an instant and the map that gave it; attributes as of ``Localization``."""
 
     answer: InstantAnswer
     map_id: str
     map_version: str
+    geodetic: Geodetic | None = None
+    ypr: bool = False

@@ -16,6 +16,7 @@ from service.schemas import (
     LocalizeSequenceRequest,
     Problem,
     RigCalibration,
+    UseVersionRequest,
 )
 
 _REF = "#/components/schemas/{model}"
@@ -29,18 +30,24 @@ _ANSWERS: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {
     ("/localize/sequence", "post", "200"): {"sequence": batch_examples.SEQUENCE},
     ("/maps", "get", "200"): {"maps": {"maps": [examples.MAP]}},
     ("/maps/{ref}", "get", "200"): {"map": examples.MAP},
+    ("/maps/{map_id}/current", "post", "200"): {"map": examples.MAP},
+    ("/maps/{map_id}/versions/{version}", "get", "200"): {"map": examples.NEW_MAP},
+    ("/maps/{map_id}/versions/{version}", "put", "201"): {"map": examples.NEW_MAP},
     ("/readyz", "get", "200"): {"ready": examples.READY},
     ("/readyz", "get", "503"): {"loading": examples.LOADING},
 }
 
 _PROBLEMS = {
     404: "no such map, version or rig",
-    409: "the features or weights that the map was built with are not here",
+    409: "the features or weights that the map was built with are not here; of maps: the version "
+    "exists already, or is in use",
     413: "over a limit on bytes, pixels, photos or instants",
     422: "the request cannot be used as it is",
     429: "too many photos are waiting, or rigs and sequences being served; try again",
     500: "a map on disk is damaged, or the server made a mistake",
     503: "the maps are being loaded; try again",
+    504: "the time for the request is over",
+    507: "there is no room on the server's disk",
 }
 
 _EXAMPLE_PROBLEM = {
@@ -83,6 +90,7 @@ class App(FastAPI):
                     (LocalizeRigRequest, "validation"),
                     (LocalizeSequenceRequest, "validation"),
                     (RigCalibration, "validation"),
+                    (UseVersionRequest, "validation"),
                     (Camera, "validation"),  # named by the requests' own schema of camera
                     (Problem, "serialization"),
                 ],

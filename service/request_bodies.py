@@ -88,7 +88,7 @@ LOCALIZE_BODY: dict[str, Any] = {
             "schema": {
                 "type": "object",
                 "allOf": [
-                    {"oneOf": [{"required": ["map"]}, {"required": ["maps"]}]},
+                    {"oneOf": [{"required": [name]} for name in ("map", "maps", "near")]},
                     {"oneOf": [{"required": ["image"]}, {"required": ["features", "camera"]}]},
                 ],
                 "additionalProperties": False,
@@ -111,6 +111,20 @@ LOCALIZE_BODY: dict[str, Any] = {
                     "options": {"type": "string", "description": "LocalizeOptions as JSON"},
                     "maps": {"type": "string", "description": "instead of map: id,id,..."},
                     "priors": {"type": "string", "description": "Priors as JSON"},
+                    "debug": {
+                        "type": "string",
+                        "enum": ["true", "false"],
+                        "description": "also return the matches and a picture of them; needs "
+                        "a photo",
+                    },
+                    "near": {
+                        "type": "string",
+                        "description": "instead of map: latitude,longitude,radius or Near as JSON",
+                    },
+                    "ypr": {
+                        "enum": ["true", "false"],
+                        "description": "also say the GeoPose in yaw, pitch and roll",
+                    },
                 },
             },
             "examples": {

@@ -91,6 +91,7 @@ class Lines(Response):
         others: the answers after it; closed at the end.
         message: an answer in the API's words.
         id_: the id of the request.
+        patience_s: longest time for the client to take a line; then it is gone for us.
     """
 
     def __init__(
@@ -99,6 +100,7 @@ class Lines(Response):
         others: AsyncGenerator[T],
         message: Callable[[T], BaseModel],
         id_: str,
+        patience_s: float,
     ) -> None:
         super().__init__(media_type=NDJSON)
         del self.headers["content-length"]
@@ -106,6 +108,7 @@ class Lines(Response):
         self._answers = _with_first(first, others)
         self._message = message
         self._id = id_
+        self._patience_s = patience_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send the lines."""
@@ -123,7 +126,7 @@ class Lines(Response):
         try:
             async with aclosing(self._answers) as answers:
                 async for answer in answers:
-                    await _send_line(send, self._message(answer).model_dump_json())
+                    await self._send_line(send, self._message(answer).model_dump_json())
         except VislocError as error:
             await self._send_problem(send, error)
         except Exception:  # the last line of defence, as for all requests
@@ -133,7 +136,15 @@ class Lines(Response):
 
     async def _send_problem(self, send: Send, error: VislocError) -> None:
         problem = problem_of(error, self._id)
-        await _send_line(send, f'{{"problem":{problem.model_dump_json()}}}')
+        await self._send_line(send, f'{{"problem":{problem.model_dump_json()}}}')
+
+    async def _send_line(self, send: Send, text: str) -> None:
+        message: Mapping[str, Any] = {"body": text.encode() + b"\n", "more_body": True}
+        try:
+            async with asyncio.timeout(self._patience_s):
+                await send({"type": "http.response.body", **message})
+        except TimeoutError:
+            raise ClientDisconnect from None
 
 
 async def _with_first(first: T, others: AsyncGenerator[T]) -> AsyncGenerator[T]:
@@ -141,8 +152,3 @@ async def _with_first(first: T, others: AsyncGenerator[T]) -> AsyncGenerator[T]:
         yield first
         async for other in others:
             yield other
-
-
-async def _send_line(send: Send, text: str) -> None:
-    message: Mapping[str, Any] = {"body": text.encode() + b"\n", "more_body": True}
-    await send({"type": "http.response.body", **message})

@@ -1,4 +1,4 @@
-"""One sequence on its way through the engine. Runs in worker threads."""
+"""One sequence on its way through the engine. Runs in worker processes."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ class SequenceRun:
 
     def localization(self, answer: InstantAnswer) -> InstantLocalization:
         """Return an answer of ``add`` or ``finish`` with the map that gave it."""
-        return self.targets[0].localization(answer)
+        return self.targets[0].localization(answer, ypr=self._start.ypr)
 
     def _released(self) -> list[InstantAnswer]:
         released, self._held[0] = self._held[0], []

@@ -6,14 +6,24 @@ import asyncio
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import uvicorn
+from starlette.applications import Starlette
 
+from service.access import open_access
+from service.connections import Arrivals, http_protocol
 from service.engine import Engine
 from service.grpc import GrpcServer
 from service.http import create_app
+from service.metrics import Metrics, ServiceState
+from service.metrics_http import metrics_app
+from service.observation import Observer
 from service.settings import ServiceSettings
-from visloc.archive import MapStore
+from service.stores import open_store
+from service.tls import check_tls, tls_config
+from service.tracing import open_spans
+from service.worker import WorkerSettings
 from visloc.images import ImageLimits
 
 
@@ -24,46 +34,92 @@ class Server:
         engine: what is behind the doors.
         http_port: where HTTP listens.
         grpc_port: where gRPC listens.
+        metrics_port: where Prometheus may ask without a key; None for nowhere.
 
     Raises:
         OSError: when an address cannot be listened on.
+        SettingsError: when a setting cannot be used after all.
     """
 
     def __init__(self, settings: ServiceSettings) -> None:
+        self._settings = settings
+        check_tls(settings)
+        access = open_access(settings)
+        self._arrivals = Arrivals(settings.arrival_timeout_s, settings.max_buffered_bytes)
+        self._store = open_store(settings)
+        self._spans = open_spans(settings)
+        self.observer = Observer(Metrics(), self._spans)
         self.engine = Engine(
-            MapStore(settings.maps_dir),
-            weights_dir=settings.weights_dir,
+            self._store,
+            WorkerSettings(
+                weights_dir=settings.weights_dir,
+                threads=settings.threads_per_worker,
+                max_loaded_bytes=settings.max_loaded_bytes,
+                max_images=settings.max_rig_images,
+                max_instants=settings.max_instants,
+                limits=ImageLimits(settings.max_image_bytes, settings.max_image_pixels),
+                log_level=settings.log_level,
+                log_format=settings.log_format,
+            ),
             workers=settings.workers,
-            threads_per_worker=settings.threads_per_worker,
             max_queue=settings.max_queue,
             max_batches=settings.max_batches,
-            max_rig_images=settings.max_rig_images,
-            max_instants=settings.max_instants,
-            limits=ImageLimits(settings.max_image_bytes, settings.max_image_pixels),
+            max_upload_bytes=settings.max_upload_bytes,
+            limit_s=settings.request_timeout_s,
+            metrics=self.observer.metrics,
         )
-        self._listener = _listen(settings.host, settings.http_port)
-        self.http_port: int = self._listener.getsockname()[1]
+        self._listeners = [_listen(settings.host, settings.http_port)]
+        self.http_port: int = self._listeners[0].getsockname()[1]
+        self.metrics_port: int | None = None
         try:
-            self._grpc = GrpcServer(self.engine, settings)
-        except RuntimeError as error:
-            self._listener.close()
+            if settings.metrics_port is not None:
+                self._listeners.append(_listen(settings.host, settings.metrics_port))
+                self.metrics_port = self._listeners[1].getsockname()[1]
+            self._grpc = GrpcServer(self.engine, settings, self.observer, access)
+        except (RuntimeError, OSError) as error:
+            for listener in self._listeners:
+                listener.close()
+            if isinstance(error, OSError):
+                raise
             address = f"{settings.host}:{settings.grpc_port}"
             raise OSError(f"cannot listen on {address}: {error}") from None
         self.grpc_port = self._grpc.port
-        self._http = _HttpServer(
-            uvicorn.Config(
-                create_app(self.engine, settings),
-                log_config=None,
-                log_level="warning",
-                access_log=False,
-                limit_concurrency=settings.max_requests + 1,  # uvicorn refuses the one that fills
+        apps: list[Starlette] = [
+            create_app(
+                self.engine,
+                settings,
+                observer=self.observer,
+                access=access,
+                arrivals=self._arrivals,
+                state=self.state,
             )
-        )
+        ]
+        if settings.metrics_port is not None:
+            apps.append(metrics_app(self._render))
+        self._http = [
+            _HttpServer(
+                uvicorn.Config(
+                    app,
+                    log_config=None,
+                    log_level="warning",
+                    access_log=False,
+                    proxy_headers=False,  # whoever is on this machine could make them up
+                    http=http_protocol(settings.arrival_timeout_s),
+                    # uvicorn refuses the one that fills
+                    limit_concurrency=settings.max_connections + 1,
+                    **(tls_config(settings) if app is apps[0] else {}),
+                )
+            )
+            for app in apps
+        ]
 
     async def open(self) -> None:
         """Answer. Before ``load`` is done, /readyz and gRPC's health say that it is not ready."""
         await self._grpc.start()
-        self._http_task = asyncio.create_task(self._http.serve(sockets=[self._listener]))
+        self._serving = [
+            asyncio.create_task(server.serve(sockets=[listener]))
+            for server, listener in zip(self._http, self._listeners, strict=True)
+        ]
 
     async def load(self) -> None:
         """Open the maps, warm up, and accept photos."""
@@ -72,10 +128,47 @@ class Server:
 
     async def close(self, grace_s: float) -> None:
         """Accept nothing new, and give running requests ``grace_s`` seconds to end."""
-        self._http.config.timeout_graceful_shutdown = int(grace_s)
-        self._http.should_exit = True
-        await asyncio.gather(self._grpc.stop(grace_s), self._http_task)
-        await asyncio.to_thread(self.engine.close)
+        self.engine.drain()
+        await self._grpc.set_not_serving()
+        for server in self._http:
+            server.config.timeout_graceful_shutdown = max(1, int(grace_s))
+            server.should_exit = True
+        await asyncio.gather(self._grpc.stop(grace_s), *self._serving)
+        await self.engine.close()
+        if self._spans is not None:
+            await asyncio.to_thread(self._spans.close)
+
+    def state(self) -> ServiceState:
+        """How the service is doing."""
+        engine, workers, settings = self.engine, self.engine.workers, self._settings
+        status = engine.status
+        loaded = {
+            (ref.partition("@")[0], ref.partition("@")[2]): size
+            for ref, size in workers.loaded.items()
+        }
+        remote = "://" in settings.maps_dir
+        return ServiceState(
+            status.ready,
+            draining=engine.draining,
+            photos_waiting=workers.waiting,
+            max_queue=settings.max_queue,
+            photos_running=workers.running,
+            batches_running=engine.batches,
+            max_batches=settings.max_batches,
+            workers=workers.count,
+            worker_pids=workers.pids,
+            loaded_maps=loaded,
+            max_loaded_bytes=settings.max_loaded_bytes,
+            unusable_maps={map_id: error.code for map_id, error in status.not_loaded.items()},
+            connections=len(self._http[0].server_state.connections),
+            max_connections=settings.max_connections,
+            buffered_bytes=self._arrivals.bytes_held,
+            max_buffered_bytes=settings.max_buffered_bytes,
+            folders={"cache": settings.cache_dir} if remote else {"maps": Path(settings.maps_dir)},
+        )
+
+    async def _render(self) -> tuple[bytes, str]:
+        return await asyncio.to_thread(self.observer.metrics.render, self.state())
 
 
 class _HttpServer(uvicorn.Server):

@@ -15,13 +15,25 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 PREFIX = "VISLOC_"
 CONFIG_VARIABLE = "VISLOC_CONFIG"
+# The clients': where the service runs too, it is no mistake.
+KEY_VARIABLE = "VISLOC_API_KEY"
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 Count = Annotated[int, Field(ge=1)]
+Seconds = Annotated[float, Field(gt=0, le=86_400)]
+
+
+def _names_of(value: object) -> object:
+    if not isinstance(value, str):
+        return value
+    return tuple(name.strip() for name in value.split(",") if name.strip())
+
+
+Names = Annotated[tuple[str, ...], BeforeValidator(_names_of)]
 
 # Room in a request for everything but the photo.
 REQUEST_OVERHEAD_BYTES = 64 * 1024
@@ -29,8 +41,6 @@ REQUEST_OVERHEAD_BYTES = 64 * 1024
 VALUES_PER_IMAGE = 64
 # So many are parsed at least, that too many photos or instants can be told as such.
 FEWEST_BATCH_VALUES = 100_000
-# Room for requests besides the photos that are worked on or wait: health, maps, refusals.
-REQUESTS_BESIDES = 32
 
 
 class SettingsError(ValueError):
@@ -42,12 +52,20 @@ class ServiceSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
-    maps_dir: Path = Path("maps")
-    """folder of maps, as `mapping build` writes it"""
+    maps_dir: Annotated[str, BeforeValidator(str)] = "maps"
+    """folder of maps, as `mapping build` writes it, or a URL of one, such as s3://bucket/maps"""
+    cache_dir: Path = Path("maps-cache")
+    """folder for local copies of the maps of a URL"""
+    max_cache_bytes: Count = 50 * 2**30
+    """room for local copies; the least recently used go first"""
+    max_loaded_bytes: Count = 8 * 2**30
+    """room for open maps; the least recently used are closed first"""
+    max_upload_bytes: Count = 20 * 2**30
+    """largest packed map that may be uploaded, bytes"""
     weights_dir: Path | None = None
     """folder of network weights, for maps whose features need them"""
     host: str = "127.0.0.1"
-    """address to listen on; 0.0.0.0 serves other machines, without any access control"""
+    """address to listen on; 0.0.0.0 serves other machines, and then needs keys_file"""
     http_port: Port = 8000
     """port of the HTTP API; 0 lets the system choose"""
     grpc_port: Port = 50051
@@ -58,10 +76,31 @@ class ServiceSettings(BaseModel):
         default_factory=lambda data: max(1, (os.cpu_count() or 1) // data.get("workers", 1)),
     )
     """processor threads for one photo; default: cores / workers"""
+    keys_file: Path | None = None
+    """API keys, as `python -m service.keys` writes them; without, whoever reaches the service may
+    do everything, so that it listens on this machine only"""
+    tls_cert: Path | None = None
+    """PEM file of the certificate chain: HTTPS and gRPC over TLS"""
+    tls_key: Path | None = None
+    """PEM file of the certificate's private key"""
+    cors_origins: Names = ()
+    """comma-separated origins of web pages that may call the HTTP API; none by default"""
+    metrics_port: Port | None = None
+    """a port of its own for /metrics, without a key, for a scraper in a private network"""
     max_queue: Annotated[int, Field(ge=0)] = 64
-    """photos that may wait for a worker; beyond it a request is refused. At each door, workers +
-    this + 32 connections (HTTP) or calls (gRPC) are served at once, which bounds the uploads held
-    in memory"""
+    """photos that may wait for a worker; beyond it a request is refused"""
+    max_connections: Count = 1000
+    """connections (HTTP) and calls (gRPC) that a door keeps open at once"""
+    max_buffered_bytes: Count = 512 * 2**20
+    """bytes of requests held while they arrive; beyond it a request is refused"""
+    request_timeout_s: Seconds = 60.0
+    """longest time from when a request has arrived to its answer; callers may ask for less.
+    Sequences: to the next answer"""
+    arrival_timeout_s: Seconds = 20.0
+    """longest time for the head of a request to arrive, and for its body, to which a second is
+    added for every 100 kB; also the longest silence within a stream"""
+    drain_timeout_s: Seconds = 30.0
+    """time for running requests to end after SIGTERM"""
     max_image_bytes: Count = 20 * 2**20
     """largest encoded photo, bytes"""
     max_image_pixels: Count = 50_000_000
@@ -75,13 +114,12 @@ class ServiceSettings(BaseModel):
     """photos of one instant of a rig"""
     max_instants: Count = 1000
     """instants of one sequence"""
+    log_format: Literal["text", "json"] = "text"
+    """how it is logged: lines for people, or one JSON object per line"""
+    otlp_endpoint: str | None = None
+    """URL of an OpenTelemetry collector (OTLP over HTTP) that gets spans"""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """what is logged to stderr: debug, info, warning or error"""
-
-    @property
-    def max_requests(self) -> int:
-        """Requests that one door serves at once; more are refused before they are read."""
-        return self.workers + self.max_queue + REQUESTS_BESIDES
 
     @property
     def max_request_bytes(self) -> int:
@@ -134,7 +172,8 @@ def _from_environment(environment: Mapping[str, str]) -> dict[str, str]:
     variables = {
         name: value for name, value in environment.items() if name.startswith(PREFIX) and value
     }
-    variables.pop(CONFIG_VARIABLE, None)
+    for name in (CONFIG_VARIABLE, KEY_VARIABLE):
+        variables.pop(name, None)
     known = {_variable(name): name for name in ServiceSettings.model_fields}
     _refuse_unknown(variables, known, "environment")
     return {known[name]: value for name, value in variables.items()}

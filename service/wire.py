@@ -12,11 +12,15 @@ import grpc
 from visloc.errors import (
     Conflict,
     DatasetError,
+    Forbidden,
     InvalidInput,
     MapCorrupt,
     NotFound,
     Overloaded,
+    StorageFull,
+    TimedOut,
     TooLarge,
+    Unauthenticated,
     Unavailable,
     VislocError,
     WeightsError,
@@ -33,6 +37,10 @@ STATUSES: Mapping[type[VislocError], tuple[HTTPStatus, grpc.StatusCode]] = {
     MapCorrupt: (HTTPStatus.INTERNAL_SERVER_ERROR, grpc.StatusCode.DATA_LOSS),
     Unavailable: (HTTPStatus.SERVICE_UNAVAILABLE, grpc.StatusCode.UNAVAILABLE),
     Overloaded: (HTTPStatus.TOO_MANY_REQUESTS, grpc.StatusCode.RESOURCE_EXHAUSTED),
+    TimedOut: (HTTPStatus.GATEWAY_TIMEOUT, grpc.StatusCode.DEADLINE_EXCEEDED),
+    StorageFull: (HTTPStatus.INSUFFICIENT_STORAGE, grpc.StatusCode.RESOURCE_EXHAUSTED),
+    Unauthenticated: (HTTPStatus.UNAUTHORIZED, grpc.StatusCode.UNAUTHENTICATED),
+    Forbidden: (HTTPStatus.FORBIDDEN, grpc.StatusCode.PERMISSION_DENIED),
 }
 
 RETRY_AFTER_S = 1

@@ -24,6 +24,7 @@ from pydantic import BaseModel
 
 import clients.cli
 import mapping.cli
+from clients.connection_options import KEY_VARIABLE
 from mapping.export import export_map
 from service.schemas import (
     InstantAnswer,
@@ -205,7 +206,7 @@ def test_python_examples_say_where_the_photo_was_taken(code: str, desk: Desk) ->
         # cp and the service are run above, for the targets of make see below; building takes long
         # and has tests of its own, as has a map of ready-made features.
         if not re.match(
-            r"make|cp|\.venv/bin/(visloc-service|mapping build|mapping import .* --map)"
+            r"make|cp|\.venv/bin/(visloc-service|mapping (build|anchor)|mapping import .* --map)"
             r"|.* --features-dir",
             line,
         )
@@ -324,7 +325,7 @@ def test_every_command_and_flag_exists(capsys: pytest.CaptureFixture[str]) -> No
 def test_every_variable_of_the_environment_is_a_setting() -> None:
     known = {f"{PREFIX}{name.upper()}" for name in ServiceSettings.model_fields}
 
-    assert set(in_pages(rf"{PREFIX}[A-Z_]+")) <= {*known, CONFIG_VARIABLE}
+    assert set(in_pages(rf"{PREFIX}[A-Z_]+")) <= {*known, CONFIG_VARIABLE, KEY_VARIABLE}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -341,16 +342,18 @@ def test_every_relative_link_leads_somewhere(page: Path) -> None:
 # docs/api.md and the code
 
 CODE = re.compile(
-    r"(request|image|camera|options|map|features|weights|server|pose|rig|sequence)\.[a-z0-9_]+"
+    r"(access|request|image|camera|options|maps?|packed|features|weights|server|pose|rig|sequence"
+    r"|upload)"
+    r"\.[a-z0-9_]+"
 )
 # Modules that take part in an answer, and the codes of theirs that no client meets.
 ANSWERING = (
     *("service/**/*.py", "visloc/*.py", "visloc/archive/*.py", "visloc/features/*.py"),
-    *("clients/requests.py", "clients/errors.py", "clients/types.py"),
+    *("clients/requests.py", "clients/connection.py", "clients/errors.py", "clients/types.py"),
+    "clients/uploads.py",
 )
 NOT_MET = {
     "image.missing",  # reading a file, in process
-    *("map.checksum", "map.manifest_hash", "map.range", "map.version_exists"),  # publishing
     *("features.metric", "features.descriptor"),  # of files
     "pose.device_from_world",  # a field
 }

@@ -55,6 +55,11 @@ class MapGeometry:
         self.origin = np.array(opened.manifest.world.origin)
         self.down = opened.gravity
 
+    @property
+    def ref(self) -> str:
+        """The map, ``id@version``."""
+        return self._map.ref
+
     @cached_property
     def centers(self) -> NDArray[np.float64]:
         """(n, 3) camera centres of the photos, relative to the origin."""

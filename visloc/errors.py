@@ -8,8 +8,12 @@
     +- NotFound          a map, a file or a record that was named does not exist
     +- Conflict          it exists already, or does not fit what exists
     +- MapCorrupt        a map on disk is not what its manifest says
+    +- Unauthenticated   the server wants to know who asks, and cannot tell
+    +- Forbidden         whoever asks may not do this
     +- Unavailable       the server cannot answer now; trying again later may help
        +- Overloaded     ... because too many requests are waiting
+       +- TimedOut       ... because the time that was given to it is over
+       +- StorageFull    ... because there is no room on its disk
 
 A photo that cannot be localized is not an error: it is an answer (``visloc.types.NotLocalized``).
 """
@@ -82,12 +86,28 @@ class MapCorrupt(VislocError):
     """A map on disk is not what its manifest says."""
 
 
+class Unauthenticated(VislocError):
+    """The server wants to know who asks, and cannot tell."""
+
+
+class Forbidden(VislocError):
+    """Whoever asks may not do this."""
+
+
 class Unavailable(VislocError):
     """The server cannot answer now; trying again later may help."""
 
 
 class Overloaded(Unavailable):
     """Too many requests are waiting."""
+
+
+class TimedOut(Unavailable):
+    """The time that the caller or the server gave to a request is over."""
+
+
+class StorageFull(Unavailable):
+    """There is no room on the server's disk."""
 
 
 def _short(value: object, limit: int = 200) -> str:

@@ -5,6 +5,8 @@ Geodetic positions are latitude (deg), longitude (deg) and height above the elli
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 _SEMI_MAJOR_M = 6378137.0
 _FLATTENING = 1 / 298.257223563
 _ECCENTRICITY2 = _FLATTENING * (2 - _FLATTENING)
+_MEAN_RADIUS_M = 6371008.8  # of the ellipsoid, (2 a + b) / 3
 
 
 def ecef_from_geodetic(positions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -49,21 +52,29 @@ def enu_from_geodetic(
 ) -> NDArray[np.float64]:
     """Convert geodetic positions (n, 3) to metres (n, 3) from a geodetic origin (3,)."""
     offsets = ecef_from_geodetic(positions) - ecef_from_geodetic(origin[None])
-    return np.asarray(offsets @ _enu_from_ecef(origin).T)
+    return np.asarray(offsets @ enu_from_ecef(origin).T)
 
 
 def geodetic_from_enu(
     points: NDArray[np.float64], origin: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Convert metres (n, 3) from a geodetic origin (3,) to geodetic positions (n, 3)."""
-    return geodetic_from_ecef(points @ _enu_from_ecef(origin) + ecef_from_geodetic(origin[None]))
+    return geodetic_from_ecef(points @ enu_from_ecef(origin) + ecef_from_geodetic(origin[None]))
 
 
-def _normal(latitude: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(_SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(latitude) ** 2))
+def ground_distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Metres along the ground between two geodetic positions (3,), whose heights do not count.
+
+    The arc of a sphere over the chord of the ellipsoid: exact to a millionth within 50 km, to a
+    few thousandths anywhere.
+    """
+    points = ecef_from_geodetic(np.array([[a[0], a[1], 0.0], [b[0], b[1], 0.0]]))
+    half = float(np.linalg.norm(points[1] - points[0])) / (2 * _MEAN_RADIUS_M)
+    return 2 * _MEAN_RADIUS_M * math.asin(min(half, 1.0))
 
 
-def _enu_from_ecef(origin: NDArray[np.float64]) -> NDArray[np.float64]:
+def enu_from_ecef(origin: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the axes east, north and up at a geodetic origin (3,), as the rows of (3, 3)."""
     latitude, longitude = np.radians(origin[:2])
     sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
     sin_lon, cos_lon = np.sin(longitude), np.cos(longitude)
@@ -74,3 +85,7 @@ def _enu_from_ecef(origin: NDArray[np.float64]) -> NDArray[np.float64]:
             [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
         ]
     )
+
+
+def _normal(latitude: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(_SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(latitude) ** 2))

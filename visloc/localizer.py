@@ -130,7 +130,7 @@ class Localizer:
             InvalidInput: ``camera.size_mismatch``; ``features.required`` when features of the map
                 are not computed here; ``priors.*`` that mean nothing in this map.
         """
-        return self._solve_one(self.look(photo, camera, options, priors, found), options, priors)
+        return self.solve_look(self.look(photo, camera, options, priors, found), options, priors)[0]
 
     def localize_features(
         self,
@@ -155,7 +155,7 @@ class Localizer:
             TooLarge: ``features.too_many``.
         """
         look = self.look_at_features(features, camera, options, priors)
-        return self._solve_one(look, options, priors)
+        return self.solve_look(look, options, priors)[0]
 
     def look(
         self,
@@ -222,17 +222,31 @@ class Localizer:
         """Find one pose from all images of an instant, as ``solve_instant``."""
         return solve_instant(images, self.geometry, options, priors, timestamp)
 
-    def _solve_one(self, look: Look, options: LocalizeOptions, priors: Priors) -> Answer:
-        """Solve a rig of one camera, and say it in terms of that camera."""
+    def solve_look(
+        self, look: Look, options: LocalizeOptions, priors: Priors = NO_PRIORS
+    ) -> tuple[Answer, NDArray[np.bool_]]:
+        """Find the pose of one photo that was looked at: a rig of one camera, in terms of it.
+
+        Args:
+            look: what the photo shows.
+            options: those that it was looked at with.
+            priors: what is known of the camera.
+
+        Returns:
+            The answer, and of the look's matches (n,) whether the best pose explains them, were
+            the pose accepted or not.
+        """
         solved = self.solve([SeenImage("camera", Pose.identity(), look)], options, priors)
         answer, pose = solved.answer, solved.answer.pose
+        none = np.zeros(len(look.matches.pixels), dtype=np.bool_)
+        inliers = solved.inliers[0] if solved.inliers else none
         evidence = replace(look.evidence, num_inliers=answer.num_inliers, seconds=answer.seconds)
         if answer.refusal is not None or pose is None or solved.pose is None:
             assert answer.refusal is not None  # without a pose there is a reason
             refusal = answer.refusal
-            return NotLocalized(evidence, refusal.stage, refusal.reason, refusal.message)
-        inliers = solved.pose.inliers[0]
-        return Localized(
+            refused = NotLocalized(evidence, refusal.stage, refusal.reason, refusal.message)
+            return refused, inliers
+        localized = Localized(
             evidence=evidence,
             cam_from_world=pose.rig_from_world,
             covariance=pose.covariance,
@@ -241,6 +255,7 @@ class Localizer:
             inlier_keypoints=look.matches.pixels[inliers].astype(np.float32),
             inlier_points=look.matches.points[inliers] + self.geometry.origin,
         )
+        return localized, inliers
 
     def _match(
         self,
@@ -279,18 +294,21 @@ class Localizer:
             )
         evidence = replace(evidence, retrieved=tuple(self._describe_retrieved(retrieved)))
         with timed(seconds, "matching"):
-            matches = self._match_photos(local, retrieved.images)
-            others = self._match_photos(local, elsewhere)
+            matches, landmarks = self._match_photos(local, retrieved.images)
+            others, _ = self._match_photos(local, elsewhere)
         evidence = replace(evidence, num_correspondences=len(matches.pixels))
-        return Look(evidence, matches, others)
+        return Look(evidence, matches, landmarks, others)
 
-    def _match_photos(self, local: LocalFeatures, photos: NDArray[np.int64]) -> Matches:
-        """Match with the landmarks that photos of the map, most similar first, see."""
+    def _match_photos(
+        self, local: LocalFeatures, photos: NDArray[np.int64]
+    ) -> tuple[Matches, NDArray[np.int64]]:
+        """Match with the landmarks that photos of the map, most similar first, see; say which."""
         pairs = match_landmarks(local.descriptors, (self.map.observations(int(i)) for i in photos))
-        return Matches(
+        matches = Matches(
             local.keypoints[pairs.keypoints].astype(np.float64),
             self.map.landmarks[pairs.landmarks].astype(np.float64),
         )
+        return matches, pairs.landmarks
 
     def _elsewhere(
         self,
@@ -340,7 +358,8 @@ class Localizer:
 
 
 def _nothing(evidence: Evidence, stage: Stage, reason: Reason, message: str) -> Look:
-    return Look(evidence, Matches.none(), Matches.none(), Refusal(stage, reason, message))
+    refusal = Refusal(stage, reason, message)
+    return Look(evidence, Matches.none(), np.empty(0, np.int64), Matches.none(), refusal)
 
 
 def _find_features(

@@ -72,6 +72,7 @@ class Look:
     Attributes:
         evidence: without inliers.
         matches: with landmarks.
+        landmarks: (n,) int64 rows of the map's landmarks, those of ``matches``.
         elsewhere: with landmarks of photos that the priors exclude, though they look more like
             the query; mostly none.
         refusal: why there is nothing to solve; None when there may be.
@@ -79,6 +80,7 @@ class Look:
 
     evidence: Evidence
     matches: Matches
+    landmarks: NDArray[np.int64]
     elsewhere: Matches
     refusal: Refusal | None = None
 
@@ -108,11 +110,14 @@ class Solved:
         answer: for the caller.
         views: what each usable image contributed, relative to the map's origin.
         pose: the accepted pose, relative to the map's origin; None when there is none.
+        inliers: of each view, (n,) whether the best pose explains the match, were the pose
+            accepted or not; () when no pose was found.
     """
 
     answer: InstantAnswer
     views: tuple[MatchedView, ...]
     pose: GeneralizedPose | None
+    inliers: tuple[NDArray[np.bool_], ...]
 
 
 def solve_instant(
@@ -146,9 +151,9 @@ def solve_instant(
     pose = None
     if refusal is None and found is not None and found.covariance is not None:
         pose = rig_pose(found.rig_from_world, found.covariance, geometry, PoseSource.ESTIMATED)
-    inliers = [] if found is None else found.inliers
+    inliers = () if found is None else tuple(found.inliers)
     answer = InstantAnswer(timestamp, image_answers(images, inliers), pose, refusal, seconds)
-    return Solved(answer, views, found if refusal is None else None)
+    return Solved(answer, views, found if refusal is None else None, inliers)
 
 
 def views_of(images: Sequence[SeenImage], matches: Sequence[Matches]) -> tuple[MatchedView, ...]:

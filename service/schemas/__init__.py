@@ -6,10 +6,18 @@ are checked and its answers made by these models, so that both doors say the sam
 
 from __future__ import annotations
 
-from service.schemas.answer import LocalizeResponse, PoseEstimate
+from service.schemas.answer import Debug, LocalizeResponse, PoseEstimate
 from service.schemas.evidence import CameraUsed, MapRef, Orientation, Refusal, RetrievedImage
 from service.schemas.features import ARRAY_DTYPES, MAX_GLOBAL_DESCRIPTORS, Array, Features
 from service.schemas.geometry import Camera, Transform
+from service.schemas.geopose import (
+    GeoAngles,
+    GeoPose,
+    GeoPoseYpr,
+    GeoPosition,
+    GeoQuaternion,
+    Near,
+)
 from service.schemas.instants import (
     ImageAnswer,
     ImageError,
@@ -18,7 +26,17 @@ from service.schemas.instants import (
     RigPose,
 )
 from service.schemas.localize import MAX_MAPS, LocalizeRequest
-from service.schemas.maps import Extent, ListMapsResponse, MapInfo, RigInfo
+from service.schemas.maps import (
+    Anchor,
+    Extent,
+    GeoCircle,
+    Geodetic,
+    ListMapsResponse,
+    MapInfo,
+    RigInfo,
+    UseVersionRequest,
+    VersionInfo,
+)
 from service.schemas.options import LocalizeOptions
 from service.schemas.priors import GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
 from service.schemas.rigs import (
@@ -43,12 +61,21 @@ __all__ = [
     "MAX_GLOBAL_DESCRIPTORS",
     "MAX_MAPS",
     "MAX_SENSORS",
+    "Anchor",
     "Array",
     "BatchLimits",
     "Camera",
     "CameraUsed",
+    "Debug",
     "Extent",
     "Features",
+    "GeoAngles",
+    "GeoCircle",
+    "GeoPose",
+    "GeoPoseYpr",
+    "GeoPosition",
+    "GeoQuaternion",
+    "Geodetic",
     "GravityPrior",
     "Health",
     "HeightBand",
@@ -66,6 +93,7 @@ __all__ = [
     "MapInfo",
     "MapNotLoaded",
     "MapRef",
+    "Near",
     "Odometry",
     "Orientation",
     "Parts",
@@ -84,4 +112,6 @@ __all__ = [
     "RigSensor",
     "SequenceStart",
     "Transform",
+    "UseVersionRequest",
+    "VersionInfo",
 ]

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import base64
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, PlainSerializer
+from pydantic.json_schema import WithJsonSchema
 
 import visloc.types
-from service.jobs import Localization
+from service.jobs import Localization, MatchPicture
 from service.schemas.evidence import CameraUsed, MapRef, Orientation, Refusal, RetrievedImage
 from service.schemas.geometry import Transform
+from service.schemas.geopose import GeoPose, GeoPoseYpr, geoposes_to_words
 
 
 class PoseEstimate(BaseModel):
@@ -41,6 +44,43 @@ class PoseEstimate(BaseModel):
     ]
 
 
+# Bytes in standard base64, as requests have them.
+Base64 = Annotated[
+    bytes,
+    PlainSerializer(lambda data: base64.b64encode(data).decode()),
+    WithJsonSchema({"type": "string", "contentEncoding": "base64"}),
+]
+
+
+class Debug(BaseModel):
+    """What the solver was given, correspondence by correspondence, and what it made of it."""
+
+    keypoints: Annotated[
+        list[float],
+        Field(description="x, y of each in pixels of the photo as stored, one after the other"),
+    ]
+    points: Annotated[
+        list[float], Field(description="x, y, z of each in the world, one after the other")
+    ]
+    inliers: Annotated[
+        list[bool], Field(description="of each: whether the best pose explains it, refused or not")
+    ]
+    overlay: Annotated[
+        Base64,
+        Field(description="JPEG: the photo with its matches, beside photos that it was found in"),
+    ]
+
+    @staticmethod
+    def of(picture: MatchPicture) -> Debug:
+        """Say it in the API's words."""
+        return Debug(
+            keypoints=picture.keypoints.ravel().tolist(),
+            points=picture.points.ravel().tolist(),
+            inliers=picture.inliers.tolist(),
+            overlay=picture.overlay,
+        )
+
+
 class LocalizeResponse(BaseModel):
     """The answer: a pose, or the reason why there is none."""
 
@@ -61,12 +101,24 @@ class LocalizeResponse(BaseModel):
     orientation: Orientation
     map: MapRef
     seconds: Annotated[dict[str, float], Field(description="wall time by stage that was reached")]
+    geopose: Annotated[
+        GeoPose | None,
+        Field(description="of the camera; null when not localized or the map is not anchored"),
+    ] = None
+    geopose_ypr: Annotated[
+        GeoPoseYpr | None, Field(description="the same in angles, when asked for")
+    ] = None
+    debug: Annotated[Debug | None, Field(description="the matches, when asked for")] = None
 
     @staticmethod
     def from_localization(found: Localization, request_id: str) -> LocalizeResponse:
         """Say it in the API's words."""
         answer, evidence = found.answer, found.answer.evidence
         localized = isinstance(answer, visloc.types.Localized)
+        cam_from_world = (
+            answer.cam_from_world if isinstance(answer, visloc.types.Localized) else None
+        )
+        geopose, geopose_ypr = geoposes_to_words(cam_from_world, found.geodetic, ypr=found.ypr)
         return LocalizeResponse(
             request_id=request_id,
             status="localized" if localized else "not_localized",
@@ -83,6 +135,9 @@ class LocalizeResponse(BaseModel):
             orientation=Orientation.of(evidence),
             map=MapRef(id=found.map_id, version=found.map_version),
             seconds=dict(evidence.seconds),
+            geopose=geopose,
+            geopose_ypr=geopose_ypr,
+            debug=None if found.debug is None else Debug.of(found.debug),
         )
 
 

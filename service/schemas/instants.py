@@ -11,6 +11,7 @@ import visloc.types
 from service.jobs import InstantLocalization
 from service.schemas.evidence import CameraUsed, MapRef, Orientation, Refusal, RetrievedImage
 from service.schemas.geometry import Transform
+from service.schemas.geopose import GeoPose, GeoPoseYpr, geoposes_to_words
 from visloc.errors import VislocError
 from visloc.trajectory import PoseSource
 
@@ -113,12 +114,25 @@ class InstantAnswer(BaseModel):
         dict[str, float],
         Field(description="wall time by stage that was reached, summed over the images"),
     ]
+    geopose: Annotated[
+        GeoPose | None,
+        Field(
+            description="of the rig, whose frame is read like a camera's; null without a pose, or "
+            "when the map is not anchored"
+        ),
+    ] = None
+    geopose_ypr: Annotated[
+        GeoPoseYpr | None, Field(description="the same in angles, when asked for")
+    ] = None
 
     @staticmethod
     def from_localization(found: InstantLocalization, request_id: str) -> InstantAnswer:
         """Say it in the API's words."""
         answer = found.answer
         pose, correspondences = answer.pose, answer.num_correspondences
+        geopose, geopose_ypr = geoposes_to_words(
+            None if pose is None else pose.rig_from_world, found.geodetic, ypr=found.ypr
+        )
         return InstantAnswer(
             request_id=request_id,
             timestamp=answer.timestamp,
@@ -142,6 +156,8 @@ class InstantAnswer(BaseModel):
             inlier_ratio=answer.num_inliers / correspondences if correspondences else 0.0,
             map=MapRef(id=found.map_id, version=found.map_version),
             seconds=dict(answer.seconds),
+            geopose=geopose,
+            geopose_ypr=geopose_ypr,
         )
 
 

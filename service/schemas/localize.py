@@ -8,9 +8,10 @@ from typing import Annotated
 from pydantic import FailFast, Field
 
 from service.incoming import IncomingMessage, converted
-from service.jobs import LocalizeJob
+from service.jobs import LocalizeJob, Where
 from service.schemas.features import GivenFeatures, GivenImage, query_to_core
 from service.schemas.geometry import GivenCamera
+from service.schemas.geopose import GivenNear, GivenYpr, Near, flag_from_text
 from service.schemas.options import GivenOptions, LocalizeOptions
 from service.schemas.priors import GivenPriors, priors_to_core
 from visloc.errors import InvalidInput
@@ -41,21 +42,35 @@ GivenMaps = Annotated[
 ]
 
 
-def maps_to_core(map_ref: str | None, maps: list[str] | None) -> tuple[str, ...]:
+GivenDebug = Annotated[
+    bool | None,
+    converted(flag_from_text),
+    Field(description="also return the matches and a picture of them; needs a photo"),
+]
+
+
+def where_to_core(map_ref: str | None, maps: list[str] | None, near: Near | None) -> Where:
     """Return where to search.
 
     Raises:
-        InvalidInput: ``request.map`` for neither or both, for one map twice, and for too many.
+        InvalidInput: ``request.map`` for none or several of the three, for one map twice, and for
+            too many; ``near...``.
     """
-    if (map_ref is None) == (maps is None) or maps == []:
-        got = "neither" if map_ref is None else "both"
+    given = [
+        name
+        for name, value in (("map", map_ref), ("maps", maps or None), ("near", near))
+        if value is not None
+    ]
+    if len(given) != 1 or maps == []:
         raise InvalidInput(
             "request.map",
-            "a request names a map, or several",
+            "a request names a map, or several, or a place",
             field="map",
-            expected="one of map, maps",
-            got=got,
+            expected="one of map, maps, near",
+            got=" and ".join(given) or "none of them",
         )
+    if near is not None:
+        return near.to_core()
     if maps is None:
         assert map_ref is not None
         return (map_ref,)
@@ -91,18 +106,31 @@ class LocalizeRequest(IncomingMessage):
     options: GivenOptions = Field(default_factory=LocalizeOptions)
     maps: GivenMaps = None
     priors: GivenPriors = None
+    near: GivenNear = None
+    ypr: GivenYpr = None
+    debug: GivenDebug = None
 
     def to_job(self) -> LocalizeJob:
         """Return the work to do.
 
         Raises:
-            InvalidInput: ``request.query``, ``request.map``, ``features...``, ``camera...``,
-                ``options...``, ``priors...`` or ``pose...``.
+            InvalidInput: ``request.query``, ``request.map``, ``near...``, ``features...``,
+                ``camera...``, ``options...``, ``priors...``, ``pose...`` or ``debug.needs_photo``.
         """
+        if self.debug and self.features is not None:
+            raise InvalidInput(
+                "debug.needs_photo",
+                "matches are drawn on the photo, and features come without it",
+                field="debug",
+                expected="false or left out with features",
+                got="true",
+            )
         return LocalizeJob(
-            maps_to_core(self.map, self.maps),
+            where_to_core(self.map, self.maps, self.near),
             query_to_core(self.image, self.features),
             None if self.camera is None else self.camera.to_core(),
             self.options.to_core(),
             priors_to_core(self.priors),
+            ypr=bool(self.ypr),
+            debug=bool(self.debug),
         )

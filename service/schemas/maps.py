@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import BaseModel, Field
 
-from visloc.archive import Map
+import visloc.archive
+from service.incoming import IncomingMessage
+
+if TYPE_CHECKING:
+    from service.catalog import ServedMap
 
 
 class Extent(BaseModel):
@@ -21,6 +26,67 @@ class RigInfo(BaseModel):
 
     id: str
     sensors: Annotated[list[str], Field(description="ids of its cameras")]
+
+
+class Geodetic(BaseModel):
+    """Where the world lies on Earth.
+
+    enu = scale R x + translation gives metres east, north and up of the position.
+    """
+
+    latitude_deg: Annotated[float, Field(description="WGS84")]
+    longitude_deg: float
+    altitude_m: Annotated[float, Field(description="above the ellipsoid")]
+    scale: Annotated[float, Field(description="metres per unit of the world")]
+    rotation_wxyz: Annotated[list[float], Field(description="R as a unit quaternion")]
+    translation: Annotated[list[float], Field(description="metres")]
+
+
+class Anchor(BaseModel):
+    """What the world's position, orientation and scale rest on."""
+
+    kind: Annotated[
+        str,
+        Field(description="dataset, model, gnss, positions, correspondences or none"),
+    ]
+    images: Annotated[int, Field(description="photos, or given points, that it rests on")]
+    rms: Annotated[
+        float | None,
+        Field(description="how far they are from where they were said to be, units of the world"),
+    ]
+    geodetic: Annotated[Geodetic | None, Field(description="null when not anchored to the Earth")]
+
+    @staticmethod
+    def of(world: visloc.archive.World) -> Anchor | None:
+        """Say it in the API's words."""
+        return None if world.anchor is None else Anchor.model_validate(world.anchor.model_dump())
+
+
+class GeoCircle(BaseModel):
+    """A circle on Earth about the middle of a map, which holds the map."""
+
+    latitude: Annotated[float, Field(description="degrees, WGS84")]
+    longitude: Annotated[float, Field(description="degrees")]
+    radius: Annotated[float, Field(description="metres")]
+
+    @staticmethod
+    def of(world: visloc.archive.World) -> GeoCircle | None:
+        """Say it in the API's words."""
+        place = visloc.archive.circle_of(world)
+        return None if place is None else GeoCircle(**asdict(place))
+
+
+class VersionInfo(BaseModel):
+    """A published version of a map."""
+
+    version: str
+    current: Annotated[bool, Field(description="whether it is in use")]
+
+
+class UseVersionRequest(IncomingMessage):
+    """Which version of a map to put into use."""
+
+    version: Annotated[str, Field(description="of those that are published")]
 
 
 class MapInfo(BaseModel):
@@ -43,10 +109,25 @@ class MapInfo(BaseModel):
         Field(description="unit vector that points down in the world; empty when not known"),
     ]
     rigs: Annotated[list[RigInfo], Field(description="that requests may name by their ids")]
+    anchor: Annotated[
+        Anchor | None, Field(description="null for maps of format 1.0, which do not tell")
+    ] = None
+    place: Annotated[GeoCircle | None, Field(description="null when not anchored to the Earth")] = (
+        None
+    )
+    current: Annotated[bool, Field(description="whether this version is in use")]
+    versions: Annotated[
+        list[VersionInfo], Field(description="all published ones of the map, oldest first")
+    ]
+    content_hash: Annotated[
+        str,
+        Field(description="sha256 over all that localizes: equal maps have equal ones"),
+    ]
 
     @staticmethod
-    def from_map(opened: Map) -> MapInfo:
+    def from_served(served: ServedMap) -> MapInfo:
         """Say it in the API's words."""
+        opened = served.opened
         manifest = opened.manifest
         return MapInfo(
             id=manifest.id,
@@ -63,6 +144,11 @@ class MapInfo(BaseModel):
             size_bytes=opened.size_bytes,
             down=[] if manifest.world.gravity is None else list(manifest.world.gravity),
             rigs=[RigInfo(id=id_, sensors=list(sensors)) for id_, sensors in opened.rigs.items()],
+            anchor=Anchor.of(manifest.world),
+            place=GeoCircle.of(manifest.world),
+            current=served.current,
+            versions=[VersionInfo(version=name, current=used) for name, used in served.versions],
+            content_hash=manifest.content_hash,
         )
 
 

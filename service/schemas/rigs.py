@@ -13,7 +13,8 @@ from service.incoming import IncomingMessage, converted, counted, inside
 from service.jobs import ONLY_SENSOR, ImageJob, RigJob
 from service.schemas.features import GivenFeatures, GivenImage, query_to_core
 from service.schemas.geometry import GivenCamera, Transform
-from service.schemas.localize import GivenMaps, maps_to_core
+from service.schemas.geopose import GivenNear, GivenYpr
+from service.schemas.localize import GivenMaps, where_to_core
 from service.schemas.options import GivenOptions, LocalizeOptions
 from service.schemas.priors import GivenPriors, priors_to_core
 from visloc.errors import InvalidInput, TooLarge
@@ -286,6 +287,8 @@ class LocalizeRigRequest(IncomingMessage):
     images: Images
     options: GivenOptions = Field(default_factory=LocalizeOptions)
     priors: GivenPriors = None
+    near: GivenNear = None
+    ypr: GivenYpr = None
 
     def to_job(self, files: Mapping[str, bytes] = NO_PARTS) -> RigJob:
         """Return the work to do.
@@ -294,15 +297,21 @@ class LocalizeRigRequest(IncomingMessage):
             files: the files of a form by the names of their parts.
 
         Raises:
-            InvalidInput: ``request...``, ``rig...``, ``features...``, ``camera...``,
-                ``options...``, ``priors...`` or ``pose...``.
+            InvalidInput: ``request...``, ``near...``, ``rig...``, ``features...``,
+                ``camera...``, ``options...``, ``priors...`` or ``pose...``.
         """
-        maps = maps_to_core(self.map, self.maps)
+        where = where_to_core(self.map, self.maps, self.near)
         if self.rig is None:
             raise InvalidInput("request.missing_field", "this field is needed", field="rig")
         rig, parts = rig_to_core(self.rig), Parts(files)
         images, timestamp = images_to_core(self.images, None, parts, has_rig=True)
         parts.check_all_taken()
         return RigJob(
-            maps, rig, images, timestamp, self.options.to_core(), priors_to_core(self.priors)
+            where,
+            rig,
+            images,
+            timestamp,
+            self.options.to_core(),
+            priors_to_core(self.priors),
+            ypr=bool(self.ypr),
         )

@@ -12,7 +12,8 @@ import visloc.sequence
 from service.incoming import IncomingMessage, counted, inside
 from service.jobs import DEFAULT_MAX_GAP_S
 from service.schemas.geometry import Numbers, Transform, covariance_to_core
-from service.schemas.localize import GivenMaps, maps_to_core
+from service.schemas.geopose import GivenNear, GivenYpr
+from service.schemas.localize import GivenMaps, where_to_core
 from service.schemas.options import GivenOptions, LocalizeOptions
 from service.schemas.priors import GivenPriors, priors_to_core
 from service.schemas.rigs import (
@@ -101,13 +102,15 @@ class SequenceStart(IncomingMessage):
     ] = None
     options: GivenOptions = Field(default_factory=LocalizeOptions)
     priors: GivenPriors = None
+    near: GivenNear = None
+    ypr: GivenYpr = None
 
     def to_core(self) -> service.jobs.SequenceStart:
         """Return what they share, checked.
 
         Raises:
-            InvalidInput: ``request.map``, ``sequence.time_unit``, ``rig...``, ``camera...``,
-                ``options...``, ``priors...`` or ``pose...``.
+            InvalidInput: ``request.map``, ``near...``, ``sequence.time_unit``, ``rig...``,
+                ``camera...``, ``options...``, ``priors...`` or ``pose...``.
         """
         units = [str(unit) for unit in TimeUnit]
         if self.time_unit and self.time_unit not in units:
@@ -119,12 +122,13 @@ class SequenceStart(IncomingMessage):
                 got=self.time_unit,
             )
         return service.jobs.SequenceStart(
-            maps=maps_to_core(self.map, self.maps),
+            maps=where_to_core(self.map, self.maps, self.near),
             rig=None if self.rig is None else rig_to_core(self.rig),
             time_unit=TimeUnit(self.time_unit) if self.time_unit else None,
             max_gap_s=DEFAULT_MAX_GAP_S if self.max_gap_s is None else self.max_gap_s,
             options=self.options.to_core(),
             priors=priors_to_core(self.priors),
+            ypr=bool(self.ypr),
         )
 
 

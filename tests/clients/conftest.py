@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import json
 import math
@@ -47,6 +48,16 @@ POSE: dict[str, Any] = {
     "position_std": [0.004, 0.005, 1 / 3],
     "orientation_std_deg": [0.1, 0.2, 0.3],
 }
+GEOPOSE: dict[str, Any] = {
+    "position": {"lat": 48.25, "lon": -122.1, "h": 1 / 3},
+    "quaternion": {"x": 0.0, "y": -0.1, "z": 1 / 7, "w": 0.98},
+}
+DEBUG: dict[str, Any] = {
+    "keypoints": [1.5, 2.0, 3.0, 0.1 + 0.2],
+    "points": [1.0, 2.0, 3.0, 1e6, -5e6, 1 / 3],
+    "inliers": [True, False],
+    "overlay": base64.b64encode(bytes(range(256))).decode(),
+}
 # The rig that the canned map knows: the right camera is half a metre to the right of the left one.
 STEREO = {
     "left": Pose.identity(),
@@ -79,6 +90,7 @@ class CannedService:
     local_features: str = "xfeat"
     global_features: tuple[str, ...] = ("densevlad", "localvlad")
     fails_at_the_end: bool = False
+    draws: bool = True
 
     def localize(
         self, image: bytes, asked: dict[str, Any], features: dict[str, Any] | None = None
@@ -134,6 +146,9 @@ class CannedService:
             "orientation": {"exif": 6, "read_as": "stored"},
             "map": {"id": "room", "version": self.version},
             "seconds": {"features": 0.25, "pose": 0.0} if refusal is None else {"features": 0.75},
+            "geopose": None if pose is None else GEOPOSE,
+            "geopose_ypr": None,
+            "debug": DEBUG if asked.get("debug") and self.draws else None,
         }
 
     def localize_instant(
@@ -229,6 +244,8 @@ class CannedService:
             "inlier_ratio": num_inliers / max(num_correspondences, 1),
             "map": {"id": "room", "version": self.version},
             "seconds": {"features": 0.5, "pose": 0.25},
+            "geopose": None,
+            "geopose_ypr": None,
         }
 
     def finish_sequence(self, num_instants: int) -> None:
@@ -257,6 +274,23 @@ class CannedService:
             "size_bytes": 2**53 + 1,
             "down": [0.0, 1.0, 0.0],
             "rigs": [{"id": "stereo", "sensors": list(STEREO)}],
+            "anchor": {
+                "kind": "gnss",
+                "images": 300,
+                "rms": 1 / 3,
+                "geodetic": {
+                    "latitude_deg": 48.25,
+                    "longitude_deg": -122.1,
+                    "altitude_m": 0.0,
+                    "scale": 1.0,
+                    "rotation_wxyz": [1.0, 0.0, 0.0, 0.0],
+                    "translation": [0.0, 0.0, 0.0],
+                },
+            },
+            "place": {"latitude": 48.25, "longitude": -122.1, "radius": 12.5},
+            "current": True,
+            "versions": [{"version": self.version, "current": True}],
+            "content_hash": "ab" * 32,
         }
 
 
@@ -313,7 +347,7 @@ def _http_app(canned: CannedService) -> Starlette:
 
     async def post(request: Request) -> Response:
         async with request.form() as form:
-            known = {"image", "features", "map", "maps", "camera", "options", "priors"}
+            known = {"image", "features", "map", "maps", "camera", "options", "priors", "debug"}
             assert set(form) <= known
             assert ("map" in form) != ("maps" in form)
             assert ("image" in form) != ("features" in form)
@@ -329,7 +363,7 @@ def _http_app(canned: CannedService) -> Starlette:
                 "camera": read("camera"),
                 "options": read("options") or {},
                 "request_id": request.headers.get("x-request-id"),
-                **{name: read(name) for name in ("maps", "priors") if name in form},
+                **{name: read(name) for name in ("maps", "priors", "debug") if name in form},
             }
             if "image" in form:
                 return await run_in_threadpool(localize, content, asked)
@@ -448,6 +482,8 @@ class _Servicer(pb2_grpc.LocalizationServicer):
         camera = MessageToDict(request.camera) if request.HasField("camera") else None
         options = MessageToDict(request.options, preserving_proto_field_name=True)
         asked = _asked(request) | {"camera": camera, "options": options}
+        if request.HasField("debug"):
+            asked["debug"] = request.debug
         features = None
         if request.WhichOneof("query") == "features":
             # protobuf writes bytes in base64, and no empty maps.

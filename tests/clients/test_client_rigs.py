@@ -612,8 +612,8 @@ def answering(lines: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
 
     original = HttpTransport.__init__
 
-    def init(self: Any, server: str, timeout_s: float) -> None:
-        original(self, server, timeout_s)
+    def init(self: Any, connection: Any) -> None:
+        original(self, connection)
         self._http.close()
         self._http.stream = stream
 

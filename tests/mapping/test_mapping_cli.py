@@ -237,7 +237,7 @@ def test_build_explains_all_its_options(run: Run, monkeypatch: pytest.MonkeyPatc
         *("--features-dir", "--pixel-origin", "--weights-dir", "--max-keypoints", "--metric"),
         *("--workers", "--force", "--voxel-size", "--depth-sensor", "--depth-scale", "--pairs"),
         *("--top-k", "--max-distance", "--max-angle", "--near", "--far", "--covisible-in"),
-        *("--pairs-file", "--mapper", "--refine", "--poses", "--gravity"),
+        *("--pairs-file", "--mapper", "--refine", "--poses", "--gravity", "--keep-photos"),
     ):
         assert re.search(rf"{option}\b", out), option
     for name in PAIRINGS:

@@ -85,7 +85,7 @@ def doors(built_maps: Path) -> Iterator[Doors]:
         yield doors
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def serve() -> Callable[..., AbstractContextManager[Doors]]:
     """``with serve(maps_dir, **settings) as doors``: a service of the test's own."""
     return serving

@@ -3,9 +3,11 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import os
 import shutil
-import threading
-from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+import signal
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -14,9 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
-from service import engine as engine_module
-from service import instants as instants_module
-from service import loaded_maps
+from service import catalog
 from service.engine import Engine
 from service.jobs import (
     ImageJob,
@@ -27,6 +27,8 @@ from service.jobs import (
     RigSensor,
     SequenceStart,
 )
+from service.metrics import Metrics
+from service.worker import WorkerSettings
 from visloc.archive import MapStore
 from visloc.errors import (
     Conflict,
@@ -34,15 +36,14 @@ from visloc.errors import (
     MapCorrupt,
     NotFound,
     Overloaded,
+    TimedOut,
     TooLarge,
     Unavailable,
 )
 from visloc.evaluation import pose_error
-from visloc.features.sift import SiftExtractor
 from visloc.geometry import Camera, Pose
 from visloc.images import ImageLimits
 from visloc.kapture import read_dataset
-from visloc.localizer import Localizer
 from visloc.priors import NO_PRIORS, GravityPrior, PositionPrior, Priors
 from visloc.sequence import Odometry
 from visloc.trajectory import PoseSource, TimeUnit
@@ -56,8 +57,41 @@ class Query(Protocol):
     camera: Camera
 
 
-def make(maps_dir: Path, **settings: Any) -> Engine:
-    return Engine(MapStore(maps_dir), limits=ImageLimits(), **settings)
+LIMITS = ImageLimits()
+
+
+def make(
+    maps_dir: Path, *, limits: ImageLimits = LIMITS, max_instants: int = 1000, **settings: Any
+) -> Engine:
+    of_workers = WorkerSettings(
+        weights_dir=None,
+        threads=1,
+        max_loaded_bytes=settings.pop("max_loaded_bytes", 2**30),
+        max_images=16,
+        max_instants=max_instants,
+        limits=limits,
+    )
+    return Engine(MapStore(maps_dir), of_workers, metrics=Metrics(), **settings)
+
+
+async def until(happened: Callable[[], bool], seconds: float = 20.0) -> None:
+    async with asyncio.timeout(seconds):
+        while not happened():
+            await asyncio.sleep(0.02)
+
+
+@contextmanager
+def held_back(engine: Engine) -> Iterator[None]:
+    """Stop the worker processes for a while, as a busy machine does."""
+    pids = engine.workers.pids
+    try:
+        for pid in pids:
+            os.kill(pid, signal.SIGSTOP)
+        yield
+    finally:
+        for pid in pids:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGCONT)
 
 
 def run(coroutine: Coroutine[Any, Any, T]) -> T:
@@ -84,7 +118,7 @@ def test_an_answer_names_its_map_and_times_every_stage(maps_dir: Path, query: Qu
         engine = make(maps_dir)
         await engine.start()
         found = await engine.localize(job_for(query))
-        engine.close()
+        await engine.close()
 
         assert isinstance(found.answer, Localized)
         assert found.map_id == "room"
@@ -107,7 +141,7 @@ def test_photos_are_refused_until_the_maps_are_warm(maps_dir: Path, query: Query
         await engine.start()
         assert engine.status.ready
         assert engine.status.maps == (f"room@{MapStore(maps_dir).current_version('room')}",)
-        engine.close()
+        await engine.close()
         assert not engine.status.ready
 
     run(play())
@@ -123,14 +157,17 @@ def test_a_published_version_and_a_new_map_are_served_without_a_restart(
         publish(maps_dir, "v2")
         publish(maps_dir, "v1", map_id="hall")
 
+        # Nobody waits for the new version: the old one answers until it is warm.
+        await engine.localize(job_for(query))
+        await until(lambda: "room@v2" in engine.status.maps)
         assert (await engine.localize(job_for(query))).map_version == "v2"
         assert (await engine.localize(job_for(query, "hall"))).map_id == "hall"
-        assert (await engine.map("room")).manifest.version == "v2"
-        assert [m.manifest.id for m in await engine.maps()] == ["hall", "room"]
-        assert engine.status.maps == ("hall@v1", "room@v2")
+        assert (await engine.map("room")).opened.manifest.version == "v2"
+        assert [m.opened.manifest.id for m in await engine.maps()] == ["hall", "room"]
+        await until(lambda: engine.status.maps == ("hall@v1", "room@v2"))
         # The older version is still there for those who name it.
         assert (await engine.localize(job_for(query, f"room@{old}"))).map_version == old
-        engine.close()
+        await engine.close()
 
     run(play())
 
@@ -145,17 +182,19 @@ def test_a_broken_new_version_leaves_the_one_before_in_service(
         publish(maps_dir, "v2")
         (maps_dir / "room" / "v2" / "landmarks.npy").unlink()
 
+        await until(lambda: "room" in engine.status.not_loaded)
         for _ in range(3):
             assert (await engine.localize(job_for(query))).map_version == old
-        assert (await engine.map("room")).manifest.version == old
-        assert [m.manifest.version for m in await engine.maps()] == [old]
+        assert (await engine.map("room")).opened.manifest.version == old
+        assert [m.opened.manifest.version for m in await engine.maps()] == [old]
         with pytest.raises(MapCorrupt):
             await engine.localize(job_for(query, "room@v2"))
 
         (maps_dir / "room" / "current").write_text(old)
         publish(maps_dir, "v3")
+        await until(lambda: "room@v3" in engine.status.maps)
         assert (await engine.localize(job_for(query))).map_version == "v3"
-        engine.close()
+        await engine.close()
 
     with caplog.at_level(logging.ERROR):
         run(play())
@@ -178,7 +217,7 @@ def test_a_broken_map_does_not_keep_the_others_from_being_served(
         assert engine.status.ready
         assert list(engine.status.not_loaded) == ["hall"]
         assert isinstance(engine.status.not_loaded["hall"], MapCorrupt)
-        assert [m.manifest.id for m in await engine.maps()] == ["room"]
+        assert [m.opened.manifest.id for m in await engine.maps()] == ["room"]
         await engine.localize(job_for(query))
         with pytest.raises(MapCorrupt):
             await engine.localize(job_for(query, "hall"))
@@ -186,7 +225,7 @@ def test_a_broken_map_does_not_keep_the_others_from_being_served(
         manifest.write_bytes(good)
         await engine.localize(job_for(query, "hall"))
         assert engine.status.not_loaded == {}
-        engine.close()
+        await engine.close()
 
     run(play())
     assert "map hall is not loaded" in caplog.text
@@ -219,8 +258,8 @@ def test_whatever_a_damaged_map_breaks_the_others_are_served(
 
         assert engine.status.ready
         assert engine.status.not_loaded.keys() == {"hall"}
-        assert engine.status.not_loaded["hall"].code == "map.unusable"
-        assert "room" in [m.manifest.id for m in await engine.maps()]
+        assert engine.status.not_loaded["hall"].code in ("map.unusable", "map.manifest")
+        assert "room" in [m.opened.manifest.id for m in await engine.maps()]
         assert (await engine.localize(job_for(query))).map_id == "room"
         with pytest.raises(MapCorrupt):
             await engine.localize(job_for(query, "hall"))
@@ -228,12 +267,13 @@ def test_whatever_a_damaged_map_breaks_the_others_are_served(
         before = (await engine.localize(job_for(query))).map_version
         publish(maps_dir, "v2")
         damage(maps_dir / "room" / "v2")
+        await until(lambda: "room" in engine.status.not_loaded)
         assert (await engine.localize(job_for(query))).map_version == before
         assert engine.status.not_loaded["room"].field == "room@v2"
-        engine.close()
+        await engine.close()
 
     run(play())
-    assert "Traceback" in caplog.text
+    assert "map room@v2 cannot take over" in caplog.text
 
 
 def test_a_refused_version_is_named_left_alone_for_a_while_and_tried_again(
@@ -247,16 +287,18 @@ def test_a_refused_version_is_named_left_alone_for_a_while_and_tried_again(
         landmarks = maps_dir / "room" / "v2" / "landmarks.npy"
         landmarks.rename(landmarks.with_name("away"))
 
+        await until(lambda: "room" in engine.status.not_loaded)
         assert (await engine.localize(job_for(query))).map_version == old
         assert engine.status.maps == (f"room@{old}",)
         assert "v2" in str(engine.status.not_loaded["room"])
 
         landmarks.with_name("away").rename(landmarks)
         assert (await engine.localize(job_for(query))).map_version == old
-        monkeypatch.setattr(loaded_maps, "RETRY_AFTER_S", 0.0)
+        monkeypatch.setattr(catalog, "RETRY_AFTER_S", 0.0)
+        await until(lambda: "room@v2" in engine.status.maps)
         assert (await engine.localize(job_for(query))).map_version == "v2"
         assert engine.status.not_loaded == {}
-        engine.close()
+        await engine.close()
 
     run(play())
 
@@ -271,9 +313,8 @@ def test_a_damaged_name_of_the_current_version_leaves_the_one_before_in_service(
         (maps_dir / "room" / "current").write_bytes(b"\xff")
 
         assert (await engine.localize(job_for(query))).map_version == old
-        assert (await engine.map("room")).manifest.version == old
         assert engine.status.not_loaded["room"].code == "map.current"
-        engine.close()
+        await engine.close()
 
     run(play())
 
@@ -290,25 +331,22 @@ def test_deleted_maps_disappear(maps_dir: Path, query: Query) -> None:
 
         for map_id in ("hall", "yard"):
             shutil.rmtree(maps_dir / map_id)
-        assert [ref.partition("@")[0] for ref in engine.status.maps] == ["room"]
-        assert engine.status.not_loaded == {}
+        await until(lambda: not engine.status.not_loaded)
+        await until(lambda: [ref.partition("@")[0] for ref in engine.status.maps] == ["room"])
         with pytest.raises(NotFound):
             await engine.localize(job_for(query, "hall"))
-        engine.close()
+        await engine.close()
 
     run(play())
 
 
-def test_a_loaded_map_is_described_without_opening_it_again(
-    maps_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_map_is_described_without_opening_it_twice(maps_dir: Path) -> None:
     async def play() -> None:
         engine = make(maps_dir)
-        await engine.start()
-        monkeypatch.setattr(MapStore, "open", None)
         by_id = await engine.map("room")
-        assert await engine.map(by_id.ref) is by_id
-        engine.close()
+        assert (await engine.map(by_id.opened.ref)).opened is by_id.opened
+        assert by_id.current
+        await engine.close()
 
     run(play())
 
@@ -325,7 +363,7 @@ def test_a_map_whose_features_are_not_here_is_a_conflict_not_the_callers_mistake
         with pytest.raises(Conflict) as caught:
             await engine.localize(job_for(query))
         assert caught.value.code == "features.unknown"
-        engine.close()
+        await engine.close()
 
     run(play())
 
@@ -345,118 +383,149 @@ def test_a_map_that_is_not_there_is_refused(
 ) -> None:
     async def play() -> None:
         engine = make(built_maps)
-        engine._ready = True  # nothing needs to be loaded for this
+        engine._started = True  # nothing needs to be loaded for this
         for call in (engine.localize(job_for(query, ref)), engine.map(ref)):
             with pytest.raises(kind) as caught:
                 await call
             assert getattr(caught.value, "code", None) == code
-        engine.close()
+        await engine.close()
 
     run(play())
 
 
-class Gate:
-    """Holds back the work of the engine until it is opened."""
+def test_one_photo_too_many_is_refused_at_once(built_maps: Path, query: Query) -> None:
+    async def play(engine: Engine) -> None:
+        with held_back(engine):
+            accepted = [asyncio.create_task(engine.localize(job_for(query))) for _ in range(3)]
+            await asyncio.sleep(0.1)
+            with pytest.raises(Overloaded) as caught:
+                await engine.localize(job_for(query))
+            assert caught.value.code == "server.busy"
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, module: Any = engine_module) -> None:
-        self.opened, self.entered = threading.Event(), threading.Semaphore(0)
-        self.count = 0
-        read_photo = module.read_photo
-
-        def waiting(*arguments: Any) -> Any:
-            self.count += 1
-            self.entered.release()
-            assert self.opened.wait(30)
-            return read_photo(*arguments)
-
-        monkeypatch.setattr(module, "read_photo", waiting)
-
-
-def test_one_photo_too_many_is_refused_at_once(
-    built_maps: Path, query: Query, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def play() -> None:
-        engine = make(built_maps, workers=1, max_queue=2)
-        await engine.start()
-        gate = Gate(monkeypatch)
-        accepted = [asyncio.create_task(engine.localize(job_for(query))) for _ in range(3)]
-        await asyncio.sleep(0)
-
-        with pytest.raises(Overloaded) as caught:
-            await engine.localize(job_for(query))
-        assert caught.value.code == "server.busy"
-
-        gate.opened.set()
         answers = await asyncio.gather(*accepted)
         assert len(answers) == 3
-        assert answers[2].answer.evidence.seconds["queued"] > 0
+        assert answers[2].answer.evidence.seconds["queued"] > 0.1
         await engine.localize(job_for(query))  # there is room again
-        engine.close()
 
-    run(play())
+    with_engine(built_maps, play, workers=1, max_queue=2)
 
 
 def test_a_photo_whose_caller_left_is_dropped_and_gives_back_its_place(
-    built_maps: Path, query: Query, monkeypatch: pytest.MonkeyPatch
+    built_maps: Path, query: Query
 ) -> None:
-    async def play() -> None:
-        engine = make(built_maps, workers=1, max_queue=1)
-        await engine.start()
-        gate = Gate(monkeypatch)
-        running, waiting = (asyncio.create_task(engine.localize(job_for(query))) for _ in range(2))
-        await asyncio.to_thread(gate.entered.acquire)
-
-        waiting.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await waiting
-        after = asyncio.create_task(engine.localize(job_for(query)))
-        await asyncio.sleep(0)
-        gate.opened.set()
+    async def play(engine: Engine) -> None:
+        with held_back(engine):
+            running = asyncio.create_task(engine.localize(job_for(query)))
+            await until(lambda: engine.workers.running == 1)
+            waiting = asyncio.create_task(engine.localize(job_for(query)))
+            await until(lambda: engine.workers.waiting == 1)
+            waiting.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await waiting
+            assert engine.workers.waiting == 0
+            after = asyncio.create_task(engine.localize(job_for(query)))
+            await asyncio.sleep(0)
         await asyncio.gather(running, after)
-        assert gate.count == 2
-        engine.close()
 
-    run(play())
+    with_engine(built_maps, play, workers=1, max_queue=1)
 
 
-def test_workers_work_at_the_same_time(
-    built_maps: Path, query: Query, monkeypatch: pytest.MonkeyPatch
+def test_a_photo_that_is_worked_on_is_given_up_when_its_caller_leaves(
+    built_maps: Path, query: Query
 ) -> None:
-    async def play() -> None:
-        engine = make(built_maps, workers=2, max_queue=0)
-        await engine.start()
-        gate = Gate(monkeypatch)
-        tasks = [asyncio.create_task(engine.localize(job_for(query))) for _ in range(2)]
-        for _ in range(2):
-            assert await asyncio.to_thread(gate.entered.acquire, timeout=10)
-        gate.opened.set()
+    async def play(engine: Engine) -> None:
+        with held_back(engine):
+            task = asyncio.create_task(engine.localize(job_for(query)))
+            await until(lambda: engine.workers.running == 1)
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+        await until(lambda: engine.workers.running == 0)
+        assert engine.workers.alive == 1
+        await engine.localize(job_for(query))
+
+    with_engine(built_maps, play)
+
+
+def test_workers_work_at_the_same_time(built_maps: Path, query: Query) -> None:
+    async def play(engine: Engine) -> None:
+        with held_back(engine):
+            tasks = [asyncio.create_task(engine.localize(job_for(query))) for _ in range(2)]
+            await until(lambda: engine.workers.running == 2)
         await asyncio.gather(*tasks)
-        engine.close()
 
-    run(play())
+    with_engine(built_maps, play, workers=2, max_queue=0)
 
 
-def test_one_extractor_serves_all_maps_that_use_it(
-    maps_dir: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_worker_that_dies_fails_its_own_request_and_is_replaced(
+    built_maps: Path, query: Query
 ) -> None:
-    publish(maps_dir, "v1", map_id="hall")
-    used = []
+    async def play(engine: Engine) -> None:
+        one, other = engine.workers.pids
+        alone = await engine.localize(job_for(query))
+        with held_back(engine):
+            tasks = [asyncio.create_task(engine.localize(job_for(query))) for _ in range(4)]
+            await until(lambda: engine.workers.running == 2)
+            os.kill(one, signal.SIGKILL)
+            await until(lambda: any(task.done() for task in tasks))
+        found = await asyncio.gather(*tasks, return_exceptions=True)
+        (died,) = [each for each in found if isinstance(each, Exception)]
+        assert isinstance(died, Unavailable)
+        assert died.code == "server.worker_died"
+        for each in found:
+            if not isinstance(each, BaseException):
+                assert isinstance(each.answer, Localized)
+                assert isinstance(alone.answer, Localized)
+                assert np.array_equal(each.answer.covariance, alone.answer.covariance)
+        await until(lambda: engine.workers.alive == 2)
+        assert other in engine.workers.pids
+        assert one not in engine.workers.pids
+        assert engine.status.ready
 
-    class Recording(Localizer):
-        def __init__(self, opened: Any, extractor: Any) -> None:
-            used.append(extractor)
-            super().__init__(opened, extractor)
+    with_engine(built_maps, play, workers=2)
 
-    monkeypatch.setattr(loaded_maps, "Localizer", Recording)
 
-    async def play() -> None:
-        engine = make(maps_dir)
-        await engine.start()
-        engine.close()
+def test_an_idle_worker_that_dies_is_replaced(built_maps: Path, query: Query) -> None:
+    async def play(engine: Engine) -> None:
+        (pid,) = engine.workers.pids
+        os.kill(pid, signal.SIGKILL)
+        await until(lambda: pid not in engine.workers.pids and engine.workers.alive == 1)
+        await engine.localize(job_for(query))
 
-    run(play())
-    assert len(used) == 2
-    assert used[0] is used[1]
+    with_engine(built_maps, play)
+
+
+def test_a_worker_that_hangs_is_replaced_and_its_request_is_told(
+    built_maps: Path, query: Query
+) -> None:
+    async def play(engine: Engine) -> None:
+        (pid,) = engine.workers.pids
+        engine.workers._limit_s = 0.5
+        os.kill(pid, signal.SIGSTOP)
+        with pytest.raises(TimedOut) as caught:
+            await engine.localize(job_for(query))
+        assert caught.value.code == "server.deadline"
+        engine.workers._limit_s = 60.0
+        await engine.localize(job_for(query))
+        assert pid not in engine.workers.pids
+
+    with_engine(built_maps, play)
+
+
+def test_maps_are_closed_by_least_recent_use(maps_dir: Path, query: Query) -> None:
+    for map_id in ("hall", "yard"):
+        publish(maps_dir, "v1", map_id=map_id)
+
+    async def play(engine: Engine) -> None:
+        room = await engine.map("room")
+        assert engine.status.ready
+        for map_id in ("hall", "room", "yard", "room"):
+            assert (await engine.localize(job_for(query, map_id))).map_id == map_id
+            assert sum(engine.workers.loaded.values()) <= 2.5 * room.opened.size_bytes
+        assert {ref.partition("@")[0] for ref in engine.status.maps} == {"room", "yard"}
+
+    size = sum(path.stat().st_size for path in MapStore(maps_dir).folder("room").rglob("*.np*"))
+    with_engine(maps_dir, play, max_loaded_bytes=int(2.5 * size))
 
 
 def test_no_maps_at_all_is_a_state_to_be_ready_in(tmp_path: Path) -> None:
@@ -465,7 +534,7 @@ def test_no_maps_at_all_is_a_state_to_be_ready_in(tmp_path: Path) -> None:
         await engine.start()
         assert engine.status.ready
         assert await engine.maps() == []
-        engine.close()
+        await engine.close()
 
     run(play())
 
@@ -526,7 +595,7 @@ def with_engine(
         try:
             return await play(engine)
         finally:
-            engine.close()
+            await engine.close()
 
     return run(playing())
 
@@ -539,32 +608,21 @@ def two_maps(maps_dir: Path) -> Path:
     return maps_dir
 
 
-def test_of_several_maps_the_one_with_the_best_answer_is_named_and_features_are_found_once(
-    two_maps: Path, query: Query, rig_photos: RigPhotos, monkeypatch: pytest.MonkeyPatch
+def test_of_several_maps_the_one_with_the_best_answer_is_named(
+    two_maps: Path, query: Query, rig_photos: RigPhotos
 ) -> None:
-    extract, calls = SiftExtractor.extract, []
-
-    def counting(self: SiftExtractor, rgb: Any, **options: Any) -> Any:
-        calls.append(rgb.shape)
-        return extract(self, rgb, **options)
-
     async def play(engine: Engine) -> None:
-        monkeypatch.setattr(SiftExtractor, "extract", counting)
         alone = await engine.localize(replace(job_for(query), options=FAST))
-        calls.clear()
         for maps in (("hall", "room"), ("room", "hall")):
             found = await engine.localize(replace(job_for(query), maps=maps, options=FAST))
             assert found.map_id == "room"
             assert isinstance(found.answer, Localized)
             assert isinstance(alone.answer, Localized)
             assert np.array_equal(found.answer.covariance, alone.answer.covariance)
-        assert len(calls) == 2
 
-        calls.clear()
         both = await engine.localize_rig(rig_job(rig_photos, maps=("hall", "room")))
         assert (both.map_id, both.answer.timestamp) == ("room", 5)
         assert both.answer.pose is not None
-        assert len(calls) == 2
 
         lost = await engine.localize(replace(job_for(query), maps=("hall",), options=FAST))
         assert lost.map_id == "hall"
@@ -598,7 +656,6 @@ def test_an_image_that_cannot_be_read_fails_alone(built_maps: Path, rig_photos: 
     too_large = ImageLimits(max_bytes=len(rig_photos.photos["left"]) + 20_000)
 
     async def play(engine: Engine) -> None:
-        engine._limits = too_large
         other_size = Camera("SIMPLE_PINHOLE", 640, 300, (500.0, 320.0, 150.0))
         for broken, code in (
             (replace(right, query=b""), "image.empty"),
@@ -619,7 +676,7 @@ def test_an_image_that_cannot_be_read_fails_alone(built_maps: Path, rig_photos: 
         assert found.answer.refusal is not None
         assert found.answer.refusal.reason is Reason.NO_USABLE_IMAGE
 
-    with_engine(built_maps, play)
+    with_engine(built_maps, play, limits=too_large)
 
 
 @pytest.mark.parametrize(
@@ -651,7 +708,6 @@ def test_a_rig_that_does_not_fit_is_refused_before_any_photo_is_read(
     field: str | None,
     maps_dir: Path,
     rig_photos: RigPhotos,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # A map that does not know which way is down.
     manifest = MapStore(maps_dir).folder("room") / "manifest.json"
@@ -659,8 +715,6 @@ def test_a_rig_that_does_not_fit_is_refused_before_any_photo_is_read(
     record["world"].pop("gravity", None)
     record["world"].pop("anchor", None)
     manifest.write_text(json.dumps(record))
-    monkeypatch.setattr(Localizer, "warm_up", lambda _: None)
-    monkeypatch.setattr(instants_module, "read_photo", None)
 
     async def play(engine: Engine) -> None:
         with pytest.raises(kind) as caught:
@@ -796,9 +850,7 @@ def test_a_sequence_that_cannot_be_is_refused_by_name(
     field: str | None,
     built_maps: Path,
     query: Query,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(Localizer, "warm_up", lambda _: None)
     instants = change(instants_of([b"x", b"y"], query.camera))
 
     async def play(engine: Engine) -> None:
@@ -854,7 +906,7 @@ def test_batches_have_places_of_their_own(built_maps: Path) -> None:
     with pytest.raises(Unavailable) as early, engine.admit_batch():
         pass
     assert early.value.code == "server.starting"
-    engine._ready = True
+    engine._started = True
     with engine.admit_batch():
         with engine.admit_batch(), pytest.raises(Overloaded) as caught, engine.admit_batch():
             pass
@@ -866,36 +918,46 @@ def test_batches_have_places_of_their_own(built_maps: Path) -> None:
             pass
     with engine.admit_batch(), engine.admit_batch():
         pass
-    engine.close()
 
 
-def test_a_sequence_that_is_given_up_frees_everything(
-    built_maps: Path, query: Query, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sequence_that_is_given_up_frees_everything(built_maps: Path, query: Query) -> None:
     async def play(engine: Engine) -> None:
-        gate = Gate(monkeypatch, instants_module)
         instants = instants_of([query.image] * 50, query.camera)
 
         async def ask() -> None:
             with engine.admit_batch():
                 await answers_of(engine, START, instants)
 
-        asking = asyncio.create_task(ask())
-        await asyncio.to_thread(gate.entered.acquire)
-        with pytest.raises(Overloaded), engine.admit_batch():
-            pass
-        asking.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await asking
-        with engine.admit_batch():  # at once, not when the photo is done
-            pass
-        gate.opened.set()
+        with held_back(engine):
+            asking = asyncio.create_task(ask())
+            await until(lambda: engine.workers.running == 1)
+            with pytest.raises(Overloaded), engine.admit_batch():
+                pass
+            asking.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await asking
+            with engine.admit_batch():  # at once, not when the photo is done
+                pass
         # Closed between two answers instead.
         answers = engine.localize_sequence(START, instants)
         await anext(answers)
         await answers.aclose()
-        assert gate.count == 2
         await engine.localize(replace(job_for(query), options=FAST))
-        assert engine._pool._work_queue.qsize() == 0
+        assert engine.workers.waiting == 0
 
     with_engine(built_maps, play, max_batches=1, workers=1)
+
+
+def test_a_sequence_survives_the_death_of_a_worker_between_two_instants(
+    built_maps: Path, query: Query
+) -> None:
+    async def play(engine: Engine) -> None:
+        answers = engine.localize_sequence(START, instants_of([query.image] * 3, query.camera))
+        first = await anext(answers)
+        (pid,) = engine.workers.pids
+        os.kill(pid, signal.SIGKILL)
+        await until(lambda: pid not in engine.workers.pids and engine.workers.alive == 1)
+        others = [each async for each in answers]
+        assert [each.answer.num_inliers for each in others] == [first.answer.num_inliers] * 2
+
+    with_engine(built_maps, play)

@@ -21,7 +21,7 @@ from visloc_api.v1 import localization_pb2 as pb2
 CAMERA = {"model": "PINHOLE", "width": 640, "height": 480, "params": [525, 525.5, 320, 240]}
 
 
-FIELDS = "map, image, features, camera, options, maps, priors"
+FIELDS = "map, image, features, camera, options, maps, priors, near, ypr, debug"
 
 
 def request(**fields: object) -> dict[str, Any]:
@@ -75,7 +75,7 @@ def test_options_may_be_text() -> None:
 @pytest.mark.parametrize(
     ("message", "code", "field", "expected"),
     [
-        ({}, "request.map", "map", "one of map, maps"),
+        ({}, "request.map", "map", "one of map, maps, near"),
         ({"map": "room"}, "request.query", "image", "one of image, features"),
         ([], "request.invalid", None, f"an object with {FIELDS}"),
         (

@@ -103,7 +103,8 @@ class Place:
             num_correspondences=len(matches.pixels),
             seconds={"local_features": 0.5},
         )
-        look = Look(evidence, matches, elsewhere or Matches.none(), refusal)
+        landmarks = np.arange(len(matches.points))
+        look = Look(evidence, matches, landmarks, elsewhere or Matches.none(), refusal)
         return SeenImage(sensor, sits, look)
 
 

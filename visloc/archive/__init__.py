@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from visloc.archive.anchoring import write_anchored
 from visloc.archive.checks import sha256_of
+from visloc.archive.places import GeoCircle, circle_of, down_of
 from visloc.archive.reader import Map, open_map, verify_map
-from visloc.archive.schema import Anchor, FingerprintRecord, Geodetic, ImageRecord, Manifest
+from visloc.archive.schema import (
+    Anchor,
+    FingerprintRecord,
+    Geodetic,
+    ImageRecord,
+    Manifest,
+    World,
+)
 from visloc.archive.store import MapStore
 from visloc.archive.writer import GlobalFeatures, Landmarks, MapContent, write_map
 
 __all__ = [
     "Anchor",
     "FingerprintRecord",
+    "GeoCircle",
     "Geodetic",
     "GlobalFeatures",
     "ImageRecord",
@@ -19,8 +29,12 @@ __all__ = [
     "Map",
     "MapContent",
     "MapStore",
+    "World",
+    "circle_of",
+    "down_of",
     "open_map",
     "sha256_of",
     "verify_map",
+    "write_anchored",
     "write_map",
 ]

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
+import os
+import stat
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
-from visloc.archive.npz import read_npz
+from visloc.archive.npz import read_npy_header, read_npz
 from visloc.archive.schema import FORMAT_MAJOR, FORMAT_MINOR, Manifest
 from visloc.errors import MapCorrupt
 
@@ -93,9 +96,13 @@ def check_files(folder: Path, manifest: Manifest) -> None:
                 got=name,
             )
         path = folder / name
-        if path.is_symlink() or not path.is_file():
+        try:
+            status = path.lstat()
+        except (OSError, ValueError):  # ValueError: lone surrogates
+            status = None
+        if status is None or not stat.S_ISREG(status.st_mode):
             raise MapCorrupt("map.file_missing", "a file of the map is missing", field=str(path))
-        size = path.stat().st_size
+        size = status.st_size
         if size != entry.size:
             raise MapCorrupt(
                 "map.file_size",
@@ -153,21 +160,27 @@ def map_array(
     """
     path = folder / name
     try:
-        array = np.load(path, mmap_mode=None if load else "r", allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
+        with path.open("rb") as file:
+            found_shape, fortran, found = read_npy_header(file)
+            offset = file.tell()
+            size = file.seek(0, os.SEEK_END)
+    except (ValueError, OSError) as error:
         raise MapCorrupt("map.array", "not a NumPy array file", field=str(path)) from error
-    # NumPy accepts trailing bytes in silence.
-    offset = getattr(array, "offset", path.stat().st_size - array.nbytes)
-    whole = path.stat().st_size == offset + array.nbytes
-    if array.dtype != np.dtype(dtype) or array.shape != shape or not whole:
+    expected = np.dtype(dtype)
+    whole = size == offset + math.prod(shape) * expected.itemsize
+    # Before any memory is taken: a header can say anything.
+    if found != expected or found_shape != shape or not whole:
         raise MapCorrupt(
             "map.array",
             "an array of the map is not what the manifest says",
             field=str(path),
-            expected=f"{np.dtype(dtype)} of shape {shape}",
-            got=f"{array.dtype} of shape {array.shape}" + ("" if whole else " and further bytes"),
+            expected=f"{expected} of shape {shape}, in a file as long as that",
+            got=f"{found} of shape {found_shape}, in {size} bytes",
         )
-    return np.asarray(array) if load else array
+    order: Literal["C", "F"] = "F" if fortran else "C"
+    if load:
+        return np.fromfile(path, expected, offset=offset).reshape(shape, order=order)
+    return np.memmap(path, expected, "r", offset, shape, order)
 
 
 def read_model(folder: Path, name: str) -> dict[str, NDArray[np.float32]]:
@@ -201,13 +214,20 @@ def read_model(folder: Path, name: str) -> dict[str, NDArray[np.float32]]:
 
 def _read_text(path: Path, limit: int, code: str) -> str:
     try:
-        if path.stat().st_size > limit:
+        status = path.lstat()
+        if not stat.S_ISREG(status.st_mode):  # to open a pipe is to wait for its other end
+            raise MapCorrupt(code, "not a file", field=str(path), expected="a plain file")
+        if status.st_size > limit:
             raise MapCorrupt(
                 code, "the file is too large", field=str(path), expected=f"at most {limit} bytes"
             )
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise MapCorrupt(code, "the file is missing", field=str(path)) from None
+    except OSError as error:
+        raise MapCorrupt(
+            code, "the file cannot be read", field=str(path), got=error.strerror
+        ) from error
     except UnicodeDecodeError as error:
         raise MapCorrupt(code, "the file is not UTF-8 text", field=str(path)) from error
 

@@ -54,14 +54,22 @@ def _check_entries(entries: list[zipfile.ZipInfo], size: int) -> None:
         raise ValueError("the arrays are larger than the archive")
 
 
-def _read_array(file: IO[bytes], entry: zipfile.ZipInfo) -> NDArray[Any]:
+def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Read what an ``.npy`` says of itself; its numbers follow in the file.
+
+    Returns:
+        Its shape, whether it is in Fortran's order, and its type. They may be anything.
+
+    Raises:
+        ValueError: it is no such file.
+    """
     try:
         version = np.lib.format.read_magic(file)
         read_header = {
             (1, 0): np.lib.format.read_array_header_1_0,
             (2, 0): np.lib.format.read_array_header_2_0,
         }[version]
-        shape, fortran, dtype = read_header(file)
+        return read_header(file)
     # What evaluating a literal raises, which the header is.
     except (
         ValueError,
@@ -72,6 +80,13 @@ def _read_array(file: IO[bytes], entry: zipfile.ZipInfo) -> NDArray[Any]:
         RecursionError,
         tokenize.TokenError,
     ) as error:
+        raise ValueError("not an array") from error
+
+
+def _read_array(file: IO[bytes], entry: zipfile.ZipInfo) -> NDArray[Any]:
+    try:
+        shape, fortran, dtype = read_npy_header(file)
+    except ValueError as error:
         raise ValueError(f"{entry.filename!r} is not an array") from error
     num_bytes = entry.file_size - file.tell()
     if (

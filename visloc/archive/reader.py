@@ -18,7 +18,16 @@ from visloc.archive.checks import (
     read_model,
     read_record,
 )
-from visloc.archive.schema import CamerasFile, ImageRecord, ImagesFile, Manifest
+from visloc.archive.places import GeoCircle, circle_of, down_of
+from visloc.archive.schema import (
+    MAX_PHOTO_BYTES,
+    CamerasFile,
+    Geodetic,
+    ImageRecord,
+    ImagesFile,
+    Manifest,
+    photo_file,
+)
 from visloc.errors import InvalidInput, MapCorrupt
 from visloc.geometry import Camera, Pose
 
@@ -76,14 +85,23 @@ class Map:
     def gravity(self) -> NDArray[np.float64] | None:
         """(3,) unit vector that points down in the world; None where that is not known.
 
-        A geodetic anchor tells it too: its axes point east, north and up.
+        A geodetic anchor tells it too.
         """
         world = self.manifest.world
         if world.gravity is not None:
             return np.array(world.gravity)
-        if world.anchor is not None and world.anchor.geodetic is not None:
-            return np.array([0.0, 0.0, -1.0])
-        return None
+        return None if self.geodetic is None else down_of(self.geodetic)
+
+    @property
+    def geodetic(self) -> Geodetic | None:
+        """Where the world lies on Earth; None where that is not known."""
+        anchor = self.manifest.world.anchor
+        return None if anchor is None else anchor.geodetic
+
+    @property
+    def place(self) -> GeoCircle | None:
+        """A circle on Earth that holds the map; None where that is not known."""
+        return circle_of(self.manifest.world)
 
     @property
     def size_bytes(self) -> int:
@@ -97,6 +115,11 @@ class Map:
         descriptors = self.observation_descriptors[start:stop].astype(np.float32)
         descriptors *= scale
         return self.observation_landmarks[start:stop], descriptors
+
+    def photo(self, image: int) -> bytes | None:
+        """A small JPEG of one photo; None when the map keeps no photos."""
+        name = photo_file(image)
+        return (self.path / name).read_bytes() if name in self.manifest.files else None
 
 
 def open_map(folder: Path) -> Map:
@@ -128,6 +151,7 @@ def open_map(folder: Path) -> Map:
             raise MapCorrupt(
                 "map.file_missing", "a file that every such map has is not listed", field=name
             )
+    _check_photos(folder, manifest)
     images = read_record(folder, "images.json", ImagesFile).images
     cameras = read_record(folder, "cameras.json", CamerasFile)
     if len(images) != n or any(image.camera not in cameras.cameras for image in images):
@@ -190,7 +214,7 @@ def verify_map(folder: Path) -> Map:
     offsets = opened.observation_offsets
     fine = {
         "image_poses.npy": is_finite(opened.image_poses)
-        and bool((np.abs(np.linalg.norm(opened.image_poses[:, :4], axis=1) - 1) < 1e-6).all()),
+        and _are_unit(opened.image_poses[:, :4]),
         "landmarks.npy": is_finite(opened.landmarks),
         "observation_offsets.npy": offsets[0] == 0
         and offsets[-1] == counts.observations
@@ -210,6 +234,25 @@ def verify_map(folder: Path) -> Map:
                 "map.range", "numbers are out of their range", field=str(folder / name)
             )
     return opened
+
+
+def _check_photos(folder: Path, manifest: Manifest) -> None:
+    """Refuse a map that keeps some of its photos only, or large ones."""
+    files = [manifest.files.get(photo_file(row)) for row in range(manifest.counts.images)]
+    kept = [file for file in files if file is not None]
+    if kept and (len(kept) < len(files) or max(file.size for file in kept) > MAX_PHOTO_BYTES):
+        raise MapCorrupt(
+            "map.photos",
+            "the map keeps some of its photos only, or large ones",
+            field=str(folder / "photos"),
+            expected=f"{len(files)} files of at most {MAX_PHOTO_BYTES} bytes, or none",
+            got=f"{len(kept)} files, the largest of {max(file.size for file in kept)} bytes",
+        )
+
+
+def _are_unit(rows: NDArray[np.float64]) -> bool:
+    with np.errstate(over="ignore"):  # the square of a number out of range is one as well
+        return bool((np.abs(np.linalg.norm(rows, axis=1) - 1) < 1e-6).all())
 
 
 _ARRAYS = (

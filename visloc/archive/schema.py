@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
 
 from visloc.types import Fingerprint
 
 FORMAT = "visloc-map"
-FORMAT_MAJOR, FORMAT_MINOR = 1, 2
+FORMAT_MAJOR, FORMAT_MINOR = 1, 3
 
 ID_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
+# A photo that a map keeps: pixels of its longer side, and bytes.
+MAX_PHOTO_SIDE = 640
+MAX_PHOTO_BYTES = 2**20
+
 Vector = tuple[float, float, float]
+VectorT = TypeVar("VectorT", bound=tuple[float, ...])
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
-def _of_unit_length(vector: Vector) -> Vector:
+def _of_unit_length(vector: VectorT) -> VectorT:
     length = math.hypot(*vector)
     if abs(length - 1.0) > 1e-6:
         raise ValueError(f"the vector should have the length 1, not {length:g}")
@@ -27,6 +32,12 @@ def _of_unit_length(vector: Vector) -> Vector:
 
 
 Direction = Annotated[Vector, AfterValidator(_of_unit_length)]
+UnitQuaternion = Annotated[tuple[float, float, float, float], AfterValidator(_of_unit_length)]
+
+
+def photo_file(image: int) -> str:
+    """The file of a map that keeps photos: that of the photo in this row of ``images.json``."""
+    return f"photos/{image:06d}.jpg"
 
 
 class _Record(BaseModel):
@@ -92,11 +103,18 @@ class Extent(_Record):
 
 
 class Geodetic(_Record):
-    """A place on Earth, WGS84."""
+    """Where the world lies on Earth, WGS84.
+
+    ``enu = scale R x + translation`` gives metres east, north and up of the position. Maps of
+    formats before 1.3 have the identity: their axes point east, north and up, in metres.
+    """
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)]
     longitude_deg: Annotated[float, Field(ge=-180, le=180)]
     altitude_m: float
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    rotation_wxyz: UnitQuaternion = (1.0, 0.0, 0.0, 0.0)
+    translation: Vector = (0.0, 0.0, 0.0)
 
 
 class Anchor(_Record):
@@ -105,15 +123,15 @@ class Anchor(_Record):
     Attributes:
         kind: ``dataset``: poses that the dataset gave; ``model``: those of an imported
             reconstruction; ``gnss`` or ``positions``: aligned to fixes or known positions;
-            ``none``: nothing, the frame is arbitrary.
-        images: photos that it rests on.
+            ``correspondences``: tied to the Earth by given points; ``none``: nothing, the frame
+            is arbitrary.
+        images: photos, or given points, that it rests on.
         rms: distance between those photos and where they were said to be, in units of the world,
             root mean square; None where nothing was fitted.
-        geodetic: where the world's (0, 0, 0) lies, its axes pointing east, north and up; None
-            when that is unknown.
+        geodetic: where the world lies on Earth; None when that is unknown.
     """
 
-    kind: Literal["dataset", "model", "gnss", "positions", "none"]
+    kind: Literal["dataset", "model", "gnss", "positions", "correspondences", "none"]
     images: Annotated[int, Field(ge=0)]
     rms: Annotated[float, Field(ge=0)] | None = None
     geodetic: Geodetic | None = None

@@ -1,43 +1,51 @@
-"""A folder of maps: ``<maps-dir>/<id>/<version>/`` and ``<maps-dir>/<id>/current``."""
+"""A folder of maps: ``<maps-dir>/<id>/<version>/`` and ``<maps-dir>/<id>/current``.
+
+Several threads and processes may read and change one store. Readers take no lock: every change
+becomes visible by one rename. Whoever changes something holds the lock ``<maps-dir>/.lock``, so
+that what it found is still true when it renames.
+"""
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
+import secrets
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from visloc.archive.reader import Map, open_map, verify_map
 from visloc.archive.schema import ID_PATTERN
-from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound
+from visloc.errors import (
+    Conflict,
+    Forbidden,
+    InvalidInput,
+    MapCorrupt,
+    NotFound,
+    StorageFull,
+)
 
 CURRENT = "current"
+INCOMING, REMOVED = ".incoming", ".removed-"
+FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class MapStore:
-    """Finds, opens and publishes maps below one folder."""
+    """Finds, opens, publishes and removes maps below one folder."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
 
     def ids(self) -> list[str]:
         """Ids of the maps that have a current version, sorted."""
-        if not self.root.is_dir():
-            return []
-        return sorted(
-            path.name
-            for path in self.root.iterdir()
-            if ID_PATTERN.fullmatch(path.name) and (path / CURRENT).is_file()
-        )
+        return [name for name in _names_in(self.root) if (self.root / name / CURRENT).is_file()]
 
     def versions(self, map_id: str) -> list[str]:
         """Published versions of a map, oldest first."""
-        folder = self.root / _checked(map_id, "map")
-        if not folder.is_dir():
-            return []
-        return sorted(
-            path.name
-            for path in folder.iterdir()
-            if ID_PATTERN.fullmatch(path.name) and (path / "manifest.json").is_file()
-        )
+        folder = self.root / checked_name(map_id, "map")
+        return [name for name in _names_in(folder) if (folder / name / "manifest.json").is_file()]
 
     def current_version(self, map_id: str) -> str:
         """The version in use.
@@ -46,7 +54,7 @@ class MapStore:
             NotFound: ``map.unknown``.
             MapCorrupt: ``map.current`` when the file that names it is damaged.
         """
-        path = self.root / _checked(map_id, "map") / CURRENT
+        path = self.root / checked_name(map_id, "map") / CURRENT
         try:
             version = path.read_text(encoding="ascii").strip()
         except FileNotFoundError:
@@ -70,7 +78,7 @@ class MapStore:
         map_id, at, version = ref.partition("@")
         if not at:
             version = self.current_version(map_id)
-        folder = self.root / _checked(map_id, "map") / _checked(version, "map version")
+        folder = self.root / checked_name(map_id, "map") / checked_name(version, "map version")
         if not folder.is_dir():
             if not self.versions(map_id):
                 self.current_version(map_id)  # raises: no such map
@@ -84,60 +92,159 @@ class MapStore:
         return folder
 
     def open(self, ref: str) -> Map:
-        """Open ``id`` or ``id@version``.
+        """Open ``id`` or ``id@version``; raises what ``folder`` and ``open_published`` raise."""
+        return open_published(self.folder(ref))
 
-        Raises:
-            MapCorrupt: ``map.renamed`` when the folder was copied or renamed: answers would
-                carry the old name.
-        """
-        folder = self.folder(ref)
-        opened = open_map(folder)
-        if (opened.manifest.id, opened.manifest.version) != (folder.parent.name, folder.name):
-            raise MapCorrupt(
-                "map.renamed",
-                "the map's folder was copied or renamed; build the map under its new id",
-                field=str(folder),
-                expected=f"{opened.manifest.id}/{opened.manifest.version}",
-                got=f"{folder.parent.name}/{folder.name}",
-            )
-        return opened
-
-    def publish(self, incoming: Path, map_id: str, version: str) -> Path:
+    def publish(
+        self, incoming: Path, map_id: str, version: str, *, make_current: bool = True
+    ) -> Path:
         """Verify a finished map folder, give it its place, and make it current.
 
         Every byte is read first. The rename and the switch of ``current`` are atomic: a reader
-        sees the old map or the new one, never a half.
+        sees the old map or the new one, never a half. Killed between the two, the version is there
+        and the one before it stays in use.
 
         Args:
             incoming: the map, in a folder on the same file system as the store.
             map_id: the map's id.
             version: the version's name.
+            make_current: whether it takes over from the version in use. A map without a current
+                version is not among ``ids``.
 
         Returns:
             The folder of the published version.
+
+        Raises:
+            Conflict: ``map.version_exists``.
+            MapCorrupt: what ``verify_map`` finds, or ``map.renamed`` when the manifest names
+                another id or version.
         """
-        verify_map(incoming)
-        parent = self.root / _checked(map_id, "map")
-        target = parent / _checked(version, "map version")
-        parent.mkdir(parents=True, exist_ok=True)
-        if target.exists():
-            raise Conflict("map.version_exists", "the version exists already", field=str(target))
-        for folder in (*(path for path in incoming.rglob("*") if path.is_dir()), incoming):
-            _sync_folder(folder)
-        incoming.rename(target)
-        _sync_folder(parent)
-        _sync_folder(self.root)
-        switch = parent / f".{CURRENT}.new"
-        with switch.open("w", encoding="ascii") as file:
-            file.write(version + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        switch.replace(parent / CURRENT)
-        _sync_folder(parent)
+        target = self.root / checked_name(map_id, "map") / checked_name(version, "map version")
+        refuse_renamed(verify_map(incoming), map_id, version)
+        with self._changing():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if target.exists():
+                raise version_exists(map_id, version)
+            for folder in (*(path for path in incoming.rglob("*") if path.is_dir()), incoming):
+                _sync_folder(folder)
+            if make_current:  # first what a full disk could refuse
+                switch = _prepare_current(target.parent, version)
+            incoming.rename(target)
+            _sync_folder(target.parent)
+            _sync_folder(self.root)
+            if make_current:
+                switch.replace(target.parent / CURRENT)
+                _sync_folder(target.parent)
         return target
 
+    def set_current(self, map_id: str, version: str) -> None:
+        """Make a published version the one in use, atomically.
 
-def _checked(name: str, what: str) -> str:
+        Raises:
+            NotFound: ``map.unknown`` or ``map.version``.
+        """
+        with self._changing():
+            parent = self.folder(f"{map_id}@{version}").parent
+            _prepare_current(parent, version).replace(parent / CURRENT)
+            _sync_folder(parent)
+
+    def remove(self, map_id: str, version: str) -> None:
+        """Remove a version; with the last one, the map.
+
+        It disappears by one rename before its files are deleted. Whoever has it open can go on.
+
+        Raises:
+            NotFound: ``map.unknown`` or ``map.version``.
+            Conflict: ``map.version_in_use`` for the current version of a map that has others.
+        """
+        with self._changing():
+            folder = self.folder(f"{map_id}@{version}")
+            others = [name for name in self.versions(map_id) if name != version]
+            if others and _current_or_none(self, map_id) == version:
+                raise version_in_use(map_id, version, others)
+            leaving = folder if others else folder.parent
+            # Beside where it was, as a full disk may have no room for another folder.
+            removed = leaving.with_name(f"{REMOVED}{secrets.token_hex(8)}")
+            leaving.rename(removed)
+            _sync_folder(removed.parent)
+        shutil.rmtree(removed, ignore_errors=True)
+
+    @contextmanager
+    def incoming(self) -> Iterator[Path]:
+        """Give an empty folder on the store's file system, for a map that is to be published.
+
+        What is left in it is deleted in the end; what a process leaves that is killed meanwhile is
+        deleted by the next ``sweep``, which comes with every ``incoming``.
+
+        Raises:
+            StorageFull: ``maps.storage_full``, also for a full disk within the block.
+            Forbidden: ``maps.read_only``, likewise.
+        """
+        self.sweep()
+        folder = self.root / INCOMING / secrets.token_hex(8)
+        lock = folder.with_suffix(".lock")
+        with storage_errors(self.root), ExitStack() as holding:
+            with self._changing():
+                folder.parent.mkdir(exist_ok=True)
+                # Held while the folder is in use: a process id means nothing in another container.
+                fcntl.flock(holding.enter_context(lock.open("w")), fcntl.LOCK_EX)
+            try:
+                folder.mkdir()
+                yield folder
+            finally:
+                shutil.rmtree(folder, ignore_errors=True)
+                lock.unlink(missing_ok=True)
+
+    def sweep(self) -> None:
+        """Delete what uploads and removals left behind whose process was killed."""
+        for removed in (*self.root.glob(f"{REMOVED}*"), *self.root.glob(f"*/{REMOVED}*")):
+            shutil.rmtree(removed, ignore_errors=True)
+        parent = self.root / INCOMING
+        if not parent.is_dir() or not os.access(parent, os.W_OK):
+            return
+        with ExitStack() as holding, self._changing():
+            for path in parent.glob("*.lock"):
+                lock = holding.enter_context(path.open("w"))
+                with suppress(BlockingIOError):
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    holding.callback(path.unlink, missing_ok=True)
+                    holding.callback(shutil.rmtree, path.with_suffix(""), ignore_errors=True)
+
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        with storage_errors(self.root):
+            self.root.mkdir(parents=True, exist_ok=True)
+            with (self.root / ".lock").open("w") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                yield
+
+
+def open_published(folder: Path) -> Map:
+    """Open the map in a folder ``<id>/<version>``.
+
+    Raises:
+        MapCorrupt: what ``open_map`` finds, or ``map.renamed`` when the folder was copied or
+            renamed: answers would carry the old name.
+    """
+    return refuse_renamed(open_map(folder), folder.parent.name, folder.name)
+
+
+def refuse_renamed(opened: Map, map_id: str, version: str) -> Map:
+    """Return the map if it is of this name; MapCorrupt ``map.renamed`` otherwise."""
+    manifest = opened.manifest
+    if (manifest.id, manifest.version) != (map_id, version):
+        raise MapCorrupt(
+            "map.renamed",
+            "the map's folder was copied or renamed; build the map under its new id",
+            field=str(opened.path),
+            expected=f"{manifest.id}/{manifest.version}",
+            got=f"{map_id}/{version}",
+        )
+    return opened
+
+
+def checked_name(name: str, what: str) -> str:
+    """Return an id of a map or version; InvalidInput ``map.id`` for what cannot be one."""
     if not ID_PATTERN.fullmatch(name):
         raise InvalidInput(
             "map.id",
@@ -147,6 +254,78 @@ def _checked(name: str, what: str) -> str:
             got=name,
         )
     return name
+
+
+def version_exists(map_id: str, version: str) -> Conflict:
+    """``map.version_exists``."""
+    return Conflict(
+        "map.version_exists",
+        "the version exists already; versions never change, publish under another name",
+        field="map",
+        got=f"{map_id}@{version}",
+    )
+
+
+def version_in_use(map_id: str, version: str, others: Sequence[str]) -> Conflict:
+    """``map.version_in_use``."""
+    return Conflict(
+        "map.version_in_use",
+        "the version is in use; make another one current first",
+        field="map",
+        expected=f"one of: {', '.join(others)}",
+        got=f"{map_id}@{version}",
+    )
+
+
+@contextmanager
+def storage_errors(place: Path) -> Iterator[None]:
+    """Turn a full or read-only disk into an error for users.
+
+    Raises:
+        StorageFull: ``maps.storage_full``.
+        Forbidden: ``maps.read_only``.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno in FULL:
+            raise StorageFull(
+                "maps.storage_full",
+                "no room on the disk; remove maps or versions that are not needed",
+                field=str(place),
+            ) from error
+        if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+            raise Forbidden(
+                "maps.read_only",
+                "the folder of maps may not be written to by this program",
+                field=str(place),
+                got=error.strerror,
+            ) from error
+        raise
+
+
+def _names_in(folder: Path) -> list[str]:
+    try:
+        return sorted(path.name for path in folder.iterdir() if ID_PATTERN.fullmatch(path.name))
+    except (FileNotFoundError, NotADirectoryError):  # another process may have removed it
+        return []
+
+
+def _current_or_none(store: MapStore, map_id: str) -> str | None:
+    try:
+        return store.current_version(map_id)
+    except NotFound:
+        return None
+
+
+def _prepare_current(folder: Path, version: str) -> Path:
+    """Write what is to replace ``current``; only under the lock, as the name is always the same."""
+    switch = folder / f".{CURRENT}.new"
+    with switch.open("w", encoding="ascii") as file:
+        file.write(version + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+    return switch
 
 
 def _sync_folder(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 import tarfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,7 +23,10 @@ def index_tar(path: Path) -> Mapping[str, tuple[int, int]]:
     members: dict[str, tuple[int, int]] = {}
     end = 0
     try:
-        total = path.stat().st_size
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):  # a pipe would be waited for
+            raise _damaged(path, "not a plain file")
+        total = status.st_size
         with path.open("rb") as file, tarfile.open(fileobj=file, mode="r:") as archive:
             while (member := archive.next()) is not None:
                 archive.members.clear()  # type: ignore[attr-defined]  # or it keeps every header

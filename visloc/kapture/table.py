@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import stat
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -122,6 +123,9 @@ class Table:
     def _lines(self) -> Iterator[str]:
         self.line = 0
         try:
+            # A pipe would be waited for, and a device may have no end.
+            if not stat.S_ISREG(self._path.stat().st_mode):
+                raise self.error("kapture.unreadable", "not a file", expected="a plain file")
             with self._path.open(encoding="utf-8-sig") as file:
                 for line in file:
                     self.line += 1

@@ -393,6 +393,36 @@ class Priors(_message.Message):
 Global___Priors: _TypeAlias = Priors  # noqa: Y015
 
 @_typing.final
+class Near(_message.Message):
+    """Where the device is on Earth, roughly: instead of a map, to search those that cover the place."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    LATITUDE_FIELD_NUMBER: _builtins.int
+    LONGITUDE_FIELD_NUMBER: _builtins.int
+    RADIUS_FIELD_NUMBER: _builtins.int
+    latitude: _builtins.float
+    """degrees, WGS84"""
+    longitude: _builtins.float
+    """degrees"""
+    radius: _builtins.float
+    """metres"""
+    def __init__(
+        self,
+        *,
+        latitude: _builtins.float = ...,
+        longitude: _builtins.float = ...,
+        radius: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["latitude", b"latitude", "longitude", b"longitude", "radius", b"radius"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Near: _TypeAlias = Near  # noqa: Y015
+
+@_typing.final
 class LocalizeRequest(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -404,12 +434,19 @@ class LocalizeRequest(_message.Message):
     REQUEST_ID_FIELD_NUMBER: _builtins.int
     MAPS_FIELD_NUMBER: _builtins.int
     PRIORS_FIELD_NUMBER: _builtins.int
+    NEAR_FIELD_NUMBER: _builtins.int
+    YPR_FIELD_NUMBER: _builtins.int
+    DEBUG_FIELD_NUMBER: _builtins.int
     map: _builtins.str
     """id, or id@version"""
     image: _builtins.bytes
     """the encoded photo (JPEG, PNG, WebP, TIFF, BMP)"""
     request_id: _builtins.str
     """chosen by the caller for the logs; made by the server when empty"""
+    ypr: _builtins.bool
+    """also say the GeoPose in yaw, pitch and roll"""
+    debug: _builtins.bool
+    """also return the matches and a picture of them; needs a photo"""
     @_builtins.property
     def features(self) -> Global___Features:
         """needs a camera"""
@@ -426,6 +463,10 @@ class LocalizeRequest(_message.Message):
 
     @_builtins.property
     def priors(self) -> Global___Priors: ...
+    @_builtins.property
+    def near(self) -> Global___Near:
+        """instead of map: search the anchored maps there"""
+
     def __init__(
         self,
         *,
@@ -437,13 +478,29 @@ class LocalizeRequest(_message.Message):
         request_id: _builtins.str = ...,
         maps: _abc.Iterable[_builtins.str] | None = ...,
         priors: Global___Priors | None = ...,
+        near: Global___Near | None = ...,
+        ypr: _builtins.bool | None = ...,
+        debug: _builtins.bool | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "features", b"features", "image", b"image", "options", b"options", "priors", b"priors", "query", b"query"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_near", b"_near", "_ypr", b"_ypr", "camera", b"camera", "debug", b"debug", "features", b"features", "image", b"image", "near", b"near", "options", b"options", "priors", b"priors", "query", b"query", "ypr", b"ypr"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "features", b"features", "image", b"image", "map", b"map", "maps", b"maps", "options", b"options", "priors", b"priors", "query", b"query", "request_id", b"request_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_near", b"_near", "_ypr", b"_ypr", "camera", b"camera", "debug", b"debug", "features", b"features", "image", b"image", "map", b"map", "maps", b"maps", "near", b"near", "options", b"options", "priors", b"priors", "query", b"query", "request_id", b"request_id", "ypr", b"ypr"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__debug: _TypeAlias = _typing.Literal["debug"]  # noqa: Y015
+    _WhichOneofArgType__debug: _TypeAlias = _typing.Literal["_debug", b"_debug"]  # noqa: Y015
+    _WhichOneofReturnType__near: _TypeAlias = _typing.Literal["near"]  # noqa: Y015
+    _WhichOneofArgType__near: _TypeAlias = _typing.Literal["_near", b"_near"]  # noqa: Y015
+    _WhichOneofReturnType__ypr: _TypeAlias = _typing.Literal["ypr"]  # noqa: Y015
+    _WhichOneofArgType__ypr: _TypeAlias = _typing.Literal["_ypr", b"_ypr"]  # noqa: Y015
     _WhichOneofReturnType_query: _TypeAlias = _typing.Literal["image", "features"]  # noqa: Y015
     _WhichOneofArgType_query: _TypeAlias = _typing.Literal["query", b"query"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__debug) -> _WhichOneofReturnType__debug | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__near) -> _WhichOneofReturnType__near | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__ypr) -> _WhichOneofReturnType__ypr | None: ...
+    @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType_query) -> _WhichOneofReturnType_query | None: ...
 
 Global___LocalizeRequest: _TypeAlias = LocalizeRequest  # noqa: Y015
@@ -575,10 +632,13 @@ class LocalizeRigRequest(_message.Message):
     OPTIONS_FIELD_NUMBER: _builtins.int
     PRIORS_FIELD_NUMBER: _builtins.int
     REQUEST_ID_FIELD_NUMBER: _builtins.int
+    NEAR_FIELD_NUMBER: _builtins.int
+    YPR_FIELD_NUMBER: _builtins.int
     map: _builtins.str
     rig_id: _builtins.str
     """a rig that the map knows"""
     request_id: _builtins.str
+    ypr: _builtins.bool
     @_builtins.property
     def maps(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]: ...
     @_builtins.property
@@ -589,6 +649,8 @@ class LocalizeRigRequest(_message.Message):
     def options(self) -> Global___LocalizeOptions: ...
     @_builtins.property
     def priors(self) -> Global___Priors: ...
+    @_builtins.property
+    def near(self) -> Global___Near: ...
     def __init__(
         self,
         *,
@@ -600,13 +662,24 @@ class LocalizeRigRequest(_message.Message):
         options: Global___LocalizeOptions | None = ...,
         priors: Global___Priors | None = ...,
         request_id: _builtins.str = ...,
+        near: Global___Near | None = ...,
+        ypr: _builtins.bool | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["calibration", b"calibration", "options", b"options", "priors", b"priors", "rig", b"rig", "rig_id", b"rig_id"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_near", b"_near", "_ypr", b"_ypr", "calibration", b"calibration", "near", b"near", "options", b"options", "priors", b"priors", "rig", b"rig", "rig_id", b"rig_id", "ypr", b"ypr"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["calibration", b"calibration", "images", b"images", "map", b"map", "maps", b"maps", "options", b"options", "priors", b"priors", "request_id", b"request_id", "rig", b"rig", "rig_id", b"rig_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_near", b"_near", "_ypr", b"_ypr", "calibration", b"calibration", "images", b"images", "map", b"map", "maps", b"maps", "near", b"near", "options", b"options", "priors", b"priors", "request_id", b"request_id", "rig", b"rig", "rig_id", b"rig_id", "ypr", b"ypr"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__near: _TypeAlias = _typing.Literal["near"]  # noqa: Y015
+    _WhichOneofArgType__near: _TypeAlias = _typing.Literal["_near", b"_near"]  # noqa: Y015
+    _WhichOneofReturnType__ypr: _TypeAlias = _typing.Literal["ypr"]  # noqa: Y015
+    _WhichOneofArgType__ypr: _TypeAlias = _typing.Literal["_ypr", b"_ypr"]  # noqa: Y015
     _WhichOneofReturnType_rig: _TypeAlias = _typing.Literal["rig_id", "calibration"]  # noqa: Y015
     _WhichOneofArgType_rig: _TypeAlias = _typing.Literal["rig", b"rig"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__near) -> _WhichOneofReturnType__near | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__ypr) -> _WhichOneofReturnType__ypr | None: ...
+    @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType_rig) -> _WhichOneofReturnType_rig | None: ...
 
 Global___LocalizeRigRequest: _TypeAlias = LocalizeRigRequest  # noqa: Y015
@@ -690,6 +763,8 @@ class SequenceStart(_message.Message):
     OPTIONS_FIELD_NUMBER: _builtins.int
     PRIORS_FIELD_NUMBER: _builtins.int
     REQUEST_ID_FIELD_NUMBER: _builtins.int
+    NEAR_FIELD_NUMBER: _builtins.int
+    YPR_FIELD_NUMBER: _builtins.int
     map: _builtins.str
     rig_id: _builtins.str
     time_unit: _builtins.str
@@ -699,6 +774,7 @@ class SequenceStart(_message.Message):
     0 fills none.
     """
     request_id: _builtins.str
+    ypr: _builtins.bool
     @_builtins.property
     def maps(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]: ...
     @_builtins.property
@@ -707,6 +783,8 @@ class SequenceStart(_message.Message):
     def options(self) -> Global___LocalizeOptions: ...
     @_builtins.property
     def priors(self) -> Global___Priors: ...
+    @_builtins.property
+    def near(self) -> Global___Near: ...
     def __init__(
         self,
         *,
@@ -719,17 +797,27 @@ class SequenceStart(_message.Message):
         options: Global___LocalizeOptions | None = ...,
         priors: Global___Priors | None = ...,
         request_id: _builtins.str = ...,
+        near: Global___Near | None = ...,
+        ypr: _builtins.bool | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_max_gap_s", b"_max_gap_s", "calibration", b"calibration", "max_gap_s", b"max_gap_s", "options", b"options", "priors", b"priors", "rig", b"rig", "rig_id", b"rig_id"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_max_gap_s", b"_max_gap_s", "_near", b"_near", "_ypr", b"_ypr", "calibration", b"calibration", "max_gap_s", b"max_gap_s", "near", b"near", "options", b"options", "priors", b"priors", "rig", b"rig", "rig_id", b"rig_id", "ypr", b"ypr"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_max_gap_s", b"_max_gap_s", "calibration", b"calibration", "map", b"map", "maps", b"maps", "max_gap_s", b"max_gap_s", "options", b"options", "priors", b"priors", "request_id", b"request_id", "rig", b"rig", "rig_id", b"rig_id", "time_unit", b"time_unit"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_max_gap_s", b"_max_gap_s", "_near", b"_near", "_ypr", b"_ypr", "calibration", b"calibration", "map", b"map", "maps", b"maps", "max_gap_s", b"max_gap_s", "near", b"near", "options", b"options", "priors", b"priors", "request_id", b"request_id", "rig", b"rig", "rig_id", b"rig_id", "time_unit", b"time_unit", "ypr", b"ypr"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__max_gap_s: _TypeAlias = _typing.Literal["max_gap_s"]  # noqa: Y015
     _WhichOneofArgType__max_gap_s: _TypeAlias = _typing.Literal["_max_gap_s", b"_max_gap_s"]  # noqa: Y015
+    _WhichOneofReturnType__near: _TypeAlias = _typing.Literal["near"]  # noqa: Y015
+    _WhichOneofArgType__near: _TypeAlias = _typing.Literal["_near", b"_near"]  # noqa: Y015
+    _WhichOneofReturnType__ypr: _TypeAlias = _typing.Literal["ypr"]  # noqa: Y015
+    _WhichOneofArgType__ypr: _TypeAlias = _typing.Literal["_ypr", b"_ypr"]  # noqa: Y015
     _WhichOneofReturnType_rig: _TypeAlias = _typing.Literal["rig_id", "calibration"]  # noqa: Y015
     _WhichOneofArgType_rig: _TypeAlias = _typing.Literal["rig", b"rig"]  # noqa: Y015
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__max_gap_s) -> _WhichOneofReturnType__max_gap_s | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__near) -> _WhichOneofReturnType__near | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__ypr) -> _WhichOneofReturnType__ypr | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType_rig) -> _WhichOneofReturnType_rig | None: ...
 
@@ -1036,6 +1124,9 @@ class LocalizeResponse(_message.Message):
     ORIENTATION_FIELD_NUMBER: _builtins.int
     MAP_FIELD_NUMBER: _builtins.int
     SECONDS_FIELD_NUMBER: _builtins.int
+    GEOPOSE_FIELD_NUMBER: _builtins.int
+    GEOPOSE_YPR_FIELD_NUMBER: _builtins.int
+    DEBUG_FIELD_NUMBER: _builtins.int
     request_id: _builtins.str
     status: _builtins.str
     """localized or not_localized"""
@@ -1059,6 +1150,14 @@ class LocalizeResponse(_message.Message):
     def seconds(self) -> _containers.ScalarMap[_builtins.str, _builtins.float]:
         """by stage"""
 
+    @_builtins.property
+    def geopose(self) -> Global___GeoPose:
+        """of a map that is anchored to the Earth"""
+
+    @_builtins.property
+    def geopose_ypr(self) -> Global___GeoPoseYpr: ...
+    @_builtins.property
+    def debug(self) -> Global___Debug: ...
     def __init__(
         self,
         *,
@@ -1075,21 +1174,210 @@ class LocalizeResponse(_message.Message):
         orientation: Global___Orientation | None = ...,
         map: Global___MapRef | None = ...,
         seconds: _abc.Mapping[_builtins.str, _builtins.float] | None = ...,
+        geopose: Global___GeoPose | None = ...,
+        geopose_ypr: Global___GeoPoseYpr | None = ...,
+        debug: Global___Debug | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_pose", b"_pose", "_refusal", b"_refusal", "camera", b"camera", "map", b"map", "orientation", b"orientation", "pose", b"pose", "refusal", b"refusal"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_geopose", b"_geopose", "_geopose_ypr", b"_geopose_ypr", "_pose", b"_pose", "_refusal", b"_refusal", "camera", b"camera", "debug", b"debug", "geopose", b"geopose", "geopose_ypr", b"geopose_ypr", "map", b"map", "orientation", b"orientation", "pose", b"pose", "refusal", b"refusal"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_pose", b"_pose", "_refusal", b"_refusal", "camera", b"camera", "correspondences", b"correspondences", "inlier_ratio", b"inlier_ratio", "inliers", b"inliers", "keypoints", b"keypoints", "map", b"map", "orientation", b"orientation", "pose", b"pose", "refusal", b"refusal", "request_id", b"request_id", "retrieved", b"retrieved", "seconds", b"seconds", "status", b"status"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_geopose", b"_geopose", "_geopose_ypr", b"_geopose_ypr", "_pose", b"_pose", "_refusal", b"_refusal", "camera", b"camera", "correspondences", b"correspondences", "debug", b"debug", "geopose", b"geopose", "geopose_ypr", b"geopose_ypr", "inlier_ratio", b"inlier_ratio", "inliers", b"inliers", "keypoints", b"keypoints", "map", b"map", "orientation", b"orientation", "pose", b"pose", "refusal", b"refusal", "request_id", b"request_id", "retrieved", b"retrieved", "seconds", b"seconds", "status", b"status"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__debug: _TypeAlias = _typing.Literal["debug"]  # noqa: Y015
+    _WhichOneofArgType__debug: _TypeAlias = _typing.Literal["_debug", b"_debug"]  # noqa: Y015
+    _WhichOneofReturnType__geopose: _TypeAlias = _typing.Literal["geopose"]  # noqa: Y015
+    _WhichOneofArgType__geopose: _TypeAlias = _typing.Literal["_geopose", b"_geopose"]  # noqa: Y015
+    _WhichOneofReturnType__geopose_ypr: _TypeAlias = _typing.Literal["geopose_ypr"]  # noqa: Y015
+    _WhichOneofArgType__geopose_ypr: _TypeAlias = _typing.Literal["_geopose_ypr", b"_geopose_ypr"]  # noqa: Y015
     _WhichOneofReturnType__pose: _TypeAlias = _typing.Literal["pose"]  # noqa: Y015
     _WhichOneofArgType__pose: _TypeAlias = _typing.Literal["_pose", b"_pose"]  # noqa: Y015
     _WhichOneofReturnType__refusal: _TypeAlias = _typing.Literal["refusal"]  # noqa: Y015
     _WhichOneofArgType__refusal: _TypeAlias = _typing.Literal["_refusal", b"_refusal"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__debug) -> _WhichOneofReturnType__debug | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__geopose) -> _WhichOneofReturnType__geopose | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__geopose_ypr) -> _WhichOneofReturnType__geopose_ypr | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__pose) -> _WhichOneofReturnType__pose | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__refusal) -> _WhichOneofReturnType__refusal | None: ...
 
 Global___LocalizeResponse: _TypeAlias = LocalizeResponse  # noqa: Y015
+
+@_typing.final
+class GeoPosition(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    LAT_FIELD_NUMBER: _builtins.int
+    LON_FIELD_NUMBER: _builtins.int
+    H_FIELD_NUMBER: _builtins.int
+    lat: _builtins.float
+    """degrees, WGS84"""
+    lon: _builtins.float
+    """degrees"""
+    h: _builtins.float
+    """metres above the ellipsoid"""
+    def __init__(
+        self,
+        *,
+        lat: _builtins.float = ...,
+        lon: _builtins.float = ...,
+        h: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["h", b"h", "lat", b"lat", "lon", b"lon"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___GeoPosition: _TypeAlias = GeoPosition  # noqa: Y015
+
+@_typing.final
+class GeoQuaternion(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    X_FIELD_NUMBER: _builtins.int
+    Y_FIELD_NUMBER: _builtins.int
+    Z_FIELD_NUMBER: _builtins.int
+    W_FIELD_NUMBER: _builtins.int
+    x: _builtins.float
+    y: _builtins.float
+    z: _builtins.float
+    w: _builtins.float
+    def __init__(
+        self,
+        *,
+        x: _builtins.float = ...,
+        y: _builtins.float = ...,
+        z: _builtins.float = ...,
+        w: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["w", b"w", "x", b"x", "y", b"y", "z", b"z"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___GeoQuaternion: _TypeAlias = GeoQuaternion  # noqa: Y015
+
+@_typing.final
+class GeoPose(_message.Message):
+    """OGC GeoPose 1.0, Basic-Quaternion: rotates the body's axes (x forward, y left, z up) to east,
+    north and up at the position.
+    """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    POSITION_FIELD_NUMBER: _builtins.int
+    QUATERNION_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def position(self) -> Global___GeoPosition: ...
+    @_builtins.property
+    def quaternion(self) -> Global___GeoQuaternion: ...
+    def __init__(
+        self,
+        *,
+        position: Global___GeoPosition | None = ...,
+        quaternion: Global___GeoQuaternion | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["position", b"position", "quaternion", b"quaternion"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["position", b"position", "quaternion", b"quaternion"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___GeoPose: _TypeAlias = GeoPose  # noqa: Y015
+
+@_typing.final
+class GeoAngles(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    YAW_FIELD_NUMBER: _builtins.int
+    PITCH_FIELD_NUMBER: _builtins.int
+    ROLL_FIELD_NUMBER: _builtins.int
+    yaw: _builtins.float
+    """degrees; 0 looks east, 90 north"""
+    pitch: _builtins.float
+    roll: _builtins.float
+    def __init__(
+        self,
+        *,
+        yaw: _builtins.float = ...,
+        pitch: _builtins.float = ...,
+        roll: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["pitch", b"pitch", "roll", b"roll", "yaw", b"yaw"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___GeoAngles: _TypeAlias = GeoAngles  # noqa: Y015
+
+@_typing.final
+class GeoPoseYpr(_message.Message):
+    """OGC GeoPose 1.0, Basic-YPR."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    POSITION_FIELD_NUMBER: _builtins.int
+    ANGLES_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def position(self) -> Global___GeoPosition: ...
+    @_builtins.property
+    def angles(self) -> Global___GeoAngles: ...
+    def __init__(
+        self,
+        *,
+        position: Global___GeoPosition | None = ...,
+        angles: Global___GeoAngles | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["angles", b"angles", "position", b"position"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["angles", b"angles", "position", b"position"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___GeoPoseYpr: _TypeAlias = GeoPoseYpr  # noqa: Y015
+
+@_typing.final
+class Debug(_message.Message):
+    """What the solver was given, one entry per correspondence, and what it made of it."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    KEYPOINTS_FIELD_NUMBER: _builtins.int
+    POINTS_FIELD_NUMBER: _builtins.int
+    INLIERS_FIELD_NUMBER: _builtins.int
+    OVERLAY_FIELD_NUMBER: _builtins.int
+    overlay: _builtins.bytes
+    """JPEG: the photo with its inliers and outliers, and the retrieved photos"""
+    @_builtins.property
+    def keypoints(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """x, y in pixels of the photo as stored, one after the other"""
+
+    @_builtins.property
+    def points(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """x, y, z in the world"""
+
+    @_builtins.property
+    def inliers(self) -> _containers.RepeatedScalarFieldContainer[_builtins.bool]: ...
+    def __init__(
+        self,
+        *,
+        keypoints: _abc.Iterable[_builtins.float] | None = ...,
+        points: _abc.Iterable[_builtins.float] | None = ...,
+        inliers: _abc.Iterable[_builtins.bool] | None = ...,
+        overlay: _builtins.bytes = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["inliers", b"inliers", "keypoints", b"keypoints", "overlay", b"overlay", "points", b"points"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Debug: _TypeAlias = Debug  # noqa: Y015
 
 @_typing.final
 class RigPose(_message.Message):
@@ -1269,6 +1557,8 @@ class InstantAnswer(_message.Message):
     INLIER_RATIO_FIELD_NUMBER: _builtins.int
     MAP_FIELD_NUMBER: _builtins.int
     SECONDS_FIELD_NUMBER: _builtins.int
+    GEOPOSE_FIELD_NUMBER: _builtins.int
+    GEOPOSE_YPR_FIELD_NUMBER: _builtins.int
     request_id: _builtins.str
     timestamp: _builtins.int
     status: _builtins.str
@@ -1292,6 +1582,12 @@ class InstantAnswer(_message.Message):
     def seconds(self) -> _containers.ScalarMap[_builtins.str, _builtins.float]:
         """by stage, summed over the images"""
 
+    @_builtins.property
+    def geopose(self) -> Global___GeoPose:
+        """of the rig, in a map that is anchored to the Earth"""
+
+    @_builtins.property
+    def geopose_ypr(self) -> Global___GeoPoseYpr: ...
     def __init__(
         self,
         *,
@@ -1307,11 +1603,17 @@ class InstantAnswer(_message.Message):
         inlier_ratio: _builtins.float = ...,
         map: Global___MapRef | None = ...,
         seconds: _abc.Mapping[_builtins.str, _builtins.float] | None = ...,
+        geopose: Global___GeoPose | None = ...,
+        geopose_ypr: Global___GeoPoseYpr | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_pose", b"_pose", "_refusal", b"_refusal", "_source", b"_source", "_timestamp", b"_timestamp", "map", b"map", "pose", b"pose", "refusal", b"refusal", "source", b"source", "timestamp", b"timestamp"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_geopose", b"_geopose", "_geopose_ypr", b"_geopose_ypr", "_pose", b"_pose", "_refusal", b"_refusal", "_source", b"_source", "_timestamp", b"_timestamp", "geopose", b"geopose", "geopose_ypr", b"geopose_ypr", "map", b"map", "pose", b"pose", "refusal", b"refusal", "source", b"source", "timestamp", b"timestamp"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_pose", b"_pose", "_refusal", b"_refusal", "_source", b"_source", "_timestamp", b"_timestamp", "correspondences", b"correspondences", "images", b"images", "inlier_ratio", b"inlier_ratio", "inliers", b"inliers", "map", b"map", "pose", b"pose", "refusal", b"refusal", "request_id", b"request_id", "seconds", b"seconds", "source", b"source", "status", b"status", "timestamp", b"timestamp"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_geopose", b"_geopose", "_geopose_ypr", b"_geopose_ypr", "_pose", b"_pose", "_refusal", b"_refusal", "_source", b"_source", "_timestamp", b"_timestamp", "correspondences", b"correspondences", "geopose", b"geopose", "geopose_ypr", b"geopose_ypr", "images", b"images", "inlier_ratio", b"inlier_ratio", "inliers", b"inliers", "map", b"map", "pose", b"pose", "refusal", b"refusal", "request_id", b"request_id", "seconds", b"seconds", "source", b"source", "status", b"status", "timestamp", b"timestamp"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__geopose: _TypeAlias = _typing.Literal["geopose"]  # noqa: Y015
+    _WhichOneofArgType__geopose: _TypeAlias = _typing.Literal["_geopose", b"_geopose"]  # noqa: Y015
+    _WhichOneofReturnType__geopose_ypr: _TypeAlias = _typing.Literal["geopose_ypr"]  # noqa: Y015
+    _WhichOneofArgType__geopose_ypr: _TypeAlias = _typing.Literal["_geopose_ypr", b"_geopose_ypr"]  # noqa: Y015
     _WhichOneofReturnType__pose: _TypeAlias = _typing.Literal["pose"]  # noqa: Y015
     _WhichOneofArgType__pose: _TypeAlias = _typing.Literal["_pose", b"_pose"]  # noqa: Y015
     _WhichOneofReturnType__refusal: _TypeAlias = _typing.Literal["refusal"]  # noqa: Y015
@@ -1320,6 +1622,10 @@ class InstantAnswer(_message.Message):
     _WhichOneofArgType__source: _TypeAlias = _typing.Literal["_source", b"_source"]  # noqa: Y015
     _WhichOneofReturnType__timestamp: _TypeAlias = _typing.Literal["timestamp"]  # noqa: Y015
     _WhichOneofArgType__timestamp: _TypeAlias = _typing.Literal["_timestamp", b"_timestamp"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__geopose) -> _WhichOneofReturnType__geopose | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__geopose_ypr) -> _WhichOneofReturnType__geopose_ypr | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__pose) -> _WhichOneofReturnType__pose | None: ...
     @_typing.overload
@@ -1335,14 +1641,23 @@ Global___InstantAnswer: _TypeAlias = InstantAnswer  # noqa: Y015
 class ListMapsRequest(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
+    NEAR_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def near(self) -> Global___Near:
+        """only the anchored maps that reach into this circle"""
+
     def __init__(
         self,
+        *,
+        near: Global___Near | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_near", b"_near", "near", b"near"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_near", b"_near", "near", b"near"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
+    _WhichOneofReturnType__near: _TypeAlias = _typing.Literal["near"]  # noqa: Y015
+    _WhichOneofArgType__near: _TypeAlias = _typing.Literal["_near", b"_near"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__near) -> _WhichOneofReturnType__near | None: ...
 
 Global___ListMapsRequest: _TypeAlias = ListMapsRequest  # noqa: Y015
 
@@ -1427,6 +1742,11 @@ class MapInfo(_message.Message):
     SIZE_BYTES_FIELD_NUMBER: _builtins.int
     DOWN_FIELD_NUMBER: _builtins.int
     RIGS_FIELD_NUMBER: _builtins.int
+    ANCHOR_FIELD_NUMBER: _builtins.int
+    PLACE_FIELD_NUMBER: _builtins.int
+    CURRENT_FIELD_NUMBER: _builtins.int
+    VERSIONS_FIELD_NUMBER: _builtins.int
+    CONTENT_HASH_FIELD_NUMBER: _builtins.int
     id: _builtins.str
     version: _builtins.str
     created: _builtins.str
@@ -1439,6 +1759,9 @@ class MapInfo(_message.Message):
     landmarks: _builtins.int
     observations: _builtins.int
     size_bytes: _builtins.int
+    current: _builtins.bool
+    """whether this version is in use"""
+    content_hash: _builtins.str
     @_builtins.property
     def global_features(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]: ...
     @_builtins.property
@@ -1451,6 +1774,14 @@ class MapInfo(_message.Message):
 
     @_builtins.property
     def rigs(self) -> _containers.RepeatedCompositeFieldContainer[Global___RigInfo]: ...
+    @_builtins.property
+    def anchor(self) -> Global___Anchor: ...
+    @_builtins.property
+    def place(self) -> Global___GeoCircle: ...
+    @_builtins.property
+    def versions(self) -> _containers.RepeatedCompositeFieldContainer[Global___VersionInfo]:
+        """all published ones, oldest first"""
+
     def __init__(
         self,
         *,
@@ -1468,14 +1799,220 @@ class MapInfo(_message.Message):
         size_bytes: _builtins.int = ...,
         down: _abc.Iterable[_builtins.float] | None = ...,
         rigs: _abc.Iterable[Global___RigInfo] | None = ...,
+        anchor: Global___Anchor | None = ...,
+        place: Global___GeoCircle | None = ...,
+        current: _builtins.bool = ...,
+        versions: _abc.Iterable[Global___VersionInfo] | None = ...,
+        content_hash: _builtins.str = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["extent", b"extent"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_anchor", b"_anchor", "_place", b"_place", "anchor", b"anchor", "extent", b"extent", "place", b"place"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["created", b"created", "down", b"down", "extent", b"extent", "global_features", b"global_features", "id", b"id", "images", b"images", "landmarks", b"landmarks", "local_features", b"local_features", "method", b"method", "metric", b"metric", "observations", b"observations", "rigs", b"rigs", "size_bytes", b"size_bytes", "version", b"version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_anchor", b"_anchor", "_place", b"_place", "anchor", b"anchor", "content_hash", b"content_hash", "created", b"created", "current", b"current", "down", b"down", "extent", b"extent", "global_features", b"global_features", "id", b"id", "images", b"images", "landmarks", b"landmarks", "local_features", b"local_features", "method", b"method", "metric", b"metric", "observations", b"observations", "place", b"place", "rigs", b"rigs", "size_bytes", b"size_bytes", "version", b"version", "versions", b"versions"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__anchor: _TypeAlias = _typing.Literal["anchor"]  # noqa: Y015
+    _WhichOneofArgType__anchor: _TypeAlias = _typing.Literal["_anchor", b"_anchor"]  # noqa: Y015
+    _WhichOneofReturnType__place: _TypeAlias = _typing.Literal["place"]  # noqa: Y015
+    _WhichOneofArgType__place: _TypeAlias = _typing.Literal["_place", b"_place"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__anchor) -> _WhichOneofReturnType__anchor | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__place) -> _WhichOneofReturnType__place | None: ...
+
+Global___MapInfo: _TypeAlias = MapInfo  # noqa: Y015
+
+@_typing.final
+class Anchor(_message.Message):
+    """What the world's position and orientation rest on."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    KIND_FIELD_NUMBER: _builtins.int
+    IMAGES_FIELD_NUMBER: _builtins.int
+    RMS_FIELD_NUMBER: _builtins.int
+    GEODETIC_FIELD_NUMBER: _builtins.int
+    kind: _builtins.str
+    """dataset, model, gnss, positions, correspondences or none"""
+    images: _builtins.int
+    rms: _builtins.float
+    @_builtins.property
+    def geodetic(self) -> Global___Geodetic: ...
+    def __init__(
+        self,
+        *,
+        kind: _builtins.str = ...,
+        images: _builtins.int = ...,
+        rms: _builtins.float | None = ...,
+        geodetic: Global___Geodetic | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_geodetic", b"_geodetic", "_rms", b"_rms", "geodetic", b"geodetic", "rms", b"rms"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_geodetic", b"_geodetic", "_rms", b"_rms", "geodetic", b"geodetic", "images", b"images", "kind", b"kind", "rms", b"rms"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__geodetic: _TypeAlias = _typing.Literal["geodetic"]  # noqa: Y015
+    _WhichOneofArgType__geodetic: _TypeAlias = _typing.Literal["_geodetic", b"_geodetic"]  # noqa: Y015
+    _WhichOneofReturnType__rms: _TypeAlias = _typing.Literal["rms"]  # noqa: Y015
+    _WhichOneofArgType__rms: _TypeAlias = _typing.Literal["_rms", b"_rms"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__geodetic) -> _WhichOneofReturnType__geodetic | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__rms) -> _WhichOneofReturnType__rms | None: ...
+
+Global___Anchor: _TypeAlias = Anchor  # noqa: Y015
+
+@_typing.final
+class Geodetic(_message.Message):
+    """Where the world lies on Earth: enu = scale R x + translation gives metres east, north and up of
+    the position.
+    """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    LATITUDE_DEG_FIELD_NUMBER: _builtins.int
+    LONGITUDE_DEG_FIELD_NUMBER: _builtins.int
+    ALTITUDE_M_FIELD_NUMBER: _builtins.int
+    SCALE_FIELD_NUMBER: _builtins.int
+    ROTATION_WXYZ_FIELD_NUMBER: _builtins.int
+    TRANSLATION_FIELD_NUMBER: _builtins.int
+    latitude_deg: _builtins.float
+    longitude_deg: _builtins.float
+    altitude_m: _builtins.float
+    scale: _builtins.float
+    @_builtins.property
+    def rotation_wxyz(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
+    @_builtins.property
+    def translation(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
+    def __init__(
+        self,
+        *,
+        latitude_deg: _builtins.float = ...,
+        longitude_deg: _builtins.float = ...,
+        altitude_m: _builtins.float = ...,
+        scale: _builtins.float = ...,
+        rotation_wxyz: _abc.Iterable[_builtins.float] | None = ...,
+        translation: _abc.Iterable[_builtins.float] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["altitude_m", b"altitude_m", "latitude_deg", b"latitude_deg", "longitude_deg", b"longitude_deg", "rotation_wxyz", b"rotation_wxyz", "scale", b"scale", "translation", b"translation"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
-Global___MapInfo: _TypeAlias = MapInfo  # noqa: Y015
+Global___Geodetic: _TypeAlias = Geodetic  # noqa: Y015
+
+@_typing.final
+class GeoCircle(_message.Message):
+    """The smallest circle about the map's middle that holds its landmarks."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    LATITUDE_FIELD_NUMBER: _builtins.int
+    LONGITUDE_FIELD_NUMBER: _builtins.int
+    RADIUS_FIELD_NUMBER: _builtins.int
+    latitude: _builtins.float
+    longitude: _builtins.float
+    radius: _builtins.float
+    """metres"""
+    def __init__(
+        self,
+        *,
+        latitude: _builtins.float = ...,
+        longitude: _builtins.float = ...,
+        radius: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["latitude", b"latitude", "longitude", b"longitude", "radius", b"radius"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___GeoCircle: _TypeAlias = GeoCircle  # noqa: Y015
+
+@_typing.final
+class VersionInfo(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    VERSION_FIELD_NUMBER: _builtins.int
+    CURRENT_FIELD_NUMBER: _builtins.int
+    version: _builtins.str
+    current: _builtins.bool
+    def __init__(
+        self,
+        *,
+        version: _builtins.str = ...,
+        current: _builtins.bool = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["current", b"current", "version", b"version"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___VersionInfo: _TypeAlias = VersionInfo  # noqa: Y015
+
+@_typing.final
+class VersionRef(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MAP_FIELD_NUMBER: _builtins.int
+    VERSION_FIELD_NUMBER: _builtins.int
+    map: _builtins.str
+    version: _builtins.str
+    def __init__(
+        self,
+        *,
+        map: _builtins.str = ...,
+        version: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["map", b"map", "version", b"version"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___VersionRef: _TypeAlias = VersionRef  # noqa: Y015
+
+@_typing.final
+class PutVersionRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    START_FIELD_NUMBER: _builtins.int
+    CHUNK_FIELD_NUMBER: _builtins.int
+    chunk: _builtins.bytes
+    """all others: the packed file, at most 1 MiB each"""
+    @_builtins.property
+    def start(self) -> Global___VersionRef:
+        """the first message"""
+
+    def __init__(
+        self,
+        *,
+        start: Global___VersionRef | None = ...,
+        chunk: _builtins.bytes = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["chunk", b"chunk", "message", b"message", "start", b"start"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["chunk", b"chunk", "message", b"message", "start", b"start"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType_message: _TypeAlias = _typing.Literal["start", "chunk"]  # noqa: Y015
+    _WhichOneofArgType_message: _TypeAlias = _typing.Literal["message", b"message"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType_message) -> _WhichOneofReturnType_message | None: ...
+
+Global___PutVersionRequest: _TypeAlias = PutVersionRequest  # noqa: Y015
+
+@_typing.final
+class DeleteVersionResponse(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___DeleteVersionResponse: _TypeAlias = DeleteVersionResponse  # noqa: Y015
 
 @_typing.final
 class RigInfo(_message.Message):

@@ -282,3 +282,213 @@ class Localization:
             timeout,
             metadata,
             _registered_method=True)
+
+
+class MapsStub:
+    """Maps as versioned data. Needs the scope manage where keys are needed; GetVersion the scope read.
+    """
+
+    def __init__(self, channel):
+        """Constructor.
+
+        Args:
+            channel: A grpc.Channel.
+        """
+        self.GetVersion = channel.unary_unary(
+                '/visloc.v1.Maps/GetVersion',
+                request_serializer=visloc__api_dot_v1_dot_localization__pb2.VersionRef.SerializeToString,
+                response_deserializer=visloc__api_dot_v1_dot_localization__pb2.MapInfo.FromString,
+                _registered_method=True)
+        self.PutVersion = channel.stream_unary(
+                '/visloc.v1.Maps/PutVersion',
+                request_serializer=visloc__api_dot_v1_dot_localization__pb2.PutVersionRequest.SerializeToString,
+                response_deserializer=visloc__api_dot_v1_dot_localization__pb2.MapInfo.FromString,
+                _registered_method=True)
+        self.DeleteVersion = channel.unary_unary(
+                '/visloc.v1.Maps/DeleteVersion',
+                request_serializer=visloc__api_dot_v1_dot_localization__pb2.VersionRef.SerializeToString,
+                response_deserializer=visloc__api_dot_v1_dot_localization__pb2.DeleteVersionResponse.FromString,
+                _registered_method=True)
+        self.SetCurrent = channel.unary_unary(
+                '/visloc.v1.Maps/SetCurrent',
+                request_serializer=visloc__api_dot_v1_dot_localization__pb2.VersionRef.SerializeToString,
+                response_deserializer=visloc__api_dot_v1_dot_localization__pb2.MapInfo.FromString,
+                _registered_method=True)
+
+
+class MapsServicer:
+    """Maps as versioned data. Needs the scope manage where keys are needed; GetVersion the scope read.
+    """
+
+    def GetVersion(self, request, context):
+        """Describes one version, published but not necessarily in use.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def PutVersion(self, request_iterator, context):
+        """Publishes a version from its packed file (mapping pack). It is verified byte by byte before
+        anyone can see it, and is not in use until SetCurrent names it.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def DeleteVersion(self, request, context):
+        """Deletes a version that is not in use.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def SetCurrent(self, request, context):
+        """Puts a version into use, a newer or an older one, once the server has it open and warm.
+        Requests that are under way are answered by the version that they began with.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+
+def add_MapsServicer_to_server(servicer, server):
+    rpc_method_handlers = {
+            'GetVersion': grpc.unary_unary_rpc_method_handler(
+                    servicer.GetVersion,
+                    request_deserializer=visloc__api_dot_v1_dot_localization__pb2.VersionRef.FromString,
+                    response_serializer=visloc__api_dot_v1_dot_localization__pb2.MapInfo.SerializeToString,
+            ),
+            'PutVersion': grpc.stream_unary_rpc_method_handler(
+                    servicer.PutVersion,
+                    request_deserializer=visloc__api_dot_v1_dot_localization__pb2.PutVersionRequest.FromString,
+                    response_serializer=visloc__api_dot_v1_dot_localization__pb2.MapInfo.SerializeToString,
+            ),
+            'DeleteVersion': grpc.unary_unary_rpc_method_handler(
+                    servicer.DeleteVersion,
+                    request_deserializer=visloc__api_dot_v1_dot_localization__pb2.VersionRef.FromString,
+                    response_serializer=visloc__api_dot_v1_dot_localization__pb2.DeleteVersionResponse.SerializeToString,
+            ),
+            'SetCurrent': grpc.unary_unary_rpc_method_handler(
+                    servicer.SetCurrent,
+                    request_deserializer=visloc__api_dot_v1_dot_localization__pb2.VersionRef.FromString,
+                    response_serializer=visloc__api_dot_v1_dot_localization__pb2.MapInfo.SerializeToString,
+            ),
+    }
+    generic_handler = grpc.method_handlers_generic_handler(
+            'visloc.v1.Maps', rpc_method_handlers)
+    server.add_generic_rpc_handlers((generic_handler,))
+    server.add_registered_method_handlers('visloc.v1.Maps', rpc_method_handlers)
+
+
+ # This class is part of an EXPERIMENTAL API.
+class Maps:
+    """Maps as versioned data. Needs the scope manage where keys are needed; GetVersion the scope read.
+    """
+
+    @staticmethod
+    def GetVersion(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/visloc.v1.Maps/GetVersion',
+            visloc__api_dot_v1_dot_localization__pb2.VersionRef.SerializeToString,
+            visloc__api_dot_v1_dot_localization__pb2.MapInfo.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def PutVersion(request_iterator,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.stream_unary(
+            request_iterator,
+            target,
+            '/visloc.v1.Maps/PutVersion',
+            visloc__api_dot_v1_dot_localization__pb2.PutVersionRequest.SerializeToString,
+            visloc__api_dot_v1_dot_localization__pb2.MapInfo.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def DeleteVersion(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/visloc.v1.Maps/DeleteVersion',
+            visloc__api_dot_v1_dot_localization__pb2.VersionRef.SerializeToString,
+            visloc__api_dot_v1_dot_localization__pb2.DeleteVersionResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def SetCurrent(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/visloc.v1.Maps/SetCurrent',
+            visloc__api_dot_v1_dot_localization__pb2.VersionRef.SerializeToString,
+            visloc__api_dot_v1_dot_localization__pb2.MapInfo.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)

@@ -139,3 +139,82 @@ class LocalizationServicer(metaclass=_abc_1.ABCMeta):
     ) -> _typing.Union[_localization_pb2.MapInfo, _abc.Awaitable[_localization_pb2.MapInfo]]: ...
 
 def add_LocalizationServicer_to_server(servicer: LocalizationServicer, server: _typing.Union[_grpc.Server, _aio.Server]) -> None: ...
+
+class MapsStub:
+    """Maps as versioned data. Needs the scope manage where keys are needed; GetVersion the scope read."""
+
+    @_typing.overload
+    def __new__(cls, channel: _grpc.Channel) -> _Self: ...
+    @_typing.overload
+    def __new__(cls, channel: _aio.Channel) -> MapsAsyncStub: ...
+    GetVersion: _grpc.UnaryUnaryMultiCallable[_localization_pb2.VersionRef, _localization_pb2.MapInfo]
+    """Describes one version, published but not necessarily in use."""
+    PutVersion: _grpc.StreamUnaryMultiCallable[_localization_pb2.PutVersionRequest, _localization_pb2.MapInfo]
+    """Publishes a version from its packed file (mapping pack). It is verified byte by byte before
+    anyone can see it, and is not in use until SetCurrent names it.
+    """
+    DeleteVersion: _grpc.UnaryUnaryMultiCallable[_localization_pb2.VersionRef, _localization_pb2.DeleteVersionResponse]
+    """Deletes a version that is not in use."""
+    SetCurrent: _grpc.UnaryUnaryMultiCallable[_localization_pb2.VersionRef, _localization_pb2.MapInfo]
+    """Puts a version into use, a newer or an older one, once the server has it open and warm.
+    Requests that are under way are answered by the version that they began with.
+    """
+
+@_typing.type_check_only
+class MapsAsyncStub(MapsStub):
+    """Maps as versioned data. Needs the scope manage where keys are needed; GetVersion the scope read."""
+
+    def __init__(self, channel: _aio.Channel) -> None: ...
+    GetVersion: _aio.UnaryUnaryMultiCallable[_localization_pb2.VersionRef, _localization_pb2.MapInfo]  # type: ignore[assignment]
+    """Describes one version, published but not necessarily in use."""
+    PutVersion: _aio.StreamUnaryMultiCallable[_localization_pb2.PutVersionRequest, _localization_pb2.MapInfo]  # type: ignore[assignment]
+    """Publishes a version from its packed file (mapping pack). It is verified byte by byte before
+    anyone can see it, and is not in use until SetCurrent names it.
+    """
+    DeleteVersion: _aio.UnaryUnaryMultiCallable[_localization_pb2.VersionRef, _localization_pb2.DeleteVersionResponse]  # type: ignore[assignment]
+    """Deletes a version that is not in use."""
+    SetCurrent: _aio.UnaryUnaryMultiCallable[_localization_pb2.VersionRef, _localization_pb2.MapInfo]  # type: ignore[assignment]
+    """Puts a version into use, a newer or an older one, once the server has it open and warm.
+    Requests that are under way are answered by the version that they began with.
+    """
+
+class MapsServicer(metaclass=_abc_1.ABCMeta):
+    """Maps as versioned data. Needs the scope manage where keys are needed; GetVersion the scope read."""
+
+    @_abc_1.abstractmethod
+    def GetVersion(
+        self,
+        request: _localization_pb2.VersionRef,
+        context: _ServicerContext,
+    ) -> _typing.Union[_localization_pb2.MapInfo, _abc.Awaitable[_localization_pb2.MapInfo]]:
+        """Describes one version, published but not necessarily in use."""
+
+    @_abc_1.abstractmethod
+    def PutVersion(
+        self,
+        request_iterator: _MaybeAsyncIterator[_localization_pb2.PutVersionRequest],
+        context: _ServicerContext,
+    ) -> _typing.Union[_localization_pb2.MapInfo, _abc.Awaitable[_localization_pb2.MapInfo]]:
+        """Publishes a version from its packed file (mapping pack). It is verified byte by byte before
+        anyone can see it, and is not in use until SetCurrent names it.
+        """
+
+    @_abc_1.abstractmethod
+    def DeleteVersion(
+        self,
+        request: _localization_pb2.VersionRef,
+        context: _ServicerContext,
+    ) -> _typing.Union[_localization_pb2.DeleteVersionResponse, _abc.Awaitable[_localization_pb2.DeleteVersionResponse]]:
+        """Deletes a version that is not in use."""
+
+    @_abc_1.abstractmethod
+    def SetCurrent(
+        self,
+        request: _localization_pb2.VersionRef,
+        context: _ServicerContext,
+    ) -> _typing.Union[_localization_pb2.MapInfo, _abc.Awaitable[_localization_pb2.MapInfo]]:
+        """Puts a version into use, a newer or an older one, once the server has it open and warm.
+        Requests that are under way are answered by the version that they began with.
+        """
+
+def add_MapsServicer_to_server(servicer: MapsServicer, server: _typing.Union[_grpc.Server, _aio.Server]) -> None: ...

@@ -348,3 +348,11 @@ def test_published_features_outside_their_dataset_are_read(shared_data: Path) ->
     vectors = open_features(root / "mapping", "global_features", "AP-GeM-LM18", root)
     assert vectors.name == "dirtorch"
     assert np.linalg.norm(vectors.read(image)) == pytest.approx(1, abs=1e-3)
+
+
+def test_a_tar_that_is_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    folder = make_folder(tmp_path, "n, float32, 3")
+    os.mkfifo(folder / "keypoints.tar")
+    with pytest.raises(DatasetError) as caught:
+        open_features(tmp_path, "keypoints", "t")
+    assert caught.value.code == "kapture.tar"

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -518,3 +519,21 @@ def test_ten_thousand_posed_images_are_read_in_seconds(tmp_path: Path) -> None:
     # About half a second; the rest is room for a busy machine.
     assert time.perf_counter() - start < 5
     assert len(dataset.images) == count
+
+
+@pytest.mark.parametrize("name", ["sensors", "rigs", "trajectories", "records_camera"])
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
+def test_what_is_no_plain_file_is_refused_and_not_waited_for(
+    tmp_path: Path, name: str, kind: str
+) -> None:
+    root = write(tmp_path, {"rigs": "", "trajectories": "", "records_camera": ""})
+    path = root / "sensors" / f"{name}.txt"
+    path.unlink()
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")  # one line without an end
+    else:
+        path.mkdir()
+    error = refusal(root)
+    assert (error.code, error.field) == ("kapture.unreadable", f"sensors/{name}.txt")

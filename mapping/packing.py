@@ -1,0 +1,28 @@
+"""``mapping pack``: a map as one file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mapping.outputs import complete_output, refuse_existing
+from visloc.archive import Manifest, verify_map
+from visloc.archive.packed import pack_map
+
+_EXISTS = "pack.output_exists"
+
+
+def write_packed(folder: Path, output: Path) -> Manifest:
+    """Pack a map, every byte of which is checked first.
+
+    Args:
+        folder: the map.
+        output: the file, which must not exist; it appears when it is complete.
+
+    Raises:
+        Conflict: ``pack.output_exists``.
+        MapCorrupt: when the map is not what its manifest says.
+    """
+    refuse_existing(output, _EXISTS)  # before the long part
+    verify_map(folder)
+    with complete_output(output, _EXISTS) as partial:
+        return pack_map(folder, partial)

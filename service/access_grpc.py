@@ -1,0 +1,81 @@
+"""Access over gRPC."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import ExitStack
+from typing import Any
+
+import grpc
+
+from service.access import Access, is_method, needed_over_grpc
+from service.access_http import tokens_of
+from service.grpc_calls import Handler, behaviour_of, handler_like
+from service.grpc_envelope import Context, Envelope
+from service.key_file import Key
+from service.logs import UNMATCHED, note_key
+from visloc.errors import Overloaded, VislocError
+
+
+class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
+    """Lets a call through or refuses it, before any of its messages is read.
+
+    Args:
+        access: decides.
+        envelope: answers what is refused.
+    """
+
+    def __init__(self, access: Access, envelope: Envelope) -> None:
+        self._access = access
+        self._envelope = envelope
+
+    async def intercept_service(
+        self,
+        continuation: Callable[[grpc.HandlerCallDetails], Awaitable[Handler]],
+        handler_call_details: grpc.HandlerCallDetails,
+    ) -> Handler:
+        """Decide on one call."""
+        method = handler_call_details.method
+        metadata: list[tuple[str, str | bytes]] = list(
+            handler_call_details.invocation_metadata or ()
+        )
+
+        def sent(name: str) -> list[str]:
+            return [value for key, value in metadata if key == name and isinstance(value, str)]
+
+        try:
+            tokens = tokens_of(sent("authorization"), sent("x-api-key"))
+            key = self._access.key_of(tokens, needed_over_grpc(method))
+        except VislocError as error:
+            return self._refusal(error, method)
+        handler: Handler | None = await continuation(handler_call_details)
+        if key is None or handler is None:
+            return handler  # type: ignore[return-value]  # None: gRPC says that there is none
+        note_key(key.name)
+        return self._counted(handler, key, method)
+
+    def _counted(self, handler: Handler, key: Key, method: str) -> Handler:
+        behaviour = behaviour_of(handler)
+
+        async def serve(messages: AsyncIterator[Any], context: Context) -> Any:
+            with ExitStack() as stack:
+                try:
+                    stack.enter_context(self._access.place(key))
+                except Overloaded as error:
+                    await self._envelope.refuse(_name(method), error, context)
+                return await behaviour(messages, context)
+
+        return handler_like(handler, serve)
+
+    def _refusal(self, error: VislocError, method: str) -> Handler:
+        async def refuse(messages: AsyncIterator[Any], context: Context) -> None:
+            del messages  # they are not read
+            await self._envelope.refuse(_name(method), error, context)
+
+        made: Handler = grpc.stream_stream_rpc_method_handler(refuse)
+        return made
+
+
+def _name(method: str) -> str:
+    """Return the name of a method that is there, else one word for all others."""
+    return method.rpartition("/")[2] if is_method(method) else UNMATCHED

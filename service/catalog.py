@@ -1,0 +1,297 @@
+"""Which maps there are and which versions of them are served, in the main process."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Coroutine, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from service import worker
+from service.jobs import Near, Where
+from service.stores import Store
+from service.worker import MapFolder
+from service.workers import Workers
+from visloc.archive import Map
+from visloc.errors import InvalidInput, MapCorrupt, NotFound, VislocError
+
+logger = logging.getLogger(__name__)
+
+# How long a published version that could not take over is left alone before it is tried again.
+RETRY_AFTER_S = 30.0
+# How often the store is asked what has become current, besides by requests.
+FOLLOW_S = 1.0
+# Most maps that one request may search.
+MAX_MAPS = 16
+# Descriptions of so many versions stay in memory; their arrays stay on disk.
+_MAX_DESCRIBED = 1000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ServedMap:
+    """A version of a map.
+
+    Attributes:
+        opened: what it holds.
+        current: whether it is the one in use.
+        versions: all published ones of the map, oldest first, and which is in use.
+    """
+
+    opened: Map
+    current: bool
+    versions: tuple[tuple[str, bool], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Refused:
+    """What is current in the store and could not be loaded.
+
+    Attributes:
+        ref: ``id@version``; ``id`` when the map does not say which version is current.
+        error: why.
+        at: when, by ``perf_counter``.
+    """
+
+    ref: str
+    error: VislocError
+    at: float
+
+
+class Catalog:
+    """Knows what is served. Used from one event loop; what may block runs in threads.
+
+    The store is asked every time which version is current, so that a map that was published a
+    moment ago is served without a restart. It takes over when a worker process has it open and
+    warm; until then, and when it cannot be opened, the version before it stays in service.
+
+    Args:
+        store: where the maps are.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._serving: dict[str, MapFolder] = {}  # by map id
+        self._refused: dict[str, _Refused] = {}  # by map id
+        self._taking_over: dict[str, asyncio.Task[None]] = {}  # by map id
+        self._described: dict[str, Map] = {}  # by id@version
+        self._background: set[asyncio.Task[None]] = set()
+
+    @property
+    def serving(self) -> tuple[MapFolder, ...]:
+        """What is served, without being asked for by version."""
+        return tuple(self._serving.values())
+
+    @property
+    def not_loaded(self) -> Mapping[str, VislocError]:
+        """Why the current version of a map cannot be served, by map id."""
+        return {map_id: refused.error for map_id, refused in sorted(self._refused.items())}
+
+    async def load_all(self, workers: Workers) -> None:
+        """Open all current maps. One that is broken does not keep back the others."""
+        for map_id in await asyncio.to_thread(self._store.ids):
+            try:
+                await self._resolve(map_id, workers)
+            except VislocError as error:
+                logger.error("map %s is not loaded: %s", map_id, error)  # noqa: TRY400
+        if self._background:
+            await asyncio.wait(self._background)  # in every process, not only in the first
+
+    async def follow(self, workers: Workers) -> None:
+        """Let versions that become current take over, and forget maps that go, for ever."""
+        while True:
+            await asyncio.sleep(FOLLOW_S)
+            try:
+                ids = set(await asyncio.to_thread(self._store.ids))
+            except VislocError as error:
+                logger.warning("the maps cannot be listed: %s", error)
+                continue
+            for map_id in (self._serving.keys() | self._refused.keys()) - ids:
+                self._gone(map_id, workers)
+            for map_id in self._serving.keys() & ids:
+                with suppress(VislocError):  # noted in not_loaded
+                    await self._resolve(map_id, workers)
+
+    async def resolve(self, where: Where, workers: Workers) -> tuple[MapFolder, ...]:
+        """Return the maps to search.
+
+        Raises:
+            NotFound: ``map.unknown``, ``map.version``, ``map.none_near``.
+            VislocError: what the store and ``worker.load`` raise.
+        """
+        refs = await self._ids_near(where) if isinstance(where, Near) else where
+        return tuple([await self._resolve(ref, workers) for ref in refs])
+
+    async def activate(self, map_id: str, version: str, workers: Workers) -> None:
+        """Put a version into use, once a worker process has it open and warm.
+
+        Raises:
+            VislocError: as ``resolve``; then nothing has changed.
+        """
+        ref = f"{map_id}@{version}"
+        of = MapFolder(ref, await asyncio.to_thread(self._store.folder, ref))
+        await workers.run(worker.load, of)
+        await asyncio.to_thread(self._store.set_current, map_id, version)
+        self._serve(map_id, of, workers)
+
+    async def forget(self, ref: str, workers: Workers) -> None:
+        """Close a version that was deleted."""
+        self._described.pop(ref, None)
+        map_id = ref.partition("@")[0]
+        if self._serving.get(map_id, MapFolder("", Path())).ref == ref:
+            del self._serving[map_id]
+        await workers.run_everywhere(worker.forget, ref)
+
+    async def describe(self, ref: str) -> ServedMap:
+        """Describe ``id``, in the version that is served, or ``id@version``.
+
+        Raises:
+            VislocError: what the store raises.
+        """
+        return await asyncio.to_thread(self._describe, ref)
+
+    async def list(self, near: Near | None) -> Sequence[ServedMap]:
+        """Describe all maps that can be opened, or those that reach into a circle, by id."""
+
+        def described() -> list[ServedMap]:
+            found = []
+            for map_id in self._store.ids():
+                try:
+                    served = self._describe(map_id)
+                except VislocError as error:
+                    logger.warning("map %s is not listed: %s", map_id, error)
+                    continue
+                if near is None or _reaches(served.opened, near):
+                    found.append(served)
+            return found
+
+        return await asyncio.to_thread(described)
+
+    async def _ids_near(self, near: Near) -> tuple[str, ...]:
+        found = [served.opened.manifest.id for served in await self.list(near)]
+        if not found:
+            raise NotFound(
+                "map.none_near",
+                "no map that is tied to the Earth reaches into this circle",
+                field="near",
+                expected="a place that a map covers: GET /maps?near=latitude,longitude,radius",
+                got=f"{near.latitude:g}, {near.longitude:g}, {near.radius:g} m",
+            )
+        if len(found) > MAX_MAPS:
+            raise InvalidInput(
+                "request.map",
+                "too many maps reach into this circle",
+                field="near.radius",
+                expected=f"a circle that at most {MAX_MAPS} maps reach into",
+                got=f"{len(found)} maps",
+            )
+        return tuple(found)
+
+    async def _resolve(self, ref: str, workers: Workers) -> MapFolder:
+        if "@" in ref:
+            before = self._serving.get(ref.partition("@")[0])
+            if before is not None and before.ref == ref:
+                return before
+            return MapFolder(ref, await asyncio.to_thread(self._store.folder, ref))
+        before, refused = self._serving.get(ref), self._refused.get(ref)
+        try:
+            current = f"{ref}@{await asyncio.to_thread(self._store.current_version, ref)}"
+        except MapCorrupt as error:
+            self._refuse(ref, ref, error)
+            if before is None:
+                raise
+            return before
+        except NotFound:
+            self._gone(ref, workers)
+            raise
+        if before is not None and before.ref == current:
+            self._refused.pop(ref, None)
+            return before
+        if (
+            before is not None
+            and refused is not None
+            and refused.ref == current
+            and perf_counter() < refused.at + RETRY_AFTER_S
+        ):
+            return before
+        task = self._taking_over.get(ref)
+        if task is None:
+            task = asyncio.create_task(self._take_over(ref, current, workers))
+            self._taking_over[ref] = task
+            task.add_done_callback(lambda _: self._taking_over.pop(ref, None))
+        if before is not None:
+            return before  # warm, while the new one is made ready
+        await asyncio.shield(task)
+        found = self._serving.get(ref)
+        if found is None:
+            raise self._refused[ref].error
+        return found
+
+    async def _take_over(self, map_id: str, current: str, workers: Workers) -> None:
+        try:
+            of = MapFolder(current, await asyncio.to_thread(self._store.folder, current))
+            await workers.run(worker.load, of)
+        except VislocError as error:
+            self._refuse(map_id, current, error)
+        else:
+            self._serve(map_id, of, workers)
+
+    def _serve(self, map_id: str, of: MapFolder, workers: Workers) -> None:
+        before = self._serving.get(map_id)
+        self._serving[map_id] = of
+        self._refused.pop(map_id, None)
+        if before is None or before.ref != of.ref:
+            logger.info("map %s is served", of.ref)
+            self._in_background(workers.run_everywhere(worker.load, of))
+            if before is not None:
+                self._in_background(workers.run_everywhere(worker.forget, before.ref))
+
+    def _refuse(self, map_id: str, current: str, error: VislocError) -> None:
+        """Note that what is current cannot be served."""
+        before, known = self._serving.get(map_id), self._refused.get(map_id)
+        self._refused[map_id] = _Refused(current, error, perf_counter())
+        if before is not None and (known is None or known.ref != current):
+            logger.error(
+                "map %s cannot take over, %s stays in service: %s", current, before.ref, error
+            )
+
+    def _gone(self, map_id: str, workers: Workers) -> None:
+        self._refused.pop(map_id, None)
+        before = self._serving.pop(map_id, None)
+        if before is not None:
+            self._in_background(workers.run_everywhere(worker.forget, before.ref))
+
+    def _in_background(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._background.add(task)  # the loop itself keeps only a weak reference
+        task.add_done_callback(self._background.discard)
+
+    def _describe(self, ref: str) -> ServedMap:
+        """Describe a map; in a thread."""
+        map_id, at, version = ref.partition("@")
+        try:
+            current = self._store.current_version(map_id)
+        except (NotFound, MapCorrupt):
+            current = ""
+        if not at:
+            served = self._serving.get(map_id)
+            version = current if served is None else served.ref.partition("@")[2]
+            if not current:
+                self._store.current_version(map_id)  # raises what is wrong
+        wanted = f"{map_id}@{version}"
+        opened = self._described.get(wanted)
+        if opened is None or not opened.path.is_dir():
+            opened = worker.open_version(MapFolder(wanted, self._store.folder(wanted)))
+            while len(self._described) >= _MAX_DESCRIBED:
+                self._described.pop(next(iter(self._described)), None)
+            self._described[wanted] = opened
+        versions = tuple((v, v == current) for v in self._store.versions(map_id))
+        return ServedMap(opened, version == current, versions)
+
+
+def _reaches(opened: Map, near: Near) -> bool:
+    place = opened.place
+    return place is not None and place.distance_to(near.latitude, near.longitude) <= near.radius

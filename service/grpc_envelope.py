@@ -1,0 +1,114 @@
+"""What all methods of gRPC have in common: answers as messages, errors as statuses, the log."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any, TypeVar
+
+import grpc
+from google.protobuf.any_pb2 import Any as AnyMessage
+from google.protobuf.json_format import ParseDict
+from google.protobuf.message import Message
+from google.rpc.error_details_pb2 import ErrorInfo
+from google.rpc.status_pb2 import Status
+from pydantic import BaseModel
+
+import visloc
+from service.logs import RequestRecord
+from service.observation import Observer
+from service.wire import internal_error, request_id, statuses_of
+from visloc.errors import VislocError
+
+logger = logging.getLogger(__name__)
+
+ERROR_DOMAIN = "visloc"
+# The server's version goes with every answer, as a header.
+VERSION_KEY = "visloc-version"
+# Details travel in a header, of which gRPC clients accept 8 kB by default.
+_MAX_DETAIL = 1000
+
+Context = grpc.aio.ServicerContext[Any, Any]
+MessageT = TypeVar("MessageT", bound=Message)
+
+
+def message_of(answer: BaseModel, message: MessageT) -> MessageT:
+    """Fill a message from the model with the same fields: HTTP and gRPC answer the same."""
+    return ParseDict(answer.model_dump(exclude_none=True), message)
+
+
+class Envelope:
+    """Turns errors into statuses with details, and takes note of every call.
+
+    Args:
+        observer: is told what becomes of it.
+    """
+
+    def __init__(self, observer: Observer) -> None:
+        self._observer = observer
+
+    @asynccontextmanager
+    async def __call__(self, method: str, id_: str, context: Context) -> AsyncIterator[None]:
+        """Serve a call in the block.
+
+        Args:
+            method: its name.
+            id_: of the request.
+            context: of the call.
+        """
+        caller = dict(context.invocation_metadata() or ()).get("traceparent")
+        traceparent = caller if isinstance(caller, str) else None
+        with self._observer.request("grpc", id_, route=method, traceparent=traceparent) as record:
+            record.status = grpc.StatusCode.CANCELLED.name
+            try:
+                headers = [(VERSION_KEY, visloc.__version__)]
+                if record.trace is not None:
+                    headers.append(("traceresponse", record.trace.traceparent))
+                await context.send_initial_metadata(headers)
+                yield
+                record.status = grpc.StatusCode.OK.name
+            except VislocError as error:
+                await self._refuse(error, id_, context, record)
+            except Exception:  # the last line of defence: gRPC would tell the caller what broke
+                logger.exception("request %s broke", id_)
+                await self._refuse(internal_error(), id_, context, record)
+
+    async def refuse(self, method: str, error: VislocError, context: Context) -> None:
+        """Answer a call with an error, before it is served."""
+        id_ = request_id(None)
+        with self._observer.request("grpc", id_, route=method) as record:
+            await self._refuse(error, id_, context, record)
+
+    async def _refuse(
+        self, error: VislocError, id_: str, context: Context, record: RequestRecord
+    ) -> None:
+        self._observer.error(error)
+        record.status = statuses_of(error)[1].name
+        await _abort(error, id_, context)
+
+
+async def _abort(error: VislocError, id_: str, context: Context) -> None:
+    code = statuses_of(error)[1]
+    details = {
+        "kind": type(error).__name__,
+        "message": error.message,
+        "field": error.field,
+        "expected": error.expected,
+        "got": error.got,
+        "request_id": id_,
+    }
+    info = ErrorInfo(
+        reason=error.code,
+        domain=ERROR_DOMAIN,
+        metadata={
+            name: str(value)[:_MAX_DETAIL] for name, value in details.items() if value is not None
+        },
+    )
+    packed = AnyMessage()
+    packed.Pack(info)
+    text = str(error)[:_MAX_DETAIL]
+    status = Status(code=code.value[0], message=text, details=[packed])
+    await context.abort(
+        code, text, trailing_metadata=(("grpc-status-details-bin", status.SerializeToString()),)
+    )

@@ -1,0 +1,49 @@
+"""How much memory processes take and how much there is, as Linux tells it; elsewhere, nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+_KINDS = {"RssAnon": "anonymous", "RssFile": "file"}
+
+
+def resident_memory(
+    worker_pids: Sequence[int], proc: Path = Path("/proc")
+) -> Mapping[tuple[str, str], int]:
+    """Return the bytes of this process (``server``) and its workers (``worker-0``...), by kind.
+
+    Mapped files count once for every process that has them, and can be given back at any time: what
+    leaks is ``anonymous``. A process that ended meanwhile is left out.
+    """
+    names = {"server": "self", **{f"worker-{i}": str(pid) for i, pid in enumerate(worker_pids)}}
+    found = {}
+    for name, folder in names.items():
+        for line in _lines_of(proc / folder / "status"):
+            key, _, rest = line.partition(":")
+            if key in _KINDS:
+                found[name, _KINDS[key]] = int(rest.split()[0]) * 1024  # always said in kB
+    return found
+
+
+def memory_limit(cgroup: Path = Path("/sys/fs/cgroup"), proc: Path = Path("/proc")) -> int | None:
+    """Return the bytes that there are for all processes: of the container, else of the machine."""
+    limits = [
+        int(line)
+        for name in ("memory.max", "memory/memory.limit_in_bytes")  # cgroup v2, v1
+        for line in _lines_of(cgroup / name)
+        if line.isdigit()  # "max": none
+    ]
+    limits += [
+        int(line.split()[1]) * 1024
+        for line in _lines_of(proc / "meminfo")
+        if line.startswith("MemTotal:")
+    ]
+    return min(limits, default=None)
+
+
+def _lines_of(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="ascii", errors="replace").splitlines()
+    except OSError:  # another system, or the process has ended
+        return []

@@ -1,0 +1,68 @@
+"""The same map tied to the Earth in another way: a new manifest over the same files."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+from pathlib import Path
+
+from visloc.archive.checks import content_hash, json_text, manifest_hash
+from visloc.archive.places import down_of
+from visloc.archive.reader import Map
+from visloc.archive.schema import FORMAT_MAJOR, FORMAT_MINOR, Anchor
+
+# What says that a file system has no hard links, or not between these two folders.
+_NO_LINKS = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP)
+
+
+def write_anchored(opened: Map, folder: Path, anchor: Anchor, *, version: str, created: str) -> str:
+    """Write a map with another anchor into an empty folder.
+
+    Landmarks and photos stay where they are in the world, in files that both versions share: they
+    are hard links where the file system has them, else copies. Down in the world is what the new
+    anchor says where the old one said it too; a direction that was given otherwise is kept.
+
+    Args:
+        opened: the map; nothing of it is changed.
+        folder: exists and is empty.
+        anchor: what its world rests on now; with its place on Earth.
+        version: the version, or a prefix ending in ``-``, to which a part of the content hash is
+            appended.
+        created: ISO 8601 in UTC.
+
+    Returns:
+        The version.
+    """
+    manifest = json.loads((opened.path / "manifest.json").read_text(encoding="utf-8"))
+    minor = int(manifest["format_version"].partition(".")[2])
+    manifest["format_version"] = f"{FORMAT_MAJOR}.{max(minor, FORMAT_MINOR)}"
+    world = manifest["world"]
+    if anchor.geodetic is not None and (world.get("gravity") is None or opened.geodetic):
+        world["gravity"] = down_of(anchor.geodetic).tolist()
+    world["anchor"] = anchor.model_dump()
+    for name in opened.manifest.files:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        _link(opened.path / name, folder / name)
+    digest = content_hash(manifest)
+    manifest["content_hash"] = digest
+    manifest["version"] = version + digest[:8] if version.endswith("-") else version
+    manifest["created"] = created
+    manifest["manifest_hash"] = manifest_hash(manifest)
+    with (folder / "manifest.json").open("w", encoding="utf-8") as file:
+        file.write(json_text(manifest))
+        file.flush()
+        os.fsync(file.fileno())
+    return str(manifest["version"])
+
+
+def _link(source: Path, target: Path) -> None:
+    try:
+        target.hardlink_to(source)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        shutil.copyfile(source, target)
+        with target.open("rb") as file:
+            os.fsync(file.fileno())
