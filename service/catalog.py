@@ -90,9 +90,15 @@ class Catalog:
         """Why the current version of a map cannot be served, by map id."""
         return {map_id: refused.error for map_id, refused in sorted(self._refused.items())}
 
-    async def load_all(self, workers: Workers) -> None:
-        """Open all current maps. One that is broken does not keep back the others."""
+    async def load_all(self, workers: Workers, max_bytes: int) -> None:
+        """Open all current maps, as far as there is room; others are opened when asked for.
+
+        One that is broken does not keep back the others.
+        """
         for map_id in await asyncio.to_thread(self._store.ids):
+            if sum(workers.loaded.values()) >= max_bytes:
+                logger.info("max_loaded_bytes is full: other maps are opened when they are asked")
+                break
             try:
                 await self._resolve(map_id, workers)
             except VislocError as error:

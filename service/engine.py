@@ -98,6 +98,7 @@ class Engine:
             warm=lambda: self._catalog.serving,
             on_death=metrics.observe_worker_death,
         )
+        self._max_loaded_bytes = settings.max_loaded_bytes
         self._max_photos = workers + max_queue
         self._photos = 0
         self._max_batches = max_batches
@@ -111,7 +112,7 @@ class Engine:
         """Open and warm up all current maps. One that is broken does not keep back the others."""
         await asyncio.to_thread(self._store.sweep)
         await self.workers.start()
-        await self._catalog.load_all(self.workers)
+        await self._catalog.load_all(self.workers, self._max_loaded_bytes)
         self._following = asyncio.create_task(self._catalog.follow(self.workers))
         self._started = True
 
@@ -158,15 +159,24 @@ class Engine:
             Unavailable: ``server.starting`` before ``start`` is done, ``server.worker_died``.
             VislocError: what the store, ``read_photo`` and the ``Localizer`` raise.
         """
-        self._check_ready()
-        if self._photos >= self._max_photos:
-            raise Overloaded("server.busy", "too many photos are waiting; try again shortly")
+        self.check_room()
         self._photos += 1
         try:
             maps = await self._catalog.resolve(job.maps, self.workers)
             return await self.workers.run(worker.localize, job, maps, time())
         finally:
             self._photos -= 1
+
+    def check_room(self) -> None:
+        """Refuse a photo for which there is no place, before it is read.
+
+        Raises:
+            Overloaded: ``server.busy``.
+            Unavailable: ``server.starting``, ``server.stopping``.
+        """
+        self._check_ready()
+        if self._photos >= self._max_photos:
+            raise Overloaded("server.busy", "too many photos are waiting; try again shortly")
 
     @contextmanager
     def admit_batch(self) -> Iterator[None]:

@@ -107,6 +107,7 @@ def create_app(
         A photo that cannot be localized is an answer (`status: not_localized`), not an error.
         """
         timeout_s = timeout(request)
+        engine.check_room()
         job = await read_localize_job(request, settings)
         async with within(timeout_s):
             found = await while_connected(request.receive, engine.localize(job))

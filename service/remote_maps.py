@@ -98,6 +98,11 @@ class RemoteMapStore:
         self._locks: dict[str, threading.Lock] = {}
         self._compared: set[str] = set()
 
+    @property
+    def reachable(self) -> bool:
+        """Whether the remote answered when it was last asked."""
+        return not self._is_away
+
     def ids(self) -> list[str]:
         """Ids of the maps that have a current version, sorted."""
         return sorted(name for name, known in self._known().items() if known.current is not None)

@@ -162,6 +162,7 @@ class Server:
             unusable_maps={map_id: error.code for map_id, error in status.not_loaded.items()},
             connections=len(self._http[0].server_state.connections),
             max_connections=settings.max_connections,
+            store_reachable=self._store.reachable,
             buffered_bytes=self._arrivals.bytes_held,
             max_buffered_bytes=settings.max_buffered_bytes,
             folders={"cache": settings.cache_dir} if remote else {"maps": Path(settings.maps_dir)},

@@ -17,6 +17,11 @@ class Store(Protocol):
     machine raises Unavailable ``maps.storage_away`` too.
     """
 
+    @property
+    def reachable(self) -> bool:
+        """Whether the place answered when it was last asked."""
+        ...
+
     def ids(self) -> list[str]:
         """Ids of the maps that have a current version, sorted."""
         ...

@@ -12,7 +12,7 @@ import pickle
 import signal
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from multiprocessing import parent_process
@@ -133,10 +133,6 @@ class _Process:
             ref, _ = self._localizers.popitem(last=False)
             logger.info("map %s closed, to keep to max_loaded_bytes", ref)
         return found
-
-    def find(self, ref: str) -> Localizer:
-        """Return the localizer of a map that was just asked for."""
-        return self._localizers[ref]
 
     def forget(self, ref: str) -> None:
         self._localizers.pop(ref, None)
@@ -406,9 +402,13 @@ class _Pickler(pickle.Pickler):
 class _Unpickler(pickle.Unpickler):
     """Puts this process's maps back in. Reads only what ``_Pickler`` wrote, in this service."""
 
+    def __init__(self, state: bytes, localizers: Mapping[str, Localizer]) -> None:
+        super().__init__(io.BytesIO(state))
+        self._localizers = localizers
+
     def persistent_load(self, pid: Any) -> Any:
         kind, ref = pid
-        localizer = _here().find(ref)
+        localizer = self._localizers[ref]
         return localizer if kind == "localizer" else localizer.geometry
 
 
@@ -419,9 +419,7 @@ def _dumped(run: SequenceRun) -> bytes:
 
 
 def _sequence(state: bytes, maps: Sequence[MapFolder]) -> SequenceRun:
-    for of in maps:
-        _here().localizer(of)
-    run = _Unpickler(io.BytesIO(state)).load()
+    run = _Unpickler(state, {of.ref: _here().localizer(of) for of in maps}).load()
     assert isinstance(run, SequenceRun)
     return run
 

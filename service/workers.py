@@ -57,7 +57,7 @@ class Workers:
         count: processes.
         settings: what each of them needs to know.
         limit_s: longest time that one task may take; a process that exceeds it is replaced.
-        warm: the maps that a new process opens before its first task.
+        warm: the maps in service; a new process opens those that the one before had open.
         on_death: called for every process that died.
     """
 
@@ -206,7 +206,8 @@ class Workers:
         while True:
             logger.error("worker process %s died; starting another", one.pid)
             try:
-                await one.start(self._warm())
+                before = {loaded.ref for loaded in one.loaded}
+                await one.start([of for of in self._warm() if of.ref in before])
             except VislocError as error:
                 logger.error("a worker process cannot start: %s", error)  # noqa: TRY400
                 await asyncio.sleep(_RESTART_PAUSE_S)

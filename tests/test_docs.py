@@ -26,6 +26,7 @@ import clients.cli
 import mapping.cli
 from clients.connection_options import KEY_VARIABLE
 from mapping.export import export_map
+from service.jobs import Near
 from service.schemas import (
     InstantAnswer,
     LocalizeRequest,
@@ -342,8 +343,8 @@ def test_every_relative_link_leads_somewhere(page: Path) -> None:
 # docs/api.md and the code
 
 CODE = re.compile(
-    r"(access|request|image|camera|options|maps?|packed|features|weights|server|pose|rig|sequence"
-    r"|upload)"
+    r"(access|request|image|camera|options|maps?|near|packed|features|weights|server|pose|geopose|rig"
+    r"|upload|near|geopose)"
     r"\.[a-z0-9_]+"
 )
 # Modules that take part in an answer, and the codes of theirs that no client meets.
@@ -383,11 +384,12 @@ def test_the_codes_listed_are_those_that_a_client_may_meet() -> None:
     }
     of_options = {f"options.{name}" for name in LocalizeOptions.__slots__}
     of_priors = {f"priors.{name}" for name in Priors.__slots__}
+    of_near = {f"near.{name}" for name in Near.__slots__}
     of_http = {f"http.{status.name.lower()}" for status in HTTPStatus}
     listed = [code for row in table("codes") for code in words(row[0])]
 
     assert len(listed) == len(set(listed))
-    assert set(listed) - of_http == (in_source | of_options | of_priors) - NOT_MET
+    assert set(listed) - of_http == (in_source | of_options | of_priors | of_near) - NOT_MET
 
 
 def test_the_errors_have_the_statuses_that_are_listed() -> None:

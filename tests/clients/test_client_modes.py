@@ -27,7 +27,11 @@ START = 1_700_000_000_000
 INFO = MapInfo(
     *("room", "v1", "", True, "rgbd", "xfeat", (), 1, 1, 1, ((0.0,), (0.0,)), 1, None),
     rigs=(RigInfo("stereo", ("left", "right")),),
-    **{"anchor": None, "place": None, "current": True, "versions": (), "content_hash": ""},
+    anchor=None,
+    place=None,
+    current=True,
+    versions=(),
+    content_hash="",
 )
 
 

@@ -13,11 +13,10 @@ from typing import Any
 
 import pytest
 
-import service.uploads
 from service.uploads import Uploads
 from visloc.archive import MapStore
 from visloc.archive.checks import json_text, manifest_hash
-from visloc.archive.packed import pack_map
+from visloc.archive.packed import pack_map, unpack_map
 from visloc.errors import Conflict, InvalidInput, StorageFull, TooLarge, VislocError
 
 
@@ -154,7 +153,7 @@ def test_a_cancelled_upload_leaves_all_or_nothing_and_can_be_repeated(
         case "enter":
             monkeypatch.setattr(store, "sweep", held(store.sweep))
         case "unpack":
-            monkeypatch.setattr(service.uploads, "unpack_map", held(service.uploads.unpack_map))
+            monkeypatch.setattr("service.uploads.unpack_map", held(unpack_map))
         case "publish":
             monkeypatch.setattr(store, "publish", held(store.publish))
 

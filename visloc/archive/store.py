@@ -38,6 +38,11 @@ class MapStore:
     def __init__(self, root: Path) -> None:
         self.root = root
 
+    @property
+    def reachable(self) -> bool:
+        """Always: the folder is on this machine."""
+        return True
+
     def ids(self) -> list[str]:
         """Ids of the maps that have a current version, sorted."""
         return [name for name in _names_in(self.root) if (self.root / name / CURRENT).is_file()]
