@@ -37,6 +37,8 @@ Names = Annotated[tuple[str, ...], BeforeValidator(_names_of)]
 
 # Room in a request for everything but the photo.
 REQUEST_OVERHEAD_BYTES = 64 * 1024
+# Largest message with a piece of a packed map: 1 MiB, and a little around it.
+PIECE_BYTES = 2**20 + 64 * 1024
 # Room in a request for the numbers of one photo: camera, sensor, its share of the instant's.
 VALUES_PER_IMAGE = 64
 # So many are parsed at least, that too many photos or instants can be told as such.
@@ -133,8 +135,8 @@ class ServiceSettings(BaseModel):
 
     @property
     def max_message_bytes(self) -> int:
-        """Largest message of gRPC: of one photo, or of an instant's."""
-        return max(self.max_request_bytes, self.max_batch_bytes)
+        """Largest message of gRPC: of one photo, an instant's, or a piece of a packed map."""
+        return max(self.max_request_bytes, self.max_batch_bytes, PIECE_BYTES)
 
     @property
     def max_batch_values(self) -> int:

@@ -343,8 +343,8 @@ def test_every_relative_link_leads_somewhere(page: Path) -> None:
 # docs/api.md and the code
 
 CODE = re.compile(
-    r"(access|request|image|camera|options|maps?|near|packed|features|weights|server|pose|geopose|rig"
-    r"|upload|near|geopose)"
+    r"(access|request|image|camera|options|maps?|near|packed|features|weights|server|pose|geopose"
+    r"|debug|rig|sequence|upload)"
     r"\.[a-z0-9_]+"
 )
 # Modules that take part in an answer, and the codes of theirs that no client meets.

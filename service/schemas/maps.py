@@ -142,7 +142,7 @@ class MapInfo(BaseModel):
             observations=manifest.counts.observations,
             extent=Extent(min=list(manifest.world.extent.min), max=list(manifest.world.extent.max)),
             size_bytes=opened.size_bytes,
-            down=[] if manifest.world.gravity is None else list(manifest.world.gravity),
+            down=[] if opened.gravity is None else opened.gravity.tolist(),
             rigs=[RigInfo(id=id_, sensors=list(sensors)) for id_, sensors in opened.rigs.items()],
             anchor=Anchor.of(manifest.world),
             place=GeoCircle.of(manifest.world),

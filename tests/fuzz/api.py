@@ -10,6 +10,7 @@ import argparse
 import base64
 import json
 import os
+import socket
 import subprocess
 import sys
 import tempfile
@@ -72,8 +73,10 @@ def check_api(url: str, cases: int, photo: bytes, random_seed: int = 0) -> Repor
     pairs: list[tuple[APIOperation[Any, Any, Any, Any], GenerationMode]] = []
     for operation in operations:
         if operation.body or list(operation.iter_parameters()):
-            pairs += [(operation, GenerationMode.POSITIVE), (operation, GenerationMode.NEGATIVE)]
-        else:  # there is one request, and none that is wrong
+            pairs.append((operation, GenerationMode.POSITIVE))
+            if operation.body or operation.query:  # in a path there is nothing but text
+                pairs.append((operation, GenerationMode.NEGATIVE))
+        else:  # there is only one request
             _check_operation(operation, GenerationMode.POSITIVE, 1, 0, url, photo, report)
     while pairs and report.cases < cases:
         # Some operations have few cases: the others get theirs.
@@ -167,10 +170,11 @@ def served(folder: Path) -> Iterator[tuple[str, bytes]]:
         lambda *_: None,
     )
     photo = next((folder / "sample" / "query").rglob("*.jpg")).read_bytes()
-    log = (folder / "service.log").open("w")
-    names = {"VISLOC_MAPS_DIR": str(folder / "maps"), "VISLOC_HTTP_PORT": "18080"}
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    names = {"VISLOC_MAPS_DIR": str(folder / "maps"), "VISLOC_HTTP_PORT": str(port)}
     with (
-        log,
+        (folder / "service.log").open("w") as log,
         subprocess.Popen(
             [sys.executable, "-m", "service"],
             env=os.environ | names | {"VISLOC_GRPC_PORT": "0"},
@@ -179,17 +183,21 @@ def served(folder: Path) -> Iterator[tuple[str, bytes]]:
         ) as process,
     ):
         try:
-            url = "http://127.0.0.1:18080"
-            for _ in range(300):
-                time.sleep(0.2)
-                try:
-                    if httpx.get(f"{url}/readyz").is_success:
-                        break
-                except httpx.TransportError:
-                    pass
+            url = f"http://127.0.0.1:{port}"
+            _wait_until_ready(url, process)
             yield url, photo
         finally:
             process.terminate()
+
+
+def _wait_until_ready(url: str, process: subprocess.Popen[bytes]) -> None:
+    deadline = time.monotonic() + 120
+    while process.poll() is None and time.monotonic() < deadline:
+        with suppress(httpx.TransportError):
+            if httpx.get(f"{url}/readyz").is_success:
+                return
+        time.sleep(0.2)
+    raise RuntimeError("the service did not become ready")
 
 
 def main() -> int:

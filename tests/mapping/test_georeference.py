@@ -382,7 +382,7 @@ def test_the_command_wants_one_way_and_all_of_it(maps_dir: Path, tmp_path: Path)
         _, _, error = run("room", "--maps-dir", str(maps_dir), *arguments)
         assert isinstance(error, InvalidInput), arguments
         assert error.code == "anchor.source"
-    arguments = ("--yaw", "0", "--gravity", "0,0,-1")
-    code, output, _ = run("room", "--maps-dir", str(maps_dir), *place, *arguments)
+    rest = ("--yaw", "0", "--gravity", "0,0,-1")
+    code, output, _ = run("room", "--maps-dir", str(maps_dir), *place, *rest)
     assert code == 0, output
     assert "place: latitude 45.000000000" in output

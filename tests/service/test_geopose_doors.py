@@ -226,7 +226,7 @@ def test_places_that_are_none_are_refused_alike(doors: Doors, query: Query) -> N
     with pytest.raises(grpc.RpcError) as caught:
         doors.stub.Localize(message)
     assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
-    assert "near.latitude" in caught.value.details()
+    assert "near.latitude" in str(caught.value.details())
     problem = doors.http.post("/localize", data={"near": "45,5"}, files=files).json()
     assert problem["code"] == "near.syntax"
     problem = doors.http.post(

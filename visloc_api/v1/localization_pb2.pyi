@@ -1901,7 +1901,7 @@ Global___Geodetic: _TypeAlias = Geodetic  # noqa: Y015
 
 @_typing.final
 class GeoCircle(_message.Message):
-    """The smallest circle about the map's middle that holds its landmarks."""
+    """A circle that holds the map's landmarks: that of its extent's corners."""
 
     DESCRIPTOR: _descriptor.Descriptor
 

@@ -1,0 +1,178 @@
+"""The service as users start it, in a process of its own, that can be killed and started again."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import httpx
+
+READY_WITHIN_S = 90.0
+
+
+class ServiceProcess:
+    """``python -m service`` on ports that stay the same when it is started again.
+
+    Args:
+        maps_dir: folder or URL of maps.
+        log: file that its log is appended to.
+        before: words before the command, such as ``unshare``'s.
+        environment: variables besides this process's own.
+        settings: further settings, by name.
+    """
+
+    def __init__(
+        self,
+        maps_dir: Path | str,
+        log: Path,
+        *,
+        before: Sequence[str] = (),
+        environment: Mapping[str, str] | None = None,
+        **settings: object,
+    ) -> None:
+        self.http_port, self.grpc_port = free_port(), free_port()
+        self.url = f"http://127.0.0.1:{self.http_port}"
+        self.grpc = f"127.0.0.1:{self.grpc_port}"
+        self.log = log
+        given = {
+            "maps_dir": maps_dir,
+            "http_port": self.http_port,
+            "grpc_port": self.grpc_port,
+            "threads_per_worker": 1,
+            "log_format": "json",
+            **settings,
+        }
+        flags = [f"--{name.replace('_', '-')}={value}" for name, value in given.items()]
+        self._command = [*before, sys.executable, "-m", "service", *flags]
+        own = {name: value for name, value in os.environ.items() if "VISLOC" not in name}
+        self._environment = own | dict(environment or {})
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def pid(self) -> int:
+        """Of the main process."""
+        assert self._process is not None
+        return self._process.pid
+
+    @property
+    def worker_pids(self) -> list[int]:
+        """Of the processes that do the vision: the fork server's children."""
+        return [pid for child in children_of(self.pid) for pid in children_of(child)]
+
+    def start(self) -> None:
+        """Begin; the doors may be closed yet."""
+        with self.log.open("ab") as log:
+            self._process = subprocess.Popen(self._command, stderr=log, env=self._environment)
+
+    def wait_until_ready(self) -> float:
+        """Wait for /readyz; the seconds that it took.
+
+        Raises:
+            RuntimeError: when it ended, or takes far too long.
+        """
+        started = time.monotonic()
+        while not self.is_ready():
+            assert self._process is not None
+            if self._process.poll() is not None or time.monotonic() > started + READY_WITHIN_S:
+                raise RuntimeError(f"the service does not come up:\n{self.log.read_text()[-3000:]}")
+            time.sleep(0.05)
+        return time.monotonic() - started
+
+    def is_ready(self) -> bool:
+        """Whether /readyz says so."""
+        try:
+            return httpx.get(f"{self.url}/readyz", timeout=5).status_code == 200
+        except httpx.TransportError:
+            return False
+
+    def kill(self) -> None:
+        """Kill the main process, as the kernel does when memory is short."""
+        assert self._process is not None
+        self._process.kill()
+        self._process.wait()
+
+    def stop(self) -> None:
+        """End it with SIGTERM, or at once when that takes too long."""
+        if self._process is None or self._process.poll() is not None:
+            return
+        self._process.send_signal(signal.SIGTERM)
+        try:
+            self._process.wait(40)
+        except subprocess.TimeoutExpired:
+            self.kill()
+
+    def resident_bytes(self) -> tuple[int, int]:
+        """Resident memory of the main process, and of it with all below it."""
+        every = [self.pid, *_descendants_of(self.pid)]
+        sizes = [resident_bytes(pid) for pid in every]
+        return sizes[0], sum(sizes)
+
+    def __enter__(self) -> Self:
+        self.start()
+        try:
+            self.wait_until_ready()
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+
+def free_port() -> int:
+    """A port of this machine that nobody listens on."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port: int = listener.getsockname()[1]
+        return port
+
+
+def children_of(pid: int) -> list[int]:
+    """Processes that a process started and that live."""
+    try:
+        tasks = list(Path(f"/proc/{pid}/task").iterdir())
+    except FileNotFoundError:
+        return []
+    found = []
+    for task in tasks:
+        with suppress(FileNotFoundError):
+            found += [int(child) for child in (task / "children").read_text().split()]
+    return found
+
+
+def is_alive(pid: int) -> bool:
+    """Whether there is such a process that does something; a zombie does not."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"
+
+
+def resident_bytes(pid: int) -> int:
+    """Resident memory of a process; 0 when it has ended."""
+    try:
+        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    except (FileNotFoundError, ProcessLookupError):
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def _descendants_of(pid: int) -> Iterator[int]:
+    for child in children_of(pid):
+        yield child
+        yield from _descendants_of(child)
