@@ -10,25 +10,88 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from benchmarks.reliability.checks import print_checks
+from benchmarks.reliability.kills import kill_service, kill_workers
+from benchmarks.reliability.refusals import refusals
+from benchmarks.reliability.slow_clients import slow_clients
+from benchmarks.reliability.soak import soak
+from benchmarks.reliability.storage import s3_away
+from benchmarks.reliability.uploads import full_disk, truncated_upload
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 
 
 @app.command("soak")
-def soak_command(
-    seconds: Annotated[float, typer.Option(help="How long.")] = 900.0,
-) -> None:
+def soak_command(seconds: Annotated[float, typer.Option(help="How long.")] = 900.0) -> None:
     """Twice the load that it can serve, good and bad, while versions are swapped every 20 s."""
-    from benchmarks.reliability.soak import soak
+    with _work() as work:
+        print_checks("soak", asyncio.run(soak(work, seconds)))
 
-    with tempfile.TemporaryDirectory() as work:
-        print_checks("soak", asyncio.run(soak(Path(work), seconds)))
+
+@app.command("kill")
+def kill_command(
+    kills: Annotated[int, typer.Option(help="Of workers, then of the service.")] = 10,
+) -> None:
+    """Kill -9 under load."""
+    with _work() as work:
+        workers = asyncio.run(kill_workers(work, kills))
+    with _work() as work:
+        service = asyncio.run(kill_service(work, kills))
+    print_checks("kill", [*workers, *service])
+
+
+@app.command("full-disk")
+def full_disk_command() -> None:
+    """Uploads to a disk without room: a small tmpfs of the service's own mount namespace."""
+    with _work() as work:
+        print_checks("full disk", full_disk(work))
+
+
+@app.command("truncated-upload")
+def truncated_upload_command() -> None:
+    """Uploads that end too early, in every way."""
+    with _work() as work:
+        print_checks("truncated upload", truncated_upload(work))
+
+
+@app.command("s3-away")
+def s3_away_command(
+    seconds: Annotated[float, typer.Option(help="How long it is away, each time.")] = 60.0,
+) -> None:
+    """An S3 server that is killed, and one that falls silent."""
+    with _work() as work:
+        print_checks("S3 away", asyncio.run(s3_away(work, seconds)))
+
+
+@app.command("slow-clients")
+def slow_clients_command(
+    connections: Annotated[int, typer.Option(help="Slow ones, at once.")] = 200,
+    seconds: Annotated[float, typer.Option(help="Of each turn.")] = 25.0,
+    rounds: Annotated[int, typer.Option(help="Of turns.")] = 3,
+) -> None:
+    """Clients that send one byte per second."""
+    with _work() as work:
+        print_checks("slow clients", asyncio.run(slow_clients(work, connections, seconds, rounds)))
+
+
+@app.command("refusals")
+def refusals_command() -> None:
+    """Wrong keys, missing scopes, replayed and oversized bodies, path tricks."""
+    with _work() as work:
+        print_checks("refusals", refusals(work))
+
+
+@contextmanager
+def _work() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="visloc-reliability-") as folder:
+        yield Path(folder)
 
 
 if __name__ == "__main__":

@@ -90,7 +90,7 @@ class Doors:
         traceback: TracebackType | None,
     ) -> None:
         await self.http.aclose()
-        await self._channel.close()
+        await self._channel.close(None)
 
 
 @dataclass(frozen=True)
@@ -245,16 +245,15 @@ def camera_text(camera: Camera) -> str:
 
 def _refusal(error: grpc.aio.AioRpcError, id_: str) -> tuple[str, Any, str, bool]:
     code = error.code().name
-    for key, value in error.trailing_metadata() or ():
-        if key == "grpc-status-details-bin":
-            info = ErrorInfo()
-            assert isinstance(value, bytes)
-            assert Status.FromString(value).details[0].Unpack(info)
-            about = dict(info.metadata)
-            answer = {"reason": info.reason, **about}
-            return f"{code} {info.reason}", answer, about.get("request_id", ""), False
-    # Not from the service, but from the client's library.
-    return f"{NO_ANSWER}: {code}", None, id_, False
+    details = dict(tuple(error.trailing_metadata())).get("grpc-status-details-bin")
+    if details is None:  # not from the service, but from the client's library
+        return f"{NO_ANSWER}: {code}", None, id_, False
+    assert isinstance(details, bytes)
+    info = ErrorInfo()
+    assert Status.FromString(details).details[0].Unpack(info)
+    about = dict(info.metadata)
+    answer = {"reason": info.reason, **about}
+    return f"{code} {info.reason}", answer, about.get("request_id", ""), False
 
 
 def _rig_body(map_id: str, photos: Sequence[Photo]) -> Mapping[str, object]:

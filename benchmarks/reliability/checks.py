@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -31,3 +32,8 @@ def print_checks(test: str, checks: Sequence[Check]) -> None:
         typer.echo(f"| {test} | {check.must_hold} | {check.measured} | {holds} |")
     if not all(check.holds for check in checks):
         raise typer.Exit(1)
+
+
+def counts_text(counts: Counter[str]) -> str:
+    """How often what was seen: ``3 x 200, 1 x 404``."""
+    return ", ".join(f"{count} x {name}" for name, count in sorted(counts.items())) or "none"

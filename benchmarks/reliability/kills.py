@@ -16,7 +16,7 @@ from pathlib import Path
 import httpx
 
 from benchmarks.reliability.asking import Case, Doors, good_cases
-from benchmarks.reliability.checks import Check
+from benchmarks.reliability.checks import Check, counts_text
 from benchmarks.reliability.load import Persisted, persist
 from benchmarks.reliability.maps import (
     TestMaps,
@@ -70,7 +70,7 @@ async def kill_workers(work: Path, kills: int) -> list[Check]:
     return [
         Check(
             "a worker that is killed costs at most the request that it worked on, and that is told",
-            f"{kills} killed, {_counts(errors) or 'no errors'}",
+            f"{kills} killed, {counts_text(errors)}",
             set(errors) <= WORKER_DIED and errors.total() <= kills,
         ),
         _retry_check(done, expected),
@@ -115,7 +115,7 @@ async def kill_service(work: Path, kills: int) -> list[Check]:
         ),
         Check(
             "clients see connections that break, then the service that starts",
-            _counts(errors),
+            counts_text(errors),
             all(error in AWAY or error.startswith("no answer") for error in errors),
         ),
         _retry_check(done, expected),
@@ -128,7 +128,7 @@ async def kill_service(work: Path, kills: int) -> list[Check]:
         ),
         Check(
             "uploads, swaps and deletions that broke can be repeated",
-            f"{changes.total()} answers: {_counts(changes)}",
+            f"{changes.total()} answers: {counts_text(changes)}",
             not any(status[0] == "5" for status in changes),
         ),
         Check(
@@ -216,7 +216,3 @@ def _retry_check(done: Sequence[Persisted], expected: Expected) -> Check:
         + "".join(f"; {one.case.name}: {one.outcome.status}" for one in wrong[:3]),
         not wrong,
     )
-
-
-def _counts(counts: Counter[str]) -> str:
-    return ", ".join(f"{count} x {name}" for name, count in sorted(counts.items()))

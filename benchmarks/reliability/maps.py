@@ -89,9 +89,11 @@ def read_photos(root: Path) -> list[Photo]:
     photos = []
     for record in dataset.images:
         camera = dataset.sensors[record.sensor_id].camera
+        cam_from_rig = rig[record.sensor_id]
         assert camera is not None
-        image, sensor = dataset.path_of(record).read_bytes(), record.sensor_id
-        photos.append(Photo(image, camera, sensor, rig[sensor], record.timestamp))
+        assert cam_from_rig is not None
+        image = dataset.path_of(record).read_bytes()
+        photos.append(Photo(image, camera, record.sensor_id, cam_from_rig, record.timestamp))
     return photos
 
 

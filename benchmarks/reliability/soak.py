@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.reliability.asking import Case, Doors, bad_cases, good_cases
-from benchmarks.reliability.checks import Check
+from benchmarks.reliability.checks import Check, counts_text
 from benchmarks.reliability.load import Asked, ask_at_rate, ask_in_turn, percentile
 from benchmarks.reliability.maps import TestMaps, make_maps
 from benchmarks.reliability.service_process import ServiceProcess
@@ -53,7 +53,7 @@ async def soak(work: Path, seconds: float) -> list[Check]:
         _once_check(asked, work / "service.log"),
         Check(
             "versions are swapped every 20 s, no swap fails",
-            f"{swaps.total()} swaps: {_counts(swaps)}",
+            f"{swaps.total()} swaps: {counts_text(swaps)}",
             set(swaps) == {"200"},
         ),
         *(_memory_check(memory, column) for column in (0, 1)),
@@ -115,7 +115,7 @@ def _answer_checks(
         ),
         Check(
             "no unexpected 5xx",
-            f"{_counts(unexpected) or 'none'} (answers: {_counts(good)})",
+            f"{counts_text(unexpected)} (answers: {counts_text(good)})",
             not unexpected,
         ),
     ]
@@ -197,7 +197,3 @@ def _worker_deaths(metrics: str) -> float:
         for line in metrics.splitlines()
         if line.startswith("visloc_worker_deaths_total")
     )
-
-
-def _counts(counts: Counter[str]) -> str:
-    return ", ".join(f"{count} x {name}" for name, count in sorted(counts.items()))

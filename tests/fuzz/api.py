@@ -150,7 +150,8 @@ def _fill_in_photo(body: dict[str, Any], photo: str | bytes) -> None:
         for name in body.keys() - {"map", "ypr"}:
             del body[name]
         body["image"] = photo
-    for image in body.get("images") or ():
+    images = body.get("images")
+    for image in images if isinstance(images, list) else ():
         if isinstance(image, dict):
             image.pop("features", None)
             image["image"] = photo

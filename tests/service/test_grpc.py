@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import asyncio
 import struct
-from typing import Any
+import threading
+from typing import Any, NoReturn
 
 import grpc
 import pytest
@@ -14,6 +16,7 @@ from grpc_status import rpc_status
 import visloc
 from clients.messages import plain
 from service.grpc import SERVICE_NAME
+from service.jobs import LocalizeJob
 from visloc_api.v1 import localization_pb2 as pb2
 
 
@@ -182,9 +185,9 @@ def test_a_message_over_the_limit_is_not_taken(doors: Any, query: Any) -> None:
 
 
 def test_calls_over_the_limit_are_refused(serve: Any, tmp_path: Any) -> None:
-    with serve(tmp_path, max_queue=0) as doors:
+    with serve(tmp_path, load=False, max_connections=8) as doors:
         stub = health_pb2_grpc.HealthStub(doors.channel)
-        watching = [stub.Watch(health_pb2.HealthCheckRequest()) for _ in range(33)]
+        watching = [stub.Watch(health_pb2.HealthCheckRequest()) for _ in range(8)]
         for watch in watching:
             next(watch)
         with pytest.raises(grpc.RpcError) as caught:
@@ -196,18 +199,40 @@ def test_calls_over_the_limit_are_refused(serve: Any, tmp_path: Any) -> None:
 
 
 def test_what_breaks_inside_is_internal_without_its_insides(
-    serve: Any,
-    tmp_path: Any,
-    query: Any,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+    doors: Any, query: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with serve(tmp_path) as doors:
-        monkeypatch.setattr(doors.server.engine, "_localize", lambda *_: 1 / 0)
-        info = refused(doors, request_for(query), grpc.StatusCode.INTERNAL, "server.internal")
+    async def broken(*_: Any) -> NoReturn:
+        raise ZeroDivisionError("division")
+
+    monkeypatch.setattr(doors.server.engine.workers, "run", broken)
+    info = refused(doors, request_for(query), grpc.StatusCode.INTERNAL, "server.internal")
 
     assert "division" not in str(info)
     assert "ZeroDivisionError" in caplog.text
+
+
+@pytest.mark.parametrize("cancel", [True, False], ids=["cancelled", "deadline"])
+def test_the_work_for_a_call_that_is_given_up_is_given_up(
+    cancel: bool, doors: Any, query: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, dropped = threading.Event(), threading.Event()
+
+    async def for_ever(_: LocalizeJob) -> NoReturn:
+        begun.set()
+        try:
+            await asyncio.Event().wait()
+        finally:
+            dropped.set()
+
+    monkeypatch.setattr(doors.server.engine, "localize", for_ever)
+    call = doors.stub.Localize.future(request_for(query), timeout=None if cancel else 0.5)
+    if cancel:
+        assert begun.wait(10)
+        call.cancel()
+    else:
+        assert call.exception(10).code() == grpc.StatusCode.DEADLINE_EXCEEDED
+
+    assert dropped.wait(10)
 
 
 def test_maps_are_listed_and_described_as_over_http(doors: Any) -> None:
@@ -226,7 +251,9 @@ def test_an_unknown_map_cannot_be_described(doors: Any) -> None:
     assert call.code() == grpc.StatusCode.NOT_FOUND
 
 
-def test_health_says_serving_only_when_the_maps_are_warm(serve: Any, built_maps: Any) -> None:
+def test_health_says_serving_only_when_the_maps_are_warm(
+    doors: Any, serve: Any, built_maps: Any
+) -> None:
     def health(doors: Any) -> list[int]:
         stub = health_pb2_grpc.HealthStub(doors.channel)
         return [
@@ -236,10 +263,9 @@ def test_health_says_serving_only_when_the_maps_are_warm(serve: Any, built_maps:
 
     serving = health_pb2.HealthCheckResponse.SERVING
     not_serving = health_pb2.HealthCheckResponse.NOT_SERVING
-    with serve(built_maps, load=False) as doors:
-        assert health(doors) == [not_serving, not_serving]
-    with serve(built_maps) as doors:
-        assert health(doors) == [serving, serving]
+    with serve(built_maps, load=False) as starting:
+        assert health(starting) == [not_serving, not_serving]
+    assert health(doors) == [serving, serving]
 
 
 def test_reflection_lists_the_service(doors: Any) -> None:

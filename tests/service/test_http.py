@@ -11,8 +11,7 @@ import threading
 import time
 import zlib
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NoReturn
 
 import httpx
 import numpy as np
@@ -21,10 +20,13 @@ from PIL import Image
 from pydantic import BaseModel
 
 import visloc
-from service import engine as engine_module
 from service import schemas
+from service.access import open_access
+from service.connections import Arrivals
 from service.http import create_app
+from service.jobs import LocalizeJob
 from service.request_bodies import EXAMPLE_REQUEST
+from service.settings import ServiceSettings
 from visloc.geometry import Pose, rotation_angle
 
 
@@ -195,7 +197,7 @@ def test_a_body_that_declares_too_much_is_refused_before_it_comes(doors: Any) ->
 
     with socket.create_connection(("127.0.0.1", doors.server.http_port)) as connection:
         head = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
-        connection.sendall(f"POST /localize HTTP/1.1\r\nHost: x\r\n{head}\r\n".encode())
+        connection.sendall(f"POST /localize HTTP/1.1\r\nHost: localhost\r\n{head}\r\n".encode())
         assert connection.recv(100).startswith(b"HTTP/1.1 413 ")
 
 
@@ -295,21 +297,21 @@ def test_an_unknown_path_or_method_is_a_problem_too(doors: Any) -> None:
     assert response.headers["allow"] == "POST"
 
 
-def test_a_full_queue_is_429_with_retry_after(serve: Any, tmp_path: Any, query: Any) -> None:
-    with serve(tmp_path) as doors:
-        while doors.server.engine._places.acquire(blocking=False):
-            pass
-        response = post(doors, query.image)
+def test_a_full_queue_is_429_with_retry_after(
+    doors: Any, query: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doors.server.engine, "_max_photos", 0)
+    response = post(doors, query.image)
 
     assert problem(response, 429, "server.busy")["kind"] == "Overloaded"
     assert response.headers["retry-after"] == "1"
 
 
 def test_connections_over_the_limit_are_503(serve: Any, tmp_path: Any) -> None:
-    with serve(tmp_path, max_queue=0) as doors:
+    with serve(tmp_path, load=False, max_connections=8) as doors:
         address = ("127.0.0.1", doors.server.http_port)
-        idle = [socket.create_connection(address) for _ in range(32)]
-        assert doors.http.get("/healthz").status_code == 200  # the 33rd
+        idle = [socket.create_connection(address) for _ in range(7)]
+        assert doors.http.get("/healthz").status_code == 200  # the eighth
         idle.append(socket.create_connection(address))
         # The server counts a connection when its loop gets to accept it, a moment later.
         deadline = time.monotonic() + 30
@@ -320,54 +322,63 @@ def test_connections_over_the_limit_are_503(serve: Any, tmp_path: Any) -> None:
             connection.close()
 
 
-def test_a_photo_whose_client_hung_up_is_dropped_from_the_queue(
-    serve: Any,
-    built_maps: Any,
-    query: Any,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+@pytest.fixture
+def given_up(doors: Any, monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """Photos are never done; set when the work for one was dropped."""
+    dropped = threading.Event()
+
+    async def for_ever(_: LocalizeJob) -> NoReturn:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            dropped.set()
+
+    monkeypatch.setattr(doors.server.engine, "localize", for_ever)
+    return dropped
+
+
+def test_the_work_for_a_client_that_hung_up_is_given_up(
+    doors: Any, query: Any, given_up: threading.Event, caplog: pytest.LogCaptureFixture
 ) -> None:
-    opened, entered = threading.Event(), threading.Semaphore(0)
-    read_photo = engine_module.read_photo
+    caplog.set_level(logging.INFO)
+    with pytest.raises(httpx.ReadTimeout):
+        httpx.post(
+            f"{doors.url}/localize",
+            data={"map": "room"},
+            files={"image": query.image},
+            timeout=httpx.Timeout(10, read=0.3),
+        )
 
-    def waiting(*arguments: Any) -> Any:
-        entered.release()
-        assert opened.wait(30)
-        return read_photo(*arguments)
+    assert given_up.wait(10)
+    deadline = time.monotonic() + 10
+    while "left before it was answered" not in caplog.text:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
-    with serve(built_maps, workers=1) as doors, ThreadPoolExecutor() as pool:
-        monkeypatch.setattr(engine_module, "read_photo", waiting)
-        running = pool.submit(post, doors, query.image)
-        assert entered.acquire(timeout=10)
-        caplog.set_level(logging.INFO)
-        with pytest.raises(httpx.ReadTimeout):
-            httpx.post(
-                f"{doors.url}/localize",
-                data={"map": "room"},
-                files={"image": query.image},
-                timeout=httpx.Timeout(10, read=0.3),
-            )
-        deadline = time.monotonic() + 10
-        while "left before it was answered" not in caplog.text:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-        opened.set()
-        assert running.result().status_code == 200
-        assert post(doors, query.image).status_code == 200
-    entered.acquire()
-    assert not entered.acquire(blocking=False), "the photo of the client that left was decoded"
+
+def test_a_caller_says_how_long_it_waits(doors: Any, query: Any, given_up: threading.Event) -> None:
+    response = post(doors, query.image, headers={"X-Request-Timeout": "0.2"})
+
+    body = problem(response, 504, "server.deadline")
+    assert (body["kind"], body["expected"]) == ("TimedOut", "an answer within 0.2 s")
+    assert given_up.wait(10)
+
+
+@pytest.mark.parametrize("seconds", ["", "soon", "0", "-1", "nan", "1" * 1000 + "s"])
+def test_a_time_that_is_none_is_refused(seconds: str, doors: Any, query: Any) -> None:
+    response = post(doors, query.image, headers={"X-Request-Timeout": seconds})
+
+    assert problem(response, 422, "request.timeout")["field"] == "X-Request-Timeout"
 
 
 def test_what_breaks_inside_is_a_500_without_its_insides(
-    serve: Any,
-    tmp_path: Any,
-    query: Any,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+    doors: Any, query: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with serve(tmp_path) as doors:
-        monkeypatch.setattr(doors.server.engine, "_localize", lambda *_: 1 / 0)
-        response = post(doors, query.image, headers={"X-Request-Id": "job-7"})
+    async def broken(*_: Any) -> NoReturn:
+        raise ZeroDivisionError("division")
+
+    monkeypatch.setattr(doors.server.engine.workers, "run", broken)
+    response = post(doors, query.image, headers={"X-Request-Id": "job-7"})
 
     body = problem(response, 500, "server.internal")
     assert "division" not in response.text
@@ -505,12 +516,20 @@ def test_nothing_of_the_service_loads_from_other_hosts(doors: Any) -> None:
 
 
 def test_what_fastapi_refuses_is_a_problem_too(doors: Any) -> None:
-    app = create_app(doors.server.engine, None)  # type: ignore[arg-type]
+    settings = ServiceSettings()
+    app = create_app(
+        doors.server.engine,
+        settings,
+        observer=doors.server.observer,
+        access=open_access(settings),
+        arrivals=Arrivals(1.0, 1),
+        state=doors.server.state,
+    )
     app.get("/cube")(_cube)
     transport = httpx.ASGITransport(app)
 
     async def ask(path: str) -> httpx.Response:
-        async with httpx.AsyncClient(transport=transport, base_url="http://x") as http:
+        async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as http:
             return await http.get(path)
 
     missing = problem(asyncio.run(ask("/cube")), 422, "request.missing_field")

@@ -94,11 +94,19 @@ def pretend(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Pretender]:
     return replace
 
 
-@pytest.fixture
-def one(serve: Any, tmp_path: Any) -> Iterator[Any]:
+@pytest.fixture(scope="module")
+def running(serve: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """A service without maps that takes one sequence at a time."""
-    with serve(tmp_path, max_batches=1, max_batch_bytes=1_000_000) as doors:
+    maps = tmp_path_factory.mktemp("maps")
+    with serve(maps, max_batches=1, max_batch_bytes=1_000_000) as doors:
         yield doors
+
+
+@pytest.fixture
+def one(running: Any) -> Iterator[Any]:
+    """The same, whose place is free."""
+    yield running
+    until(lambda: running.server.engine.batches == 0)
 
 
 def body(num: int) -> dict[str, Any]:
@@ -222,7 +230,7 @@ def test_a_client_that_reads_no_lines_is_not_worked_for(one: Any, pretend: Any) 
     pretender = pretend(one, message="x" * 100_000)
     content = json.dumps(body(900)).encode()
     head = (
-        "POST /localize/sequence HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+        "POST /localize/sequence HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
         f"Accept: application/x-ndjson\r\nContent-Length: {len(content)}\r\n\r\n"
     )
     with socket.socket() as connection:
@@ -243,23 +251,29 @@ def stalled(pretender: Pretender) -> int:
     return before
 
 
-def test_one_more_sequence_is_refused_before_its_body_is_read(one: Any, pretend: Any) -> None:
+def test_one_more_sequence_is_refused_when_it_has_come(one: Any, pretend: Any) -> None:
     pretender = pretend(one, gate=False)
     with one.http.stream("POST", "/localize/sequence", json=body(2), headers=LINES) as response:
         lines = response.iter_lines()
         next(lines)
-        for path in ("rig", "sequence"):
-            with socket.create_connection(("127.0.0.1", one.server.http_port)) as connection:
-                connection.sendall(
-                    f"POST /localize/{path} HTTP/1.1\r\nHost: x\r\nContent-Length: 9\r\n"
-                    "Content-Type: application/json\r\n\r\n".encode()
-                )
-                assert connection.recv(100).startswith(b"HTTP/1.1 429 ")
-        refused = post(one, 1)
-        assert (refused.json()["code"], refused.headers["retry-after"]) == ("server.busy", "1")
+        rig = {"map": "room", "rig": "rig", "images": [{"sensor": "left", "image": ""}]}
+        for refused in (post(one, 1), one.http.post("/localize/rig", json=rig)):
+            assert refused.status_code == 429
+            assert (refused.json()["code"], refused.headers["retry-after"]) == ("server.busy", "1")
         pretender.gate.set()
         assert len(list(lines)) == 1
     until(lambda: post(one, 1).status_code == 200)  # the place is free a moment after the last line
+
+
+def test_sequences_that_do_not_come_hold_no_place(one: Any, pretend: Any) -> None:
+    pretend(one)
+    head = (
+        "POST /localize/sequence HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n"
+        "Content-Type: application/json\r\n\r\n"
+    )
+    with socket.create_connection(("127.0.0.1", one.server.http_port)) as connection:
+        connection.sendall(head.encode())
+        assert post(one, 1).status_code == 200
 
 
 # gRPC

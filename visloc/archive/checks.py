@@ -21,7 +21,7 @@ from visloc.errors import MapCorrupt
 
 RecordType = TypeVar("RecordType", bound=BaseModel)
 
-_MAX_JSON_BYTES = 2**30
+_MAX_JSON_BYTES = 2**27  # about a million photos; read, it takes some 20 times the memory
 _MAX_MANIFEST_BYTES = 16 * 2**20
 
 
