@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all fmt lint types contracts proto proto-check check serve clean
+.PHONY: help install demo test test-all fuzz fuzz-api fmt lint types contracts proto proto-check check serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -27,6 +27,12 @@ test: install ## the tests, in under ten minutes on two cores
 
 test-all: install ## the slow tests too
 	$(BIN)/pytest
+
+fuzz: install ## fuzz what reads strangers' bytes: RUNS inputs for each target
+	$(BIN)/python -m tests.fuzz --runs $(or $(RUNS),100000)
+
+fuzz-api: install ## send CASES requests made from our OpenAPI
+	$(BIN)/python -m tests.fuzz.api --cases $(or $(CASES),5000)
 
 fmt: install ## format the code
 	$(BIN)/ruff format .

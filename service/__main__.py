@@ -7,11 +7,18 @@ import logging
 import os
 import signal
 import sys
+from typing import TYPE_CHECKING
 
 from service.logs import configure_logging
 from service.settings import ServiceSettings, SettingsError, read_settings
 
+if TYPE_CHECKING:
+    from service.server import Server
+
 logger = logging.getLogger("service")
+
+# Pause before what is needed for the start is asked for again.
+RETRY_S = 5.0
 
 
 def main() -> None:
@@ -43,7 +50,7 @@ async def _serve(settings: ServiceSettings) -> None:
 
     # The doors open first, so that /readyz can be asked while the maps are loaded.
     await server.open()
-    loading = asyncio.create_task(server.load())
+    loading = asyncio.create_task(_load(server))
     await asyncio.wait({loading, stopping}, return_when=asyncio.FIRST_COMPLETED)
     if loading.done():
         loading.result()
@@ -55,6 +62,20 @@ async def _serve(settings: ServiceSettings) -> None:
         await stopping
     logger.info("stopping")
     await server.close(settings.drain_timeout_s)
+
+
+async def _load(server: Server) -> None:
+    """Load until it works: what is away now, such as the storage of the maps, comes back."""
+    from visloc.errors import Unavailable
+
+    while True:
+        try:
+            await server.load()
+        except Unavailable as error:
+            logger.error("cannot start yet, trying again in %g s: %s", RETRY_S, error)  # noqa: TRY400
+            await asyncio.sleep(RETRY_S)
+        else:
+            return
 
 
 if __name__ == "__main__":

@@ -8,13 +8,17 @@ from typing import Any
 
 import grpc
 
-from service.access import Access, is_method, needed_over_grpc
+from service.access import NOTHING, Access, is_method, needed_over_grpc
 from service.access_http import tokens_of
 from service.grpc_calls import Handler, behaviour_of, handler_like
 from service.grpc_envelope import Context, Envelope
 from service.key_file import Key
 from service.logs import UNMATCHED, note_key
 from visloc.errors import Overloaded, VislocError
+
+# Calls that need no key (health) and are open at once: one may stay open for ever, and those who
+# have a key must find the door open.
+_MAX_KEYLESS = 100
 
 
 class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
@@ -28,6 +32,7 @@ class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
     def __init__(self, access: Access, envelope: Envelope) -> None:
         self._access = access
         self._envelope = envelope
+        self._keyless = 0
 
     async def intercept_service(
         self,
@@ -49,10 +54,27 @@ class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         except VislocError as error:
             return self._refusal(error, method)
         handler: Handler | None = await continuation(handler_call_details)
+        if handler is not None and needed_over_grpc(method) is NOTHING:
+            return self._few(handler, method)
         if key is None or handler is None:
             return handler  # type: ignore[return-value]  # None: gRPC says that there is none
         note_key(key.name)
         return self._counted(handler, key, method)
+
+    def _few(self, handler: Handler, method: str) -> Handler:
+        behaviour = behaviour_of(handler)
+
+        async def serve(messages: AsyncIterator[Any], context: Context) -> Any:
+            if self._keyless >= _MAX_KEYLESS:
+                error = Overloaded("server.busy", "too many calls without a key; try again shortly")
+                await self._envelope.refuse(_name(method), error, context)
+            self._keyless += 1
+            try:
+                return await behaviour(messages, context)
+            finally:
+                self._keyless -= 1
+
+        return handler_like(handler, serve)
 
     def _counted(self, handler: Handler, key: Key, method: str) -> Handler:
         behaviour = behaviour_of(handler)

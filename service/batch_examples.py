@@ -126,6 +126,8 @@ RIG: dict[str, Any] = {
         "matching": 2.0,
         "pose": 0.58,
     },
+    "geopose": None,
+    "geopose_ypr": None,
 }
 # The first two of three instants; of the second the photo was damaged.
 SEQUENCE: dict[str, Any] = {
@@ -214,6 +216,8 @@ SEQUENCE: dict[str, Any] = {
                 "pose": 0.33,
                 "sequence": 6.7e-05,
             },
+            "geopose": None,
+            "geopose_ypr": None,
         },
         {
             "request_id": "c1e5dd49e9f247828a097a859433480d",
@@ -275,6 +279,8 @@ SEQUENCE: dict[str, Any] = {
                 "pose": 1.1e-05,
                 "sequence": 0.00041,
             },
+            "geopose": None,
+            "geopose_ypr": None,
         },
     ],
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Coroutine, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,17 +17,19 @@ from service.jobs import Near, Where
 from service.stores import Store
 from service.worker import MapFolder
 from service.workers import Workers
-from visloc.archive import Map
-from visloc.errors import InvalidInput, MapCorrupt, NotFound, VislocError
+from visloc.archive import MapOutline
+from visloc.errors import InvalidInput, MapCorrupt, NotFound, Unavailable, VislocError
 
 logger = logging.getLogger(__name__)
 
-# How long a published version that could not take over is left alone before it is tried again.
-RETRY_AFTER_S = 30.0
+# How long a version that could not be opened is left alone before it is tried again.
+RETRY_AFTER_S = 10.0
 # How often the store is asked what has become current, besides by requests.
 FOLLOW_S = 1.0
 # Most maps that one request may search.
 MAX_MAPS = 16
+# Maps that are fetched at once.
+_MAX_FETCHES = 4
 # Descriptions of so many versions stay in memory; their arrays stay on disk.
 _MAX_DESCRIBED = 1000
 
@@ -36,12 +39,12 @@ class ServedMap:
     """A version of a map.
 
     Attributes:
-        opened: what it holds.
+        outline: what it says about itself.
         current: whether it is the one in use.
         versions: all published ones of the map, oldest first, and which is in use.
     """
 
-    opened: Map
+    outline: MapOutline
     current: bool
     versions: tuple[tuple[str, bool], ...]
 
@@ -74,10 +77,13 @@ class Catalog:
 
     def __init__(self, store: Store) -> None:
         self._store = store
+        # Fetching a map may take minutes, in which everything else that needs a thread goes on.
+        self._fetchers = ThreadPoolExecutor(_MAX_FETCHES, thread_name_prefix="fetch")
+        self._fetching: dict[str, asyncio.Future[Path]] = {}  # by id@version
         self._serving: dict[str, MapFolder] = {}  # by map id
         self._refused: dict[str, _Refused] = {}  # by map id
         self._taking_over: dict[str, asyncio.Task[None]] = {}  # by map id
-        self._described: dict[str, Map] = {}  # by id@version
+        self._described: dict[str, MapOutline] = {}  # by id@version
         self._background: set[asyncio.Task[None]] = set()
 
     @property
@@ -112,7 +118,7 @@ class Catalog:
             await asyncio.sleep(FOLLOW_S)
             try:
                 ids = set(await asyncio.to_thread(self._store.ids))
-            except VislocError as error:
+            except (VislocError, OSError) as error:  # of this task, nobody asks what became
                 logger.warning("the maps cannot be listed: %s", error)
                 continue
             for map_id in (self._serving.keys() | self._refused.keys()) - ids:
@@ -129,7 +135,7 @@ class Catalog:
             VislocError: what the store and ``worker.load`` raise.
         """
         refs = await self._ids_near(where) if isinstance(where, Near) else where
-        return tuple([await self._resolve(ref, workers) for ref in refs])
+        return tuple([await self._present(await self._resolve(ref, workers)) for ref in refs])
 
     async def activate(self, map_id: str, version: str, workers: Workers) -> None:
         """Put a version into use, once a worker process has it open and warm.
@@ -138,10 +144,18 @@ class Catalog:
             VislocError: as ``resolve``; then nothing has changed.
         """
         ref = f"{map_id}@{version}"
-        of = MapFolder(ref, await asyncio.to_thread(self._store.folder, ref))
+        of = MapFolder(ref, await self._folder(ref))
         await workers.run(worker.load, of)
         await asyncio.to_thread(self._store.set_current, map_id, version)
         self._serve(map_id, of, workers)
+
+    def serves(self, ref: str) -> bool:
+        """Tell whether a version answers for its map."""
+        return any(of.ref == ref for of in self._serving.values())
+
+    def close(self) -> None:
+        """Let go of the threads."""
+        self._fetchers.shutdown(wait=False, cancel_futures=True)
 
     async def forget(self, ref: str, workers: Workers) -> None:
         """Close a version that was deleted."""
@@ -170,14 +184,21 @@ class Catalog:
                 except VislocError as error:
                     logger.warning("map %s is not listed: %s", map_id, error)
                     continue
-                if near is None or _reaches(served.opened, near):
+                if near is None or _reaches(served.outline, near):
                     found.append(served)
             return found
 
         return await asyncio.to_thread(described)
 
+    async def _present(self, of: MapFolder) -> MapFolder:
+        """Let the store know of the use, and fetch a copy that left its cache meanwhile."""
+        try:
+            return MapFolder(of.ref, await asyncio.to_thread(self._store.folder, of.ref))
+        except NotFound:  # removed a moment ago: workers that have it open can go on
+            return of
+
     async def _ids_near(self, near: Near) -> tuple[str, ...]:
-        found = [served.opened.manifest.id for served in await self.list(near)]
+        found = [served.outline.manifest.id for served in await self.list(near)]
         if not found:
             raise NotFound(
                 "map.none_near",
@@ -198,10 +219,7 @@ class Catalog:
 
     async def _resolve(self, ref: str, workers: Workers) -> MapFolder:
         if "@" in ref:
-            before = self._serving.get(ref.partition("@")[0])
-            if before is not None and before.ref == ref:
-                return before
-            return MapFolder(ref, await asyncio.to_thread(self._store.folder, ref))
+            return MapFolder(ref, await self._folder(ref))
         before, refused = self._serving.get(ref), self._refused.get(ref)
         try:
             current = f"{ref}@{await asyncio.to_thread(self._store.current_version, ref)}"
@@ -215,14 +233,17 @@ class Catalog:
             raise
         if before is not None and before.ref == current:
             self._refused.pop(ref, None)
-            return before
+            # Asked every time: copies of a remote store come and go by their use.
+            return MapFolder(current, await self._folder(current))
         if (
-            before is not None
-            and refused is not None
+            refused is not None
             and refused.ref == current
             and perf_counter() < refused.at + RETRY_AFTER_S
         ):
-            return before
+            if before is not None:
+                return before
+            if not isinstance(refused.error, Unavailable):
+                raise refused.error
         task = self._taking_over.get(ref)
         if task is None:
             task = asyncio.create_task(self._take_over(ref, current, workers))
@@ -238,7 +259,7 @@ class Catalog:
 
     async def _take_over(self, map_id: str, current: str, workers: Workers) -> None:
         try:
-            of = MapFolder(current, await asyncio.to_thread(self._store.folder, current))
+            of = MapFolder(current, await self._folder(current))
             await workers.run(worker.load, of)
         except VislocError as error:
             self._refuse(map_id, current, error)
@@ -270,6 +291,22 @@ class Catalog:
         if before is not None:
             self._in_background(workers.run_everywhere(worker.forget, before.ref))
 
+    async def _folder(self, ref: str) -> Path:
+        """Return where a version lies on this machine, fetched once for all who wait for it."""
+        fetching = self._fetching.get(ref)
+        if fetching is None:
+            loop = asyncio.get_running_loop()
+            fetching = loop.run_in_executor(self._fetchers, self._store.folder, ref)
+            self._fetching[ref] = fetching
+
+            def fetched(done: asyncio.Future[Path]) -> None:
+                self._fetching.pop(ref, None)
+                if not done.cancelled():
+                    done.exception()  # seen, also when nobody waits for it any more
+
+            fetching.add_done_callback(fetched)
+        return await asyncio.shield(fetching)
+
     def _in_background(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(work)
         self._background.add(task)  # the loop itself keeps only a weak reference
@@ -288,16 +325,16 @@ class Catalog:
             if not current:
                 self._store.current_version(map_id)  # raises what is wrong
         wanted = f"{map_id}@{version}"
-        opened = self._described.get(wanted)
-        if opened is None or not opened.path.is_dir():
-            opened = worker.open_version(MapFolder(wanted, self._store.folder(wanted)))
+        versions = self._store.versions(map_id)
+        outline = self._described.get(wanted) if version in versions else None
+        if outline is None:
+            outline = self._store.outline(wanted)
             while len(self._described) >= _MAX_DESCRIBED:
                 self._described.pop(next(iter(self._described)), None)
-            self._described[wanted] = opened
-        versions = tuple((v, v == current) for v in self._store.versions(map_id))
-        return ServedMap(opened, version == current, versions)
+            self._described[wanted] = outline
+        return ServedMap(outline, version == current, tuple((v, v == current) for v in versions))
 
 
-def _reaches(opened: Map, near: Near) -> bool:
-    place = opened.place
+def _reaches(outline: MapOutline, near: Near) -> bool:
+    place = outline.place
     return place is not None and place.distance_to(near.latitude, near.longitude) <= near.radius

@@ -16,6 +16,8 @@ from service.grpc_calls import Handler, behaviour_of, handler_like
 from service.grpc_envelope import Context, Envelope
 from visloc.errors import Overloaded, TimedOut, TooLarge
 
+# Calls whose only message may be large.
+_LARGE_MESSAGES = ("Localize", "LocalizeRig")
 # Whoever sends or takes less than this, once the grace is over, is let go.
 SLOWEST_BYTES_PER_S = 100_000
 
@@ -180,8 +182,8 @@ class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         if handler is None:
             return handler  # type: ignore[return-value]  # gRPC says that there is none
         behaviour = behaviour_of(handler)
-        patience_s = self._silence_s if handler.request_streaming else self._patience_s
         name = handler_call_details.method.rpartition("/")[2]
+        patience_s = self._patience_s if name in _LARGE_MESSAGES else self._silence_s
 
         async def serve(messages: AsyncIterator[Any], context: Context) -> Any:
             try:

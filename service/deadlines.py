@@ -14,6 +14,7 @@ T = TypeVar("T")
 
 # The header with which an HTTP caller says how many seconds it waits; gRPC has deadlines.
 TIMEOUT_HEADER = "X-Request-Timeout"
+_MAX_TIMEOUT_CHARS = 32
 
 
 def timeout_of(header: str | None, limit_s: float) -> float:
@@ -29,7 +30,7 @@ def timeout_of(header: str | None, limit_s: float) -> float:
     if header is None:
         return limit_s
     try:
-        seconds = float(header[:32])
+        seconds = float(header) if len(header) <= _MAX_TIMEOUT_CHARS else math.nan
     except ValueError:
         seconds = math.nan
     if not seconds > 0:  # NaN fails too

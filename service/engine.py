@@ -27,6 +27,7 @@ from service.stores import Store
 from service.uploads import Uploads
 from service.worker import MapFolder, WorkerSettings
 from service.workers import Workers
+from visloc.archive.store import version_in_use
 from visloc.errors import (
     InvalidInput,
     Overloaded,
@@ -109,9 +110,14 @@ class Engine:
         self._draining = False
 
     async def start(self) -> None:
-        """Open and warm up all current maps. One that is broken does not keep back the others."""
+        """Open and warm up all current maps. One that is broken does not keep back the others.
+
+        Raises:
+            Unavailable: when the maps cannot be listed, or no process starts; call it again then.
+        """
         await asyncio.to_thread(self._store.sweep)
-        await self.workers.start()
+        if not self.workers.started:
+            await self.workers.start()
         await self._catalog.load_all(self.workers, self._max_loaded_bytes)
         self._following = asyncio.create_task(self._catalog.follow(self.workers))
         self._started = True
@@ -125,6 +131,7 @@ class Engine:
         self._draining = True
         if self._following is not None:
             self._following.cancel()
+        self._catalog.close()
         await self.workers.close()
 
     @property
@@ -310,6 +317,10 @@ class Engine:
             Conflict: ``map.version_in_use``.
         """
         with self._noted("delete"):
+            # One that answers while the current one cannot be opened is in use too.
+            others = set(await asyncio.to_thread(self._store.versions, map_id)) - {version}
+            if others and self._catalog.serves(f"{map_id}@{version}"):
+                raise version_in_use(map_id, version, sorted(others))
             await asyncio.to_thread(self._store.remove, map_id, version)
         await self._catalog.forget(f"{map_id}@{version}", self.workers)
 

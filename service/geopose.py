@@ -165,7 +165,7 @@ async def _answer(
             "geopose.not_anchored",
             f"map {found.map_ref} localizes the photo and is not anchored to the Earth",
         )
-    anchor = (await engine.map(found.map_ref)).opened.manifest.world.anchor
+    anchor = (await engine.map(found.map_ref)).outline.manifest.world.anchor
     accuracy = accuracy_of(
         found.cam_from_world,
         found.covariance,

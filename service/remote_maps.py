@@ -14,6 +14,7 @@ import json
 import logging
 import math
 import os
+import tempfile
 import threading
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -26,7 +27,7 @@ from urllib.parse import urlsplit
 import fsspec
 from pydantic import RootModel, ValidationError
 
-from visloc.archive import MapStore
+from visloc.archive import MapOutline, MapStore, read_outline
 from visloc.archive.checks import read_manifest
 from visloc.archive.packed import FILE_NAME, MANIFEST
 from visloc.archive.schema import ID_PATTERN
@@ -34,6 +35,8 @@ from visloc.archive.store import (
     CURRENT,
     FULL,
     checked_name,
+    read_published_outline,
+    refuse_renamed,
     version_exists,
     version_in_use,
 )
@@ -133,6 +136,35 @@ class RemoteMapStore:
                 got=known.current,
             )
         return known.current
+
+    def outline(self, ref: str) -> MapOutline:
+        """Say what ``id`` or ``id@version`` is; of one without a copy here, two files are fetched.
+
+        Raises:
+            InvalidInput: ``map.id`` for a reference that is neither.
+            NotFound: ``map.unknown`` or ``map.version``.
+            MapCorrupt: when what was fetched is not what it should be.
+            Unavailable: ``maps.storage_away`` when it is not here and cannot be fetched.
+        """
+        map_id, at, version = ref.partition("@")
+        if not at:
+            version = self.current_version(map_id)
+        self._refuse_unknown(map_id, version)
+        copy = self._copies.root / map_id / version
+        if copy.is_dir():
+            return read_published_outline(copy)
+        with tempfile.TemporaryDirectory() as folder, self._asking():
+            for name in (MANIFEST, "cameras.json"):
+                try:
+                    place = f"{self._place(map_id, version)}/{name}"
+                    if self._fs.size(place) > _MAX_MANIFEST_BYTES:
+                        raise self._damaged(map_id, version, name, "is too large")
+                    self._fs.get_file(place, str(Path(folder, name)))
+                except FileNotFoundError:
+                    raise self._damaged(map_id, version, name, "is missing") from None
+            outline = read_outline(Path(folder))
+            refuse_renamed(outline.manifest, Path(place).parent, map_id, version)
+            return outline
 
     def folder(self, ref: str) -> Path:
         """The copy of ``id`` (its current version) or ``id@version``, fetched when it is not here.

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from service.settings import ServiceSettings, SettingsError
-from visloc.archive import MapStore
+from visloc.archive import MapOutline, MapStore
 
 
 class Store(Protocol):
@@ -32,6 +32,10 @@ class Store(Protocol):
 
     def current_version(self, map_id: str) -> str:
         """The version in use."""
+        ...
+
+    def outline(self, ref: str) -> MapOutline:
+        """What ``id`` or ``id@version`` says about itself; quick, wherever the store is."""
         ...
 
     def folder(self, ref: str) -> Path:

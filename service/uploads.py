@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
@@ -13,6 +15,8 @@ from visloc.archive.packed import unpack_map
 from visloc.archive.store import checked_name
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, TooLarge
 
+# Uploads that are written or verified at once.
+_MAX_UPLOADS = 4
 # What is taken from an upload before it is written to disk.
 _WRITE_BYTES = 4 * 2**20
 
@@ -30,6 +34,8 @@ class Uploads:
 
     def __init__(self, store: Store, max_bytes: int) -> None:
         self._store, self._max_bytes = store, max_bytes
+        # Verifying gigabytes takes minutes, in which all else that needs a thread goes on.
+        self._threads = ThreadPoolExecutor(_MAX_UPLOADS, thread_name_prefix="upload")
         self._running: set[str] = set()
 
     async def publish(self, map_id: str, version: str, chunks: AsyncIterator[bytes]) -> None:
@@ -65,7 +71,7 @@ class Uploads:
         try:
             async with self._incoming() as folder:
                 await self._write(folder / "packed", chunks)
-                await _to_end(self._publish, folder, map_id, version)
+                await self._to_end(self._publish, folder, map_id, version)
         finally:
             self._running.discard(ref)
 
@@ -73,11 +79,11 @@ class Uploads:
     async def _incoming(self) -> AsyncIterator[Path]:
         stack = ExitStack()
         try:
-            yield await _to_end(stack.enter_context, self._store.incoming())
+            yield await self._to_end(stack.enter_context, self._store.incoming())
         except BaseException as error:
-            await _to_end(stack.__exit__, type(error), error, error.__traceback__)
+            await self._to_end(stack.__exit__, type(error), error, error.__traceback__)
             raise
-        await _to_end(stack.close)
+        await self._to_end(stack.close)
 
     async def _write(self, path: Path, chunks: AsyncIterator[bytes]) -> None:
         size, waiting = 0, bytearray()
@@ -87,7 +93,7 @@ class Uploads:
                 data = memoryview(bytes(waiting))
                 waiting.clear()
                 while data:
-                    data = data[await _to_end(file.write, data) :]
+                    data = data[await self._to_end(file.write, data) :]
 
             async for chunk in chunks:
                 size += len(chunk)
@@ -125,22 +131,22 @@ class Uploads:
                 error.code, error.message, field=field, expected=error.expected, got=error.got
             ) from error
 
+    async def _to_end(self, work: Callable[P, T], *given: P.args, **named: P.kwargs) -> T:
+        """Run in a thread, and wait for its end also when cancelled.
 
-async def _to_end(work: Callable[P, T], *given: P.args, **named: P.kwargs) -> T:
-    """Run in a thread, and wait for its end also when cancelled.
-
-    Or what it works on would be deleted under its hands.
-    """
-    task = asyncio.ensure_future(asyncio.to_thread(work, *given, **named))
-    cancelled: asyncio.CancelledError | None = None
-    while not task.done():
-        try:
-            await asyncio.wait({task})
-        except asyncio.CancelledError as error:
-            cancelled = error
-    failure = task.exception()  # or it would be logged as never retrieved
-    if cancelled is not None:
-        raise cancelled
-    if failure is not None:
-        raise failure
-    return task.result()
+        Or what it works on would be deleted under its hands.
+        """
+        loop = asyncio.get_running_loop()
+        task = loop.run_in_executor(self._threads, partial(work, *given, **named))
+        cancelled: asyncio.CancelledError | None = None
+        while not task.done():
+            try:
+                await asyncio.wait({task})
+            except asyncio.CancelledError as error:
+                cancelled = error
+        failure = task.exception()  # or it would be logged as never retrieved
+        if cancelled is not None:
+            raise cancelled
+        if failure is not None:
+            raise failure
+        return task.result()

@@ -5,6 +5,7 @@ The main process calls these functions through ``service.workers``, with values 
 
 from __future__ import annotations
 
+import ctypes
 import io
 import logging
 import os
@@ -16,7 +17,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from multiprocessing import parent_process
-from multiprocessing.synchronize import Event
 from pathlib import Path
 from time import perf_counter, time
 from typing import Any, NamedTuple, TypeVar
@@ -103,7 +103,7 @@ class Abandoned(Exception):
 class _Process:
     """What a worker process keeps between tasks."""
 
-    def __init__(self, settings: WorkerSettings, abandoned: Event) -> None:
+    def __init__(self, settings: WorkerSettings, abandoned: ctypes.c_bool) -> None:
         self.settings = settings
         self._abandoned = abandoned
         self._localizers: OrderedDict[str, Localizer] = OrderedDict()  # most recently used last
@@ -115,7 +115,7 @@ class _Process:
 
     def step(self) -> None:
         """Stop here when nobody waits any more."""
-        if self._abandoned.is_set():
+        if self._abandoned.value:
             raise Abandoned
 
     def localizer(self, of: MapFolder) -> Localizer:
@@ -166,7 +166,7 @@ class _Process:
 _process: _Process | None = None
 
 
-def start(settings: WorkerSettings, abandoned: Event) -> None:
+def start(settings: WorkerSettings, abandoned: ctypes.c_bool) -> None:
     """Make the process ready; runs once in each."""
     global _process
     # Ctrl-C reaches all processes of a terminal: when to end is the main process's business.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import ctypes
 import logging
 import os
 import signal
@@ -41,7 +42,7 @@ _START_LIMIT_S = 300.0
 
 @dataclass(eq=False)
 class _Task:
-    """Something to do and who waits for it."""
+    """Something to do, who waits for it, and who works on it now."""
 
     work: Callable[[], Any]
     answer: asyncio.Future[Any]
@@ -82,6 +83,11 @@ class Workers:
     def count(self) -> int:
         """Processes, alive or being replaced."""
         return len(self._workers)
+
+    @property
+    def started(self) -> bool:
+        """Whether ``start`` is done."""
+        return bool(self._serving)
 
     @property
     def waiting(self) -> int:
@@ -132,9 +138,13 @@ class Workers:
             self._changed.notify_all()
         try:
             found: T = await task.answer
-        finally:
-            if task.worker is not None and task.answer.cancelled():
+        except asyncio.CancelledError:
+            if task.worker is not None:
                 task.worker.abandon()
+            else:
+                with suppress(ValueError):  # it has just ended
+                    self._queue.remove(task)
+            raise
         return found
 
     async def run_everywhere(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> None:
@@ -191,6 +201,8 @@ class Workers:
         else:
             if not task.answer.done():
                 task.answer.set_result(found)
+        finally:
+            task.worker = None  # which may work on another before the caller hears of it
 
     async def _next(self, one: _Worker) -> _Task | None:
         """Wait for a task; None when there is none for a while."""
@@ -225,7 +237,8 @@ class _Worker:
         # has loaded the libraries and used none, so that a new process begins in no time.
         self._context = get_context("forkserver")
         self._context.set_forkserver_preload([worker.__name__])
-        self._abandoned = self._context.Event()
+        # Not an Event: its lock stays taken when a process is killed that looks at it.
+        self._abandoned = self._context.RawValue(ctypes.c_bool, False)
         self._executor: ProcessPoolExecutor | None = None
         self.pid = 0
         self.alive = False
@@ -247,10 +260,15 @@ class _Worker:
             initargs=(self._settings, self._abandoned),
         )
         self._executor = executor
-        self._abandoned.clear()
+        self._abandoned.value = False
         self.pid, self.alive = 0, True
-        # In a thread: the first process waits for the fork server, which loads libraries first.
-        first = await asyncio.to_thread(executor.submit, worker.call, os.getpid)
+        try:
+            # In a thread: the first process waits for the fork server, which loads libraries first.
+            first = await asyncio.to_thread(executor.submit, worker.call, os.getpid)
+        except (OSError, EOFError) as error:  # no memory or file descriptors for a process
+            self.alive = False
+            logger.error("no process can be started: %s", error)  # noqa: TRY400
+            raise _died() from None
         self.pid = await self._answer_of(first, _START_LIMIT_S)
         await self._call(_START_LIMIT_S, partial(worker.warm, tuple(maps)))
 
@@ -261,7 +279,7 @@ class _Worker:
             Unavailable: ``server.worker_died``.
             TimedOut: ``server.deadline``; the process is killed.
         """
-        self._abandoned.clear()
+        self._abandoned.value = False
         self.busy = True
         try:
             return await self._call(limit_s, work)
@@ -271,7 +289,7 @@ class _Worker:
     def abandon(self) -> None:
         """Tell the process that nobody waits for its task."""
         if self.busy:
-            self._abandoned.set()
+            self._abandoned.value = True
 
     def stop(self) -> None:
         """End the process, whatever it does."""

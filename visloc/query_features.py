@@ -126,7 +126,8 @@ def _check_kind(kind: str, manifest: Manifest) -> None:
 
 
 def _check_inside(keypoints: NDArray[np.generic], camera: Camera) -> None:
-    xy = keypoints.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # of signalling NaN, which are outside as all others
+        xy = keypoints.astype(np.float64)
     low, high = -EDGE_TOLERANCE_PX, np.array([camera.width, camera.height]) + EDGE_TOLERANCE_PX
     outside = np.flatnonzero(~((xy >= low) & (xy <= high)).all(axis=1))  # NaN is outside too
     if len(outside):
@@ -140,7 +141,8 @@ def _check_inside(keypoints: NDArray[np.generic], camera: Camera) -> None:
 
 
 def _check_finite(part: str, field: str, values: NDArray[np.generic]) -> None:
-    with np.errstate(over="ignore"):  # what float32 cannot hold is refused as well
+    # What float32 cannot hold is refused as well, and NaN of any kind.
+    with np.errstate(over="ignore", invalid="ignore"):
         finite = np.isfinite(values.astype(np.float32, copy=False))
     if not finite.all():
         where = ", ".join(str(int(i)) for i in np.argwhere(~finite)[0])

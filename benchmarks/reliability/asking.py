@@ -7,11 +7,11 @@ import struct
 import uuid
 import zlib
 from base64 import b64encode
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import grpc
 import httpx
@@ -245,7 +245,8 @@ def camera_text(camera: Camera) -> str:
 
 def _refusal(error: grpc.aio.AioRpcError, id_: str) -> tuple[str, Any, str, bool]:
     code = error.code().name
-    details = dict(tuple(error.trailing_metadata())).get("grpc-status-details-bin")
+    trailing = cast(Iterable[tuple[str, str | bytes]], error.trailing_metadata() or ())
+    details = dict(trailing).get("grpc-status-details-bin")
     if details is None:  # not from the service, but from the client's library
         return f"{NO_ANSWER}: {code}", None, id_, False
     assert isinstance(details, bytes)

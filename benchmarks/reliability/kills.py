@@ -17,7 +17,7 @@ import httpx
 
 from benchmarks.reliability.asking import Case, Doors, good_cases
 from benchmarks.reliability.checks import Check, counts_text
-from benchmarks.reliability.load import Persisted, persist
+from benchmarks.reliability.load import RETRY_PAUSE_S, Persisted, persist
 from benchmarks.reliability.maps import (
     TestMaps,
     leftovers,
@@ -192,7 +192,7 @@ async def _change(service: ServiceProcess, maps: TestMaps, stop: asyncio.Event) 
                         statuses[f"{response.status_code} {method}"] += 1
                         assert response.status_code in done, response.text
                         return
-                await asyncio.sleep(_POLL_S)
+                await asyncio.sleep(RETRY_PAUSE_S)
 
         version = f"/maps/room/versions/{last}"
         headers = {"Content-Type": "application/zip"}

@@ -11,7 +11,7 @@ from time import perf_counter
 from benchmarks.reliability.asking import Case, Doors, Outcome
 
 # Between two attempts of a client that got an error.
-RETRY_PAUSE_S = 0.2
+RETRY_PAUSE_S = 0.5
 
 
 @dataclass(frozen=True)

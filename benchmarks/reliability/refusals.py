@@ -10,6 +10,7 @@ import time
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -77,26 +78,28 @@ def refusals(work: Path) -> list[Check]:
     (maps.folder / "secrets").write_text(CANARY)
     keys = {scope: _new_key(outside / "keys.json", scope) for scope in SCOPES}
     log = work / "service.log"
-    settings = {"keys_file": outside / "keys.json", "max_upload_bytes": 50 * 2**20}
-    with ServiceProcess(maps.folder, log, **settings) as service:
-        with (
-            httpx.Client(base_url=service.url, timeout=60) as http,
-            grpc.insecure_channel(service.grpc) as channel,
-        ):
-            asking = _Asking(service, http, channel, maps, keys)
-            checks = [
-                _checked(name, list(requests), outside, maps)
-                for name, requests in (
-                    ("wrong key, or none", asking.without_key()),
-                    ("a key without the scope", asking.without_scope()),
-                    ("oversized, before a byte of the body", asking.oversized()),
-                    ("replayed upload, removed key", asking.replayed(outside / "keys.json")),
-                    ("path tricks over HTTP", asking.tricks_over_http()),
-                    ("path tricks over gRPC", asking.tricks_over_grpc()),
-                    ("packed maps with path tricks", asking.packed_tricks()),
-                )
-            ]
-            good = asking.localize(keys["localize"], maps.photos["room"][0])
+    service = ServiceProcess(
+        maps.folder, log, keys_file=outside / "keys.json", max_upload_bytes=50 * 2**20
+    )
+    with (
+        service,
+        httpx.Client(base_url=service.url, timeout=60) as http,
+        grpc.insecure_channel(service.grpc) as channel,
+    ):
+        asking = _Asking(service, http, channel, maps, keys)
+        checks = [
+            _checked(name, list(requests), outside, maps)
+            for name, requests in (
+                ("wrong key, or none", asking.without_key()),
+                ("a key without the scope", asking.without_scope()),
+                ("oversized, before a byte of the body", asking.oversized()),
+                ("replayed upload, removed key", asking.replayed(outside / "keys.json")),
+                ("path tricks over HTTP", asking.tricks_over_http()),
+                ("path tricks over gRPC", asking.tricks_over_grpc()),
+                ("packed maps with path tricks", asking.packed_tricks()),
+            )
+        ]
+        good = asking.localize(keys["localize"], maps.photos["room"][0])
     said = [scope for scope, key in keys.items() if key in log.read_text()]
     return [
         *checks,
@@ -173,8 +176,10 @@ class _Asking:
             for method, path in self._routes():
                 yield self._over_http(f"{kind}, {method} {path}", method, path, headers, "401")
             for name, call in self._calls():
-                metadata = [(n.lower(), v) for n, v in headers.items()]
-                yield _over_grpc(f"{kind}, {name}", call, metadata, "UNAUTHENTICATED")
+                metadata = tuple((n.lower(), v) for n, v in headers.items())
+                # gRPC's library has its own limit for what comes before a message.
+                allowed = ("UNAUTHENTICATED", "RESOURCE_EXHAUSTED")
+                yield _over_grpc(f"{kind}, {name}", call, metadata, *allowed)
 
     def without_scope(self) -> Iterator[_Refusal]:
         """Every route with every key that is not for it."""
@@ -200,11 +205,11 @@ class _Asking:
                     else "read"
                 )
                 if of_call != scope:
-                    metadata = [("x-api-key", key)]
+                    metadata: _Metadata = (("x-api-key", key),)
                     yield _over_grpc(f"{scope}, {name}", call, metadata, "PERMISSION_DENIED")
 
     def oversized(self) -> Iterator[_Refusal]:
-        """Heads that promise too much, whose bodies are never sent; and a body without a promise."""
+        """Heads that promise too much, whose bodies never come; and a body without a promise."""
         path = "/maps/room/versions/new"
         for size in (50 * 2**20 + 1, 10**12, 10**18):
             name = f"PUT of {size} bytes"
@@ -225,7 +230,7 @@ class _Asking:
         yield _Refusal("chunked PUT of too much", endless, ["413"])
 
     def replayed(self, keys_file: Path) -> Iterator[_Refusal]:
-        """An upload that succeeded once, sent again, whole or its head only; a key after its end."""
+        """An upload that succeeded once, again, whole or its head only; a key after its end."""
         path, headers = f"/maps/room/versions/{self._version}", {"X-API-Key": self._keys["manage"]}
         headers |= {"Content-Type": "application/zip"}
 
@@ -239,7 +244,7 @@ class _Asking:
         yield _over_grpc(
             "the same upload over gRPC",
             self._upload_call("room", self._version, self._packed),
-            [("x-api-key", self._keys["manage"])],
+            (("x-api-key", self._keys["manage"]),),
             "FAILED_PRECONDITION",
         )
         key = _new_key(keys_file, "manage", "leaving")
@@ -278,7 +283,7 @@ class _Asking:
             plain = httpx.URL(f"http://x/{trick}").path[1:] if "/" not in trick else trick
             ref, here = VersionRef(map=plain, version=self._version), VersionRef(map="room")
             here.version = plain
-            calls = {
+            calls: dict[str, tuple[Callable[..., object], object, str]] = {
                 "GetMap": (self._localization.GetMap, GetMapRequest(map=plain), "read"),
                 "Localize": (
                     self._localization.Localize,
@@ -295,13 +300,13 @@ class _Asking:
                 yield _over_grpc(
                     f"{name} {plain[:50]!r}",
                     _bound(method, message),
-                    [("x-api-key", self._keys[scope])],
+                    (("x-api-key", self._keys[scope]),),
                     *refused,
                 )
             yield _over_grpc(
                 f"PutVersion {plain[:50]!r}",
                 self._upload_call(plain, self._version, self._packed),
-                [("x-api-key", self._keys["manage"])],
+                (("x-api-key", self._keys["manage"]),),
                 *refused,
             )
 
@@ -356,7 +361,7 @@ class _Asking:
         )
 
     def _upload_call(self, map_id: str, version: str, packed: bytes) -> _Call:
-        def call(metadata: Sequence[tuple[str, str]]) -> object:
+        def call(metadata: _Metadata) -> object:
             start = PutVersionRequest(start=VersionRef(map=map_id, version=version))
             parts = [start, *(PutVersionRequest(chunk=c) for c in _pieces(packed))]
             return self._managing.PutVersion(iter(parts), metadata=metadata, timeout=60)
@@ -408,10 +413,8 @@ class _Asking:
                 *lines,
             )
             text = "\r\n".join([*head, "", ""]).encode("latin-1")
-            try:
+            with suppress(ConnectionError):  # refused already
                 connection.sendall(text + content)
-            except ConnectionError:
-                pass  # answered already
             answer = b""
             try:
                 while b"\r\n\r\n" not in answer and (more := connection.recv(65536)):
@@ -437,24 +440,22 @@ class _Asking:
             time.sleep(0.05)
 
 
-_Call = Callable[[Sequence[tuple[str, str]]], object]
+_Metadata = tuple[tuple[str, str | bytes], ...]
+_Call = Callable[[_Metadata], object]
 
 
 def _bound(method: Callable[..., object], message: object) -> _Call:
-    def call(metadata: Sequence[tuple[str, str]]) -> object:
+    def call(metadata: _Metadata) -> object:
         return method(message, metadata=metadata, timeout=60)
 
     return call
 
 
-def _over_grpc(
-    name: str, call: _Call, metadata: Sequence[tuple[str, str]], *allowed: str
-) -> _Refusal:
+def _over_grpc(name: str, call: _Call, metadata: _Metadata, *allowed: str) -> _Refusal:
     def send() -> tuple[str, bytes]:
         try:
             answer = call(metadata)
         except grpc.RpcError as error:
-            assert isinstance(error, grpc.Call)
             return error.code().name, str(error).encode()
         return "OK", str(answer).encode()
 

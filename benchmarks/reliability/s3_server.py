@@ -10,7 +10,7 @@ import sys
 import threading
 from pathlib import Path
 
-import boto3
+import boto3  # type: ignore[import-untyped]
 from moto.server import ThreadedMotoServer
 
 BUCKET = "maps"

@@ -84,7 +84,7 @@ class ServiceProcess:
             assert self._process is not None
             if self._process.poll() is not None or time.monotonic() > started + READY_WITHIN_S:
                 raise RuntimeError(f"the service does not come up:\n{self.log.read_text()[-3000:]}")
-            time.sleep(0.05)
+            time.sleep(0.1)
         return time.monotonic() - started
 
     def is_ready(self) -> bool:

@@ -1,4 +1,4 @@
-"""Maps in S3, and S3 away: killed, so that connections are refused, or silent, so that they hang."""
+"""Maps in S3, and S3 away: killed, so that it refuses connections, or silent, so that they hang."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import boto3
+import boto3  # type: ignore[import-untyped]
 import httpx
 
 from benchmarks.reliability.asking import Case, Doors, good_cases

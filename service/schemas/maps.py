@@ -127,7 +127,7 @@ class MapInfo(BaseModel):
     @staticmethod
     def from_served(served: ServedMap) -> MapInfo:
         """Say it in the API's words."""
-        opened = served.opened
+        opened = served.outline
         manifest = opened.manifest
         return MapInfo(
             id=manifest.id,

@@ -98,6 +98,38 @@ def run(coroutine: Coroutine[Any, Any, T]) -> T:
     return asyncio.run(coroutine)
 
 
+Play = Callable[[Engine], Coroutine[Any, Any, None]]
+WithEngine = Callable[[Play], None]
+
+
+@contextmanager
+def started(maps_dir: Path, **settings: Any) -> Iterator[WithEngine]:
+    """Start an engine, and give what plays with it."""
+    with asyncio.Runner() as runner:
+        engine = make(maps_dir, **settings)
+        runner.run(engine.start())
+        try:
+            yield lambda play: runner.run(play(engine))
+        finally:
+            runner.run(engine.close())
+
+
+@pytest.fixture(scope="module")
+def with_engine(built_maps: Path) -> Iterator[WithEngine]:
+    """An engine with the map ``room`` and narrow limits, for all tests that leave it as it was."""
+    limits = ImageLimits(max_bytes=200_000)
+    settings = {"max_queue": 2, "max_batches": 1, "max_instants": 20}
+    with started(built_maps, limits=limits, **settings) as with_engine:
+        yield with_engine
+
+
+@pytest.fixture(scope="module")
+def with_two_workers(built_maps: Path) -> Iterator[WithEngine]:
+    """An engine with the map ``room`` and two worker processes."""
+    with started(built_maps, workers=2) as with_engine:
+        yield with_engine
+
+
 def job_for(query: Query, ref: str = "room") -> LocalizeJob:
     return LocalizeJob((ref,), query.image, query.camera, LocalizeOptions())
 
@@ -113,21 +145,20 @@ def publish(maps_dir: Path, version: str, map_id: str = "room") -> None:
     (maps_dir / map_id / "current").write_text(version)
 
 
-def test_an_answer_names_its_map_and_times_every_stage(maps_dir: Path, query: Query) -> None:
-    async def play() -> None:
-        engine = make(maps_dir)
-        await engine.start()
+def test_an_answer_names_its_map_and_times_every_stage(
+    with_engine: WithEngine, built_maps: Path, query: Query
+) -> None:
+    async def play(engine: Engine) -> None:
         found = await engine.localize(job_for(query))
-        await engine.close()
 
         assert isinstance(found.answer, Localized)
         assert found.map_id == "room"
-        assert found.map_version == MapStore(maps_dir).current_version("room")
+        assert found.map_version == MapStore(built_maps).current_version("room")
         seconds = found.answer.evidence.seconds
         assert list(seconds)[:4] == ["queued", "open_map", "decode", "local_features"]
         assert all(value >= 0 for value in seconds.values())
 
-    run(play())
+    with_engine(play)
 
 
 def test_photos_are_refused_until_the_maps_are_warm(maps_dir: Path, query: Query) -> None:
@@ -162,8 +193,8 @@ def test_a_published_version_and_a_new_map_are_served_without_a_restart(
         await until(lambda: "room@v2" in engine.status.maps)
         assert (await engine.localize(job_for(query))).map_version == "v2"
         assert (await engine.localize(job_for(query, "hall"))).map_id == "hall"
-        assert (await engine.map("room")).opened.manifest.version == "v2"
-        assert [m.opened.manifest.id for m in await engine.maps()] == ["hall", "room"]
+        assert (await engine.map("room")).outline.manifest.version == "v2"
+        assert [m.outline.manifest.id for m in await engine.maps()] == ["hall", "room"]
         await until(lambda: engine.status.maps == ("hall@v1", "room@v2"))
         # The older version is still there for those who name it.
         assert (await engine.localize(job_for(query, f"room@{old}"))).map_version == old
@@ -185,8 +216,8 @@ def test_a_broken_new_version_leaves_the_one_before_in_service(
         await until(lambda: "room" in engine.status.not_loaded)
         for _ in range(3):
             assert (await engine.localize(job_for(query))).map_version == old
-        assert (await engine.map("room")).opened.manifest.version == old
-        assert [m.opened.manifest.version for m in await engine.maps()] == [old]
+        assert (await engine.map("room")).outline.manifest.version == old
+        assert [m.outline.manifest.version for m in await engine.maps()] == [old]
         with pytest.raises(MapCorrupt):
             await engine.localize(job_for(query, "room@v2"))
 
@@ -204,7 +235,7 @@ def test_a_broken_new_version_leaves_the_one_before_in_service(
 
 
 def test_a_broken_map_does_not_keep_the_others_from_being_served(
-    maps_dir: Path, query: Query, caplog: pytest.LogCaptureFixture
+    maps_dir: Path, query: Query, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def play() -> None:
         publish(maps_dir, "v1", map_id="hall")
@@ -217,12 +248,13 @@ def test_a_broken_map_does_not_keep_the_others_from_being_served(
         assert engine.status.ready
         assert list(engine.status.not_loaded) == ["hall"]
         assert isinstance(engine.status.not_loaded["hall"], MapCorrupt)
-        assert [m.opened.manifest.id for m in await engine.maps()] == ["room"]
+        assert [m.outline.manifest.id for m in await engine.maps()] == ["room"]
         await engine.localize(job_for(query))
         with pytest.raises(MapCorrupt):
             await engine.localize(job_for(query, "hall"))
 
         manifest.write_bytes(good)
+        monkeypatch.setattr(catalog, "RETRY_AFTER_S", 0.0)
         await engine.localize(job_for(query, "hall"))
         assert engine.status.not_loaded == {}
         await engine.close()
@@ -246,9 +278,16 @@ def with_a_folder_as_manifest(folder: Path) -> None:
     (folder / "manifest.json").mkdir()
 
 
-@pytest.mark.parametrize("damage", [without_an_array, with_a_folder_as_manifest])
+@pytest.mark.parametrize(
+    ("damage", "code"),
+    [(without_an_array, "map.unusable"), (with_a_folder_as_manifest, "map.manifest")],
+)
 def test_whatever_a_damaged_map_breaks_the_others_are_served(
-    damage: Callable[[Path], None], maps_dir: Path, query: Query, caplog: pytest.LogCaptureFixture
+    damage: Callable[[Path], None],
+    code: str,
+    maps_dir: Path,
+    query: Query,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     async def play() -> None:
         publish(maps_dir, "v1", map_id="hall")
@@ -258,8 +297,8 @@ def test_whatever_a_damaged_map_breaks_the_others_are_served(
 
         assert engine.status.ready
         assert engine.status.not_loaded.keys() == {"hall"}
-        assert engine.status.not_loaded["hall"].code in ("map.unusable", "map.manifest")
-        assert "room" in [m.opened.manifest.id for m in await engine.maps()]
+        assert engine.status.not_loaded["hall"].code == code
+        assert "room" in [m.outline.manifest.id for m in await engine.maps()]
         assert (await engine.localize(job_for(query))).map_id == "room"
         with pytest.raises(MapCorrupt):
             await engine.localize(job_for(query, "hall"))
@@ -269,7 +308,7 @@ def test_whatever_a_damaged_map_breaks_the_others_are_served(
         damage(maps_dir / "room" / "v2")
         await until(lambda: "room" in engine.status.not_loaded)
         assert (await engine.localize(job_for(query))).map_version == before
-        assert engine.status.not_loaded["room"].field == "room@v2"
+        assert engine.status.not_loaded["room"].code == code
         await engine.close()
 
     run(play())
@@ -344,7 +383,7 @@ def test_a_map_is_described_without_opening_it_twice(maps_dir: Path) -> None:
     async def play() -> None:
         engine = make(maps_dir)
         by_id = await engine.map("room")
-        assert (await engine.map(by_id.opened.ref)).opened is by_id.opened
+        assert (await engine.map(by_id.outline.ref)).outline is by_id.outline
         assert by_id.current
         await engine.close()
 
@@ -393,7 +432,7 @@ def test_a_map_that_is_not_there_is_refused(
     run(play())
 
 
-def test_one_photo_too_many_is_refused_at_once(built_maps: Path, query: Query) -> None:
+def test_one_photo_too_many_is_refused_at_once(with_engine: WithEngine, query: Query) -> None:
     async def play(engine: Engine) -> None:
         with held_back(engine):
             accepted = [asyncio.create_task(engine.localize(job_for(query))) for _ in range(3)]
@@ -407,31 +446,31 @@ def test_one_photo_too_many_is_refused_at_once(built_maps: Path, query: Query) -
         assert answers[2].answer.evidence.seconds["queued"] > 0.1
         await engine.localize(job_for(query))  # there is room again
 
-    with_engine(built_maps, play, workers=1, max_queue=2)
+    with_engine(play)
 
 
 def test_a_photo_whose_caller_left_is_dropped_and_gives_back_its_place(
-    built_maps: Path, query: Query
+    with_engine: WithEngine, query: Query
 ) -> None:
     async def play(engine: Engine) -> None:
         with held_back(engine):
             running = asyncio.create_task(engine.localize(job_for(query)))
             await until(lambda: engine.workers.running == 1)
-            waiting = asyncio.create_task(engine.localize(job_for(query)))
-            await until(lambda: engine.workers.waiting == 1)
-            waiting.cancel()
+            leaves, stays = (asyncio.create_task(engine.localize(job_for(query))) for _ in range(2))
+            await until(lambda: engine.workers.waiting == 2)
+            leaves.cancel()
             with pytest.raises(asyncio.CancelledError):
-                await waiting
-            assert engine.workers.waiting == 0
+                await leaves
+            assert engine.workers.waiting == 1
             after = asyncio.create_task(engine.localize(job_for(query)))
             await asyncio.sleep(0)
-        await asyncio.gather(running, after)
+        await asyncio.gather(running, stays, after)
 
-    with_engine(built_maps, play, workers=1, max_queue=1)
+    with_engine(play)
 
 
 def test_a_photo_that_is_worked_on_is_given_up_when_its_caller_leaves(
-    built_maps: Path, query: Query
+    with_engine: WithEngine, query: Query
 ) -> None:
     async def play(engine: Engine) -> None:
         with held_back(engine):
@@ -444,21 +483,21 @@ def test_a_photo_that_is_worked_on_is_given_up_when_its_caller_leaves(
         assert engine.workers.alive == 1
         await engine.localize(job_for(query))
 
-    with_engine(built_maps, play)
+    with_engine(play)
 
 
-def test_workers_work_at_the_same_time(built_maps: Path, query: Query) -> None:
+def test_workers_work_at_the_same_time(with_two_workers: WithEngine, query: Query) -> None:
     async def play(engine: Engine) -> None:
         with held_back(engine):
             tasks = [asyncio.create_task(engine.localize(job_for(query))) for _ in range(2)]
             await until(lambda: engine.workers.running == 2)
         await asyncio.gather(*tasks)
 
-    with_engine(built_maps, play, workers=2, max_queue=0)
+    with_two_workers(play)
 
 
 def test_a_worker_that_dies_fails_its_own_request_and_is_replaced(
-    built_maps: Path, query: Query
+    with_two_workers: WithEngine, query: Query
 ) -> None:
     async def play(engine: Engine) -> None:
         one, other = engine.workers.pids
@@ -482,21 +521,21 @@ def test_a_worker_that_dies_fails_its_own_request_and_is_replaced(
         assert one not in engine.workers.pids
         assert engine.status.ready
 
-    with_engine(built_maps, play, workers=2)
+    with_two_workers(play)
 
 
-def test_an_idle_worker_that_dies_is_replaced(built_maps: Path, query: Query) -> None:
+def test_an_idle_worker_that_dies_is_replaced(with_engine: WithEngine, query: Query) -> None:
     async def play(engine: Engine) -> None:
         (pid,) = engine.workers.pids
         os.kill(pid, signal.SIGKILL)
         await until(lambda: pid not in engine.workers.pids and engine.workers.alive == 1)
         await engine.localize(job_for(query))
 
-    with_engine(built_maps, play)
+    with_engine(play)
 
 
 def test_a_worker_that_hangs_is_replaced_and_its_request_is_told(
-    built_maps: Path, query: Query
+    with_engine: WithEngine, query: Query
 ) -> None:
     async def play(engine: Engine) -> None:
         (pid,) = engine.workers.pids
@@ -509,7 +548,7 @@ def test_a_worker_that_hangs_is_replaced_and_its_request_is_told(
         await engine.localize(job_for(query))
         assert pid not in engine.workers.pids
 
-    with_engine(built_maps, play)
+    with_engine(play)
 
 
 def test_maps_are_closed_by_least_recent_use(maps_dir: Path, query: Query) -> None:
@@ -521,11 +560,12 @@ def test_maps_are_closed_by_least_recent_use(maps_dir: Path, query: Query) -> No
         assert engine.status.ready
         for map_id in ("hall", "room", "yard", "room"):
             assert (await engine.localize(job_for(query, map_id))).map_id == map_id
-            assert sum(engine.workers.loaded.values()) <= 2.5 * room.opened.size_bytes
+            assert sum(engine.workers.loaded.values()) <= 2.5 * room.outline.size_bytes
         assert {ref.partition("@")[0] for ref in engine.status.maps} == {"room", "yard"}
 
     size = sum(path.stat().st_size for path in MapStore(maps_dir).folder("room").rglob("*.np*"))
-    with_engine(maps_dir, play, max_loaded_bytes=int(2.5 * size))
+    with started(maps_dir, max_loaded_bytes=int(2.5 * size)) as with_engine:
+        with_engine(play)
 
 
 def test_no_maps_at_all_is_a_state_to_be_ready_in(tmp_path: Path) -> None:
@@ -586,30 +626,37 @@ def rig_job(rig_photos: RigPhotos, **changes: Any) -> RigJob:
     return replace(job, **changes)
 
 
-def with_engine(
-    maps_dir: Path, play: Callable[[Engine], Coroutine[Any, Any, T]], **settings: Any
-) -> T:
-    async def playing() -> T:
-        engine = make(maps_dir, **settings)
-        await engine.start()
-        try:
-            return await play(engine)
-        finally:
-            await engine.close()
-
-    return run(playing())
-
-
-@pytest.fixture
-def two_maps(maps_dir: Path) -> Path:
-    """``room``, and ``hall`` with its landmarks mixed up."""
+@pytest.fixture(scope="module")
+def with_two_maps(
+    built_maps: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[WithEngine]:
+    """An engine with ``room``, and ``hall``, whose landmarks are mixed up."""
+    maps_dir = tmp_path_factory.mktemp("two") / "maps"
+    shutil.copytree(built_maps, maps_dir)
     publish(maps_dir, "v1", map_id="hall")
     scramble(maps_dir, "hall")
-    return maps_dir
+    with started(maps_dir) as with_engine:
+        yield with_engine
+
+
+@pytest.fixture(scope="module")
+def with_a_map_without_down(
+    built_maps: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[WithEngine]:
+    """An engine with a map that does not know which way is down."""
+    maps_dir = tmp_path_factory.mktemp("no_down") / "maps"
+    shutil.copytree(built_maps, maps_dir)
+    manifest = MapStore(maps_dir).folder("room") / "manifest.json"
+    record = json.loads(manifest.read_text())
+    record["world"].pop("gravity", None)
+    record["world"].pop("anchor", None)
+    manifest.write_text(json.dumps(record))
+    with started(maps_dir) as with_engine:
+        yield with_engine
 
 
 def test_of_several_maps_the_one_with_the_best_answer_is_named(
-    two_maps: Path, query: Query, rig_photos: RigPhotos
+    with_two_maps: WithEngine, query: Query, rig_photos: RigPhotos
 ) -> None:
     async def play(engine: Engine) -> None:
         alone = await engine.localize(replace(job_for(query), options=FAST))
@@ -628,11 +675,11 @@ def test_of_several_maps_the_one_with_the_best_answer_is_named(
         assert lost.map_id == "hall"
         assert not isinstance(lost.answer, Localized)
 
-    with_engine(two_maps, play)
+    with_two_maps(play)
 
 
 def test_the_rig_of_the_sample_is_localized_within_a_few_millimetres(
-    built_maps: Path, rig_photos: RigPhotos
+    with_two_workers: WithEngine, rig_photos: RigPhotos
 ) -> None:
     # 256 x 192 pixels and 8 mapping photos: measured 1.1 mm and 0.037 degrees.
     async def play(engine: Engine) -> None:
@@ -648,12 +695,13 @@ def test_the_rig_of_the_sample_is_localized_within_a_few_millimetres(
             used = [image.evidence.camera for image in found.answer.images if image.evidence]
             assert used == [sensor.camera for sensor in rig_photos.sensors.values()]
 
-    with_engine(built_maps, play, workers=2)
+    with_two_workers(play)
 
 
-def test_an_image_that_cannot_be_read_fails_alone(built_maps: Path, rig_photos: RigPhotos) -> None:
+def test_an_image_that_cannot_be_read_fails_alone(
+    with_engine: WithEngine, rig_photos: RigPhotos
+) -> None:
     left, right = (ImageJob(name, photo, None) for name, photo in rig_photos.photos.items())
-    too_large = ImageLimits(max_bytes=len(rig_photos.photos["left"]) + 20_000)
 
     async def play(engine: Engine) -> None:
         other_size = Camera("SIMPLE_PINHOLE", 640, 300, (500.0, 320.0, 150.0))
@@ -676,7 +724,7 @@ def test_an_image_that_cannot_be_read_fails_alone(built_maps: Path, rig_photos: 
         assert found.answer.refusal is not None
         assert found.answer.refusal.reason is Reason.NO_USABLE_IMAGE
 
-    with_engine(built_maps, play, limits=too_large)
+    with_engine(play)
 
 
 @pytest.mark.parametrize(
@@ -706,16 +754,9 @@ def test_a_rig_that_does_not_fit_is_refused_before_any_photo_is_read(
     kind: type[Exception],
     code: str,
     field: str | None,
-    maps_dir: Path,
+    with_a_map_without_down: WithEngine,
     rig_photos: RigPhotos,
 ) -> None:
-    # A map that does not know which way is down.
-    manifest = MapStore(maps_dir).folder("room") / "manifest.json"
-    record = json.loads(manifest.read_text())
-    record["world"].pop("gravity", None)
-    record["world"].pop("anchor", None)
-    manifest.write_text(json.dumps(record))
-
     async def play(engine: Engine) -> None:
         with pytest.raises(kind) as caught:
             await engine.localize_rig(rig_job(rig_photos, **change(rig_photos)))
@@ -724,7 +765,7 @@ def test_a_rig_that_does_not_fit_is_refused_before_any_photo_is_read(
         assert field is None or error.field == field
         assert error.expected or error.message
 
-    with_engine(maps_dir, play)
+    with_a_map_without_down(play)
 
 
 def instants_of(
@@ -752,7 +793,7 @@ async def answers_of(
 
 
 def test_a_sequence_in_several_maps_keeps_the_first_that_localizes_and_all_its_answers(
-    two_maps: Path, query: Query
+    with_two_maps: WithEngine, query: Query
 ) -> None:
     instants = instants_of([blank(), b"broken", query.image, blank()], query.camera)
     start = replace(START, maps=("hall", "room"))
@@ -774,10 +815,10 @@ def test_a_sequence_in_several_maps_keeps_the_first_that_localizes_and_all_its_a
         assert [each.map_id for each in lost] == ["hall", "hall"]
         assert [each.answer.pose for each in lost] == [None, None]
 
-    with_engine(two_maps, play)
+    with_two_maps(play)
 
 
-def test_a_sequence_is_answered_as_it_comes(built_maps: Path, query: Query) -> None:
+def test_a_sequence_is_answered_as_it_comes(with_engine: WithEngine, query: Query) -> None:
     first, second, third = instants_of([query.image, blank(), query.image], query.camera)
     taken: list[int] = []
 
@@ -795,7 +836,7 @@ def test_a_sequence_is_answered_as_it_comes(built_maps: Path, query: Query) -> N
         assert len(taken) == 3
         assert [a.answer.timestamp async for a in answers] == [third.timestamp]
 
-    with_engine(built_maps, play)
+    with_engine(play)
 
 
 def odometry() -> Odometry:
@@ -848,7 +889,7 @@ def test_a_sequence_that_cannot_be_is_refused_by_name(
     kind: type[Exception],
     code: str,
     field: str | None,
-    built_maps: Path,
+    with_engine: WithEngine,
     query: Query,
 ) -> None:
     instants = change(instants_of([b"x", b"y"], query.camera))
@@ -866,10 +907,12 @@ def test_a_sequence_that_cannot_be_is_refused_by_name(
             assert error.code == code
             assert field is None or error.field == field
 
-    with_engine(built_maps, play, max_instants=20)
+    with_engine(play)
 
 
-def test_priors_of_an_instant_replace_those_of_the_sequence(built_maps: Path, query: Query) -> None:
+def test_priors_of_an_instant_replace_those_of_the_sequence(
+    with_engine: WithEngine, query: Query
+) -> None:
     lie = Priors(PositionPrior(np.array([900.0, 0.0, 0.0]), 1.0))
     one, two = instants_of([query.image, query.image], query.camera)
 
@@ -881,10 +924,10 @@ def test_priors_of_an_instant_replace_those_of_the_sequence(built_maps: Path, qu
         assert refusals[0].reason is Reason.NO_PHOTO_NEAR
         assert refusals[1] is None
 
-    with_engine(built_maps, play)
+    with_engine(play)
 
 
-def test_instants_without_images_live_on_odometry(built_maps: Path, query: Query) -> None:
+def test_instants_without_images_live_on_odometry(with_engine: WithEngine, query: Query) -> None:
     seen, *unseen = instants_of([query.image, b"", b""], query.camera)
     instants = [replace(seen, odometry=odometry())]
     instants += [replace(instant, images=(), odometry=odometry()) for instant in unseen]
@@ -898,7 +941,7 @@ def test_instants_without_images_live_on_odometry(built_maps: Path, query: Query
             PoseSource.MOTION,
         ]
 
-    with_engine(built_maps, play)
+    with_engine(play)
 
 
 def test_batches_have_places_of_their_own(built_maps: Path) -> None:
@@ -920,9 +963,11 @@ def test_batches_have_places_of_their_own(built_maps: Path) -> None:
         pass
 
 
-def test_a_sequence_that_is_given_up_frees_everything(built_maps: Path, query: Query) -> None:
+def test_a_sequence_that_is_given_up_frees_everything(
+    with_engine: WithEngine, query: Query
+) -> None:
     async def play(engine: Engine) -> None:
-        instants = instants_of([query.image] * 50, query.camera)
+        instants = instants_of([query.image] * 20, query.camera)
 
         async def ask() -> None:
             with engine.admit_batch():
@@ -945,11 +990,11 @@ def test_a_sequence_that_is_given_up_frees_everything(built_maps: Path, query: Q
         await engine.localize(replace(job_for(query), options=FAST))
         assert engine.workers.waiting == 0
 
-    with_engine(built_maps, play, max_batches=1, workers=1)
+    with_engine(play)
 
 
 def test_a_sequence_survives_the_death_of_a_worker_between_two_instants(
-    built_maps: Path, query: Query
+    with_engine: WithEngine, query: Query
 ) -> None:
     async def play(engine: Engine) -> None:
         answers = engine.localize_sequence(START, instants_of([query.image] * 3, query.camera))
@@ -960,4 +1005,4 @@ def test_a_sequence_survives_the_death_of_a_worker_between_two_instants(
         others = [each async for each in answers]
         assert [each.answer.num_inliers for each in others] == [first.answer.num_inliers] * 2
 
-    with_engine(built_maps, play)
+    with_engine(play)

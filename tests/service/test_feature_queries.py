@@ -110,11 +110,11 @@ def answer_of(response: httpx.Response) -> dict[str, Any]:
 
 
 def bits(value: object) -> object:
-    """Floats by their bits, so that equal means equal."""
+    """Floats by their bits, so that equal means equal; what gRPC leaves out is left out."""
     if isinstance(value, float):
         return struct.pack("<d", value)
     if isinstance(value, dict):
-        return {name: bits(inner) for name, inner in value.items()}
+        return {name: bits(inner) for name, inner in value.items() if inner is not None}
     return [bits(inner) for inner in value] if isinstance(value, list) else value
 
 
@@ -147,7 +147,6 @@ def test_form_json_and_grpc_give_the_same_answer_bit_for_bit(
 
     assert over_json["status"] == "localized"
     assert bits(over_form) == bits(over_json)
-    assert over_json.pop("refusal") is None
     del over_grpc["seconds"], over_grpc["request_id"]
     assert bits(over_grpc) == bits(over_json)
 

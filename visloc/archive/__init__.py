@@ -5,7 +5,7 @@ from __future__ import annotations
 from visloc.archive.anchoring import write_anchored
 from visloc.archive.checks import sha256_of
 from visloc.archive.places import GeoCircle, circle_of, down_of
-from visloc.archive.reader import Map, open_map, verify_map
+from visloc.archive.reader import Map, MapOutline, open_map, read_outline, verify_map
 from visloc.archive.schema import (
     Anchor,
     FingerprintRecord,
@@ -28,11 +28,13 @@ __all__ = [
     "Manifest",
     "Map",
     "MapContent",
+    "MapOutline",
     "MapStore",
     "World",
     "circle_of",
     "down_of",
     "open_map",
+    "read_outline",
     "sha256_of",
     "verify_map",
     "write_anchored",

@@ -35,46 +35,18 @@ Model = Mapping[str, NDArray[np.float32]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Map:
-    """One version of a map, open for reading. Files stay mapped while it lives.
+class MapOutline:
+    """What a version of a map says about itself: its small files, read.
 
     Attributes:
-        path: its folder.
-        manifest: what it says about itself.
+        manifest: ``manifest.json``.
         cameras: intrinsics by camera id.
         rigs: of each rig, cam_from_rig by camera id.
-        images: the mapping photos.
-        image_poses: (n, 7) float64, cam_from_world as qw qx qy qz tx ty tz.
-        landmarks: (P, 3) float32, relative to the manifest's origin.
-        track_lengths: (P,) uint16, mapping photos that see each landmark.
-        errors_px: (P,) float32, mean reprojection error; NaN where it does not apply.
-        angles_deg: (P,) float32, largest angle between viewing rays; NaN where not computed.
-        colors: (P, 3) uint8 RGB; None when the map has none.
-        observation_offsets: (n + 1,) int64; rows offsets[i]:offsets[i + 1] belong to photo i.
-        observation_landmarks: (M,) uint32 rows of ``landmarks``.
-        observation_descriptors: (M, D) int8; times the manifest's ``descriptor_scale``.
-        observation_keypoints: (M, 2) float32 pixels.
-        global_descriptors: (n, D) float32 unit rows by name.
-        global_models: the arrays of each global descriptor's model.
     """
 
-    path: Path
     manifest: Manifest
     cameras: Mapping[str, Camera]
     rigs: Mapping[str, Mapping[str, Pose]]
-    images: tuple[ImageRecord, ...]
-    image_poses: NDArray[np.float64]
-    landmarks: NDArray[np.float32]
-    track_lengths: NDArray[np.uint16]
-    errors_px: NDArray[np.float32]
-    angles_deg: NDArray[np.float32]
-    colors: NDArray[np.uint8] | None
-    observation_offsets: NDArray[np.int64]
-    observation_landmarks: NDArray[np.uint32]
-    observation_descriptors: NDArray[np.int8]
-    observation_keypoints: NDArray[np.float32]
-    global_descriptors: Mapping[str, NDArray[np.float32]]
-    global_models: Mapping[str, Model]
 
     @property
     def ref(self) -> str:
@@ -108,6 +80,43 @@ class Map:
         """Size of all files but the manifest."""
         return sum(entry.size for entry in self.manifest.files.values())
 
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Map(MapOutline):
+    """One version of a map, open for reading. Files stay mapped while it lives.
+
+    Attributes:
+        path: its folder.
+        images: the mapping photos.
+        image_poses: (n, 7) float64, cam_from_world as qw qx qy qz tx ty tz.
+        landmarks: (P, 3) float32, relative to the manifest's origin.
+        track_lengths: (P,) uint16, mapping photos that see each landmark.
+        errors_px: (P,) float32, mean reprojection error; NaN where it does not apply.
+        angles_deg: (P,) float32, largest angle between viewing rays; NaN where not computed.
+        colors: (P, 3) uint8 RGB; None when the map has none.
+        observation_offsets: (n + 1,) int64; rows offsets[i]:offsets[i + 1] belong to photo i.
+        observation_landmarks: (M,) uint32 rows of ``landmarks``.
+        observation_descriptors: (M, D) int8; times the manifest's ``descriptor_scale``.
+        observation_keypoints: (M, 2) float32 pixels.
+        global_descriptors: (n, D) float32 unit rows by name.
+        global_models: the arrays of each global descriptor's model.
+    """
+
+    path: Path
+    images: tuple[ImageRecord, ...]
+    image_poses: NDArray[np.float64]
+    landmarks: NDArray[np.float32]
+    track_lengths: NDArray[np.uint16]
+    errors_px: NDArray[np.float32]
+    angles_deg: NDArray[np.float32]
+    colors: NDArray[np.uint8] | None
+    observation_offsets: NDArray[np.int64]
+    observation_landmarks: NDArray[np.uint32]
+    observation_descriptors: NDArray[np.int8]
+    observation_keypoints: NDArray[np.float32]
+    global_descriptors: Mapping[str, NDArray[np.float32]]
+    global_models: Mapping[str, Model]
+
     def observations(self, image: int) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
         """Landmarks (m,) that one photo observes and their unit descriptors (m, D)."""
         start, stop = self.observation_offsets[image], self.observation_offsets[image + 1]
@@ -120,6 +129,30 @@ class Map:
         """A small JPEG of one photo; None when the map keeps no photos."""
         name = photo_file(image)
         return (self.path / name).read_bytes() if name in self.manifest.files else None
+
+
+def read_outline(folder: Path) -> MapOutline:
+    """Read the small files of a map that say what it is; its arrays need not be there.
+
+    Raises:
+        MapCorrupt: with the file that is wrong.
+    """
+    manifest = read_manifest(folder)
+    cameras = read_record(folder, "cameras.json", CamerasFile)
+    try:
+        return MapOutline(
+            manifest,
+            {
+                key: Camera(c.model, c.width, c.height, c.params)
+                for key, c in cameras.cameras.items()
+            },
+            {
+                rig: {key: Pose.from_quaternion(p[:4], p[4:]) for key, p in members.items()}
+                for rig, members in cameras.rigs.items()
+            },
+        )
+    except InvalidInput as error:
+        raise MapCorrupt("map.cameras", str(error), field=str(folder / "cameras.json")) from error
 
 
 def open_map(folder: Path) -> Map:
@@ -153,28 +186,18 @@ def open_map(folder: Path) -> Map:
             )
     _check_photos(folder, manifest)
     images = read_record(folder, "images.json", ImagesFile).images
-    cameras = read_record(folder, "cameras.json", CamerasFile)
-    if len(images) != n or any(image.camera not in cameras.cameras for image in images):
+    outline = read_outline(folder)
+    if len(images) != n or any(image.camera not in outline.cameras for image in images):
         raise MapCorrupt(
             "map.images",
             "the photos do not fit the manifest or the cameras",
             field=str(folder / "images.json"),
         )
-    try:
-        camera_by_id = {
-            key: Camera(c.model, c.width, c.height, c.params) for key, c in cameras.cameras.items()
-        }
-        rigs = {
-            rig: {key: Pose.from_quaternion(p[:4], p[4:]) for key, p in members.items()}
-            for rig, members in cameras.rigs.items()
-        }
-    except InvalidInput as error:
-        raise MapCorrupt("map.cameras", str(error), field=str(folder / "cameras.json")) from error
     return Map(
         path=folder,
         manifest=manifest,
-        cameras=camera_by_id,
-        rigs=rigs,
+        cameras=outline.cameras,
+        rigs=outline.rigs,
         images=images,
         image_poses=map_array(folder, "image_poses.npy", "<f8", (n, 7), load=True),
         landmarks=map_array(folder, "landmarks.npy", "<f4", (num_landmarks, 3)),
@@ -213,8 +236,7 @@ def verify_map(folder: Path) -> Map:
     counts = opened.manifest.counts
     offsets = opened.observation_offsets
     fine = {
-        "image_poses.npy": is_finite(opened.image_poses)
-        and _are_unit(opened.image_poses[:, :4]),
+        "image_poses.npy": is_finite(opened.image_poses) and _are_unit(opened.image_poses[:, :4]),
         "landmarks.npy": is_finite(opened.landmarks),
         "observation_offsets.npy": offsets[0] == 0
         and offsets[-1] == counts.observations

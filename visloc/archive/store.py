@@ -16,8 +16,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from visloc.archive.reader import Map, open_map, verify_map
-from visloc.archive.schema import ID_PATTERN
+from visloc.archive.checks import check_files
+from visloc.archive.reader import Map, MapOutline, open_map, read_outline, verify_map
+from visloc.archive.schema import ID_PATTERN, Manifest
 from visloc.errors import (
     Conflict,
     Forbidden,
@@ -100,6 +101,10 @@ class MapStore:
         """Open ``id`` or ``id@version``; raises what ``folder`` and ``open_published`` raise."""
         return open_published(self.folder(ref))
 
+    def outline(self, ref: str) -> MapOutline:
+        """Say what ``id`` or ``id@version`` is, without opening its arrays; raises as ``open``."""
+        return read_published_outline(self.folder(ref))
+
     def publish(
         self, incoming: Path, map_id: str, version: str, *, make_current: bool = True
     ) -> Path:
@@ -125,7 +130,7 @@ class MapStore:
                 another id or version.
         """
         target = self.root / checked_name(map_id, "map") / checked_name(version, "map version")
-        refuse_renamed(verify_map(incoming), map_id, version)
+        refuse_renamed(verify_map(incoming).manifest, incoming, map_id, version)
         with self._changing():
             target.parent.mkdir(parents=True, exist_ok=True)
             if target.exists():
@@ -231,21 +236,33 @@ def open_published(folder: Path) -> Map:
         MapCorrupt: what ``open_map`` finds, or ``map.renamed`` when the folder was copied or
             renamed: answers would carry the old name.
     """
-    return refuse_renamed(open_map(folder), folder.parent.name, folder.name)
+    opened = open_map(folder)
+    refuse_renamed(opened.manifest, folder, folder.parent.name, folder.name)
+    return opened
 
 
-def refuse_renamed(opened: Map, map_id: str, version: str) -> Map:
-    """Return the map if it is of this name; MapCorrupt ``map.renamed`` otherwise."""
-    manifest = opened.manifest
+def read_published_outline(folder: Path) -> MapOutline:
+    """Read what the map in a folder ``<id>/<version>`` says, whose files must be there.
+
+    Raises:
+        MapCorrupt: as ``open_published``, but the arrays are not opened.
+    """
+    outline = read_outline(folder)
+    check_files(folder, outline.manifest)
+    refuse_renamed(outline.manifest, folder, folder.parent.name, folder.name)
+    return outline
+
+
+def refuse_renamed(manifest: Manifest, folder: Path, map_id: str, version: str) -> None:
+    """Raise MapCorrupt ``map.renamed`` unless a manifest is of this name."""
     if (manifest.id, manifest.version) != (map_id, version):
         raise MapCorrupt(
             "map.renamed",
             "the map's folder was copied or renamed; build the map under its new id",
-            field=str(opened.path),
+            field=str(folder),
             expected=f"{manifest.id}/{manifest.version}",
             got=f"{map_id}/{version}",
         )
-    return opened
 
 
 def checked_name(name: str, what: str) -> str:
