@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import sys
+from multiprocessing import forkserver, get_context
 from typing import TYPE_CHECKING
 
 from service.logs import configure_logging
@@ -33,10 +34,17 @@ def main() -> None:
         os.environ.setdefault(variable, str(settings.threads_per_worker))
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(settings.max_image_pixels))
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # damaged photos are answered, not logged
+    # The fork server loads the same libraries as this process, at the same time.
+    context = get_context("forkserver")
+    context.set_forkserver_preload(["service.fork_server"])
+    forkserver.ensure_running()
     try:
         asyncio.run(_serve(settings))
     except (OSError, SettingsError) as error:
         sys.exit(f"visloc-service: {error}")
+    # A thread that still fetches or verifies a map leaves nothing half-done, and is not waited for.
+    logging.shutdown()
+    os._exit(0)
 
 
 async def _serve(settings: ServiceSettings) -> None:
@@ -61,6 +69,8 @@ async def _serve(settings: ServiceSettings) -> None:
         )
         await stopping
     logger.info("stopping")
+    loading.cancel()
+    await asyncio.wait({loading})
     await server.close(settings.drain_timeout_s)
 
 

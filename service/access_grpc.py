@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import ExitStack
 from typing import Any
@@ -14,11 +15,10 @@ from service.grpc_calls import Handler, behaviour_of, handler_like
 from service.grpc_envelope import Context, Envelope
 from service.key_file import Key
 from service.logs import UNMATCHED, note_key
-from visloc.errors import Overloaded, VislocError
+from visloc.errors import Overloaded, TimedOut, VislocError
 
-# Calls that need no key (health) and are open at once: one may stay open for ever, and those who
-# have a key must find the door open.
-_MAX_KEYLESS = 100
+# How long a call may stay open that needs no key (health). Its watchers ask again.
+_KEYLESS_S = 300.0
 
 
 class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
@@ -27,11 +27,13 @@ class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
     Args:
         access: decides.
         envelope: answers what is refused.
+        max_keyless: calls that need no key and are open at once; who has a key must find a place.
     """
 
-    def __init__(self, access: Access, envelope: Envelope) -> None:
+    def __init__(self, access: Access, envelope: Envelope, max_keyless: int) -> None:
         self._access = access
         self._envelope = envelope
+        self._max_keyless = max_keyless
         self._keyless = 0
 
     async def intercept_service(
@@ -65,12 +67,16 @@ class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         behaviour = behaviour_of(handler)
 
         async def serve(messages: AsyncIterator[Any], context: Context) -> Any:
-            if self._keyless >= _MAX_KEYLESS:
-                error = Overloaded("server.busy", "too many calls without a key; try again shortly")
-                await self._envelope.refuse(_name(method), error, context)
+            if self._keyless >= self._max_keyless:
+                busy = Overloaded("server.busy", "too many calls without a key; try again shortly")
+                await self._envelope.refuse(_name(method), busy, context)
             self._keyless += 1
             try:
-                return await behaviour(messages, context)
+                async with asyncio.timeout(_KEYLESS_S):
+                    return await behaviour(messages, context)
+            except TimeoutError:
+                over = TimedOut("server.deadline", "watching ends after a while; ask again")
+                await self._envelope.refuse(_name(method), over, context)
             finally:
                 self._keyless -= 1
 

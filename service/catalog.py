@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Coroutine, Mapping, Sequence
+from collections import Counter
+from collections.abc import AsyncIterator, Coroutine, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import asynccontextmanager, suppress
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -18,6 +20,7 @@ from service.stores import Store
 from service.worker import MapFolder
 from service.workers import Workers
 from visloc.archive import MapOutline
+from visloc.archive.store import version_in_use
 from visloc.errors import InvalidInput, MapCorrupt, NotFound, Unavailable, VislocError
 
 logger = logging.getLogger(__name__)
@@ -28,6 +31,10 @@ RETRY_AFTER_S = 10.0
 FOLLOW_S = 1.0
 # Most maps that one request may search.
 MAX_MAPS = 16
+# How often it is looked whether the last request of a version has ended, and how long at most
+# before it is closed all the same.
+_UNUSED_POLL_S = 0.05
+_FORGET_LIMIT_S = 600.0
 # Maps that are fetched at once.
 _MAX_FETCHES = 4
 # Descriptions of so many versions stay in memory; their arrays stay on disk.
@@ -84,6 +91,8 @@ class Catalog:
         self._refused: dict[str, _Refused] = {}  # by map id
         self._taking_over: dict[str, asyncio.Task[None]] = {}  # by map id
         self._described: dict[str, MapOutline] = {}  # by id@version
+        self._users: Counter[str] = Counter()  # requests under way, by id@version
+        self._leaving: set[str] = set()  # id@version of what is being deleted
         self._background: set[asyncio.Task[None]] = set()
 
     @property
@@ -127,21 +136,29 @@ class Catalog:
                 with suppress(VislocError):  # noted in not_loaded
                     await self._resolve(map_id, workers)
 
-    async def resolve(self, where: Where, workers: Workers) -> tuple[MapFolder, ...]:
-        """Return the maps to search.
+    @asynccontextmanager
+    async def using(self, where: Where, workers: Workers) -> AsyncIterator[tuple[MapFolder, ...]]:
+        """Give the maps to search; they stay until the block ends, whatever takes over.
 
         Raises:
             NotFound: ``map.unknown``, ``map.version``, ``map.none_near``.
             VislocError: what the store and ``worker.load`` raise.
         """
         refs = await self._ids_near(where) if isinstance(where, Near) else where
-        return tuple([await self._present(await self._resolve(ref, workers)) for ref in refs])
+        taken: list[MapFolder] = []
+        try:
+            for ref in refs:
+                taken.append(await self._take(ref, workers))
+            yield tuple(taken)
+        finally:
+            for of in taken:
+                self._give_back(of.ref)
 
     async def activate(self, map_id: str, version: str, workers: Workers) -> None:
         """Put a version into use, once a worker process has it open and warm.
 
         Raises:
-            VislocError: as ``resolve``; then nothing has changed.
+            VislocError: as ``using``; then nothing has changed.
         """
         ref = f"{map_id}@{version}"
         of = MapFolder(ref, await self._folder(ref))
@@ -149,19 +166,38 @@ class Catalog:
         await asyncio.to_thread(self._store.set_current, map_id, version)
         self._serve(map_id, of, workers)
 
-    def serves(self, ref: str) -> bool:
-        """Tell whether a version answers for its map."""
-        return any(of.ref == ref for of in self._serving.values())
-
     def close(self) -> None:
         """Let go of the threads."""
         self._fetchers.shutdown(wait=False, cancel_futures=True)
 
-    async def forget(self, ref: str, workers: Workers) -> None:
-        """Close a version that was deleted."""
+    async def delete(self, map_id: str, version: str, workers: Workers, limit_s: float) -> None:
+        """Delete a version that is not in use, after the requests that began with it.
+
+        Args:
+            map_id: the map.
+            version: of it.
+            workers: that may have it open.
+            limit_s: longest time to wait for those requests.
+
+        Raises:
+            NotFound: ``map.unknown``, ``map.version``.
+            Conflict: ``map.version_in_use``.
+        """
+        ref = f"{map_id}@{version}"
+        # One that answers while the current one cannot be opened is in use too.
+        others = set(await asyncio.to_thread(self._store.versions, map_id)) - {version}
+        if others and any(of.ref == ref for of in self._serving.values()):
+            raise version_in_use(map_id, version, sorted(others))
+        self._leaving.add(ref)
+        try:
+            await self._until_unused(ref, limit_s)
+            if self._users[ref]:
+                raise version_in_use(map_id, version, sorted(others))
+            await asyncio.to_thread(self._store.remove, map_id, version)
+        finally:
+            self._leaving.discard(ref)
         self._described.pop(ref, None)
-        map_id = ref.partition("@")[0]
-        if self._serving.get(map_id, MapFolder("", Path())).ref == ref:
+        if map_id in self._serving and not others:
             del self._serving[map_id]
         await workers.run_everywhere(worker.forget, ref)
 
@@ -190,12 +226,41 @@ class Catalog:
 
         return await asyncio.to_thread(described)
 
-    async def _present(self, of: MapFolder) -> MapFolder:
-        """Let the store know of the use, and fetch a copy that left its cache meanwhile."""
-        try:
-            return MapFolder(of.ref, await asyncio.to_thread(self._store.folder, of.ref))
-        except NotFound:  # removed a moment ago: workers that have it open can go on
-            return of
+    async def _take(self, ref: str, workers: Workers) -> MapFolder:
+        """Return a map, which stays until it is given back."""
+        while True:
+            found = ref if "@" in ref else (await self._resolve(ref, workers)).ref
+            if found in self._leaving:
+                raise NotFound(
+                    "map.version", "the version is being deleted", field="map", got=found
+                )
+            self._users[found] += 1
+            try:
+                # Asked every time: copies of a remote store come and go by their use.
+                return MapFolder(found, await self._folder(found))
+            except BaseException as error:
+                self._give_back(found)
+                served = self._serving.get(ref)
+                if isinstance(error, NotFound) and served is not None and served.ref != found:
+                    continue  # another version took over meanwhile
+                raise
+
+    def _give_back(self, ref: str) -> None:
+        self._users[ref] -= 1
+        if not self._users[ref]:
+            del self._users[ref]
+
+    async def _until_unused(self, ref: str, limit_s: float) -> None:
+        with suppress(TimeoutError):
+            async with asyncio.timeout(limit_s):
+                while self._users[ref]:
+                    await asyncio.sleep(_UNUSED_POLL_S)
+
+    async def _forget(self, ref: str, workers: Workers) -> None:
+        """Close a version that another one took over from, after its last request."""
+        await self._until_unused(ref, _FORGET_LIMIT_S)
+        if not any(of.ref == ref for of in self._serving.values()):
+            await workers.run_everywhere(worker.forget, ref)
 
     async def _ids_near(self, near: Near) -> tuple[str, ...]:
         found = [served.outline.manifest.id for served in await self.list(near)]
@@ -218,8 +283,7 @@ class Catalog:
         return tuple(found)
 
     async def _resolve(self, ref: str, workers: Workers) -> MapFolder:
-        if "@" in ref:
-            return MapFolder(ref, await self._folder(ref))
+        """Return what ``id`` stands for: what is current, or the version before it."""
         before, refused = self._serving.get(ref), self._refused.get(ref)
         try:
             current = f"{ref}@{await asyncio.to_thread(self._store.current_version, ref)}"
@@ -233,8 +297,7 @@ class Catalog:
             raise
         if before is not None and before.ref == current:
             self._refused.pop(ref, None)
-            # Asked every time: copies of a remote store come and go by their use.
-            return MapFolder(current, await self._folder(current))
+            return before
         if (
             refused is not None
             and refused.ref == current
@@ -243,7 +306,7 @@ class Catalog:
             if before is not None:
                 return before
             if not isinstance(refused.error, Unavailable):
-                raise refused.error
+                raise copy(refused.error)
         task = self._taking_over.get(ref)
         if task is None:
             task = asyncio.create_task(self._take_over(ref, current, workers))
@@ -252,9 +315,9 @@ class Catalog:
         if before is not None:
             return before  # warm, while the new one is made ready
         await asyncio.shield(task)
-        found = self._serving.get(ref)
+        found, refused = self._serving.get(ref), self._refused.get(ref)
         if found is None:
-            raise self._refused[ref].error
+            raise copy(refused.error) if refused else _gone_meanwhile(ref)
         return found
 
     async def _take_over(self, map_id: str, current: str, workers: Workers) -> None:
@@ -274,7 +337,7 @@ class Catalog:
             logger.info("map %s is served", of.ref)
             self._in_background(workers.run_everywhere(worker.load, of))
             if before is not None:
-                self._in_background(workers.run_everywhere(worker.forget, before.ref))
+                self._in_background(self._forget(before.ref, workers))
 
     def _refuse(self, map_id: str, current: str, error: VislocError) -> None:
         """Note that what is current cannot be served."""
@@ -289,10 +352,13 @@ class Catalog:
         self._refused.pop(map_id, None)
         before = self._serving.pop(map_id, None)
         if before is not None:
-            self._in_background(workers.run_everywhere(worker.forget, before.ref))
+            self._in_background(self._forget(before.ref, workers))
 
     async def _folder(self, ref: str) -> Path:
         """Return where a version lies on this machine, fetched once for all who wait for it."""
+        at_hand = await asyncio.to_thread(self._store.at_hand, ref)
+        if at_hand is not None:
+            return at_hand
         fetching = self._fetching.get(ref)
         if fetching is None:
             loop = asyncio.get_running_loop()
@@ -333,6 +399,10 @@ class Catalog:
                 self._described.pop(next(iter(self._described)), None)
             self._described[wanted] = outline
         return ServedMap(outline, version == current, tuple((v, v == current) for v in versions))
+
+
+def _gone_meanwhile(map_id: str) -> NotFound:
+    return NotFound("map.unknown", "the map was deleted a moment ago", field="map", got=map_id)
 
 
 def _reaches(outline: MapOutline, near: Near) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import AsyncGenerator, AsyncIterator, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import aclosing, contextmanager
 from dataclasses import dataclass, replace
 from time import time
 
@@ -27,7 +27,6 @@ from service.stores import Store
 from service.uploads import Uploads
 from service.worker import MapFolder, WorkerSettings
 from service.workers import Workers
-from visloc.archive.store import version_in_use
 from visloc.errors import (
     InvalidInput,
     Overloaded,
@@ -100,6 +99,7 @@ class Engine:
             on_death=metrics.observe_worker_death,
         )
         self._max_loaded_bytes = settings.max_loaded_bytes
+        self._limit_s = limit_s
         self._max_photos = workers + max_queue
         self._photos = 0
         self._max_batches = max_batches
@@ -169,8 +169,8 @@ class Engine:
         self.check_room()
         self._photos += 1
         try:
-            maps = await self._catalog.resolve(job.maps, self.workers)
-            return await self.workers.run(worker.localize, job, maps, time())
+            async with self._catalog.using(job.maps, self.workers) as maps:
+                return await self.workers.run(worker.localize, job, maps, time())
         finally:
             self._photos -= 1
 
@@ -214,11 +214,11 @@ class Engine:
         """
         if not job.images:
             raise InvalidInput("rig.empty", "there is no image", field="images")
-        maps = await self._catalog.resolve(job.maps, self.workers)
         bare = replace(job, images=tuple(_without_photo(image) for image in job.images))
-        await self.workers.run(worker.check_rig, bare, maps)
-        seen = await self._look(maps, job.rig, job.images, job.options, job.priors)
-        return await self.workers.run(worker.solve_rig, bare, maps, seen)
+        async with self._catalog.using(job.maps, self.workers) as maps:
+            await self.workers.run(worker.check_rig, bare, maps)
+            seen = await self._look(maps, job.rig, job.images, job.options, job.priors)
+            return await self.workers.run(worker.solve_rig, bare, maps, seen)
 
     async def localize_sequence(
         self, start: SequenceStart, instants: AsyncIterator[Instant] | Sequence[Instant]
@@ -235,8 +235,20 @@ class Engine:
             Unavailable: ``server.worker_died``.
             VislocError: what the store raises.
         """
+        async with (
+            self._catalog.using(start.maps, self.workers) as maps,
+            aclosing(self._answers(start, instants, maps)) as answers,
+        ):
+            async for answer in answers:
+                yield answer
+
+    async def _answers(
+        self,
+        start: SequenceStart,
+        instants: AsyncIterator[Instant] | Sequence[Instant],
+        maps: tuple[MapFolder, ...],
+    ) -> AsyncGenerator[InstantLocalization]:
         run = self.workers.run
-        maps = await self._catalog.resolve(start.maps, self.workers)
         state = await run(worker.open_sequence, start, maps)
         if isinstance(instants, Sequence):
             bare = [_without_photos(instant) for instant in instants]
@@ -291,8 +303,14 @@ class Engine:
         Raises:
             VislocError: what ``Uploads.publish`` raises.
         """
+
+        async def counted() -> AsyncIterator[bytes]:
+            async for chunk in chunks:
+                self._metrics.observe_uploaded(len(chunk))
+                yield chunk
+
         with self._noted("upload"):
-            await self._uploads.publish(map_id, version, chunks)
+            await self._uploads.publish(map_id, version, counted())
         logger.info("map %s@%s was uploaded", map_id, version)
         return await self.map(f"{map_id}@{version}")
 
@@ -317,12 +335,7 @@ class Engine:
             Conflict: ``map.version_in_use``.
         """
         with self._noted("delete"):
-            # One that answers while the current one cannot be opened is in use too.
-            others = set(await asyncio.to_thread(self._store.versions, map_id)) - {version}
-            if others and self._catalog.serves(f"{map_id}@{version}"):
-                raise version_in_use(map_id, version, sorted(others))
-            await asyncio.to_thread(self._store.remove, map_id, version)
-        await self._catalog.forget(f"{map_id}@{version}", self.workers)
+            await self._catalog.delete(map_id, version, self.workers, self._limit_s)
 
     @contextmanager
     def _noted(self, change: str) -> Iterator[None]:

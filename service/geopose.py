@@ -77,11 +77,11 @@ def add_geopose_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) 
             observer.error(error)
             return problem_response(error, request.state.request_id, HTTPStatus.NOT_ACCEPTABLE)
         checked_media_type(request, _READ)
-        async with within(
-            timeout_of(request.headers.get(TIMEOUT_HEADER), settings.request_timeout_s)
-        ):
-            async with arrivals_of(request).body(request, settings.max_batch_bytes) as body:
-                asked, job = await asyncio.to_thread(_read, body, settings)
+        timeout_s = timeout_of(request.headers.get(TIMEOUT_HEADER), settings.request_timeout_s)
+        engine.check_room()
+        async with arrivals_of(request).body(request, settings.max_batch_bytes) as body:
+            asked, job = await asyncio.to_thread(_read, body, settings)
+        async with within(timeout_s):
             work = _answer(engine, observer, asked, job, request.state.request_id)
             answer = await while_connected(request.receive, work)
         if kind.partition(";")[0] == OGC:

@@ -145,7 +145,7 @@ class GrpcServer:
         envelope = Envelope(observer)
         self._server = grpc.aio.server(
             interceptors=[
-                AccessInterceptor(access, envelope),
+                AccessInterceptor(access, envelope, max(1, settings.max_connections // 2)),
                 TimelyCalls(envelope, settings.arrival_timeout_s, settings.max_message_bytes),
             ],
             options=[

@@ -87,6 +87,7 @@ def create_app(
         summary="Localizes photos in maps of posed photos.",
         docs_url=None,  # its page loads scripts from another host
         redoc_url=None,
+        redirect_slashes=False,  # to wherever the request says that this server is
     )
     app.state.observer, app.state.arrivals = observer, arrivals
     add_access(app, access, observer)

@@ -137,6 +137,21 @@ class RemoteMapStore:
             )
         return known.current
 
+    def at_hand(self, ref: str) -> Path | None:
+        """The copy of ``id@version``, None when it has to be fetched or compared first.
+
+        Raises:
+            NotFound: ``map.unknown`` or ``map.version``.
+        """
+        map_id, _, version = ref.partition("@")
+        self._refuse_unknown(map_id, version)
+        copy = self._copies.root / map_id / version
+        if not copy.is_dir() or not (ref in self._compared or self._is_away):
+            return None
+        with suppress(OSError):  # a copy on a read-only disk has no time of last use
+            os.utime(copy)
+        return copy
+
     def outline(self, ref: str) -> MapOutline:
         """Say what ``id`` or ``id@version`` is; of one without a copy here, two files are fetched.
 

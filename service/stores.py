@@ -38,6 +38,10 @@ class Store(Protocol):
         """What ``id`` or ``id@version`` says about itself; quick, wherever the store is."""
         ...
 
+    def at_hand(self, ref: str) -> Path | None:
+        """``folder`` of ``id@version`` if it is quick, None when it is to be fetched first."""
+        ...
+
     def folder(self, ref: str) -> Path:
         """The local folder ``.../<id>/<version>`` of ``id`` or ``id@version``.
 

@@ -169,9 +169,9 @@ _process: _Process | None = None
 def start(settings: WorkerSettings, abandoned: ctypes.c_bool) -> None:
     """Make the process ready; runs once in each."""
     global _process
-    # Ctrl-C reaches all processes of a terminal: when to end is the main process's business.
+    # Both may reach all processes of a group: when to end is the main process's business.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     configure_logging(settings)
     torch.set_num_threads(settings.threads)

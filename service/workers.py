@@ -32,6 +32,8 @@ logger = logging.getLogger(__name__)
 P = ParamSpec("P")
 T = TypeVar("T")
 
+# The module that the fork server loads; not imported here, where it would change what SIGTERM does.
+FORK_SERVER = "service.fork_server"
 # How often an idle worker is asked whether it still lives.
 _WATCH_S = 1.0
 # Pause before a worker that cannot start is tried again.
@@ -236,7 +238,7 @@ class _Worker:
         # Not fork: torch hangs in a child of a process that has used it, gRPC too. The fork server
         # has loaded the libraries and used none, so that a new process begins in no time.
         self._context = get_context("forkserver")
-        self._context.set_forkserver_preload([worker.__name__])
+        self._context.set_forkserver_preload([FORK_SERVER])
         # Not an Event: its lock stays taken when a process is killed that looks at it.
         self._abandoned = self._context.RawValue(ctypes.c_bool, False)
         self._executor: ProcessPoolExecutor | None = None

@@ -19,6 +19,7 @@ import typer
 
 from benchmarks.reliability.checks import print_checks
 from benchmarks.reliability.kills import kill_service, kill_workers
+from benchmarks.reliability.maps import SampleMaps, make_maps
 from benchmarks.reliability.refusals import refusals
 from benchmarks.reliability.slow_clients import slow_clients
 from benchmarks.reliability.soak import soak
@@ -31,8 +32,8 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 @app.command("soak")
 def soak_command(seconds: Annotated[float, typer.Option(help="How long.")] = 900.0) -> None:
     """Twice the load that it can serve, good and bad, while versions are swapped every 20 s."""
-    with _work() as work:
-        print_checks("soak", asyncio.run(soak(work, seconds)))
+    with _prepared() as (maps, work):
+        print_checks("soak", asyncio.run(soak(maps, work, seconds)))
 
 
 @app.command("kill")
@@ -40,25 +41,25 @@ def kill_command(
     kills: Annotated[int, typer.Option(help="Of workers, then of the service.")] = 10,
 ) -> None:
     """Kill -9 under load."""
-    with _work() as work:
-        workers = asyncio.run(kill_workers(work, kills))
-    with _work() as work:
-        service = asyncio.run(kill_service(work, kills))
-    print_checks("kill", [*workers, *service])
+    with _prepared() as (maps, work):
+        copy = maps.copied_to(work / "copy")
+        workers = asyncio.run(kill_workers(maps, work, kills))
+        service = asyncio.run(kill_service(copy, work, kills))
+        print_checks("kill", [*workers, *service])
 
 
 @app.command("full-disk")
 def full_disk_command() -> None:
     """Uploads to a disk without room: a small tmpfs of the service's own mount namespace."""
-    with _work() as work:
-        print_checks("full disk", full_disk(work))
+    with _prepared() as (maps, work):
+        print_checks("full disk", full_disk(maps, work))
 
 
 @app.command("truncated-upload")
 def truncated_upload_command() -> None:
     """Uploads that end too early, in every way."""
-    with _work() as work:
-        print_checks("truncated upload", truncated_upload(work))
+    with _prepared() as (maps, work):
+        print_checks("truncated upload", truncated_upload(maps, work))
 
 
 @app.command("s3-away")
@@ -66,8 +67,8 @@ def s3_away_command(
     seconds: Annotated[float, typer.Option(help="How long it is away, each time.")] = 60.0,
 ) -> None:
     """An S3 server that is killed, and one that falls silent."""
-    with _work() as work:
-        print_checks("S3 away", asyncio.run(s3_away(work, seconds)))
+    with _prepared() as (maps, work):
+        print_checks("S3 away", asyncio.run(s3_away(maps, work, seconds)))
 
 
 @app.command("slow-clients")
@@ -77,21 +78,25 @@ def slow_clients_command(
     rounds: Annotated[int, typer.Option(help="Of turns.")] = 3,
 ) -> None:
     """Clients that send one byte per second."""
-    with _work() as work:
-        print_checks("slow clients", asyncio.run(slow_clients(work, connections, seconds, rounds)))
+    with _prepared() as (maps, work):
+        print_checks(
+            "slow clients", asyncio.run(slow_clients(maps, work, connections, seconds, rounds))
+        )
 
 
 @app.command("refusals")
 def refusals_command() -> None:
     """Wrong keys, missing scopes, replayed and oversized bodies, path tricks."""
-    with _work() as work:
-        print_checks("refusals", refusals(work))
+    with _prepared() as (maps, work):
+        print_checks("refusals", refusals(maps, work))
 
 
 @contextmanager
-def _work() -> Iterator[Path]:
+def _prepared() -> Iterator[tuple[SampleMaps, Path]]:
+    """Make the maps and a folder for the rest."""
     with tempfile.TemporaryDirectory(prefix="visloc-reliability-") as folder:
-        yield Path(folder)
+        work = Path(folder)
+        yield make_maps(work), work
 
 
 if __name__ == "__main__":

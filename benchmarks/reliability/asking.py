@@ -19,7 +19,7 @@ from google.protobuf.json_format import MessageToDict
 from google.rpc.error_details_pb2 import ErrorInfo
 from google.rpc.status_pb2 import Status
 
-from benchmarks.reliability.maps import Photo, TestMaps
+from benchmarks.reliability.maps import Photo, SampleMaps
 from benchmarks.reliability.service_process import ServiceProcess
 from visloc.geometry import Camera
 from visloc_api.v1.localization_pb2 import Camera as WireCamera
@@ -122,7 +122,7 @@ class Case:
         return Outcome(status, _comparable(answer), answered_id == id_, retry_after, seconds)
 
 
-def good_cases(maps: TestMaps) -> list[Case]:
+def good_cases(maps: SampleMaps) -> list[Case]:
     """All photos over both doors, those of one instant as a rig, of a camera as a sequence."""
     cases = []
     for map_id, photos in maps.photos.items():
@@ -139,7 +139,7 @@ def good_cases(maps: TestMaps) -> list[Case]:
     return cases
 
 
-def bad_cases(maps: TestMaps) -> list[Case]:
+def bad_cases(maps: SampleMaps) -> list[Case]:
     """What cannot be localized, and what should not have been sent."""
     room, hall = maps.photos["room"][0], maps.photos["hall"][0]
     cut = replace(room, image=room.image[: len(room.image) // 3])

@@ -19,9 +19,8 @@ from benchmarks.reliability.asking import Case, Doors, good_cases
 from benchmarks.reliability.checks import Check, counts_text
 from benchmarks.reliability.load import RETRY_PAUSE_S, Persisted, persist
 from benchmarks.reliability.maps import (
-    TestMaps,
+    SampleMaps,
     leftovers,
-    make_maps,
     tree_hash,
     verify_store,
 )
@@ -54,9 +53,8 @@ class _Return:
     leftovers: int
 
 
-async def kill_workers(work: Path, kills: int) -> list[Check]:
+async def kill_workers(maps: SampleMaps, work: Path, kills: int) -> list[Check]:
     """Kill workers one after another while clients ask."""
-    maps = make_maps(work)
     cases = good_cases(maps)
     with ServiceProcess(maps.folder, work / "service.log", workers=2) as service:
         async with Doors(service) as doors:
@@ -82,9 +80,8 @@ async def kill_workers(work: Path, kills: int) -> list[Check]:
     ]
 
 
-async def kill_service(work: Path, kills: int) -> list[Check]:
+async def kill_service(maps: SampleMaps, work: Path, kills: int) -> list[Check]:
     """Kill the whole service while clients ask and versions are uploaded, swapped and deleted."""
-    maps = make_maps(work)
     cases = good_cases(maps)
     service = ServiceProcess(maps.folder, work / "service.log", workers=1)
     with service:
@@ -153,7 +150,7 @@ async def _kill_a_worker(service: ServiceProcess, number: int) -> float:
 
 
 async def _kill_service(
-    service: ServiceProcess, maps: TestMaps, case: Case, doors: Doors
+    service: ServiceProcess, maps: SampleMaps, case: Case, doors: Doors
 ) -> _Return:
     workers = service.worker_pids
     service.kill()
@@ -177,7 +174,7 @@ async def _kill_service(
     return _Return(ready_s, answer_s, orphans, versions, len(left))
 
 
-async def _change(service: ServiceProcess, maps: TestMaps, stop: asyncio.Event) -> Counter[str]:
+async def _change(service: ServiceProcess, maps: SampleMaps, stop: asyncio.Event) -> Counter[str]:
     """Delete, upload and swap the versions of ``room`` in turn; each until it is done."""
     first, last = maps.versions["room"]
     packed = maps.packed.read_bytes()

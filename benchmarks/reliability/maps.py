@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mapping.build import BuildSettings, build_map
@@ -33,7 +34,7 @@ class Photo:
 
 
 @dataclass(frozen=True)
-class TestMaps:
+class SampleMaps:
     """What the tests serve and ask.
 
     Attributes:
@@ -43,15 +44,18 @@ class TestMaps:
         packed: the last version of ``room``, packed.
     """
 
-    __test__ = False  # not one of pytest's
-
     folder: Path
     versions: Mapping[str, Sequence[str]]
     photos: Mapping[str, Sequence[Photo]]
     packed: Path
 
+    def copied_to(self, folder: Path) -> SampleMaps:
+        """The same in a new folder, where it may be changed."""
+        shutil.copytree(self.folder, folder)
+        return replace(self, folder=folder)
 
-def make_maps(work: Path) -> TestMaps:
+
+def make_maps(work: Path) -> SampleMaps:
     """Render two rooms and build both versions of each; takes some 20 s.
 
     Args:
@@ -79,7 +83,7 @@ def make_maps(work: Path) -> TestMaps:
     versions = {map_id: store.versions(map_id) for map_id in SEEDS}
     packed = work / "room.zip"
     write_packed(folder / "room" / versions["room"][-1], packed)
-    return TestMaps(folder, versions, photos, packed)
+    return SampleMaps(folder, versions, photos, packed)
 
 
 def read_photos(root: Path) -> list[Photo]:

@@ -20,7 +20,7 @@ import httpx
 
 from benchmarks.reliability.asking import camera_text
 from benchmarks.reliability.checks import Check
-from benchmarks.reliability.maps import Photo, TestMaps, leftovers, make_maps, tree_hash
+from benchmarks.reliability.maps import Photo, SampleMaps, leftovers, tree_hash
 from benchmarks.reliability.service_process import ServiceProcess
 from visloc_api.v1.localization_pb2 import (
     GetMapRequest,
@@ -69,11 +69,11 @@ class _Refusal:
     allowed: Sequence[str]
 
 
-def refusals(work: Path) -> list[Check]:
+def refusals(every: SampleMaps, work: Path) -> list[Check]:
     """Send what must be refused; the store, the keys and what lies beside them stay as they are."""
     outside = work / "outside"
     outside.mkdir()
-    maps = make_maps(outside)
+    maps = every.copied_to(outside / "maps")
     (outside / "secrets").write_text(CANARY)
     (maps.folder / "secrets").write_text(CANARY)
     keys = {scope: _new_key(outside / "keys.json", scope) for scope in SCOPES}
@@ -111,7 +111,7 @@ def refusals(work: Path) -> list[Check]:
     ]
 
 
-def _checked(name: str, requests: Sequence[_Refusal], outside: Path, maps: TestMaps) -> Check:
+def _checked(name: str, requests: Sequence[_Refusal], outside: Path, maps: SampleMaps) -> Check:
     """Send one after another; after each, everything must be as before."""
     wrong, statuses = [], Counter[str]()
     for request in requests:
@@ -140,7 +140,7 @@ class _Asking:
         service: ServiceProcess,
         http: httpx.Client,
         channel: grpc.Channel,
-        maps: TestMaps,
+        maps: SampleMaps,
         keys: dict[str, str],
     ) -> None:
         self._service, self._http, self._maps, self._keys = service, http, maps, keys

@@ -11,7 +11,7 @@ from pathlib import Path
 from benchmarks.reliability.asking import Doors, good_cases
 from benchmarks.reliability.checks import Check, counts_text
 from benchmarks.reliability.load import Asked, ask_in_turn, percentile
-from benchmarks.reliability.maps import make_maps
+from benchmarks.reliability.maps import SampleMaps
 from benchmarks.reliability.service_process import ServiceProcess
 from benchmarks.reliability.soak import unloaded_answers
 
@@ -21,12 +21,13 @@ _PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 _PATHS = {"heads": "a head", "bodies": "a body", "gRPC": "the preface of HTTP/2, to gRPC"}
 
 
-async def slow_clients(work: Path, connections: int, seconds: float, rounds: int) -> list[Check]:
+async def slow_clients(
+    maps: SampleMaps, work: Path, connections: int, seconds: float, rounds: int
+) -> list[Check]:
     """Measure one client in turns of so many seconds: alone, and beside slow ones of every kind.
 
     Turns, so that whatever else the machine does meets all of them alike.
     """
-    maps = make_maps(work)
     cases = [case for case in good_cases(maps) if " photo " in case.name and "two" not in case.name]
     found: dict[str, list[Asked]] = {kind: [] for kind in KINDS}
     closings = {kind: Counter[str]() for kind in KINDS}
@@ -99,7 +100,8 @@ async def _send_slowly(
     reader: asyncio.StreamReader, writer: asyncio.StreamWriter, at_once: bytes, slowly: bytes
 ) -> str:
     writer.write(at_once)
-    answer = asyncio.ensure_future(reader.read(65536))
+    # gRPC says hello at once; HTTP answers when it has had enough.
+    answer = asyncio.ensure_future(reader.read(-1 if slowly == _PREFACE else 65536))
     for byte in slowly:
         writer.write(bytes([byte]))
         with suppress(ConnectionError):

@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.reliability.asking import Case, Doors, bad_cases, good_cases
 from benchmarks.reliability.checks import Check, counts_text
 from benchmarks.reliability.load import Asked, ask_at_rate, ask_in_turn, percentile
-from benchmarks.reliability.maps import TestMaps, make_maps
+from benchmarks.reliability.maps import SampleMaps
 from benchmarks.reliability.service_process import ServiceProcess
 
 SWAP_EVERY_S = 20.0
@@ -30,9 +30,8 @@ _MIB = 2**20
 Expected = Mapping[str, set[tuple[str, str]]]
 
 
-async def soak(work: Path, seconds: float) -> list[Check]:
+async def soak(maps: SampleMaps, work: Path, seconds: float) -> list[Check]:
     """Load a service, and compare every answer with what it said when it had nothing else to do."""
-    maps = make_maps(work)
     good, bad = good_cases(maps), bad_cases(maps)
     with ServiceProcess(
         maps.folder, work / "service.log", workers=1, max_queue=MAX_QUEUE, max_batches=2
@@ -61,7 +60,7 @@ async def soak(work: Path, seconds: float) -> list[Check]:
     ]
 
 
-async def unloaded_answers(doors: Doors, maps: TestMaps, cases: Sequence[Case]) -> Expected:
+async def unloaded_answers(doors: Doors, maps: SampleMaps, cases: Sequence[Case]) -> Expected:
     """Ask everything once for each version of the maps, one by one."""
     expected: dict[str, set[tuple[str, str]]] = defaultdict(set)
     for hall in maps.versions["hall"]:
@@ -161,7 +160,7 @@ async def _capacity(doors: Doors, cases: Sequence[Case]) -> float:
     return len(asked) / CAPACITY_S
 
 
-async def _swap(doors: Doors, maps: TestMaps, stop: asyncio.Event) -> Counter[str]:
+async def _swap(doors: Doors, maps: SampleMaps, stop: asyncio.Event) -> Counter[str]:
     statuses: Counter[str] = Counter()
     count = 0
     while not await _stopped_within(stop, SWAP_EVERY_S):

@@ -21,7 +21,7 @@ import httpx
 from benchmarks.reliability.asking import Case, Doors, good_cases
 from benchmarks.reliability.checks import Check, counts_text
 from benchmarks.reliability.load import Asked, ask_in_turn, percentile
-from benchmarks.reliability.maps import TestMaps, make_maps, verify_store
+from benchmarks.reliability.maps import SampleMaps, verify_store
 from benchmarks.reliability.s3_server import ACCOUNT, BUCKET
 from benchmarks.reliability.service_process import ServiceProcess, free_port
 from benchmarks.reliability.soak import Expected, unloaded_answers
@@ -50,7 +50,9 @@ class S3Process:
             RuntimeError: when it does not.
         """
         words = ("-m", "benchmarks.reliability.s3_server", str(self._folder), str(self._port))
-        self._process = subprocess.Popen([sys.executable, *words])
+        self._process = subprocess.Popen(
+            [sys.executable, *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         end = time.monotonic() + 60
         while time.monotonic() < end:
             with suppress(httpx.TransportError):
@@ -102,16 +104,15 @@ class _World:
         quiet: answers while the storage was there.
     """
 
-    maps: TestMaps
+    maps: SampleMaps
     coming: str
     cases: Sequence[Case]
     expected: Expected
     quiet: Sequence[Asked]
 
 
-async def s3_away(work: Path, seconds: float) -> list[Check]:
+async def s3_away(every: SampleMaps, work: Path, seconds: float) -> list[Check]:
     """Take the storage away twice, for so many seconds each, while clients ask."""
-    every = make_maps(work)
     first, coming = every.versions["room"]
     store = MapStore(every.folder)
     store.set_current("room", first)

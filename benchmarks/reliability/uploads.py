@@ -8,6 +8,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import grpc
@@ -15,9 +16,8 @@ import httpx
 
 from benchmarks.reliability.checks import Check
 from benchmarks.reliability.maps import (
-    TestMaps,
+    SampleMaps,
     leftovers,
-    make_maps,
     tree_hash,
     verify_store,
 )
@@ -30,9 +30,8 @@ _CHUNK_BYTES = 64 * 1024
 ZIP = {"Content-Type": "application/zip"}
 
 
-def truncated_upload(work: Path) -> list[Check]:
+def truncated_upload(maps: SampleMaps, work: Path) -> list[Check]:
     """Send a packed map in many broken ways; nothing of it may stay."""
-    maps = make_maps(work)
     packed = maps.packed.read_bytes()
     version = maps.versions["room"][-1]
     service = ServiceProcess(maps.folder, work / "service.log", arrival_timeout_s=3)
@@ -87,23 +86,22 @@ def truncated_upload(work: Path) -> list[Check]:
     ]
 
 
-def full_disk(work: Path) -> list[Check]:
+def full_disk(maps: SampleMaps, work: Path) -> list[Check]:
     """Upload to a file system without room, then with room again.
 
     The store is on a small tmpfs that only the service's own mount namespace has, so that neither
     an administrator nor a change to this machine is needed, only ``unshare``.
     """
-    maps = make_maps(work)
     packed = maps.packed.read_bytes()
     version = maps.versions["room"][-1]
+    mounted = work / "mounted"
+    mounted.mkdir()
     size_kib = _tree_kib(maps.folder) + 8 * len(packed) // 1024
     script = (
-        f"mount -t tmpfs -o size={size_kib}k visloc-test {maps.folder}-mount"
-        f" && cp -a {maps.folder}/. {maps.folder}-mount"
+        f"mount -t tmpfs -o size={size_kib}k visloc-test {mounted}"
+        f" && cp -a {maps.folder}/. {mounted}"
         ' && exec "$@"'
     )
-    mounted = Path(f"{maps.folder}-mount")
-    mounted.mkdir()
     before = ["unshare", "--map-root-user", "--mount", "sh", "-ec", script, "sh"]
     probe = [*before, "true"]
     done = subprocess.run(probe, capture_output=True, text=True, check=False)
@@ -112,7 +110,7 @@ def full_disk(work: Path) -> list[Check]:
     service = ServiceProcess(mounted, work / "service.log", before=before)
     with service, httpx.Client(base_url=service.url, timeout=60) as http:
         store = Path(f"/proc/{service.pid}/root{mounted}")
-        seen = TestMaps(store, maps.versions, maps.photos, maps.packed)
+        seen = replace(maps, folder=store)
         _make_way(http, maps)
         path = f"/maps/room/versions/{version}"
 
@@ -156,7 +154,7 @@ def full_disk(work: Path) -> list[Check]:
     ]
 
 
-def _make_way(http: httpx.Client, maps: TestMaps) -> None:
+def _make_way(http: httpx.Client, maps: SampleMaps) -> None:
     """Delete the version that is to be uploaded."""
     first, last = maps.versions["room"]
     http.post("/maps/room/current", json={"version": first}).raise_for_status()
@@ -164,7 +162,7 @@ def _make_way(http: httpx.Client, maps: TestMaps) -> None:
 
 
 def _nothing_stays(
-    maps: TestMaps,
+    maps: SampleMaps,
     service: ServiceProcess,
     name: str,
     way: Callable[[], str],

@@ -331,6 +331,11 @@ def test_a_version_published_while_it_runs_is_served_and_sigterm_ends_it_with_0(
             assert built.returncode == 0, built.stderr
             after = MapStore(maps_dir).current_version("room")
             assert after != before
+            # The version before answers until this one is warm.
+            deadline = time.monotonic() + 30
+            while f"room@{after}" not in httpx.get(f"{service.http}/readyz").json()["maps"]:
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
             for client in clients:
                 result = client.localize(query.image, "room", query.camera)
                 assert (result.localized, result.map.version) == (True, after)

@@ -97,6 +97,10 @@ class MapStore:
             )
         return folder
 
+    def at_hand(self, ref: str) -> Path | None:
+        """The same as ``folder``: nothing needs to be fetched."""
+        return self.folder(ref)
+
     def open(self, ref: str) -> Map:
         """Open ``id`` or ``id@version``; raises what ``folder`` and ``open_published`` raise."""
         return open_published(self.folder(ref))

@@ -1,0 +1,64 @@
+"""Short runs of ``python -m benchmarks.reliability`` (docs/reliability.md has the long ones)."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from benchmarks.reliability.checks import Check
+from benchmarks.reliability.kills import kill_service, kill_workers
+from benchmarks.reliability.maps import SampleMaps, make_maps
+from benchmarks.reliability.refusals import refusals
+from benchmarks.reliability.slow_clients import slow_clients
+from benchmarks.reliability.uploads import full_disk, truncated_upload
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def made_maps(tmp_path_factory: pytest.TempPathFactory) -> SampleMaps:
+    """Two maps in two versions each; only to be read."""
+    return make_maps(tmp_path_factory.mktemp("reliability"))
+
+
+@pytest.fixture
+def maps(made_maps: SampleMaps, tmp_path: Path) -> SampleMaps:
+    """A copy of them that a test may change."""
+    return made_maps.copied_to(tmp_path / "maps")
+
+
+def broken(checks: Sequence[Check]) -> list[Check]:
+    assert checks
+    return [check for check in checks if not check.holds]
+
+
+def test_a_killed_worker_costs_one_request_and_the_client_retries_safely(
+    maps: SampleMaps, tmp_path: Path
+) -> None:
+    assert broken(asyncio.run(kill_workers(maps, tmp_path, kills=2))) == []
+
+
+def test_a_killed_service_comes_back_with_all_that_was_published(
+    maps: SampleMaps, tmp_path: Path
+) -> None:
+    assert broken(asyncio.run(kill_service(maps, tmp_path, kills=2))) == []
+
+
+def test_slow_clients_do_not_slow_down_others(maps: SampleMaps, tmp_path: Path) -> None:
+    checks = asyncio.run(slow_clients(maps, tmp_path, connections=200, seconds=6, rounds=1))
+    assert broken(checks) == []
+
+
+def test_refused_requests_read_and_write_nothing(maps: SampleMaps, tmp_path: Path) -> None:
+    assert broken(refusals(maps, tmp_path)) == []
+
+
+def test_nothing_stays_of_an_upload_that_breaks(maps: SampleMaps, tmp_path: Path) -> None:
+    assert broken(truncated_upload(maps, tmp_path)) == []
+
+
+def test_a_full_disk_loses_and_tears_nothing(maps: SampleMaps, tmp_path: Path) -> None:
+    assert broken(full_disk(maps, tmp_path)) == []
