@@ -56,6 +56,13 @@ def received(parts: Mapping[str, object], fallback: Fallback, message: str) -> V
 
 def unreachable(server: str, why: str) -> Unavailable:
     """Make the exception for a server that does not take or keep the connection."""
+    if "CERTIFICATE_VERIFY_FAILED" in why:
+        return Unavailable(
+            "server.unreachable",
+            "the server's certificate is not trusted; name the authority that signed it: --ca, ca=",
+            field=server,
+            got=why,
+        )
     return Unavailable(
         "server.unreachable",
         "the server cannot be reached; check that it runs, and its address and port",

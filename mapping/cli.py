@@ -422,6 +422,14 @@ def anchor(
             "north, degrees."
         ),
     ] = None,
+    accuracy: Annotated[
+        float | None,
+        typer.Option(
+            help="With --latitude: how far off the map may be by it, metres (rms); left out, "
+            "/geopose says that it does not know.",
+            min=0,
+        ),
+    ] = None,
     scale: Annotated[
         float | None,
         typer.Option(help="With --latitude, for a map that is not metric: metres per unit."),
@@ -444,13 +452,13 @@ def anchor(
     """
     said = (latitude, longitude, altitude, yaw)
     ways = (dataset is not None, correspondences is not None, any(v is not None for v in said))
-    details = scale is not None or gravity is not None
+    details = any(one is not None for one in (accuracy, scale, gravity))
     if sum(ways) != 1 or (ways[2] and None in said) or (details and not ways[2]):
         raise InvalidInput(
             "anchor.source",
             "say in one way where the map lies",
             expected="--dataset; or --correspondences; or all of --latitude, --longitude, "
-            "--altitude, --yaw, and where needed --scale and --gravity",
+            "--altitude, --yaw, and where needed --accuracy, --scale and --gravity",
         )
     opened = open_map(_folder(map_ref, maps_dir))
     if dataset is not None:
@@ -464,7 +472,7 @@ def anchor(
         assert yaw is not None
         down = None if gravity is None else _parse_vector("--gravity", gravity)
         position = (latitude, longitude, altitude)
-        found = given_place(opened, position, yaw, scale=scale, gravity=down)
+        found = given_place(opened, position, yaw, accuracy=accuracy, scale=scale, gravity=down)
     print_georeference(_out, found)
     folder = publish_anchored(opened, found, maps_dir, force=force)
     _out.print(f"map {open_map(folder).ref}", highlight=False, soft_wrap=True)

@@ -200,6 +200,7 @@ def given_place(
     position: tuple[float, float, float],
     yaw_deg: float,
     *,
+    accuracy: float | None = None,
     scale: float | None = None,
     gravity: tuple[float, float, float] | None = None,
 ) -> Georeference:
@@ -209,6 +210,7 @@ def given_place(
         opened: the map.
         position: latitude, longitude (deg) and height (m) of the world's (0, 0, 0).
         yaw_deg: direction of the level part of the world's x axis: 0 east, 90 north.
+        accuracy: how far off the map may be, metres (rms); None when that is not known.
         scale: metres per unit of the world; for maps that are not metric.
         gravity: what points down in the world, of any length; for maps that do not know it.
 
@@ -247,7 +249,8 @@ def given_place(
     turned = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ upright
     similarity = Similarity(1.0 if scale is None else scale, turned, np.zeros(3))
     geodetic = _geodetic(np.array(position), similarity)
-    anchor = Anchor(kind="correspondences", images=0, geodetic=geodetic)
+    rms = None if accuracy is None else accuracy / similarity.scale
+    anchor = Anchor(kind="correspondences", images=0, rms=rms, geodetic=geodetic)
     return Georeference(anchor, (), np.zeros((0, 3)), np.zeros(0, bool))
 
 

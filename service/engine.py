@@ -25,6 +25,7 @@ from service.jobs import (
 from service.metrics import Metrics
 from service.stores import Store
 from service.uploads import Uploads
+from service.wire import stopping_error
 from service.worker import MapFolder, WorkerSettings
 from service.workers import Workers
 from visloc.errors import (
@@ -348,9 +349,7 @@ class Engine:
 
     def _check_ready(self) -> None:
         if self._draining:
-            raise Unavailable(
-                "server.stopping", "the server is being stopped; ask another, or later"
-            )
+            raise stopping_error()
         if not self._started:
             raise Unavailable("server.starting", "the maps are being loaded; try again shortly")
 

@@ -40,6 +40,8 @@ OGC = "application/geopose+json"
 JSON = "application/json"
 _VERSIONS = {OSCP: ("1.0", "2.0"), OGC: ("1.0",), JSON: ()}
 _READ = (JSON, OSCP)
+# The protocol's accuracy where it is not known.
+UNKNOWN = -1.0
 _MAX_ID = 200
 
 
@@ -165,6 +167,7 @@ async def _answer(
             "geopose.not_anchored",
             f"map {found.map_ref} localizes the photo and is not anchored to the Earth",
         )
+    # Of a place that was simply given, nobody knows how exact it is.
     anchor = (await engine.map(found.map_ref)).outline.manifest.world.anchor
     accuracy = accuracy_of(
         found.cam_from_world,
@@ -175,7 +178,10 @@ async def _answer(
     return GeoPoseResponse(
         id=(asked.id or request_id)[:_MAX_ID],
         timestamp=round(time() * 1000) if asked.timestamp is None else asked.timestamp,
-        accuracy=GeoPoseAccuracy(position=accuracy.position, orientation=accuracy.orientation),
+        accuracy=GeoPoseAccuracy(
+            position=UNKNOWN if anchor is None or anchor.rms is None else accuracy.position,
+            orientation=accuracy.orientation,
+        ),
         geopose=geopose,
     )
 

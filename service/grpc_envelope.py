@@ -78,6 +78,7 @@ class Envelope:
         """Answer a call with an error, before it is served."""
         id_ = request_id(None)
         with self._observer.request("grpc", id_, route=method) as record:
+            record.peer = context.peer()
             await self._refuse(error, id_, context, record)
 
     async def _refuse(

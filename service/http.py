@@ -50,7 +50,7 @@ from service.schemas import (
     Readiness,
 )
 from service.settings import ServiceSettings
-from service.wire import internal_error, request_id
+from service.wire import internal_error, request_id, stopping_error
 from visloc.errors import InvalidInput, NotFound, VislocError
 
 logger = logging.getLogger(__name__)
@@ -91,7 +91,7 @@ def create_app(
     )
     app.state.observer, app.state.arrivals = observer, arrivals
     add_access(app, access, observer)
-    app.add_middleware(RequestEnvelope, observer=observer)
+    app.add_middleware(RequestEnvelope, observer=observer, is_stopping=lambda: engine.draining)
     app.add_exception_handler(VislocError, _on_error)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(HTTPException, _on_http_exception)
@@ -193,9 +193,10 @@ def create_app(
 class RequestEnvelope:
     """Gives every request an id, a line in the log, and an answer even when something broke."""
 
-    def __init__(self, app: ASGIApp, observer: Observer) -> None:
+    def __init__(self, app: ASGIApp, observer: Observer, is_stopping: Callable[[], bool]) -> None:
         self._app = app
         self._observer = observer
+        self._is_stopping = is_stopping
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
@@ -206,6 +207,7 @@ class RequestEnvelope:
         id_ = request_id(headers.get("x-request-id"))
         scope.setdefault("state", {})["request_id"] = id_
         with self._observer.request("http", id_, traceparent=headers.get("traceparent")) as record:
+            record.peer = scope["client"][0] if scope.get("client") else None
 
             async def send_with_id(message: Message) -> None:
                 if message["type"] == "http.response.start":
@@ -217,18 +219,41 @@ class RequestEnvelope:
                 await send(message)
 
             try:
+                if "content-length" in headers and "transfer-encoding" in headers:
+                    # RFC 9112, 6.3: a proxy may have understood it otherwise.
+                    await self._refuse(_ambiguous(), id_, scope, receive, send_with_id)
+                    return
                 await self._app(scope, receive, send_with_id)
+            except asyncio.CancelledError:
+                if record.status or not self._is_stopping():
+                    raise
+                await self._refuse(stopping_error(), id_, scope, receive, send_with_id)
             except ClientDisconnect:
                 logger.info("the client of request %s left before it was answered", id_)
             except Exception:  # the last line of defence: whatever it is, the caller gets an answer
                 logger.exception("request %s broke", id_)
                 if record.status:
                     raise  # too late to answer: the server closes the connection
-                error = internal_error()
-                self._observer.error(error)
-                await problem_response(error, id_)(scope, receive, send_with_id)
+                await self._refuse(internal_error(), id_, scope, receive, send_with_id)
             finally:
                 record.route = route_of(scope)
+
+    async def _refuse(
+        self, error: VislocError, id_: str, scope: Scope, receive: Receive, send: Send
+    ) -> None:
+        self._observer.error(error)
+        response = problem_response(error, id_)
+        response.headers["Connection"] = "close"
+        await response(scope, receive, send)
+
+
+def _ambiguous() -> InvalidInput:
+    return InvalidInput(
+        "request.framing",
+        "the request says in two ways where its body ends",
+        field="Transfer-Encoding",
+        expected="Content-Length or Transfer-Encoding, not both",
+    )
 
 
 async def _next_of(answers: AsyncGenerator[InstantLocalization]) -> InstantLocalization:

@@ -32,6 +32,7 @@ class RequestRecord:
         request_id: the caller's or ours; checked by ``wire.request_id``.
         trace: where it stands in the caller's trace; None without a trace.
         key: the name of the API key.
+        peer: the address that asks; logged only of those who are refused access.
         route: the template of the path with its method, or the name of the gRPC method.
         status: of the answer: ``200``, ``OK``; empty until there is one.
         map: the id of the map that answered.
@@ -47,6 +48,7 @@ class RequestRecord:
     request_id: str
     trace: TraceContext | None = None
     key: str | None = None
+    peer: str | None = None
     route: str = UNMATCHED
     status: str = ""
     map: str | None = None

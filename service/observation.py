@@ -150,6 +150,8 @@ def _write(record: RequestRecord, seconds: float) -> None:
         facts |= {"map": record.map, "outcome": record.outcome}
     if record.code is not None:
         facts["code"] = record.code
+        if record.code.startswith("access."):
+            facts["peer"] = record.peer
     level = logging.DEBUG if record.route in _PROBES else logging.INFO
     access_log.log(level, "request", extra={"facts": facts})
 

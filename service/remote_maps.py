@@ -35,6 +35,7 @@ from visloc.archive.store import (
     CURRENT,
     FULL,
     checked_name,
+    none_in_use,
     read_published_outline,
     refuse_renamed,
     version_exists,
@@ -120,14 +121,16 @@ class RemoteMapStore:
         """The version in use.
 
         Raises:
-            NotFound: ``map.unknown``.
+            NotFound: ``map.unknown``, ``map.none_in_use``.
             MapCorrupt: ``map.current`` when the object that names it is damaged.
             Unavailable: ``maps.storage_away`` when nothing is known of the storage.
         """
         checked_name(map_id, "map")
         known = self._known().get(map_id)
-        if known is None or known.current is None:
+        if known is None:
             raise self._unknown_map(map_id)
+        if known.current is None:
+            raise none_in_use(map_id, known.versions)
         if not ID_PATTERN.fullmatch(known.current):
             raise MapCorrupt(
                 "map.current",

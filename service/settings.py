@@ -72,7 +72,7 @@ class ServiceSettings(BaseModel):
     """port of the HTTP API; 0 lets the system choose"""
     grpc_port: Port = 50051
     """port of the gRPC API; 0 lets the system choose"""
-    workers: Count = 1
+    workers: Annotated[int, Field(ge=1, le=256)] = 1
     """photos that are worked on at the same time"""
     threads_per_worker: Count = Field(
         default_factory=lambda data: max(1, (os.cpu_count() or 1) // data.get("workers", 1)),

@@ -60,6 +60,11 @@ def internal_error() -> VislocError:
     )
 
 
+def stopping_error() -> Unavailable:
+    """Return what a caller is told whose request the end of the server cuts off."""
+    return Unavailable("server.stopping", "the server is being stopped; ask another, or later")
+
+
 def request_id(given: str | None) -> str:
     """Return the caller's id when it is short and visible ASCII, else a new one."""
     return given if given and _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex

@@ -24,6 +24,7 @@ from multiprocessing import get_context
 from typing import Any, ParamSpec, TypeVar
 
 from service import worker
+from service.wire import stopping_error
 from service.worker import Loaded, MapFolder, WorkerSettings
 from visloc.errors import TimedOut, Unavailable, VislocError
 
@@ -174,7 +175,7 @@ class Workers:
             await asyncio.wait(self._serving)
         for task in (*self._queue, *(task for one in self._workers for task in one.errands)):
             if not task.answer.done():
-                task.answer.set_exception(_stopping())
+                task.answer.set_exception(stopping_error())
         await asyncio.gather(*(asyncio.to_thread(one.stop) for one in self._workers))
 
     async def _serve(self, one: _Worker) -> None:
@@ -195,7 +196,7 @@ class Workers:
             found = await one.run(self._limit_s, task.work)
         except asyncio.CancelledError:
             if not task.answer.done():
-                task.answer.set_exception(_stopping())
+                task.answer.set_exception(stopping_error())
             raise
         except Exception as error:  # noqa: BLE001  whatever it is, it is the caller's
             if not task.answer.done():
@@ -338,10 +339,6 @@ class _Worker:
         if self.pid:
             with suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGKILL)
-
-
-def _stopping() -> Unavailable:
-    return Unavailable("server.stopping", "the server is being stopped; ask another, or later")
 
 
 def _died() -> Unavailable:

@@ -487,7 +487,10 @@ def grpc_door(access: Access, grace_s: float = 20.0) -> Iterator[GrpcDoor]:
     async def start() -> tuple[grpc.aio.Server, int]:
         envelope = Envelope(Observer(Metrics()))
         server = grpc.aio.server(
-            interceptors=(AccessInterceptor(access, envelope), TimelyCalls(envelope, grace_s, 0))
+            interceptors=(
+                AccessInterceptor(access, envelope, 10),
+                TimelyCalls(envelope, grace_s, 0),
+            )
         )
         pb2_grpc.add_LocalizationServicer_to_server(servicer, server)
         pb2_grpc.add_MapsServicer_to_server(Maps(), server)  # type: ignore[abstract]

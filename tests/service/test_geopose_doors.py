@@ -37,7 +37,7 @@ def anchored_maps(built_maps: Path, tmp_path_factory: pytest.TempPathFactory) ->
     shutil.copytree(built_maps, maps)
     room = MapStore(maps).open("room")
     place = (LATITUDE, LONGITUDE, ALTITUDE)
-    found = given_place(room, place, 90.0, gravity=(0.0, 0.0, -1.0))
+    found = given_place(room, place, 90.0, accuracy=0.1, gravity=(0.0, 0.0, -1.0))
     publish_anchored(room, found, maps, force=False)
     return maps
 

@@ -183,16 +183,17 @@ def test_a_message_over_the_limit_is_not_taken(doors: Any, query: Any) -> None:
     assert call.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
 
 
-def test_calls_over_the_limit_are_refused(serve: Any, tmp_path: Any) -> None:
+def test_who_watches_health_leaves_room_for_others(serve: Any, tmp_path: Any) -> None:
     with serve(tmp_path, load=False, max_connections=8) as doors:
         stub = health_pb2_grpc.HealthStub(doors.channel)
-        watching = [stub.Watch(health_pb2.HealthCheckRequest()) for _ in range(8)]
+        watching = [stub.Watch(health_pb2.HealthCheckRequest()) for _ in range(4)]
         for watch in watching:
             next(watch)
         with pytest.raises(grpc.RpcError) as caught:
-            doors.stub.ListMaps(pb2.ListMapsRequest())
+            next(stub.Watch(health_pb2.HealthCheckRequest()))
         call: Any = caught.value
         assert call.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+        assert doors.stub.ListMaps(pb2.ListMapsRequest()).maps == []
         for watch in watching:
             watch.cancel()
 

@@ -57,13 +57,16 @@ class MapStore:
         """The version in use.
 
         Raises:
-            NotFound: ``map.unknown``.
+            NotFound: ``map.unknown``, ``map.none_in_use``.
             MapCorrupt: ``map.current`` when the file that names it is damaged.
         """
         path = self.root / checked_name(map_id, "map") / CURRENT
         try:
             version = path.read_text(encoding="ascii").strip()
         except FileNotFoundError:
+            versions = self.versions(map_id)
+            if versions:
+                raise none_in_use(map_id, versions) from None
             known = ", ".join(self.ids()) or "none"
             raise NotFound(
                 "map.unknown", "no such map", field="map", expected=f"one of: {known}", got=map_id
@@ -289,6 +292,17 @@ def version_exists(map_id: str, version: str) -> Conflict:
         "the version exists already; versions never change, publish under another name",
         field="map",
         got=f"{map_id}@{version}",
+    )
+
+
+def none_in_use(map_id: str, versions: Sequence[str]) -> NotFound:
+    """``map.none_in_use``."""
+    return NotFound(
+        "map.none_in_use",
+        "no version of the map is in use; put one into use, or name one",
+        field="map",
+        expected=f"one of: {', '.join(f'{map_id}@{version}' for version in versions)}",
+        got=map_id,
     )
 
 
