@@ -19,7 +19,7 @@ from service.http import create_app
 from service.metrics import Metrics, ServiceState
 from service.metrics_http import metrics_app
 from service.observation import Observer
-from service.settings import ServiceSettings
+from service.settings import ServiceSettings, SettingsError
 from service.stores import open_store
 from service.tls import check_tls, tls_config
 from service.tracing import open_spans
@@ -44,6 +44,8 @@ class Server:
     def __init__(self, settings: ServiceSettings) -> None:
         self._settings = settings
         check_tls(settings)
+        if settings.weights_dir is not None and not settings.weights_dir.is_dir():
+            raise SettingsError(f"weights_dir: {settings.weights_dir} is no folder")
         access = open_access(settings)
         self._arrivals = Arrivals(settings.arrival_timeout_s, settings.max_buffered_bytes)
         self._store = open_store(settings)

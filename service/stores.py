@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Protocol
 
 from service.settings import ServiceSettings, SettingsError
 from visloc.archive import MapOutline, MapStore
+
+logger = logging.getLogger(__name__)
 
 
 class Store(Protocol):
@@ -79,7 +82,7 @@ def open_store(settings: ServiceSettings) -> Store:
     """Return the store that ``maps_dir`` names.
 
     Raises:
-        SettingsError: for a URL that cannot be used.
+        SettingsError: for a URL that cannot be used, and for what is no folder.
     """
     if "://" in settings.maps_dir:
         from service.remote_maps import RemoteMapStore  # its libraries take long to load
@@ -88,4 +91,9 @@ def open_store(settings: ServiceSettings) -> Store:
             return RemoteMapStore(settings.maps_dir, settings.cache_dir, settings.max_cache_bytes)
         except (ImportError, ValueError) as error:  # a protocol that is not known or not installed
             raise SettingsError(f"maps_dir: the URL cannot be used: {error}") from None
-    return MapStore(Path(settings.maps_dir))
+    folder = Path(settings.maps_dir)
+    if not settings.maps_dir or (folder.exists() and not folder.is_dir()):
+        raise SettingsError(f"maps_dir: {settings.maps_dir!r} is no folder")
+    if not folder.exists():
+        logger.warning("maps_dir: %s is not there yet; it is made with the first map", folder)
+    return MapStore(folder)
