@@ -145,7 +145,7 @@ def test_a_map_that_is_new_is_not_listed_until_a_version_is_in_use(
 
     assert [(v.version, v.current) for v in uploaded.versions] == [("v1", False)]
     assert map_id not in {info.id for info in client.maps()}
-    refused(NotFound, "map.unknown", lambda: client.map(map_id))
+    refused(NotFound, "map.none_in_use", lambda: client.map(map_id))
 
     client.use_version(map_id, "v1")
     assert map_id in {info.id for info in client.maps()}
