@@ -221,7 +221,10 @@ class RequestEnvelope:
             try:
                 if "content-length" in headers and "transfer-encoding" in headers:
                     # RFC 9112, 6.3: a proxy may have understood it otherwise.
-                    await self._refuse(_ambiguous(), id_, scope, receive, send_with_id)
+                    refused = _ambiguous()
+                    await self._refuse(
+                        refused, id_, scope, receive, send_with_id, HTTPStatus.BAD_REQUEST
+                    )
                     return
                 await self._app(scope, receive, send_with_id)
             except asyncio.CancelledError:
@@ -239,10 +242,16 @@ class RequestEnvelope:
                 record.route = route_of(scope)
 
     async def _refuse(
-        self, error: VislocError, id_: str, scope: Scope, receive: Receive, send: Send
+        self,
+        error: VislocError,
+        id_: str,
+        scope: Scope,
+        receive: Receive,
+        send: Send,
+        status: HTTPStatus | None = None,
     ) -> None:
         self._observer.error(error)
-        response = problem_response(error, id_)
+        response = problem_response(error, id_, status)
         response.headers["Connection"] = "close"
         await response(scope, receive, send)
 

@@ -1006,3 +1006,31 @@ def test_a_sequence_survives_the_death_of_a_worker_between_two_instants(
         assert [each.answer.num_inliers for each in others] == [first.answer.num_inliers] * 2
 
     with_engine(play)
+
+
+def test_a_version_is_deleted_after_the_requests_that_began_with_it(
+    maps_dir: Path, query: Query
+) -> None:
+    old = MapStore(maps_dir).current_version("room")
+    publish(maps_dir, "v2")
+
+    async def play(engine: Engine) -> None:
+        with held_back(engine):
+            asked = asyncio.create_task(engine.localize(job_for(query, f"room@{old}")))
+            await until(lambda: engine.workers.running == 1)
+            deleting = asyncio.create_task(engine.delete("room", old))
+            await asyncio.sleep(0.2)
+            assert not deleting.done()
+            with pytest.raises(NotFound):  # it is not to be had any more
+                await engine.localize(job_for(query, f"room@{old}"))
+        assert (await asked).map_version == old
+        await deleting
+        assert MapStore(maps_dir).versions("room") == ["v2"]
+        publish(maps_dir, "v3")
+        await until(lambda: "room@v3" in engine.status.maps)
+        with pytest.raises(Conflict) as caught:
+            await engine.delete("room", "v3")
+        assert caught.value.code == "map.version_in_use"
+
+    with started(maps_dir) as with_engine:
+        with_engine(play)

@@ -540,3 +540,18 @@ def test_what_fastapi_refuses_is_a_problem_too(doors: Any) -> None:
 
 def _cube(side: int) -> int:
     return side**3
+
+
+def test_a_request_with_two_ends_is_refused_and_the_connection_closed(doors: Any) -> None:
+    with socket.create_connection(("127.0.0.1", doors.server.http_port), timeout=10) as connection:
+        connection.sendall(
+            b"POST /localize HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5\r\n"
+            b"Transfer-Encoding: chunked\r\n\r\n0\r\n\r\nGET /healthz HTTP/1.1\r\n"
+            b"Host: localhost\r\n\r\n"
+        )
+        answer = b""
+        while part := connection.recv(65536):
+            answer += part
+    assert answer.startswith(b"HTTP/1.1 400 ")
+    assert b"request.framing" in answer
+    assert answer.count(b"HTTP/1.1") == 1

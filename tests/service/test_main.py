@@ -9,13 +9,14 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import grpc
 import httpx
 import pytest
 
 from service.server import Server
-from service.settings import ServiceSettings
+from service.settings import ServiceSettings, SettingsError
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.v1.localization_pb2_grpc import LocalizationStub
 
@@ -62,6 +63,14 @@ def test_a_wrong_setting_ends_the_command_with_one_line() -> None:
         assert process.stderr is not None
         assert process.stderr.read().startswith("visloc-service: --http-port: http_port cannot be")
         assert process.wait(10) == 1
+
+
+@pytest.mark.parametrize("name", ["maps_dir", "weights_dir"])
+def test_what_is_no_folder_is_refused_by_name(name: str, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    given: dict[str, Any] = {"maps_dir": tmp_path, name: tmp_path / "file"}
+    with pytest.raises(SettingsError, match=f"{name}: .* is no folder"):
+        Server(ServiceSettings(**given, http_port=0, grpc_port=0))
 
 
 @pytest.mark.parametrize("taken", ["http_port", "grpc_port"])
