@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from clients.geopose import GeoPose
 from clients.running import Outcome
 from clients.types import LocalizeResult, MapInfo, PoseEstimate
 
@@ -43,6 +44,8 @@ def print_result(console: Console, result: LocalizeResult, unit: str) -> None:
     if result.pose is not None:
         print_line(console, "localized", f"in {result.map.id}@{result.map.version}", "bold green")
         _print_pose(console, result.pose, unit)
+        if result.geopose is not None:
+            print_line(console, "on Earth", _on_earth(result.geopose))
     elif result.refusal is not None:
         print_line(console, "not localized", result.refusal.message, "bold yellow")
         print_line(console, "gave up at", f"{result.refusal.stage} ({result.refusal.reason})")
@@ -126,6 +129,10 @@ def print_line(console: Console, label: str, text: str, style: str = "bold") -> 
     clean = "".join(letter if letter.isprintable() else "?" for letter in text)
     line = Text.assemble((f"{label:<14} ", style), clean)
     console.print(line, highlight=False, soft_wrap=True)
+
+
+def _on_earth(place: GeoPose) -> str:
+    return f"{place.latitude:.8f}, {place.longitude:.8f}, {place.height:.3f} m above the ellipsoid"
 
 
 def _print_pose(console: Console, pose: PoseEstimate, unit: str) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rich.console import Console
 
 from clients.display import print_line, unit_of
-from clients.types import MapInfo
+from clients.types import Anchor, MapInfo
 
 
 def print_maps(console: Console, maps: Sequence[MapInfo]) -> None:
@@ -41,7 +41,7 @@ def print_map(console: Console, info: MapInfo) -> None:
     print_line(console, "extent", f"{sides} {unit}")
     print_line(console, "on Earth", _place(info) or "not known; mapping anchor tells it")
     if info.anchor is not None:
-        print_line(console, "anchor", f"{info.anchor.kind}, {info.anchor.images} photos")
+        print_line(console, "anchor", _anchor(info.anchor))
     for number, rig in enumerate(info.rigs):
         print_line(console, "" if number else "rigs", f"{rig.id}: {', '.join(rig.sensors)}")
     for number, version in enumerate(info.versions):
@@ -68,3 +68,13 @@ def _size(size_bytes: int) -> str:
             return f"{size:.0f} {unit}" if unit == "bytes" else f"{size:.1f} {unit}"
         size /= 1000
     return f"{size:.1f} GB"
+
+
+def _anchor(anchor: Anchor) -> str:
+    if anchor.kind in ("dataset", "model", "none"):
+        by = anchor.kind
+    elif anchor.images:
+        by = f"{anchor.kind}, {anchor.images} photos or points"
+    else:
+        by = "a place that was given"
+    return by if anchor.rms is None else f"{by}, {anchor.rms:.3g} off (rms, units of the world)"

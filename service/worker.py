@@ -40,7 +40,7 @@ from service.jobs import (
 )
 from service.logs import configure_logging
 from service.sequences import SequenceRun
-from visloc.archive import Map, open_map
+from visloc.archive.store import open_published
 from visloc.constraints import MapGeometry
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, VislocError
 from visloc.features import LocalFeatureExtractor, make_local_features
@@ -144,7 +144,7 @@ class _Process:
     def _open(self, of: MapFolder) -> Localizer:
         start = perf_counter()
         with _damage_named(of.ref):
-            opened = open_version(of)
+            opened = open_published(of.folder)
             name = opened.manifest.local_features.fingerprint.name
             try:
                 if name not in self._extractors and not is_ready_made(name):
@@ -427,25 +427,6 @@ def _sequence(state: bytes, maps: Sequence[MapFolder]) -> SequenceRun:
 def _targets(maps: Sequence[MapFolder], rig: Rig | None) -> list[Target]:
     localizers = [_here().localizer(of) for of in maps]
     return [Target(found, rig_in_map(rig, found.map)) for found in localizers]
-
-
-def open_version(of: MapFolder) -> Map:
-    """Open a version of a map.
-
-    Raises:
-        MapCorrupt: ``map.renamed`` when the folder was copied or renamed: answers would carry the
-            old name; or as ``open_map``.
-    """
-    opened = open_map(of.folder)
-    if opened.ref != of.ref:
-        raise MapCorrupt(
-            "map.renamed",
-            "the map's folder was copied or renamed; build the map under its new id",
-            field=str(of.folder),
-            expected=opened.ref,
-            got=of.ref,
-        )
-    return opened
 
 
 @contextmanager
