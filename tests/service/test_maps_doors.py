@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import shutil
 import socket
 import threading
@@ -96,7 +97,9 @@ def nothing_is_left(root: Path) -> Iterator[None]:
 
 
 def files_below(folder: Path) -> list[Path]:
-    return [path for path in folder.rglob("*") if path.is_file() and path.name != ".lock"]
+    # os.walk passes over a folder that the service removes meanwhile; rglob raises.
+    found = (Path(at, name) for at, _, names in os.walk(folder) for name in names)
+    return [path for path in found if path.name != ".lock"]
 
 
 def used(client: Client) -> str:
