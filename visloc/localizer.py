@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,7 @@ from visloc.types import (
     Answer,
     CameraSource,
     Evidence,
+    Extraction,
     LocalFeatures,
     Localized,
     LocalizeOptions,
@@ -55,7 +57,7 @@ _NUM_ELSEWHERE = 5
 
 # Of one photo: what an extractor found with a limit, and the pixels it looked at.
 FeatureCache = dict[
-    tuple[LocalFeatureExtractor, int, ReadAs], tuple[LocalFeatures, NDArray[np.uint8]]
+    tuple[LocalFeatureExtractor, int, ReadAs, Extraction], tuple[LocalFeatures, NDArray[np.uint8]]
 ]
 
 
@@ -174,7 +176,7 @@ class Localizer:
         evidence = Evidence(used, source, photo.exif_orientation, options.read_as, seconds=seconds)
         with timed(seconds, "local_features"):
             max_keypoints = self.map.manifest.local_features.max_keypoints
-            key = self._extractor, max_keypoints, options.read_as
+            key = self._extractor, max_keypoints, options.read_as, options.extraction
             local, rgb = (found or {}).get(key) or _find_features(photo, *key)
             if found is not None:
                 found[key] = local, rgb
@@ -363,13 +365,18 @@ def _nothing(evidence: Evidence, stage: Stage, reason: Reason, message: str) -> 
 
 
 def _find_features(
-    photo: Photo, extractor: LocalFeatureExtractor, max_keypoints: int, read_as: ReadAs
+    photo: Photo,
+    extractor: LocalFeatureExtractor,
+    max_keypoints: int,
+    read_as: ReadAs,
+    extraction: Extraction,
 ) -> tuple[LocalFeatures, NDArray[np.uint8]]:
     """Features with keypoints in the stored pixels, and the image they were found in."""
+    find = partial(extractor.extract, max_keypoints=max_keypoints, extraction=extraction)
     if read_as is ReadAs.STORED or photo.exif_orientation == 1:
-        return extractor.extract(photo.rgb, max_keypoints=max_keypoints), photo.rgb
+        return find(photo.rgb), photo.rgb
     rgb = upright(photo.rgb, photo.exif_orientation)
-    local = extractor.extract(rgb, max_keypoints=max_keypoints)
+    local = find(rgb)
     keypoints = stored_from_upright(
         local.keypoints, photo.exif_orientation, photo.width, photo.height
     )

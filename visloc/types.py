@@ -87,6 +87,26 @@ class ReadAs(StrEnum):
     UPRIGHT = "upright"  # turned by the photo's EXIF orientation
 
 
+class Extraction(StrEnum):
+    """How much effort goes into finding the local features of a photo.
+
+    Maps are made with the most. Where an extractor has one way only, all three are that way.
+    """
+
+    FAST = "fast"
+    DEFAULT = "default"
+    ACCURATE = "accurate"
+
+
+class Inference(StrEnum):
+    """How networks are computed. Descriptors of all ways match each other's."""
+
+    AUTO = "auto"  # torch where there is a CUDA GPU, else 8 bits where the CPU is made for them
+    INT8 = "int8"  # OpenVINO, 8-bit weights and activations
+    FP32 = "fp32"  # OpenVINO, 32-bit
+    TORCH = "torch"  # the reference; on a CUDA GPU where there is one
+
+
 class Reason(StrEnum):
     """Why a photo was not localized."""
 
@@ -145,6 +165,7 @@ class LocalizeOptions:
         min_inlier_ratio: smallest share of inliers among the correspondences, 0 to 1.
         read_as: whether to turn the photo upright by its EXIF orientation before finding
             features. Camera, pose and 2D points refer to the pixels as stored either way.
+        extraction: the effort that goes into finding the photo's local features.
         seed: of RANSAC; equal seeds give equal answers.
     """
 
@@ -154,6 +175,7 @@ class LocalizeOptions:
     min_inliers: int | None = None
     min_inlier_ratio: float | None = None
     read_as: ReadAs = ReadAs.STORED
+    extraction: Extraction = Extraction.DEFAULT
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -13,6 +13,7 @@ from typing import cast
 
 from visloc.errors import InvalidInput
 from visloc.features.base import Fingerprint, GlobalDescriptor, LocalFeatureExtractor
+from visloc.types import Inference
 
 __all__ = [
     "DEFAULT_GLOBAL_FEATURES",
@@ -26,7 +27,8 @@ __all__ = [
     "make_local_features",
 ]
 
-# name -> module and function; functions of local features take the folder with weights, or None.
+# name -> module and function; functions of local features take the folder with weights or None, how
+# networks are computed, and with how many threads.
 LOCAL_FEATURES: Mapping[str, tuple[str, str]] = {
     "faster2d2": ("visloc.features.r2d2", "load_faster2d2"),
     "r2d2": ("visloc.features.r2d2", "load_r2d2"),
@@ -42,18 +44,29 @@ DEFAULT_LOCAL_FEATURES = "xfeat"
 DEFAULT_GLOBAL_FEATURES = ("densevlad", "localvlad")
 
 
-def make_local_features(name: str, weights_dir: Path | None = None) -> LocalFeatureExtractor:
+def make_local_features(
+    name: str,
+    weights_dir: Path | None = None,
+    inference: Inference = Inference.AUTO,
+    threads: int | None = None,
+) -> LocalFeatureExtractor:
     """Build the extractor that a command or a map names.
+
+    Args:
+        name: a name of ``LOCAL_FEATURES``.
+        weights_dir: folder with network weights.
+        inference: how networks are computed.
+        threads: processor threads for one photo; None for all processors.
 
     Raises:
         InvalidInput: ``features.unknown``.
         WeightsError: when its weights are missing or not its own.
     """
     load = cast(
-        "Callable[[Path | None], LocalFeatureExtractor]",
+        "Callable[[Path | None, Inference, int | None], LocalFeatureExtractor]",
         _find(LOCAL_FEATURES, name, "local_features"),
     )
-    return load(weights_dir)
+    return load(weights_dir, inference, threads)
 
 
 def make_global_descriptor(name: str) -> GlobalDescriptor:

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.types import Fingerprint, LocalFeatures
+from visloc.types import Extraction, Fingerprint, LocalFeatures
 
 __all__ = ["Fingerprint", "GlobalDescriptor", "LocalFeatureExtractor"]
 
@@ -21,10 +21,20 @@ class LocalFeatureExtractor(Protocol):
         """Name, parameters and weights; kept in the manifest of every map."""
 
     @property
+    def computed_with(self) -> str:
+        """What computes it, for instance ``torch 2.13.0 on cpu``: other bits, alike features."""
+
+    @property
     def descriptor_dim(self) -> int:
         """Length D of one descriptor."""
 
-    def extract(self, rgb: NDArray[np.uint8], *, max_keypoints: int) -> LocalFeatures:
+    def extract(
+        self,
+        rgb: NDArray[np.uint8],
+        *,
+        max_keypoints: int,
+        extraction: Extraction = Extraction.ACCURATE,
+    ) -> LocalFeatures:
         """Return at most ``max_keypoints`` features, strongest first.
 
         rgb: (H, W, 3). Keypoints are in its pixels, whatever size the network worked at.

