@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all fuzz fuzz-api fmt lint types contracts proto proto-check check serve clean
+.PHONY: help install demo test test-all fuzz fuzz-api bench bench-scale fmt lint types contracts proto proto-check check serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -33,6 +33,13 @@ fuzz: install ## fuzz what reads strangers' bytes: RUNS inputs for each target
 
 fuzz-api: install ## send CASES requests made from our OpenAPI
 	$(BIN)/python -m tests.fuzz.api --cases $(or $(CASES),5000)
+
+bench: install ## seconds and accuracy beside the peer and the machine's limit, of DATASET with FEATURES
+	$(BIN)/python -m benchmarks.speed $(or $(DATASET),../shared/data/redkitchen) \
+		--local-features $(or $(FEATURES),faster2d2) --weights-dir $(or $(WEIGHTS),../shared/weights) $(ARGS)
+
+bench-scale: install ## maps of 100 to 100 000 images: opening, memory, retrieval
+	$(BIN)/python -m benchmarks.scale $(ARGS)
 
 fmt: install ## format the code
 	$(BIN)/ruff format .
@@ -62,4 +69,4 @@ serve: install ## serve the maps in maps/ on 127.0.0.1:8000 (HTTP) and :50051 (g
 	$(BIN)/python -m service --maps-dir maps
 
 clean: ## remove what make made
-	rm -rf $(VENV) .demo
+	rm -rf $(VENV) .demo .bench

@@ -28,9 +28,9 @@ from visloc.images import ImageLimits, read_photo
 from visloc.kapture import Dataset, read_dataset
 from visloc.localizer import Localizer
 from visloc.priors import NO_PRIORS
-from visloc.sequence import Odometry, SeenInstant, SequenceSolver
+from visloc.sequence import SeenInstant, SequenceSolver
 from visloc.solving import Look, SeenImage
-from visloc.trajectory import PoseSource, TimeUnit, TracedPose, fill_rig, interpolate_pose
+from visloc.trajectory import Odometry, PoseSource, TimeUnit, TracedPose, fill_rig, interpolate_pose
 from visloc.types import InstantAnswer, LocalizeOptions
 
 Pixels = NDArray[np.uint8]

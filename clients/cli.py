@@ -61,8 +61,8 @@ Options = Annotated[
     typer.Option(
         "--option",
         metavar="NAME=VALUE",
-        help="preset, top_k, max_error_px, min_inliers, min_inlier_ratio, read_as or seed; "
-        "can be repeated.",
+        help="preset, top_k, max_error_px, min_inliers, min_inlier_ratio, read_as, extraction "
+        "(fast, default, accurate) or seed; can be repeated.",
     ),
 ]
 Seed = Annotated[int | None, typer.Option("--seed", min=0, help="The same as --option seed=...")]

@@ -25,6 +25,7 @@ _OPTION_KINDS: Mapping[str, type[int] | type[float] | type[str]] = {
     "min_inliers": int,
     "min_inlier_ratio": float,
     "read_as": str,
+    "extraction": str,
     "seed": int,
 }
 _EXPECTED = {int: f"a whole number from 0 to {_MAX_WHOLE}", float: "a finite number", str: "a text"}
@@ -42,6 +43,8 @@ class LocalizeOptions:
         min_inlier_ratio: smallest share of inliers among the correspondences, 0 to 1.
         read_as: ``stored``, or ``upright`` to turn the photo by its EXIF orientation before
             features are found; the pose refers to the pixels as stored either way.
+        extraction: the effort that goes into finding the photo's features: fast, default or
+            accurate. Features that are sent are taken as they are.
         seed: of RANSAC; equal seeds give equal answers.
 
     Raises:
@@ -54,6 +57,7 @@ class LocalizeOptions:
     min_inliers: int | None = None
     min_inlier_ratio: float | None = None
     read_as: str | None = None
+    extraction: str | None = None
     seed: int | None = None
 
     def __post_init__(self) -> None:

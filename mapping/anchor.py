@@ -26,7 +26,7 @@ import numpy as np
 import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
 from numpy.typing import NDArray
-from scipy.stats import t as student_t
+from scipy.special import stdtrit
 
 from mapping.photos import MappingPhoto
 from visloc.archive import Anchor, Geodetic
@@ -237,7 +237,7 @@ def _margin(squared_misfit: float, freedom: int) -> float:
     """Half of the 95 % interval of a mean of one measurement, its sigma estimated by a misfit."""
     if freedom < 1:
         return math.inf
-    return float(student_t.ppf(0.975, freedom)) * math.sqrt(squared_misfit / freedom)
+    return float(stdtrit(freedom, 0.975)) * math.sqrt(squared_misfit / freedom)
 
 
 def scale_doubt(centers: NDArray[np.float64], known: NDArray[np.float64]) -> str | None:

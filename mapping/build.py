@@ -21,6 +21,7 @@ from mapping.features import (
     ReadyMadeFeatures,
     describe_photos,
     find_local_features,
+    open_extractor,
     read_global_features,
 )
 from mapping.known_model import landmarks_from_reconstruction, refuse_without_points
@@ -54,11 +55,11 @@ from visloc.features import (
     DEFAULT_GLOBAL_FEATURES,
     DEFAULT_LOCAL_FEATURES,
     make_global_descriptor,
-    make_local_features,
 )
 from visloc.features.readymade import is_ready_made, ready_made_type
 from visloc.geometry import PixelOrigin, Pose
 from visloc.kapture import Dataset, open_features, open_local_features, read_dataset
+from visloc.types import Inference
 
 # How landmarks are made: from depth, from matches, or from points that the dataset brings along.
 METHODS = ("rgbd", "sfm", "model")
@@ -83,6 +84,7 @@ class BuildSettings:
         features_dir: where ready-made features lie, when not in the dataset.
         pixel_origin: what the dataset's principal points and ready-made keypoints count from.
         weights_dir: folder with network weights.
+        inference: how networks are computed.
         max_keypoints: strongest keypoints kept per photo, in the map and in queries.
         metric: whether a unit of the dataset's poses is a metre; None: yes, as kapture has it, but
             not for ``model``, since a reconstruction has the unit that its tool chose.
@@ -105,6 +107,7 @@ class BuildSettings:
     features_dir: Path | None = None
     pixel_origin: PixelOrigin = PixelOrigin.CORNER
     weights_dir: Path | None = None
+    inference: Inference = Inference.AUTO
     max_keypoints: int = 5000
     metric: bool | None = None
     depth: DepthSettings = field(default_factory=DepthSettings)
@@ -141,8 +144,8 @@ def build_map(settings: BuildSettings, progress: Progress) -> Path:
             "--force publishes a new version and keeps the old one",
             field="--map",
         )
-    if not is_ready_made(settings.local_features):
-        make_local_features(settings.local_features, settings.weights_dir)  # raises when it cannot
+    if not is_ready_made(settings.local_features):  # raises when it cannot
+        open_extractor(settings.local_features, settings.weights_dir, settings.inference)
     dataset = read_dataset(settings.dataset).with_pixels_from(settings.pixel_origin)
     work_root = settings.maps_dir / ".work" / settings.map_id
     try:
@@ -376,7 +379,17 @@ def _refuse_gravity_that_is_not_down(settings: BuildSettings) -> None:
 def _local_features(work: WorkFolder, settings: BuildSettings) -> LocalFeaturesSource:
     name = settings.local_features
     if not is_ready_made(name):
-        return ExtractedFeatures(work, name, settings.weights_dir, settings.max_keypoints)
+        extractor = open_extractor(name, settings.weights_dir, settings.inference)
+        return ExtractedFeatures(
+            work,
+            name,
+            settings.weights_dir,
+            settings.inference,
+            settings.max_keypoints,
+            extractor.fingerprint,
+            extractor.descriptor_dim,
+            extractor.computed_with,
+        )
     keypoints, descriptors = open_local_features(
         settings.dataset, ready_made_type(name), settings.features_dir
     )
@@ -468,6 +481,7 @@ def _content(
         image_poses=tuple(view.cam_from_world for view in made.views),
         landmarks=made.landmarks,
         local_fingerprint=FingerprintRecord.of(features.fingerprint),
+        computed_with=features.computed_with,
         max_keypoints=features.max_keypoints,
         descriptor_dim=features.descriptor_dim,
         descriptors=observed_descriptors,

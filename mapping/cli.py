@@ -41,6 +41,7 @@ from mapping.options import (
     FarOption,
     FeaturesDirOption,
     GlobalFeaturesOption,
+    InferenceOption,
     LocalFeaturesOption,
     MapArgument,
     MapsDirOption,
@@ -74,6 +75,7 @@ from visloc.features.readymade import is_ready_made
 from visloc.geometry import PixelOrigin
 from visloc.kapture import read_dataset
 from visloc.localizer import Localizer
+from visloc.types import Inference
 
 app = typer.Typer(
     name="mapping",
@@ -104,6 +106,7 @@ def build(
     features_dir: FeaturesDirOption = None,
     pixel_origin: PixelOriginOption = PixelOrigin.CORNER,
     weights_dir: WeightsDirOption = None,
+    inference: InferenceOption = Inference.AUTO,
     max_keypoints: MaxKeypointsOption = 5000,
     metric: MetricOption = None,
     gravity: Annotated[
@@ -199,6 +202,7 @@ def build(
         features_dir=features_dir,
         pixel_origin=pixel_origin,
         weights_dir=weights_dir,
+        inference=inference,
         max_keypoints=max_keypoints,
         metric=metric,
         depth=DepthSettings(voxel_size=voxel_size, depth_scale=depth_scale),
@@ -558,6 +562,7 @@ def export_features_command(
     output: Annotated[Path, typer.Option("--output", help="Folder of the new kapture.")],
     local_features: LocalFeaturesOption = DEFAULT_LOCAL_FEATURES,
     weights_dir: WeightsDirOption = None,
+    inference: InferenceOption = Inference.AUTO,
     max_keypoints: MaxKeypointsOption = 5000,
     map_ref: Annotated[
         str | None,
@@ -573,6 +578,7 @@ def export_features_command(
             output,
             local_features=local_features,
             weights_dir=weights_dir,
+            inference=inference,
             max_keypoints=max_keypoints,
             global_from=opened,
             progress=progress,

@@ -52,6 +52,7 @@ def print_map(out: Console, opened: Map) -> None:
         "observations": f"{counts['observations']}",
         "local features": f"{local['fingerprint']['name']}, {local['descriptor_dim']} dimensions, "
         f"at most {local['max_keypoints']} per photo",
+        "computed with": local["computed_with"] or "not known",
         "global features": ", ".join(
             f"{g['fingerprint']['name']} ({g['dim']})" for g in summary["global_features"]
         ),

@@ -108,9 +108,9 @@ def _model(opened: Map) -> _Model:
     return _Model(
         points=opened.landmarks.astype(np.float64) + origin,
         colors=None if opened.colors is None else np.asarray(opened.colors),
-        keypoints=np.split(np.asarray(opened.observation_keypoints), offsets[1:-1]),
+        keypoints=[opened.keypoints(row) for row in range(len(opened.images))],
         observations=np.column_stack([landmark, photo, np.arange(len(photo)) - offsets[photo]]),
-        errors_px=np.asarray(opened.errors_px),
+        errors_px=np.asarray(opened.errors_px, np.float32),
         described=True,
     )
 
@@ -185,7 +185,8 @@ def _export_kapture(opened: Map, output: Path) -> None:
     for row, record in enumerate(opened.images):
         keypoints = exported.keypoints[row]
         if exported.described:
-            _, descriptors = opened.observations(row)
+            _, rows = opened.observations(row)
+            descriptors = rows * np.float32(opened.manifest.local_features.descriptor_scale)
             write_local_features(output, local, record.name, keypoints, descriptors, name=local)
         else:
             write_keypoints(output, _IMPORTED, record.name, keypoints, name=_IMPORTED)

@@ -20,6 +20,7 @@ from visloc.kapture import (
     write_global_features,
     write_local_features,
 )
+from visloc.types import Inference
 
 
 def export_features(
@@ -28,6 +29,7 @@ def export_features(
     *,
     local_features: str,
     weights_dir: Path | None,
+    inference: Inference,
     max_keypoints: int,
     global_from: Map | None,
     progress: Callable[[str, int, int], None],
@@ -43,6 +45,7 @@ def export_features(
         output: folder to make, or one that an earlier run with the same settings left.
         local_features: a name of ``visloc.features.LOCAL_FEATURES``.
         weights_dir: folder with network weights.
+        inference: how networks are computed.
         max_keypoints: strongest keypoints kept per photo.
         global_from: a map whose global descriptors are computed for the photos; its local
             features must be the same and as many, since ``localvlad`` is made of them.
@@ -57,7 +60,7 @@ def export_features(
             else.
     """
     dataset = read_dataset(dataset_root)
-    extractor = make_local_features(local_features, weights_dir)
+    extractor = make_local_features(local_features, weights_dir, inference)
     descriptors = {}
     if global_from is not None:
         built_with = global_from.manifest.local_features
@@ -79,6 +82,7 @@ def export_features(
     reconstruction = output / "reconstruction"
     settings = {
         "local_features": FingerprintRecord.of(extractor.fingerprint).model_dump(),
+        "computed_with": extractor.computed_with,
         "max_keypoints": max_keypoints,
         "global_from": global_from and global_from.manifest.content_hash,
     }

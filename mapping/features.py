@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import cache, partial
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,13 +33,17 @@ from visloc.features.readymade import (
 from visloc.geometry import PixelOrigin
 from visloc.images import read_photo_file
 from visloc.kapture import FeatureSet, read_local
-from visloc.types import Fingerprint, LocalFeatures
+from visloc.types import Fingerprint, Inference, LocalFeatures
 
+T = TypeVar("T")
 Progress = Callable[[str, int, int], None]
 """Told the stage, how much of it is done, and how much there is."""
 
-# The vocabulary of a global descriptor is learned from at most this many photos, evenly chosen.
-_VOCABULARY_PHOTOS = 200
+# Vocabulary and projection of a global descriptor are learned from at most this many photos,
+# evenly chosen.
+_VOCABULARY_PHOTOS, _PROJECTION_PHOTOS = 200, 2048
+# Raw vectors of this many photos are projected at a time: 64 MB of DenseVLAD.
+_PROJECTED_TOGETHER = 1024
 # Raised when the code of a stage here changes what comes out.
 _REVISION = {"local_features": 1, "words": 1, "vocabulary": 1, "pooled": 1, "projection": 1}
 
@@ -54,6 +58,10 @@ class LocalFeaturesSource(Protocol):
     @property
     def descriptor_dim(self) -> int:
         """Length of a descriptor."""
+
+    @property
+    def computed_with(self) -> str | None:
+        """What computes it here; None for features that were computed elsewhere."""
 
     @property
     def max_keypoints(self) -> int:
@@ -73,27 +81,28 @@ class LocalFeaturesSource(Protocol):
 class ExtractedFeatures:
     """Local features found in the photos, kept in the work folder.
 
+    What is known of the extractor travels along, so that a worker that only reads features need
+    not load a network.
+
     Attributes:
         work: where they are kept.
         name: of the extractor, in ``visloc.features.LOCAL_FEATURES``.
         weights_dir: folder with network weights.
+        inference: how networks are computed.
         max_keypoints: strongest ones kept per photo.
+        fingerprint: of the extractor.
+        descriptor_dim: length of a descriptor.
+        computed_with: what computes it here.
     """
 
     work: WorkFolder
     name: str
     weights_dir: Path | None
+    inference: Inference
     max_keypoints: int
-
-    @property
-    def fingerprint(self) -> Fingerprint:
-        """Of the extractor."""
-        return _extractor(self.name, self.weights_dir).fingerprint
-
-    @property
-    def descriptor_dim(self) -> int:
-        """Length of a descriptor."""
-        return _extractor(self.name, self.weights_dir).descriptor_dim
+    fingerprint: Fingerprint
+    descriptor_dim: int
+    computed_with: str
 
     def key(self, photo: MappingPhoto) -> str:
         """Name of a photo's features in the work folder."""
@@ -102,6 +111,7 @@ class ExtractedFeatures:
             photo=photo.sha256,
             size=[photo.camera.width, photo.camera.height],
             fingerprint=_json(self.fingerprint),
+            computed_with=self.computed_with,
             max_keypoints=self.max_keypoints,
         )
 
@@ -129,7 +139,7 @@ class ExtractedFeatures:
                 f"it for {photo.record.sensor_id}",
                 got=f"{pixels.width} x {pixels.height}",
             )
-        extractor = _extractor(self.name, self.weights_dir)
+        extractor = open_extractor(self.name, self.weights_dir, self.inference)
         return asdict(extractor.extract(pixels.rgb, max_keypoints=self.max_keypoints))
 
 
@@ -157,6 +167,10 @@ class ReadyMadeFeatures:
     def descriptor_dim(self) -> int:
         """Length of a descriptor."""
         return self.descriptors.dsize
+
+    @property
+    def computed_with(self) -> None:
+        """Unknown."""
 
     @property
     def max_keypoints(self) -> int:
@@ -201,6 +215,18 @@ class ReadyMadeFeatures:
             return to_local_features(*rows)
 
 
+@cache
+def open_extractor(
+    name: str, weights_dir: Path | None, inference: Inference
+) -> LocalFeatureExtractor:
+    """Return the extractor of this process; it uses one thread, as ``Workers`` has it.
+
+    Raises:
+        WeightsError, InvalidInput: what ``make_local_features`` raises.
+    """
+    return make_local_features(name, weights_dir, inference, threads=1)
+
+
 def find_local_features(
     source: LocalFeaturesSource,
     photos: Sequence[MappingPhoto],
@@ -224,11 +250,10 @@ def describe_photos(
     fingerprint = _json(descriptor.fingerprint)
     task = _DescribeTask(work, features, name, fingerprint)
 
-    def read_all(entry: str, keys: list[str]) -> list[NDArray[np.float32]]:
+    def read_all(entry: str, keys: Sequence[str]) -> list[NDArray[np.float32]]:
         return [work.read(key)[entry] for key in keys]
 
-    chosen = np.unique(np.linspace(0, len(photos) - 1, _VOCABULARY_PHOTOS).astype(int)).tolist()
-    learned_from = [photos[row] for row in chosen]
+    learned_from = _evenly(photos, _VOCABULARY_PHOTOS)
     workers.run(task.find_words, learned_from, partial(progress, f"{name} words"))
     word_keys = [task.words_key(photo) for photo in learned_from]
     vocabulary_key = _key("vocabulary", fingerprint=fingerprint, words=word_keys)
@@ -238,14 +263,26 @@ def describe_photos(
     )
     workers.run(partial(task.pool, vocabulary_key), photos, partial(progress, name))
     pooled_keys = [task.pooled_key(vocabulary_key, photo) for photo in photos]
-    pooled = np.stack(read_all("pooled", pooled_keys))
+    taught_by = _evenly(pooled_keys, _PROJECTION_PHOTOS)
     projection = work.get(
-        _key("projection", pooled=pooled_keys), lambda: descriptor.learn_projection(pooled)
+        _key("projection", pooled=taught_by),
+        lambda: descriptor.learn_projection(np.stack(read_all("pooled", taught_by))),
     )
     model = {**vocabulary, **projection}
+    blocks = [
+        descriptor.project(
+            np.stack(read_all("pooled", pooled_keys[first : first + _PROJECTED_TOGETHER])), model
+        )
+        for first in range(0, len(photos), _PROJECTED_TOGETHER)
+    ]
     return GlobalFeatures(
-        FingerprintRecord.of(descriptor.fingerprint), descriptor.project(pooled, model), model
+        FingerprintRecord.of(descriptor.fingerprint), np.concatenate(blocks), model
     )
+
+
+def _evenly(items: Sequence[T], count: int) -> list[T]:
+    """Return at most ``count`` of the items, evenly chosen."""
+    return [items[row] for row in np.unique(np.linspace(0, len(items) - 1, count).astype(int))]
 
 
 def read_global_features(features: FeatureSet, photos: Sequence[MappingPhoto]) -> GlobalFeatures:
@@ -313,11 +350,6 @@ def _pixels(descriptor: GlobalDescriptor, photo: MappingPhoto) -> NDArray[np.uin
     if descriptor.needs_image:
         return read_photo_file(photo.path).rgb
     return np.empty((0, 0, 3), dtype=np.uint8)
-
-
-@cache
-def _extractor(name: str, weights_dir: Path | None) -> LocalFeatureExtractor:
-    return make_local_features(name, weights_dir)
 
 
 @cache

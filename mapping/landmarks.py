@@ -111,7 +111,8 @@ def assemble_landmarks(
     Returns:
         The landmarks, and of each photo the rows of its features that observe them.
     """
-    observations = observations.take(np.argsort(observations.views, kind="stable"))
+    if (np.diff(observations.views) < 0).any():
+        observations = observations.take(np.argsort(observations.views, kind="stable"))
     num_points = len(points)
     seen = np.bincount(observations.points, minlength=num_points)
     errors = reprojection_errors(views, points, observations)

@@ -22,11 +22,12 @@ from mapping.stages import Item, WorkFolder, key_of
 from mapping.workers import Workers
 from visloc.geometry import Camera, Pose
 from visloc.matching.correspondences import mutual_nearest_neighbours
+from visloc.matching.products import in_eight_bits
 from visloc.matching.verification import epipolar_errors
 from visloc.pose.colmap import colmap_camera, normalized_rays
 
 # Raised when the code of a stage here changes what comes out.
-_REVISION = {"matches": 1, "verified": 1}
+_REVISION = {"matches": 2, "verified": 1}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,10 +140,11 @@ class _MatchTask:
 
     def match(self, group: _Partners) -> None:
         def compute() -> Item:
-            own = self.features.read(group.photo).descriptors
+            own = in_eight_bits(self.features.read(group.photo).descriptors)
             found = []
             for partner in group.partners:
-                i, j, _ = mutual_nearest_neighbours(own, self.features.read(partner).descriptors)
+                theirs = in_eight_bits(self.features.read(partner).descriptors)
+                i, j, _ = mutual_nearest_neighbours(own, theirs)
                 found.append(np.column_stack([i, j]).astype(np.uint32))
             return _item(found)
 

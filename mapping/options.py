@@ -10,6 +10,7 @@ import typer
 from mapping.pairing import PAIRINGS
 from visloc.features import DEFAULT_GLOBAL_FEATURES, GLOBAL_FEATURES, LOCAL_FEATURES
 from visloc.geometry import PixelOrigin
+from visloc.types import Inference
 
 GLOBAL_DEFAULT = ",".join(DEFAULT_GLOBAL_FEATURES)
 RGBD_PANEL, SFM_PANEL = "Method rgbd", "Method sfm"
@@ -23,6 +24,14 @@ WeightsDirOption = Annotated[
         "--weights-dir",
         envvar="VISLOC_WEIGHTS_DIR",
         help="Folder with network weights; r2d2 and faster2d2 need it.",
+    ),
+]
+InferenceOption = Annotated[
+    Inference,
+    typer.Option(
+        help="How networks are computed. torch: the reference, on a CUDA GPU where there is one. "
+        "fp32, int8: OpenVINO with 32 or 8 bits. auto: torch where there is a CUDA GPU, else int8 "
+        "where the processor is made for it, else fp32. Features of all ways match each other's."
     ),
 ]
 LocalFeaturesOption = Annotated[

@@ -7,7 +7,7 @@ point.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 
@@ -76,8 +76,8 @@ def landmarks_from_depth(
     """
     task = _LiftTask(work, dataset, features, settings.depth_scale)
     workers.run(task.lift, photos, partial(progress, "depth"))
-    lifted = [LiftedKeypoints(**work.read(task.key(photo))) for photo in photos]
     progress("landmarks", 0, 1)
+    lifted = (LiftedKeypoints(**work.read(task.key(photo))) for photo in photos)
     landmarks, rows = merge_landmarks(photos, lifted, settings.voxel_size)
     progress("landmarks", 1, 1)
     return MadeLandmarks(
@@ -161,12 +161,12 @@ def lift_keypoints(
 
 
 def merge_landmarks(
-    photos: Sequence[MappingPhoto], lifted: Sequence[LiftedKeypoints], voxel_size: float
+    photos: Sequence[MappingPhoto], lifted: Iterable[LiftedKeypoints], voxel_size: float
 ) -> tuple[Landmarks, list[NDArray[np.int64]]]:
     """Merge the lifted keypoints of all photos: one landmark per occupied voxel, at their mean.
 
     Of several keypoints of one photo in a voxel (a corner found at several scales) the strongest
-    stays.
+    stays. It takes about 150 bytes of memory per keypoint.
 
     Args:
         photos: n photos.
@@ -179,7 +179,17 @@ def merge_landmarks(
     Raises:
         InvalidInput: ``rgbd.no_landmarks`` or ``rgbd.voxel_size``.
     """
-    points = np.concatenate([one.points for one in lifted])
+    points_of, pixels_of, rows_of = zip(
+        *((one.points, one.pixels, one.rows) for one in lifted), strict=True
+    )
+    seen_in = np.repeat(np.arange(len(rows_of)), [len(rows) for rows in rows_of])
+    # One after the other, so that little is there twice.
+    points = np.concatenate(points_of)
+    del points_of
+    pixels = np.concatenate(pixels_of)
+    del pixels_of
+    rows = np.concatenate(rows_of)
+    del rows_of
     if len(points) == 0:
         raise InvalidInput(
             "rgbd.no_landmarks",
@@ -191,25 +201,25 @@ def merge_landmarks(
     origin = np.round(np.mean([photo.pose.center for photo in photos], axis=0))
     points -= origin
     landmark, num_landmarks = _voxel_index(points, voxel_size)
-    seen_in = np.repeat(np.arange(len(lifted)), [len(one.rows) for one in lifted])
     # np.unique gives the first row of each pair, which is the strongest keypoint.
-    _, first = np.unique(landmark * len(photos) + seen_in, return_index=True)
-    kept = np.sort(first)
-    points, landmark, seen_in = points[kept], landmark[kept], seen_in[kept]
-    pixels = np.concatenate([one.pixels for one in lifted])[kept]
-    rows = np.concatenate([one.rows for one in lifted])[kept]
+    kept = np.sort(np.unique(landmark * len(photos) + seen_in, return_index=True)[1])
+    points, pixels, rows = points[kept], pixels[kept], rows[kept]
+    landmark, seen_in = landmark[kept], seen_in[kept]
 
     tracks = np.bincount(landmark, minlength=num_landmarks)
     mean = np.column_stack(
         [np.bincount(landmark, points[:, axis], num_landmarks) / tracks for axis in range(3)]
     )
+    mean += origin
+    del points, kept
     views = [View(photo.camera, photo.pose) for photo in photos]
-    return assemble_landmarks(views, mean + origin, Observations(landmark, seen_in, rows, pixels))
+    return assemble_landmarks(views, mean, Observations(landmark, seen_in, rows, pixels))
 
 
 def _voxel_index(points: NDArray[np.float64], voxel_size: float) -> tuple[NDArray[np.int64], int]:
     """Number the occupied voxels in the order of their cells; return (rows, how many)."""
-    cells = np.floor(points / voxel_size)
+    cells = points / voxel_size
+    np.floor(cells, out=cells)
     cells -= cells.min(axis=0)
     size = cells.max(axis=0) + 1.0
     if np.prod(size) >= 2**62:
@@ -220,7 +230,10 @@ def _voxel_index(points: NDArray[np.float64], voxel_size: float) -> tuple[NDArra
             expected=f"more for an extent of {', '.join(f'{s:g}' for s in size * voxel_size)}",
             got=voxel_size,
         )
-    x, y, z = cells.astype(np.int64).T
-    flat = (x * int(size[1]) + y) * int(size[2]) + z
+    flat = np.zeros(len(cells), dtype=np.int64)
+    for axis in range(3):
+        flat *= int(size[axis])
+        flat += cells[:, axis].astype(np.int64)
+    del cells
     occupied, index = np.unique(flat, return_inverse=True)
     return index.astype(np.int64), len(occupied)

@@ -3,6 +3,9 @@
 A stage asks for an item by its key. If the file is there it is read, otherwise the work is done
 and the file appears by one atomic rename. A build that was killed finds its finished items again;
 a build whose photos, settings, weights or code changed finds none of those that depend on them.
+
+Nobody waits until an item is on the disk: that took longer than making most of them. A machine that
+loses power may leave damaged ones; their checksums tell, and they are made again.
 """
 
 from __future__ import annotations
@@ -21,7 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import Conflict
+from visloc.errors import Conflict, Unavailable
+
+# What NumPy raises for a damaged file.
+_DAMAGE = (zipfile.BadZipFile, EOFError, ValueError)
 
 Item = Mapping[str, NDArray[Any]]
 
@@ -49,25 +55,39 @@ class WorkFolder:
         return self._path(key).is_file()
 
     def read(self, key: str) -> Item:
-        """Read a finished item."""
-        with self._path(key).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
+        """Read a finished item.
+
+        Raises:
+            Unavailable: ``build.damaged_item``.
+        """
+        try:
+            return self._load(key)
+        except _DAMAGE as error:
+            self._path(key).unlink(missing_ok=True)
+            raise Unavailable(
+                "build.damaged_item",
+                "finished work was damaged, maybe by a loss of power, and is now removed; "
+                "the same command makes it again",
+                field=str(self._path(key)),
+            ) from error
 
     def get(self, key: str, compute: Callable[[], Item]) -> Item:
         """Read an item, or compute and keep it."""
         try:
-            return self.read(key)
-        except (FileNotFoundError, zipfile.BadZipFile, EOFError, ValueError):
+            return self._load(key)
+        except (FileNotFoundError, *_DAMAGE):
             item = compute()
         path = self._path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
         unfinished = path.with_suffix(f".{os.getpid()}.tmp")
         with unfinished.open("wb") as file:
             np.savez(file, **item)  # type: ignore[arg-type]  # the stub knows no **arrays
-            file.flush()
-            os.fsync(file.fileno())
         unfinished.replace(path)
         return item
+
+    def _load(self, key: str) -> Item:
+        with self._path(key).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
 
     def _path(self, key: str) -> Path:
         return self.root / f"{key}.npz"

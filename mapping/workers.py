@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -14,7 +15,6 @@ from types import TracebackType
 from typing import TypeVar
 
 import cv2
-import torch
 
 from visloc.errors import Unavailable
 
@@ -23,9 +23,14 @@ T = TypeVar("T")
 # Processes of a build unless told otherwise: more than this few machines have memory for.
 DEFAULT_WORKERS = min(os.cpu_count() or 1, 8)
 
-# Each library would otherwise start as many threads as there are processors, in every worker.
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
+# Each library would otherwise start as many threads as there are processors, in every worker. They
+# read these when they are loaded; torch reads the first.
+_THREADS = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+)
 
 # Items that travel together: few, so that progress is seen, and all workers have work to the end.
 _MAX_BATCH, _MIN_BATCHES = 16, 200
@@ -105,8 +110,6 @@ def _do_all(task: Callable[[T], object], items: Sequence[T]) -> int:
 def _start_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
 
 
 def _end_with_parent() -> None:
@@ -141,14 +144,19 @@ def _interrupted_later() -> Iterator[None]:
 @contextmanager
 def _one_thread_here() -> Iterator[None]:
     """Compute as a worker does: networks differ in the last bits with the number of threads."""
-    before = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(1)
+    # A network that torch computes was made before, with torch. Without one it would take seconds
+    # to load for nothing.
+    torch = sys.modules.get("torch")
+    before = cv2.getNumThreads(), torch.get_num_threads() if torch else 0
     cv2.setNumThreads(1)
+    if torch:
+        torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(before[0])
-        cv2.setNumThreads(before[1])
+        cv2.setNumThreads(before[0])
+        if torch:
+            torch.set_num_threads(before[1])
 
 
 @contextmanager

@@ -30,8 +30,10 @@ def main() -> None:
         sys.exit(f"visloc-service: {error}")
     configure_logging(settings)
     # What libraries read once, when they are loaded: hence the late import below.
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ.setdefault(variable, str(settings.threads_per_worker))
+    os.environ.setdefault("OMP_NUM_THREADS", str(settings.threads_per_worker))
+    # What takes long is computed by torch and OpenVINO. OpenBLAS's threads would wait for each
+    # other at full speed, on the cores that those need.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(settings.max_image_pixels))
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # damaged photos are answered, not logged
     # The fork server loads the same libraries as this process, at the same time.

@@ -26,7 +26,7 @@ from service.metrics import Metrics
 from service.stores import Store
 from service.uploads import Uploads
 from service.wire import stopping_error
-from service.worker import MapFolder, WorkerSettings
+from service.worker import MapFolder, Seen, WorkerSettings
 from service.workers import Workers
 from visloc.errors import (
     InvalidInput,
@@ -35,7 +35,6 @@ from visloc.errors import (
     VislocError,
 )
 from visloc.priors import Priors
-from visloc.solving import SeenImage
 from visloc.types import LocalizeOptions
 
 logger = logging.getLogger(__name__)
@@ -360,8 +359,8 @@ class Engine:
         images: Sequence[ImageJob],
         options: LocalizeOptions,
         priors: Priors,
-    ) -> list[tuple[SeenImage, ...]]:
-        """Look at all images of an instant; the result is by map."""
+    ) -> list[Seen]:
+        """Look at all images of an instant."""
         now = time()
         tasks = [
             asyncio.ensure_future(
@@ -370,11 +369,10 @@ class Engine:
             for image in images
         ]
         try:
-            looks = await asyncio.gather(*tasks)
+            return await asyncio.gather(*tasks)
         finally:
             for task in tasks:
                 task.cancel()  # when one refuses the request, nobody waits for the others
-        return [tuple(look[i] for look in looks) for i in range(len(maps))]
 
 
 def _without_photo(image: ImageJob) -> ImageJob:

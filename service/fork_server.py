@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import signal
 
-import service.worker  # noqa: F401  loaded once, for all of them
+import service.vision  # noqa: F401  loaded once, for all of them
 
 # Who stops the service by its group of processes means the main process: it lets requests end.
 signal.signal(signal.SIGTERM, signal.SIG_IGN)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from typing import Any, TypeVar
 
 import grpc
 from google.protobuf.any_pb2 import Any as AnyMessage
-from google.protobuf.json_format import ParseDict
 from google.protobuf.message import Message
 from google.rpc.error_details_pb2 import ErrorInfo
 from google.rpc.status_pb2 import Status
@@ -34,8 +33,40 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 
 def message_of(answer: BaseModel, message: MessageT) -> MessageT:
-    """Fill a message from the model with the same fields: HTTP and gRPC answer the same."""
-    return ParseDict(answer.model_dump(exclude_none=True), message)
+    """Fill a message from the model with the same fields: HTTP and gRPC answer the same.
+
+    Straight from one to the other: by way of JSON, an answer with its matches takes ten times as
+    long.
+    """
+    for name in type(answer).model_fields:
+        value = getattr(answer, name)
+        if isinstance(value, BaseModel):
+            part = getattr(message, name)
+            part.SetInParent()  # it is there, also when it is empty
+            message_of(value, part)
+        elif isinstance(value, Mapping):
+            _fill_map(getattr(message, name), value)
+        elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
+            _fill_list(getattr(message, name), value)
+        elif value is not None:
+            setattr(message, name, value)
+    return message
+
+
+def _fill_map(entries: Any, values: Mapping[str, Any]) -> None:
+    for name, value in values.items():
+        if isinstance(value, BaseModel):
+            message_of(value, entries[name])
+        else:
+            entries[name] = value
+
+
+def _fill_list(entries: Any, values: Sequence[Any]) -> None:
+    if values and isinstance(values[0], BaseModel):
+        for value in values:
+            message_of(value, entries.add())
+    else:
+        entries.extend(values)
 
 
 class Envelope:

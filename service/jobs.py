@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from visloc.archive import Geodetic
 from visloc.geometry import Camera, Pose
 from visloc.priors import NO_PRIORS, Priors
-from visloc.sequence import Odometry
-from visloc.trajectory import TimeUnit
+from visloc.trajectory import Odometry, TimeUnit
 from visloc.types import Answer, InstantAnswer, LocalizeOptions, QueryFeatures
 
 # The longest time between two measured instants across which gaps are filled, by default.

@@ -24,7 +24,7 @@ from service.stores import open_store
 from service.tls import check_tls, tls_config
 from service.tracing import open_spans
 from service.worker import WorkerSettings
-from visloc.images import ImageLimits
+from visloc.types import Inference
 
 
 class Server:
@@ -55,11 +55,13 @@ class Server:
             self._store,
             WorkerSettings(
                 weights_dir=settings.weights_dir,
+                inference=Inference(settings.inference),
                 threads=settings.threads_per_worker,
                 max_loaded_bytes=settings.max_loaded_bytes,
                 max_images=settings.max_rig_images,
                 max_instants=settings.max_instants,
-                limits=ImageLimits(settings.max_image_bytes, settings.max_image_pixels),
+                max_image_bytes=settings.max_image_bytes,
+                max_image_pixels=settings.max_image_pixels,
                 log_level=settings.log_level,
                 log_format=settings.log_format,
             ),
@@ -183,6 +185,11 @@ class _HttpServer(uvicorn.Server):
 def _listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        return socket.create_server((host, port), family=family, backlog=2048)
+        listener = socket.create_server((host, port), family=family, backlog=2048)
     except OSError as error:
         raise OSError(f"cannot listen on {host}:{port}: {error}") from None
+    # Connections inherit it. Left to itself, asyncio sets it on sockets only that were made with
+    # the number of TCP, which create_server does not do; and then every answer on a connection
+    # that was used before waits 40 ms for an acknowledgement.
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return listener

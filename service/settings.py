@@ -66,6 +66,9 @@ class ServiceSettings(BaseModel):
     """largest packed map that may be uploaded, bytes"""
     weights_dir: Path | None = None
     """folder of network weights, for maps whose features need them"""
+    inference: Literal["auto", "int8", "fp32", "torch"] = "auto"
+    """how networks are computed; auto: torch where there is a CUDA GPU, else 8 bits where the
+    processor is made for them"""
     host: str = "127.0.0.1"
     """address to listen on; 0.0.0.0 serves other machines, and then needs keys_file"""
     http_port: Port = 8000

@@ -22,6 +22,7 @@ from visloc.fingerprints import check_fingerprint
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo, stored_from_upright, upright
 from visloc.matching.correspondences import match_landmarks
+from visloc.matching.products import EightBitRows, in_eight_bits
 from visloc.priors import NO_PRIORS, Priors
 from visloc.query_camera import resolve_camera
 from visloc.query_features import (
@@ -305,7 +306,12 @@ class Localizer:
         self, local: LocalFeatures, photos: NDArray[np.int64]
     ) -> tuple[Matches, NDArray[np.int64]]:
         """Match with the landmarks that photos of the map, most similar first, see; say which."""
-        pairs = match_landmarks(local.descriptors, (self.map.observations(int(i)) for i in photos))
+        scale = self.map.manifest.local_features.descriptor_scale
+        observed = (self.map.observations(int(photo)) for photo in photos)
+        pairs = match_landmarks(
+            in_eight_bits(local.descriptors),
+            ((landmarks, EightBitRows(rows, scale)) for landmarks, rows in observed),
+        )
         matches = Matches(
             local.keypoints[pairs.keypoints].astype(np.float64),
             self.map.landmarks[pairs.landmarks].astype(np.float64),

@@ -183,7 +183,7 @@ def _shown(opened: Map, look: Look, query: _Panel) -> Iterator[_Shown]:
         corner = left, _HEAD_PX + rank // _COLUMNS * pitch
         start, stop = opened.observation_offsets[row], opened.observation_offsets[row + 1]
         observed = opened.observation_landmarks[start:stop].astype(np.int64)
-        keypoints = opened.observation_keypoints[start:stop]
+        keypoints = opened.keypoints(row)
         _, matches, places = np.intersect1d(look.landmarks, observed, return_indices=True)
         yield _Shown(
             name=f"{rank + 1}  {name}",

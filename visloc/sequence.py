@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from visloc.constraints import Constraints, MapGeometry
 from visloc.errors import InvalidInput
-from visloc.geometry import Pose, rotation_angle
+from visloc.geometry import rotation_angle
 from visloc.pose.covariance import with_origin
 from visloc.pose.motion import RelativeMotion, default_motion_covariance, link_from_motion
 from visloc.pose.window import WindowInstant, WindowPose, solve_window
@@ -33,6 +33,8 @@ from visloc.solving import (
 )
 from visloc.timing import timed
 from visloc.trajectory import (
+    MAX_GAP_S,
+    Odometry,
     PoseSource,
     TimeUnit,
     TracedPose,
@@ -45,7 +47,6 @@ from visloc.types import InstantAnswer, LocalizeOptions, Reason, Refusal
 # At most so many instants wait, and as many answered ones are remembered, however long the gap
 # may be: what is further away in a fast sequence adds little and costs time.
 MAX_WAITING = 30
-MAX_GAP_S = 60.0
 # Standard deviation, as a share of the way, of motion that no measured pose can contradict.
 _UNCHECKED_SHARE = 0.05
 # A window in which no instant has a pose of its own takes seconds to search; one in which nothing
@@ -56,20 +57,6 @@ _CONTRADICTED = Refusal(
     Reason.CONTRADICTS_MOTION,
     "the pose of its own images contradicts those of its neighbours and the motion between",
 )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Odometry:
-    """Where a tracker has the rig, in a world of its own.
-
-    Attributes:
-        rig_from_odometry: the pose, metres.
-        covariance: (6, 6) of ``rig_from_previous_rig``, the motion since the instant before, for
-            R <- Exp(w) R and t <- t + dt; None when unknown.
-    """
-
-    rig_from_odometry: Pose
-    covariance: NDArray[np.float64] | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -49,7 +49,7 @@ _MAX_HALVES_MAHALANOBIS2 = 22.46
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
-    """2D-3D correspondences of one image.
+    """2D-3D correspondences of one image, best first.
 
     Attributes:
         pixels: (n, 2) float64.
@@ -326,10 +326,7 @@ def _halves_disagree(
     first = [random.permutation(len(view)) < len(view) // 2 for view in views]
     halves = []
     for masks in (first, [~mask for mask in first]):
-        half = [
-            replace(view, pixels=view.pixels[mask], points=view.points[mask])
-            for view, mask in zip(views, masks, strict=True)
-        ]
+        half = [view.selected(mask) for view, mask in zip(views, masks, strict=True)]
         pose = _estimate(half, registration, options, constraints)
         if pose is not None and pose.covariance is not None:
             halves.append((pose.rig_from_world, pose.covariance))

@@ -42,6 +42,9 @@ _UNKNOWN_SPEED = 10.0  # m/s
 # The spread of an angle that nothing is known about: uniform between -pi and pi.
 _UNKNOWN_ANGLE_STD = math.pi / math.sqrt(3.0)
 
+# The longest gap between measured instants that may be asked to be filled, seconds.
+MAX_GAP_S = 60.0
+
 
 class PoseSource(StrEnum):
     """What a pose rests on."""
@@ -65,6 +68,20 @@ class TimeUnit(StrEnum):
     def seconds(self) -> float:
         """How long it is."""
         return {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[self.value]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Odometry:
+    """Where a tracker has the rig, in a world of its own.
+
+    Attributes:
+        rig_from_odometry: the pose, metres.
+        covariance: (6, 6) of ``rig_from_previous_rig``, the motion since the instant before, for
+            R <- Exp(w) R and t <- t + dt; None when unknown.
+    """
+
+    rig_from_odometry: Pose
+    covariance: NDArray[np.float64] | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

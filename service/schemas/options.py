@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from enum import StrEnum
+from typing import Annotated, ClassVar, TypeVar
 
 from pydantic import Field
 
 import visloc.types
 from service.incoming import IncomingMessage, converted
 from visloc.errors import InvalidInput
+
+WordT = TypeVar("WordT", bound=StrEnum)
 
 
 class LocalizeOptions(IncomingMessage):
@@ -50,6 +53,13 @@ class LocalizeOptions(IncomingMessage):
             "before features are found"
         ),
     ] = None
+    extraction: Annotated[
+        str | None,
+        Field(
+            description="effort that goes into finding the photo's features: fast, default or "
+            "accurate; features that are sent are taken as they are"
+        ),
+    ] = None
     seed: Annotated[int | None, Field(description="of RANSAC: 0 to 2147483647, by default 0")] = (
         None
     )
@@ -58,17 +68,26 @@ class LocalizeOptions(IncomingMessage):
         """Return the options, checked."""
         given = self.model_dump(exclude_none=True)
         if self.read_as is not None:
-            known = [str(value) for value in visloc.types.ReadAs]
-            if self.read_as not in known:
-                raise InvalidInput(
-                    "options.read_as",
-                    "unknown orientation to read in",
-                    field="options.read_as",
-                    expected=f"one of {', '.join(known)}",
-                    got=self.read_as,
-                )
-            given["read_as"] = visloc.types.ReadAs(self.read_as)
+            given["read_as"] = _known_word(
+                visloc.types.ReadAs, self.read_as, "read_as", "unknown orientation to read in"
+            )
+        if self.extraction is not None:
+            given["extraction"] = _known_word(
+                visloc.types.Extraction, self.extraction, "extraction", "unknown effort"
+            )
         return visloc.types.LocalizeOptions(**given)
+
+
+def _known_word(words: type[WordT], given: str, name: str, message: str) -> WordT:
+    if given not in list(words):
+        raise InvalidInput(
+            f"options.{name}",
+            message,
+            field=f"options.{name}",
+            expected=f"one of {', '.join(words)}",
+            got=given,
+        )
+    return words(given)
 
 
 def _options_from_text(value: object) -> object:

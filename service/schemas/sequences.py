@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import FailFast, Field
 
 import service.jobs
-import visloc.sequence
+import visloc.trajectory
 from service.incoming import IncomingMessage, counted, inside
 from service.jobs import DEFAULT_MAX_GAP_S
 from service.schemas.geometry import Numbers, Transform, covariance_to_core
@@ -45,9 +45,9 @@ class Odometry(IncomingMessage):
         ),
     ] = None
 
-    def to_core(self) -> visloc.sequence.Odometry:
+    def to_core(self) -> visloc.trajectory.Odometry:
         """Return the odometry, checked."""
-        return visloc.sequence.Odometry(
+        return visloc.trajectory.Odometry(
             self.rig_from_odometry.to_core("odometry.rig_from_odometry"),
             None
             if self.covariance is None
@@ -97,7 +97,7 @@ class SequenceStart(IncomingMessage):
         float | None,
         Field(
             description="longest time between two measured instants across which gaps are "
-            f"filled: 0 (none) to {visloc.sequence.MAX_GAP_S:g}, by default {DEFAULT_MAX_GAP_S:g}"
+            f"filled: 0 (none) to {visloc.trajectory.MAX_GAP_S:g}, by default {DEFAULT_MAX_GAP_S:g}"
         ),
     ] = None
     options: GivenOptions = Field(default_factory=LocalizeOptions)

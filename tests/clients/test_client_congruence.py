@@ -86,6 +86,7 @@ def test_all_clients_send_the_same_request(
         min_inliers=10,
         min_inlier_ratio=0.0,
         read_as="upright",
+        extraction="accurate",
         seed=0,
     )
     ask_all(http_url, grpc_url, lambda c: c.localize(photo, "room@v1", CAMERA, options, "id-1"))

@@ -79,7 +79,7 @@ class Archive:
                 assert opened.images[i].camera in opened.cameras
                 landmarks, descriptors = opened.observations(i)
                 assert descriptors.shape == (len(landmarks), manifest.local_features.descriptor_dim)
-                assert np.isfinite(descriptors).all()
+                assert descriptors.dtype == np.int8
                 assert np.isfinite(opened.landmarks[landmarks]).all()
         return "accepted"
 

@@ -30,6 +30,7 @@ from visloc.errors import (
 )
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
+from visloc.features.sift import SiftExtractor
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
@@ -353,7 +354,7 @@ def stop_before_archive(stage: str, _done: int, _total: int) -> None:
 
 
 def test_a_changed_setting_finds_again_what_does_not_depend_on_it(
-    dataset: Path, tmp_path: Path
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def work(**changes: object) -> dict[Path, tuple[int, int]]:
         with pytest.raises(Stopped):
@@ -376,6 +377,11 @@ def test_a_changed_setting_finds_again_what_does_not_depend_on_it(
 
     fewer = work(max_keypoints=200)
     new = [stage_of(item) for item in fewer.keys() - changed.keys()]
+    assert new.count("local_features") == new.count("lifted") == 8
+
+    monkeypatch.setattr(SiftExtractor, "computed_with", "another OpenCV")
+    elsewhere = work(max_keypoints=200)
+    new = [stage_of(item) for item in elsewhere.keys() - fewer.keys()]
     assert new.count("local_features") == new.count("lifted") == 8
 
 

@@ -126,7 +126,7 @@ def test_pycolmap_reads_the_same_cameras_poses_and_points(opened: Map, tmp_path:
         seen = slice(OFFSETS[row], OFFSETS[row + 1])
         assert [point.point3D_id - 1 for point in image.points2D] == OBSERVED[seen]
         xy = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
-        assert np.array_equal(xy, opened.observation_keypoints[seen])
+        assert np.array_equal(xy, opened.keypoints(row))
     assert opened.colors is not None
     points = [model.points3D[index + 1] for index in range(6)]
     assert np.array_equal([point.xyz for point in points], points_of(opened))
@@ -154,8 +154,9 @@ def test_our_reader_reads_the_same_dataset(opened: Map, tmp_path: Path) -> None:
         keypoints = open_features(output, "keypoints", "sift").read(record.path)
         descriptors = open_features(output, "descriptors", "sift").read(record.path)
         vector = open_features(output, "global_features", "AP-GeM").read(record.path)
-        assert np.array_equal(keypoints, opened.observation_keypoints[seen])
-        assert np.array_equal(descriptors, opened.observations(row)[1])
+        assert np.array_equal(keypoints, opened.keypoints(row))
+        scale = np.float32(opened.manifest.local_features.descriptor_scale)
+        assert np.array_equal(descriptors, opened.observations(row)[1] * scale)
         assert np.array_equal(vector, [np.eye(3, 4)[row]])
     known = read_reconstruction(output)
     assert known is not None

@@ -14,6 +14,7 @@ from visloc.errors import Conflict
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
+from visloc.types import Inference
 
 SIFT_DIM = 128
 
@@ -24,6 +25,7 @@ def export(dataset: Path, output: Path, **changes: Any) -> list[tuple[str, int, 
     settings: dict[str, Any] = {
         "local_features": "sift",
         "weights_dir": None,
+        "inference": Inference.AUTO,
         "max_keypoints": 5000,
         "global_from": None,
     } | changes
@@ -181,6 +183,7 @@ def test_photos_that_are_absent_are_told_and_passed_over(sample: Path, tmp_path:
         tmp_path / "out",
         local_features="sift",
         weights_dir=None,
+        inference=Inference.AUTO,
         max_keypoints=400,
         global_from=None,
         progress=lambda *step: steps.append(step),

@@ -55,7 +55,7 @@ def far_apart(opened: Map) -> Map:
     for row, center in zip(poses, centers, strict=True):
         row[4:] = -Pose.from_quaternion(row[:4], row[4:]).rotation @ center
     images = tuple(
-        image.model_copy(update={"timestamp": row}) for row, image in enumerate(opened.images)
+        replace(image, timestamp=row) for row, image in enumerate(opened.images)
     )
     return replace(opened, image_poses=poses, images=images)
 
@@ -270,7 +270,7 @@ def test_an_anchored_map_is_a_new_version_of_the_same_files(room: Map, maps_dir:
     assert MapStore(maps_dir).current_version("room") == opened.manifest.version
     assert opened.manifest.version != room.manifest.version
     assert opened.manifest.version.endswith(opened.manifest.content_hash[:8])
-    assert opened.manifest.format_version == "1.3"
+    assert opened.manifest.format_version == "1.4"
     assert opened.manifest.files == room.manifest.files
     assert opened.geodetic == found.anchor.geodetic
     assert opened.gravity is not None

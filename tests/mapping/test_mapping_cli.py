@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import PIL.Image  # noqa: F401  before pycolmap
 import pycolmap
@@ -62,6 +63,7 @@ def test_inspect_gives_json_for_programs(run: Run, built_maps: Path) -> None:
         "observations": len(opened.observation_landmarks),
     }
     assert summary["local_features"]["fingerprint"]["name"] == "sift"
+    assert summary["local_features"]["computed_with"] == f"OpenCV {cv2.__version__}"
     assert [g["fingerprint"]["name"] for g in summary["global_features"]] == [
         *("densevlad", "localvlad"),
     ]
@@ -226,6 +228,14 @@ def test_every_command_has_help(run: Run, command: str) -> None:
     status, out, err = run(*command.split(), "--help")
     assert (status, err) == (0, "")
     assert f"mapping {command}".strip() in out  # whatever started the tests comes before it
+
+
+def test_a_command_starts_without_what_takes_seconds_to_load() -> None:
+    code = "import sys, mapping.cli; print(*sys.modules)"
+    command = [sys.executable, "-c", code]
+    loaded = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    assert "mapping.cli" in loaded
+    assert not set(loaded) & {"torch", "openvino", "faiss", "scipy.stats"}
 
 
 def test_build_explains_all_its_options(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

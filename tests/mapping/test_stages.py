@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mapping.stages import WorkFolder, exclusive, key_of
-from visloc.errors import Conflict
+from visloc.errors import Conflict, Unavailable
 
 
 def test_a_finished_item_is_not_computed_again(tmp_path: Path) -> None:
@@ -44,6 +44,22 @@ def test_a_torn_item_is_computed_again(tmp_path: Path, torn: bytes) -> None:
     key = key_of("stage", 1)
     work.get(key, lambda: {"a": np.zeros(1)})
     next(tmp_path.rglob("*.npz")).write_bytes(torn)
+    assert work.get(key, lambda: {"a": np.ones(1)})["a"].tolist() == [1.0]
+
+
+def test_a_damaged_item_is_named_and_made_again_by_the_next_build(tmp_path: Path) -> None:
+    work = WorkFolder(tmp_path)
+    key = key_of("stage", 1)
+    work.get(key, lambda: {"a": np.zeros(100)})
+    path = next(tmp_path.rglob("*.npz"))
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    assert work.has(key)
+    with pytest.raises(Unavailable, match="same command makes it again") as caught:
+        work.read(key)
+    assert (caught.value.code, caught.value.field) == ("build.damaged_item", str(path))
+    assert not work.has(key)
     assert work.get(key, lambda: {"a": np.ones(1)})["a"].tolist() == [1.0]
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import cv2
 import pytest
 
 from mapping.workers import Workers
@@ -25,6 +26,12 @@ def write_square(folder: Path, number: int) -> None:
 def fail_at_3(number: int) -> None:
     if number == 3:
         raise ValueError(f"number {number}")
+
+
+def write_threads(folder: Path, name: str) -> None:
+    import torch  # as a network does, when it is made
+
+    (folder / name).write_text(f"{torch.get_num_threads()} {cv2.getNumThreads()}")
 
 
 def ignore(_done: int, _total: int) -> None:
@@ -127,6 +134,16 @@ def test_every_item_is_done_once_and_told(tmp_path: Path, count: int) -> None:
     assert [int(square) for square, _ in results] == [0, 1, 4, 9, 16]
     here = {pid == str(os.getpid()) for _, pid in results}
     assert here == {count == 1}
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_libraries_use_one_thread(tmp_path: Path, count: int) -> None:
+    import torch
+
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    Workers(count).run(partial(write_threads, tmp_path), ["first", "second"], ignore)
+    assert {path.read_text() for path in tmp_path.iterdir()} == {"1 1"}
+    assert (torch.get_num_threads(), cv2.getNumThreads()) == before
 
 
 def test_nothing_to_do_is_done() -> None:

@@ -45,8 +45,7 @@ from visloc.geometry import Camera, Pose
 from visloc.images import ImageLimits
 from visloc.kapture import read_dataset
 from visloc.priors import NO_PRIORS, GravityPrior, PositionPrior, Priors
-from visloc.sequence import Odometry
-from visloc.trajectory import PoseSource, TimeUnit
+from visloc.trajectory import Odometry, PoseSource, TimeUnit
 from visloc.types import Localized, LocalizeOptions, Reason
 
 T = TypeVar("T")
@@ -69,7 +68,8 @@ def make(
         max_loaded_bytes=settings.pop("max_loaded_bytes", 2**30),
         max_images=16,
         max_instants=max_instants,
-        limits=limits,
+        max_image_bytes=limits.max_bytes,
+        max_image_pixels=limits.max_pixels,
     )
     return Engine(MapStore(maps_dir), of_workers, metrics=Metrics(), **settings)
 

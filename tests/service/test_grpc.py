@@ -163,6 +163,12 @@ def test_every_answer_carries_the_servers_version(doors: Any) -> None:
             "options.read_as",
             "options.read_as",
         ),
+        (
+            {"options": pb2.LocalizeOptions(extraction="thorough")},
+            "INVALID_ARGUMENT",
+            "options.extraction",
+            "options.extraction",
+        ),
     ],
 )
 def test_bad_input_has_the_matching_status_code_and_field(

@@ -58,6 +58,16 @@ def test_the_command_says_when_it_is_ready_answers_on_both_doors_and_ends_on_sig
         assert "Traceback" not in process.stderr.read()
 
 
+def test_the_main_process_loads_none_of_what_only_workers_need() -> None:
+    code = "import sys, service.server; print(*sys.modules)"
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+
+    of_workers = {"torch", "openvino", "pycolmap", "poselib", "cv2", "PIL", "scipy", "faiss"}
+    assert of_workers.isdisjoint(loaded.stdout.split())
+
+
 def test_a_wrong_setting_ends_the_command_with_one_line() -> None:
     with started("--http-port", "many") as process:
         assert process.stderr is not None

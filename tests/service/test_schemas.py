@@ -14,8 +14,8 @@ from service import schemas
 from service.schemas import LocalizeOptions, LocalizeRequest
 from visloc.errors import InvalidInput, TooLarge
 from visloc.priors import NO_PRIORS, HeightBand
+from visloc.types import Extraction, ReadAs
 from visloc.types import LocalizeOptions as CoreOptions
-from visloc.types import ReadAs
 from visloc_api.v1 import localization_pb2 as pb2
 
 CAMERA = {"model": "PINHOLE", "width": 640, "height": 480, "params": [525, 525.5, 320, 240]}
@@ -42,6 +42,7 @@ def test_a_full_request_becomes_the_job_that_it_says() -> None:
         "min_inliers": 12,
         "min_inlier_ratio": 0.5,
         "read_as": "upright",
+        "extraction": "fast",
         "seed": 9,
     }
 
@@ -50,7 +51,9 @@ def test_a_full_request_becomes_the_job_that_it_says() -> None:
     assert (job.maps, job.query) == (("room",), b"photo")
     assert job.camera is not None
     assert job.camera.params == (525.0, 525.5, 320.0, 240.0)
-    assert job.options == CoreOptions("config1", 5, 8.0, 12, 0.5, ReadAs.UPRIGHT, 9)
+    assert job.options == CoreOptions(
+        "config1", 5, 8.0, 12, 0.5, ReadAs.UPRIGHT, Extraction.FAST, 9
+    )
 
 
 def test_what_is_left_out_or_null_takes_the_default() -> None:
@@ -88,7 +91,8 @@ def test_options_may_be_text() -> None:
             request(options={"topk": 1}),
             "request.unknown_field",
             "options.topk",
-            "one of preset, top_k, max_error_px, min_inliers, min_inlier_ratio, read_as, seed",
+            "one of preset, top_k, max_error_px, min_inliers, min_inlier_ratio, read_as, "
+            "extraction, seed",
         ),
         (
             request(camera=CAMERA | {"fov": 60}),

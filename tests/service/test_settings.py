@@ -45,6 +45,7 @@ def test_every_setting_has_a_flag_a_variable_and_a_line_of_help(
     words = {
         "cors_origins": "https://a.example,https://b.example",
         "host": "::1",
+        "inference": "fp32",
         "log_format": "json",
         "log_level": "error",
     }

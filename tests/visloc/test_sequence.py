@@ -14,9 +14,9 @@ from visloc import sequence as sequence_module
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose
 from visloc.priors import NO_PRIORS, HeightBand, PositionPrior, Priors
-from visloc.sequence import MAX_GAP_S, MAX_WAITING, Odometry, SeenInstant, SequenceSolver
+from visloc.sequence import MAX_WAITING, SeenInstant, SequenceSolver
 from visloc.solving import Matches, SeenImage, solve_instant
-from visloc.trajectory import PoseSource, TimeUnit, center_covariance
+from visloc.trajectory import MAX_GAP_S, Odometry, PoseSource, TimeUnit, center_covariance
 from visloc.types import InstantAnswer, LocalizeOptions, Reason
 
 OPTIONS = LocalizeOptions()

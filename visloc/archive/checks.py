@@ -24,6 +24,9 @@ RecordType = TypeVar("RecordType", bound=BaseModel)
 _MAX_JSON_BYTES = 2**27  # about a million photos; read, it takes some 20 times the memory
 _MAX_MANIFEST_BYTES = 16 * 2**20
 
+# What follows the name of a model's int8 matrix in the name of the scales of its columns.
+SCALES = ".scales"
+
 
 def sha256_of(path: Path) -> str:
     """Checksum of a file as lower-case hex."""
@@ -151,9 +154,23 @@ def read_record(folder: Path, name: str, record: type[RecordType]) -> RecordType
 
 
 def map_array(
-    folder: Path, name: str, dtype: str, shape: tuple[int, ...], *, load: bool = False
+    folder: Path,
+    name: str,
+    dtype: str,
+    shape: tuple[int, ...],
+    *,
+    before: str | None = None,
+    load: bool = False,
 ) -> NDArray[Any]:
     """Open one ``.npy`` of a map, memory-mapped and read-only unless ``load``.
+
+    Args:
+        folder: the map.
+        name: the file.
+        dtype: what it holds.
+        shape: its shape.
+        before: what it held in older formats, where that was another type.
+        load: read it now.
 
     Raises:
         MapCorrupt: ``map.array`` when it is not exactly such an array.
@@ -166,7 +183,7 @@ def map_array(
             size = file.seek(0, os.SEEK_END)
     except (ValueError, OSError) as error:
         raise MapCorrupt("map.array", "not a NumPy array file", field=str(path)) from error
-    expected = np.dtype(dtype)
+    expected = np.dtype(dtype if before is None or found != np.dtype(before) else before)
     whole = size == offset + math.prod(shape) * expected.itemsize
     # Before any memory is taken: a header can say anything.
     if found != expected or found_shape != shape or not whole:
@@ -200,16 +217,27 @@ def read_model(folder: Path, name: str) -> dict[str, NDArray[np.float32]]:
             expected="an .npz without compression",
             got=str(error),
         ) from error
+    for key in [key for key in model if key + SCALES in model]:
+        model[key] = _widened(model[key], model.pop(key + SCALES))
     for key, array in model.items():
         if array.dtype != np.float32 or not np.isfinite(array).all():
             raise MapCorrupt(
                 "map.array",
                 f"array {key!r} of a model is not usable",
                 field=str(path),
-                expected="finite float32",
+                expected="finite float32, or int8 with finite float32 scales of its columns",
                 got=str(array.dtype),
             )
     return model
+
+
+def _widened(values: NDArray[Any], scales: NDArray[Any]) -> NDArray[Any]:
+    """Multiply the columns of an int8 matrix with their scales; what is none stays as it is."""
+    fits = values.ndim == 2 and scales.shape == values.shape[1:]
+    if not fits or values.dtype != np.int8 or scales.dtype != np.float32:
+        return values
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused next
+        return np.asarray(values * scales)
 
 
 def _read_text(path: Path, limit: int, code: str) -> str:

@@ -23,6 +23,7 @@ from visloc.archive.schema import (
     MAX_PHOTO_BYTES,
     CamerasFile,
     Geodetic,
+    GlobalFeaturesRecord,
     ImageRecord,
     ImagesFile,
     Manifest,
@@ -30,6 +31,8 @@ from visloc.archive.schema import (
 )
 from visloc.errors import InvalidInput, MapCorrupt
 from visloc.geometry import Camera, Pose
+from visloc.retrieval.rows import GlobalRows
+from visloc.retrieval.shortlist import Clusters
 
 Model = Mapping[str, NDArray[np.float32]]
 
@@ -91,14 +94,16 @@ class Map(MapOutline):
         image_poses: (n, 7) float64, cam_from_world as qw qx qy qz tx ty tz.
         landmarks: (P, 3) float32, relative to the manifest's origin.
         track_lengths: (P,) uint16, mapping photos that see each landmark.
-        errors_px: (P,) float32, mean reprojection error; NaN where it does not apply.
-        angles_deg: (P,) float32, largest angle between viewing rays; NaN where not computed.
+        errors_px: (P,) float16 (float32 before format 1.4), mean reprojection error; NaN where it
+            does not apply.
+        angles_deg: (P,) as ``errors_px``, largest angle between viewing rays; NaN where not
+            computed.
         colors: (P, 3) uint8 RGB; None when the map has none.
         observation_offsets: (n + 1,) int64; rows offsets[i]:offsets[i + 1] belong to photo i.
         observation_landmarks: (M,) uint32 rows of ``landmarks``.
         observation_descriptors: (M, D) int8; times the manifest's ``descriptor_scale``.
-        observation_keypoints: (M, 2) float32 pixels.
-        global_descriptors: (n, D) float32 unit rows by name.
+        observation_keypoints: (M, 2) int16, or float32; ``keypoints`` reads them as pixels.
+        global_descriptors: unit rows (n, D) by name.
         global_models: the arrays of each global descriptor's model.
     """
 
@@ -113,17 +118,24 @@ class Map(MapOutline):
     observation_offsets: NDArray[np.int64]
     observation_landmarks: NDArray[np.uint32]
     observation_descriptors: NDArray[np.int8]
-    observation_keypoints: NDArray[np.float32]
-    global_descriptors: Mapping[str, NDArray[np.float32]]
+    observation_keypoints: NDArray[np.int16] | NDArray[np.float32]
+    global_descriptors: Mapping[str, GlobalRows]
     global_models: Mapping[str, Model]
 
-    def observations(self, image: int) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
-        """Landmarks (m,) that one photo observes and their unit descriptors (m, D)."""
+    def observations(self, image: int) -> tuple[NDArray[np.uint32], NDArray[np.int8]]:
+        """Landmarks (m,) that one photo observes and their descriptors (m, D), not copied.
+
+        Descriptors times the manifest's ``descriptor_scale`` are unit rows but for the rounding.
+        """
         start, stop = self.observation_offsets[image], self.observation_offsets[image + 1]
-        scale = np.float32(self.manifest.local_features.descriptor_scale)
-        descriptors = self.observation_descriptors[start:stop].astype(np.float32)
-        descriptors *= scale
-        return self.observation_landmarks[start:stop], descriptors
+        return self.observation_landmarks[start:stop], self.observation_descriptors[start:stop]
+
+    def keypoints(self, image: int) -> NDArray[np.float32]:
+        """Where one photo sees its landmarks, (m, 2) pixels in the order of ``observations``."""
+        start, stop = self.observation_offsets[image], self.observation_offsets[image + 1]
+        keypoints = self.observation_keypoints[start:stop].astype(np.float32)
+        step = self.manifest.local_features.keypoint_step_px
+        return keypoints if step is None else keypoints * np.float32(step)
 
     def photo(self, image: int) -> bytes | None:
         """A small JPEG of one photo; None when the map keeps no photos."""
@@ -137,7 +149,10 @@ def read_outline(folder: Path) -> MapOutline:
     Raises:
         MapCorrupt: with the file that is wrong.
     """
-    manifest = read_manifest(folder)
+    return _outline(folder, read_manifest(folder))
+
+
+def _outline(folder: Path, manifest: Manifest) -> MapOutline:
     cameras = read_record(folder, "cameras.json", CamerasFile)
     try:
         return MapOutline(
@@ -179,14 +194,17 @@ def open_map(folder: Path) -> Map:
             field=str(folder / "manifest.json"),
             got=", ".join(record.fingerprint.name for record in manifest.global_features),
         )
-    for name in (*_ARRAYS, *(f + end for f in files.values() for end in (".npy", ".model.npz"))):
+    described = [f + end for f in files.values() for end in (".npy", ".model.npz")]
+    for record in manifest.global_features:
+        described += [name for name, _, _ in _beside_rows(record, n)]
+    for name in (*_ARRAYS, *described):
         if name not in manifest.files:
             raise MapCorrupt(
                 "map.file_missing", "a file that every such map has is not listed", field=name
             )
     _check_photos(folder, manifest)
     images = read_record(folder, "images.json", ImagesFile).images
-    outline = read_outline(folder)
+    outline = _outline(folder, manifest)
     if len(images) != n or any(image.camera not in outline.cameras for image in images):
         raise MapCorrupt(
             "map.images",
@@ -202,8 +220,12 @@ def open_map(folder: Path) -> Map:
         image_poses=map_array(folder, "image_poses.npy", "<f8", (n, 7), load=True),
         landmarks=map_array(folder, "landmarks.npy", "<f4", (num_landmarks, 3)),
         track_lengths=map_array(folder, "landmark_track_length.npy", "<u2", (num_landmarks,)),
-        errors_px=map_array(folder, "landmark_error_px.npy", "<f4", (num_landmarks,)),
-        angles_deg=map_array(folder, "landmark_angle_deg.npy", "<f4", (num_landmarks,)),
+        errors_px=map_array(folder, "landmark_error_px.npy", "<f2", (num_landmarks,), before="<f4"),
+        angles_deg=map_array(
+            folder, "landmark_angle_deg.npy", "<f2", (num_landmarks,), before="<f4"
+        )
+        if "landmark_angle_deg.npy" in manifest.files
+        else np.broadcast_to(np.float16(np.nan), num_landmarks),
         colors=map_array(folder, "landmark_rgb.npy", "|u1", (num_landmarks, 3))
         if "landmark_rgb.npy" in manifest.files
         else None,
@@ -214,11 +236,14 @@ def open_map(folder: Path) -> Map:
         observation_descriptors=map_array(
             folder, "observation_descriptors.npy", "|i1", (m, local.descriptor_dim)
         ),
-        observation_keypoints=map_array(folder, "observation_keypoints.npy", "<f4", (m, 2)),
+        observation_keypoints=map_array(
+            folder,
+            "observation_keypoints.npy",
+            "<f4" if local.keypoint_step_px is None else "<i2",
+            (m, 2),
+        ),
         global_descriptors={
-            record.fingerprint.name: map_array(
-                folder, f"{files[record.fingerprint.name]}.npy", "<f4", (n, record.dim)
-            )
+            record.fingerprint.name: _map_rows(folder, record, n)
             for record in manifest.global_features
         },
         global_models={name: read_model(folder, f"{f}.model.npz") for name, f in files.items()},
@@ -243,13 +268,17 @@ def verify_map(folder: Path) -> Map:
         and bool((np.diff(offsets) >= 0).all()),
         "observation_landmarks.npy": int(opened.observation_landmarks.max()) < counts.landmarks,
         "observation_keypoints.npy": is_finite(opened.observation_keypoints),
-        **{
-            f"global/{record.fingerprint.file_stem}.npy": is_finite(
-                opened.global_descriptors[record.fingerprint.name]
-            )
-            for record in opened.manifest.global_features
-        },
     }
+    for record in opened.manifest.global_features:
+        stem, rows = (
+            record.fingerprint.file_stem,
+            opened.global_descriptors[record.fingerprint.name],
+        )
+        fine[f"global/{stem}.npy"] = is_finite(rows.values)
+        if rows.scales is not None:
+            fine[f"global/{stem}.scales.npy"] = is_finite(rows.scales) and rows.scales.min() >= 0
+        if rows.clusters is not None:
+            fine[f"index/{stem}.members.npy"] = _are_good(rows.clusters, counts.images)
     for name, good in fine.items():
         if not good:
             raise MapCorrupt(
@@ -258,8 +287,49 @@ def verify_map(folder: Path) -> Map:
     return opened
 
 
+def _map_rows(folder: Path, record: GlobalFeaturesRecord, num_images: int) -> GlobalRows:
+    dtype = "|i1" if record.bits == 8 else "<f4"
+    name = f"global/{record.fingerprint.file_stem}.npy"
+    values = map_array(folder, name, dtype, (num_images, record.dim))
+    beside = [map_array(folder, *one) for one in _beside_rows(record, num_images)]
+    scales = beside.pop(0) if record.bits == 8 else None
+    return GlobalRows(values, scales, Clusters(*beside) if beside else None)
+
+
+def _beside_rows(
+    record: GlobalFeaturesRecord, num_images: int
+) -> list[tuple[str, str, tuple[int, ...]]]:
+    """Name, type and shape of the arrays that a global descriptor has beside its rows."""
+    stem, clusters = record.fingerprint.file_stem, record.clusters
+    beside: list[tuple[str, str, tuple[int, ...]]] = []
+    if record.bits == 8:
+        beside.append((f"global/{stem}.scales.npy", "<f4", (num_images,)))
+    if clusters is not None:
+        beside += [
+            (f"index/{stem}.centers.npy", "<f4", (clusters, record.dim)),
+            (f"index/{stem}.offsets.npy", "<i8", (clusters + 1,)),
+            (f"index/{stem}.members.npy", "<u4", (num_images,)),
+        ]
+    return beside
+
+
+def _are_good(clusters: Clusters, num_images: int) -> bool:
+    """Whether clusters hold every photo once."""
+    offsets, members = clusters.offsets, clusters.members
+    return (
+        is_finite(clusters.centers)
+        and offsets[0] == 0
+        and offsets[-1] == num_images
+        and bool((np.diff(offsets) >= 0).all())
+        and int(members.max()) < num_images
+        and bool((np.bincount(members, minlength=num_images) == 1).all())
+    )
+
+
 def _check_photos(folder: Path, manifest: Manifest) -> None:
     """Refuse a map that keeps some of its photos only, or large ones."""
+    if not any(name.startswith("photos/") for name in manifest.files):
+        return
     files = [manifest.files.get(photo_file(row)) for row in range(manifest.counts.images)]
     kept = [file for file in files if file is not None]
     if kept and (len(kept) < len(files) or max(file.size for file in kept) > MAX_PHOTO_BYTES):
@@ -284,7 +354,6 @@ _ARRAYS = (
     "landmarks.npy",
     "landmark_track_length.npy",
     "landmark_error_px.npy",
-    "landmark_angle_deg.npy",
     "observation_offsets.npy",
     "observation_landmarks.npy",
     "observation_descriptors.npy",

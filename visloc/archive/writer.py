@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
+import itertools
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import JsonValue
 
-from visloc.archive.checks import content_hash, json_text, manifest_hash, sha256_of
+from visloc.archive.checks import SCALES, content_hash, json_text, manifest_hash, sha256_of
 from visloc.archive.schema import (
     FORMAT,
     FORMAT_MAJOR,
@@ -23,6 +27,18 @@ from visloc.archive.schema import (
     Vector,
 )
 from visloc.geometry import Camera, Pose
+from visloc.retrieval.index import MAX_EXACT
+from visloc.retrieval.rows import in_8_bits
+from visloc.retrieval.shortlist import make_clusters
+
+# Rows of an array that are converted and written at a time.
+_BLOCK_ROWS = 8192
+# Pixels are stored in steps of a power of two, such that an image is at most so many steps wide;
+# some room is left beyond its edges. In 16 bits where that is fine enough and all lie in that room.
+_MAX_STEPS = 30_000
+_MAX_KEYPOINT_STEP_PX = 0.25
+# Matrices of a model with more numbers than this are stored in 8 bits.
+_MAX_FLOAT_MODEL = 2**16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +83,8 @@ class MapContent:
 
     ``descriptors()`` yields, photo by photo, the unit descriptors (m_i, D) float32 of that photo's
     observations in the order of ``landmarks``; it is read twice. ``gravity`` is the unit vector
-    that points down in the world, None where that is not known.
+    that points down in the world, None where that is not known. ``computed_with`` tells what
+    computed the local features, for people. Arrays may be mapped from files: none is copied whole.
     """
 
     metric: bool
@@ -86,6 +103,7 @@ class MapContent:
     global_features: tuple[GlobalFeatures, ...]
     anchor: Anchor | None = None
     gravity: Vector | None = None
+    computed_with: str | None = None
 
 
 def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, created: str) -> str:
@@ -103,9 +121,9 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
         The version.
     """
     landmarks = content.landmarks
-    (folder / "global").mkdir()
-    _write_json(
-        folder / "cameras.json",
+    files = _Files(folder)
+    files.write_json(
+        "cameras.json",
         {
             "cameras": {
                 key: {"model": c.model, "width": c.width, "height": c.height, "params": c.params}
@@ -117,34 +135,23 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
             },
         },
     )
-    _write_json(
-        folder / "images.json", {"images": [image.model_dump() for image in content.images]}
-    )
-    arrays: dict[str, NDArray[Any]] = {
-        "image_poses.npy": np.array([_row(pose) for pose in content.image_poses], dtype="<f8"),
-        "landmarks.npy": landmarks.points.astype("<f4", copy=False),
-        "landmark_track_length.npy": landmarks.track_lengths.astype("<u2", copy=False),
-        "landmark_error_px.npy": landmarks.errors_px.astype("<f4", copy=False),
-        "landmark_angle_deg.npy": landmarks.angles_deg.astype("<f4", copy=False),
-        "observation_offsets.npy": landmarks.offsets.astype("<i8", copy=False),
-        "observation_landmarks.npy": landmarks.observed.astype("<u4", copy=False),
-        "observation_keypoints.npy": landmarks.keypoints.astype("<f4", copy=False),
-    }
+    files.write_json("images.json", {"images": [asdict(image) for image in content.images]})
+    poses = np.array([_row(pose) for pose in content.image_poses])
+    files.write_array("image_poses.npy", "<f8", poses)
+    files.write_array("landmarks.npy", "<f4", landmarks.points)
+    files.write_array("landmark_track_length.npy", "<u2", landmarks.track_lengths)
+    files.write_array("landmark_error_px.npy", "<f2", landmarks.errors_px, _within_float16)
+    if any(not np.isnan(block).all() for block in _blocks(landmarks.angles_deg)):
+        files.write_array("landmark_angle_deg.npy", "<f2", landmarks.angles_deg, _within_float16)
     if landmarks.colors is not None:
-        arrays["landmark_rgb.npy"] = landmarks.colors.astype("u1", copy=False)
-    for features in content.global_features:
-        stem = features.fingerprint.file_stem
-        arrays[f"global/{stem}.npy"] = features.descriptors.astype("<f4", copy=False)
-        with (folder / f"global/{stem}.model.npz").open("xb") as file:
-            # The savez stub takes no mapping of arrays as keywords beside allow_pickle.
-            np.savez(file, **features.model)  # type: ignore[arg-type]
-    for name, array in arrays.items():
-        _write_array(folder / name, array.dtype, array.shape, [array])
+        files.write_array("landmark_rgb.npy", "|u1", landmarks.colors)
+    files.write_array("observation_offsets.npy", "<i8", landmarks.offsets)
+    files.write_array("observation_landmarks.npy", "<u4", landmarks.observed)
+    keypoint_step = _write_keypoints(files, landmarks.keypoints, content.cameras)
     scale = _write_descriptors(
-        folder / "observation_descriptors.npy",
-        content.descriptors,
-        (len(landmarks.observed), content.descriptor_dim),
+        files, content.descriptors, (len(landmarks.observed), content.descriptor_dim)
     )
+    clusters = [_write_global(files, features) for features in content.global_features]
     extent = landmarks.points.min(axis=0), landmarks.points.max(axis=0)
     manifest: dict[str, Any] = {
         "format": FORMAT,
@@ -167,10 +174,17 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
             "max_keypoints": content.max_keypoints,
             "descriptor_dim": content.descriptor_dim,
             "descriptor_scale": scale,
+            "keypoint_step_px": keypoint_step,
+            "computed_with": content.computed_with,
         },
         "global_features": [
-            {"fingerprint": f.fingerprint.model_dump(), "dim": f.descriptors.shape[1]}
-            for f in content.global_features
+            {
+                "fingerprint": f.fingerprint.model_dump(),
+                "dim": f.descriptors.shape[1],
+                "bits": 8,
+                "clusters": count,
+            }
+            for f, count in zip(content.global_features, clusters, strict=True)
         ],
         "counts": {
             "images": len(content.images),
@@ -178,20 +192,13 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
             "observations": len(landmarks.observed),
         },
         "notes": list(content.notes),
-        "files": {
-            path.relative_to(folder).as_posix(): {
-                "size": path.stat().st_size,
-                "sha256": sha256_of(path),
-            }
-            for path in sorted(folder.rglob("*"))
-            if path.is_file()
-        },
+        "files": files.entries(),
     }
     digest = content_hash(manifest)
     manifest["content_hash"] = digest
     manifest["version"] = version + digest[:8] if version.endswith("-") else version
     manifest["manifest_hash"] = manifest_hash(manifest)
-    _write_json(folder / "manifest.json", manifest)
+    files.write_json("manifest.json", manifest)
     for path in folder.rglob("*"):
         if path.is_file():
             with path.open("rb") as file:
@@ -203,12 +210,101 @@ def _row(pose: Pose) -> list[float]:
     return [*pose.rotation_wxyz.tolist(), *pose.translation.tolist()]
 
 
-def _write_json(path: Path, value: object) -> None:
-    path.write_text(json_text(value), encoding="utf-8")
+class _Files:
+    """The files of a map as they are written, each with its checksum."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._written: dict[str, str] = {}
+
+    def write_json(self, name: str, value: object) -> None:
+        self._write(name, [json_text(value).encode()])
+
+    def write_array(
+        self,
+        name: str,
+        dtype: str,
+        array: NDArray[Any],
+        converted: Callable[[NDArray[Any]], NDArray[Any]] = np.asarray,
+    ) -> None:
+        """Write an array of which a block at a time is in memory, converted to ``dtype``."""
+        self.write_blocks(name, dtype, array.shape, map(converted, _blocks(array)))
+
+    def write_blocks(
+        self, name: str, dtype: str, shape: tuple[int, ...], blocks: Iterable[NDArray[Any]]
+    ) -> None:
+        """Write an ``.npy`` block by block.
+
+        On a full disk ``np.save`` does not say what is wrong, and a memory map ends the process.
+        """
+        header = io.BytesIO()
+        np.lib.format.write_array_header_1_0(
+            header, {"descr": dtype, "fortran_order": False, "shape": shape}
+        )
+        rows = (np.ascontiguousarray(block, dtype).data for block in blocks if block.size)
+        self._write(name, itertools.chain([header.getvalue()], rows))
+
+    def write_model(self, name: str, model: Mapping[str, NDArray[Any]]) -> None:
+        path = self._path(name)
+        with path.open("xb") as file:
+            # The savez stub takes no mapping of arrays as keywords beside allow_pickle.
+            np.savez(file, **model)  # type: ignore[arg-type]
+        self._written[name] = sha256_of(path)
+
+    def entries(self) -> dict[str, dict[str, int | str]]:
+        """Size and checksum of all files in the folder, those written by others read again."""
+        entries: dict[str, dict[str, int | str]] = {}
+        for path in sorted(self.folder.rglob("*")):
+            if path.is_file():
+                name = path.relative_to(self.folder).as_posix()
+                sha256 = self._written.get(name) or sha256_of(path)
+                entries[name] = {"size": path.stat().st_size, "sha256": sha256}
+        return entries
+
+    def _write(self, name: str, parts: Iterable[bytes | memoryview]) -> None:
+        digest = hashlib.sha256()
+        with self._path(name).open("wb") as file:
+            for part in parts:
+                file.write(part)
+                digest.update(part)
+        self._written[name] = digest.hexdigest()
+
+    def _path(self, name: str) -> Path:
+        path = self.folder / name
+        path.parent.mkdir(exist_ok=True)
+        return path
+
+
+def _blocks(array: NDArray[Any]) -> Iterator[NDArray[Any]]:
+    for start in range(0, len(array), _BLOCK_ROWS):
+        yield array[start : start + _BLOCK_ROWS]
+
+
+def _within_float16(values: NDArray[Any]) -> NDArray[Any]:
+    """Clip to what float16 can hold; NaN stays."""
+    limit = float(np.finfo(np.float16).max)
+    return np.asarray(np.clip(values, -limit, limit))
+
+
+def _write_keypoints(
+    files: _Files, keypoints: NDArray[np.float32], cameras: Mapping[str, Camera]
+) -> float | None:
+    """Store pixels in 16 bits where they fit, and return the step; None for float32."""
+    name = "observation_keypoints.npy"
+    side = max(max(camera.width, camera.height) for camera in cameras.values())
+    step = 2.0 ** math.ceil(math.log2(side / _MAX_STEPS))
+    most = step * np.iinfo(np.int16).max
+    # NaN fits no comparison.
+    fits = all(bool((np.abs(block) <= most).all()) for block in _blocks(keypoints))
+    if step > _MAX_KEYPOINT_STEP_PX or not fits:
+        files.write_array(name, "<f4", keypoints)
+        return None
+    files.write_array(name, "<i2", keypoints, lambda block: np.rint(block / np.float32(step)))
+    return step
 
 
 def _write_descriptors(
-    path: Path, descriptors: Callable[[], Iterator[NDArray[np.float32]]], shape: tuple[int, int]
+    files: _Files, descriptors: Callable[[], Iterator[NDArray[np.float32]]], shape: tuple[int, int]
 ) -> float:
     """Store unit descriptors in 8 bits and return the value of one step.
 
@@ -224,21 +320,44 @@ def _write_descriptors(
             num_rows += len(block)
             yield np.rint(block / np.float32(scale)).astype(np.int8)
 
-    _write_array(path, np.dtype(np.int8), shape, stored())
+    files.write_blocks("observation_descriptors.npy", "|i1", shape, stored())
     if num_rows != shape[0]:
         raise AssertionError(f"{num_rows} descriptors for {shape[0]} observations")
     return scale
 
 
-def _write_array(
-    path: Path, dtype: np.dtype[Any], shape: tuple[int, ...], blocks: Iterable[NDArray[Any]]
-) -> None:
-    """Write an ``.npy`` block by block.
+def _write_global(files: _Files, features: GlobalFeatures) -> int | None:
+    """Store a global descriptor's rows and model in 8 bits; return how many clusters it has."""
+    stem, rows = features.fingerprint.file_stem, features.descriptors
+    scales = np.empty(len(rows), np.float32)
 
-    On a full disk ``np.save`` does not say what is wrong, and a memory map ends the process.
-    """
-    header = {"descr": dtype.str, "fortran_order": False, "shape": shape}
-    with path.open("wb") as file:
-        np.lib.format.write_array_header_1_0(file, header)
-        for block in blocks:
-            file.write(np.ascontiguousarray(block).data)
+    def stored() -> Iterator[NDArray[np.int8]]:
+        for number, block in enumerate(_blocks(rows)):
+            values, some = in_8_bits(np.asarray(block))
+            scales[number * _BLOCK_ROWS :][: len(block)] = some
+            yield values
+
+    files.write_blocks(f"global/{stem}.npy", "|i1", rows.shape, stored())
+    files.write_array(f"global/{stem}.scales.npy", "<f4", scales)
+    files.write_model(f"global/{stem}.model.npz", _stored_model(features.model))
+    if len(rows) <= MAX_EXACT:
+        return None
+    clusters = make_clusters(rows)
+    files.write_array(f"index/{stem}.centers.npy", "<f4", clusters.centers)
+    files.write_array(f"index/{stem}.offsets.npy", "<i8", clusters.offsets)
+    files.write_array(f"index/{stem}.members.npy", "<u4", clusters.members)
+    return len(clusters.centers)
+
+
+def _stored_model(model: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[Any]]:
+    """A model with its large matrices in 8 bits, which have a scale for each column."""
+    stored: dict[str, NDArray[Any]] = {}
+    for name, array in model.items():
+        if array.ndim != 2 or array.size <= _MAX_FLOAT_MODEL:
+            stored[name] = array
+            continue
+        largest = np.abs(array).max(axis=0)
+        scales = np.where(largest > 0, largest, 1).astype(np.float32) / np.float32(127)
+        stored[name] = np.rint(array / scales).astype(np.int8)
+        stored[name + SCALES] = scales
+    return stored

@@ -1,13 +1,11 @@
-"""Convolutions for inference: fixed weights, batch norm folded in, fast memory layout."""
+"""Convolutions for inference: batch norm folded in."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import nn
 
 _EPSILON = 1e-5  # PyTorch's default for batch norms
 
@@ -24,25 +22,3 @@ def fold_batch_norm(
     folded_weight: NDArray[np.float64] = weight * factor[:, None, None, None]
     folded_bias: NDArray[np.float64] = (bias - mean) * factor
     return folded_weight, folded_bias
-
-
-def fixed_convolution(
-    weight: NDArray[Any],
-    bias: NDArray[Any],
-    *,
-    stride: int = 1,
-    dilation: int = 1,
-    padding: int = 0,
-) -> nn.Conv2d:
-    """Return a float32 convolution that will not be trained; weight (O, I, k, k), bias (O,)."""
-    outputs, inputs, kernel, _ = weight.shape
-    convolution = nn.Conv2d(
-        inputs, outputs, kernel, stride=stride, dilation=dilation, padding=padding
-    )
-    # channels_last is a quarter faster on CPUs when the input has the same layout.
-    fast_weight = torch.tensor(weight, dtype=torch.float32).contiguous(
-        memory_format=torch.channels_last
-    )
-    convolution.weight = nn.Parameter(fast_weight, requires_grad=False)
-    convolution.bias = nn.Parameter(torch.tensor(bias, dtype=torch.float32), requires_grad=False)
-    return convolution

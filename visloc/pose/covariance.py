@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.geometry import Camera, Pose, cross_matrix
-from visloc.pose.colmap import project
+from visloc.geometry import Pose, cross_matrix
+from visloc.pose.reprojection import linearized
 from visloc.pose.views import MatchedView
 
 _MIN_POINTS = 4
@@ -45,30 +45,27 @@ def pose_covariance(
     num_points = sum(len(view) for view in views)
     if num_points < _MIN_POINTS:
         return None
-    linear = [_linearize(view, rig_from_world) for view in views]
-    residuals = np.concatenate([view_residuals for view_residuals, _ in linear])
-    jacobian = np.concatenate([view_jacobian for _, view_jacobian in linear])
+    residuals, jacobian = linearized(views, rig_from_world, about=rig_from_world.translation)
     weight = 1.0 / (1.0 + np.sum(residuals**2, axis=1) / loss_scale_px**2)
-    outer = residuals[:, :, None] * residuals[:, None, :]
-    curvature = (
-        weight[:, None, None] * np.eye(2)
-        - (2.0 * (weight / loss_scale_px) ** 2)[:, None, None] * outer
-    )
     psi = weight[:, None] * residuals
+    gradients = np.einsum("nai,na->ni", jacobian, psi)
+    scatter = _squared(gradients)
+    # The second derivative of the loss is weight - 2 psi psi^T / c^2.
+    by_weight = np.sqrt(weight)[:, None, None] * jacobian
+    curvature = _squared(by_weight.reshape(-1, 6)) - 2.0 / loss_scale_px**2 * scatter
 
     num_residuals = 2 * num_points
     spare = num_residuals - 6
-    slope = np.trace(curvature, axis1=1, axis2=2).sum() / num_residuals
+    slope = np.mean(weight**2)  # half the trace of the second derivative
     if not (np.isfinite(jacobian).all() and slope > 0):
         return None
-    common = _inverse(np.einsum("nai,naj->ij", jacobian, jacobian))
-    bread = _inverse(np.einsum("nai,nab,nbj->ij", jacobian, curvature, jacobian))
+    common = _inverse(_squared(jacobian.reshape(-1, 6)))
+    bread = _inverse(curvature)
     if common is None or bread is None:
         return None
     # Never quite zero: exact correspondences, as in tests, would leave nothing to compare.
     common *= max(np.sum(psi**2) / spare, _MIN_VARIANCE_PX2) / slope**2
-    gradients = np.einsum("nai,na->ni", jacobian, psi)
-    sandwich = bread @ (gradients.T @ gradients) @ bread * (num_residuals / spare)
+    sandwich = bread @ scatter @ bread * (num_residuals / spare)
     # The sandwich scatters by about 1 / sqrt(n) in each direction: the largest of both would be
     # too wide by that in half of them, were it not taken off first.
     return _wider(common, sandwich / (1.0 + _SANDWICH_SCATTER / math.sqrt(num_points)))
@@ -103,40 +100,11 @@ def with_origin(
     return pose, jacobian @ covariance @ jacobian.T
 
 
-def _linearize(
-    view: MatchedView, rig_from_world: Pose
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Residuals (n, 2) of a view in pixels, and their derivative (n, 2, 6) by the rig's pose."""
-    in_rig = rig_from_world.apply(view.points)
-    seen = view.cam_from_rig.apply(in_rig)
-    motion = _motion_jacobian(in_rig - rig_from_world.translation)
-    jacobian = _projection_jacobian(view.camera, seen) @ view.cam_from_rig.rotation @ motion
-    return project(view.camera, seen) - view.pixels, jacobian
-
-
-def _motion_jacobian(rotated: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivative (n, 3, 6) of Exp(w) R x + t + dt by (w, dt), given R x (n, 3)."""
-    jacobian = np.zeros((len(rotated), 3, 6))
-    x, y, z = rotated.T
-    jacobian[:, 0, 1], jacobian[:, 0, 2] = z, -y
-    jacobian[:, 1, 0], jacobian[:, 1, 2] = -z, x
-    jacobian[:, 2, 0], jacobian[:, 2, 1] = y, -x
-    jacobian[:, :, 3:] = np.eye(3)
-    return jacobian
-
-
-def _projection_jacobian(camera: Camera, seen: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivative (n, 2, 3) of the pixel by the point in the camera's frame, numerically.
-
-    Central differences work for every camera model; their error is about 1e-9 relative.
-    """
-    step = 1e-5 * np.linalg.norm(seen, axis=1)
-    columns = []
-    for axis in np.eye(3):
-        shift = step[:, None] * axis
-        difference = project(camera, seen + shift) - project(camera, seen - shift)
-        columns.append(difference / (2 * step[:, None]))
-    return np.stack(columns, axis=2)
+def _squared(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The product rows^T rows (6, 6) of rows (n, 6)."""
+    # Unlike a product of matrices, equal bits however many threads the linear algebra has.
+    columns = np.ascontiguousarray(rows.T)
+    return np.asarray(np.einsum("in,jn->ij", columns, columns))
 
 
 def _inverse(information: NDArray[np.float64]) -> NDArray[np.float64] | None:

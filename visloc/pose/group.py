@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from visloc.geometry import Pose
 from visloc.pose.generalized import estimate_generalized_pose
@@ -123,9 +122,4 @@ def _thinned(views: Sequence[MatchedView], seed: int) -> list[MatchedView]:
         return list(views)
     rng = np.random.default_rng(seed)
     share = _MAX_CORRESPONDENCES / count
-    return [selected(view, rng.random(len(view)) < share) for view in views]
-
-
-def selected(view: MatchedView, which: NDArray[np.bool_]) -> MatchedView:
-    """Keep some of a view's correspondences."""
-    return MatchedView(view.camera, view.cam_from_rig, view.pixels[which], view.points[which])
+    return [view.selected(rng.random(len(view)) < share) for view in views]

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.geometry import Camera, Pose
-from visloc.pose.colmap import project
+from visloc.geometry import Pose
 from visloc.pose.motion import UncertainPose, adjoint, difference, moved
+from visloc.pose.reprojection import linearized
 from visloc.pose.views import MatchedView
 
 _MAX_STEPS = 30
@@ -155,17 +155,7 @@ class _PixelTerms:
 def _pixel_terms(
     views: Sequence[MatchedView], rig_from_world: Pose, loss_scale_px: float
 ) -> _PixelTerms:
-    errors, jacobians = [], []
-    for view in views:
-        in_rig = rig_from_world.apply(view.points)
-        in_cam = view.cam_from_rig.apply(in_rig)
-        pixels, by_point = _projected(view.camera, in_cam)
-        errors.append(pixels - view.pixels)
-        by_pose = np.zeros((len(view), 3, 6))
-        by_pose[:, :, :3] = -_cross_matrices(in_rig)
-        by_pose[:, :, 3:] = np.eye(3)
-        jacobians.append(by_point @ view.cam_from_rig.rotation @ by_pose)
-    error, jacobian = np.concatenate(errors), np.concatenate(jacobians)
+    error, jacobian = linearized(views, rig_from_world, about=np.zeros(3))
     # A step too far puts points behind the camera, where there is no error to speak of: infinite.
     squared = np.sum(error**2, axis=1) / loss_scale_px**2
     weight = 1.0 / (1.0 + squared)
@@ -219,23 +209,3 @@ def _linearized(
         information[here, here] += pixels.outer * (pixels.slope / error_scale_px2)
         slope[here] += pixels.gradient / error_scale_px2
     return _Linearized(cost, information, slope)
-
-
-def _projected(
-    camera: Camera, in_cam: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pixels (n, 2) of points, and their derivatives (n, 2, 3) by central differences."""
-    step = 1e-5 * np.linalg.norm(in_cam, axis=1)
-    shifts = step[:, None] * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])[:, None]
-    # All at once: with few points, the calls take longer than the work.
-    pixels = project(camera, (in_cam + shifts).reshape(-1, 3)).reshape(7, -1, 2)
-    return pixels[0], np.stack([*(pixels[1:4] - pixels[4:])], axis=2) / (2 * step)[:, None, None]
-
-
-def _cross_matrices(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    matrices = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    matrices[:, 0, 1], matrices[:, 0, 2] = -z, y
-    matrices[:, 1, 0], matrices[:, 1, 2] = z, -x
-    matrices[:, 2, 0], matrices[:, 2, 1] = -y, x
-    return matrices

@@ -17,7 +17,8 @@ class MatchedView:
     Attributes:
         camera: intrinsics.
         cam_from_rig: where it sits; the identity for a camera on its own.
-        pixels: (n, 2) float64 in the camera's image.
+        pixels: (n, 2) float64 in the camera's image; those matched best come first, where that is
+            known.
         points: (n, 3) float64 in a world frame whose numbers are not large.
     """
 
@@ -28,3 +29,7 @@ class MatchedView:
 
     def __len__(self) -> int:
         return len(self.pixels)
+
+    def selected(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> MatchedView:
+        """Keep some of the correspondences, by mask or by rows."""
+        return MatchedView(self.camera, self.cam_from_rig, self.pixels[which], self.points[which])

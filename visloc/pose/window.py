@@ -18,19 +18,16 @@ from numpy.typing import NDArray
 
 from visloc.geometry import Pose
 from visloc.pose.agreement import agreeing_pieces
-from visloc.pose.generalized import (
-    LOSS_SCALE_PX,
-    GeneralizedPose,
-    refine_generalized_pose,
-    reprojection_errors,
-)
-from visloc.pose.group import carried, find_groups, selected
+from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
+from visloc.pose.group import carried, find_groups
 from visloc.pose.motion import (
     RelativeMotion,
     UncertainPose,
     link_from_motion,
 )
 from visloc.pose.pose_graph import Chain, error_scale, solve_chain
+from visloc.pose.refinement import LOSS_SCALE_PX
+from visloc.pose.reprojection import reprojection_errors
 from visloc.pose.views import MatchedView
 from visloc.types import RegistrationPreset
 
@@ -228,7 +225,7 @@ def _solve_together(
         inliers = [_inliers(i.views, p, registration) for i, p in zip(instants, poses, strict=True)]
         seen = {
             i: tuple(
-                selected(v, k) for v, k in zip(instant.views, inliers[i], strict=True) if k.any()
+                v.selected(k) for v, k in zip(instant.views, inliers[i], strict=True) if k.any()
             )
             for i, instant in enumerate(instants)
             if i not in measured

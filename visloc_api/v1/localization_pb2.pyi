@@ -63,6 +63,7 @@ class LocalizeOptions(_message.Message):
     MIN_INLIERS_FIELD_NUMBER: _builtins.int
     MIN_INLIER_RATIO_FIELD_NUMBER: _builtins.int
     READ_AS_FIELD_NUMBER: _builtins.int
+    EXTRACTION_FIELD_NUMBER: _builtins.int
     SEED_FIELD_NUMBER: _builtins.int
     preset: _builtins.str
     """default, config1 or config2"""
@@ -76,6 +77,8 @@ class LocalizeOptions(_message.Message):
     """0 to 1"""
     read_as: _builtins.str
     """stored (default) or upright (by EXIF orientation)"""
+    extraction: _builtins.str
+    """effort to find features: fast, default or accurate"""
     seed: _builtins.int
     """of RANSAC"""
     def __init__(
@@ -87,12 +90,15 @@ class LocalizeOptions(_message.Message):
         min_inliers: _builtins.int | None = ...,
         min_inlier_ratio: _builtins.float | None = ...,
         read_as: _builtins.str | None = ...,
+        extraction: _builtins.str | None = ...,
         seed: _builtins.int | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_top_k", b"_top_k", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "top_k", b"top_k"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_top_k", b"_top_k", "extraction", b"extraction", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "top_k", b"top_k"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_top_k", b"_top_k", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "top_k", b"top_k"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_top_k", b"_top_k", "extraction", b"extraction", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "top_k", b"top_k"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__extraction: _TypeAlias = _typing.Literal["extraction"]  # noqa: Y015
+    _WhichOneofArgType__extraction: _TypeAlias = _typing.Literal["_extraction", b"_extraction"]  # noqa: Y015
     _WhichOneofReturnType__max_error_px: _TypeAlias = _typing.Literal["max_error_px"]  # noqa: Y015
     _WhichOneofArgType__max_error_px: _TypeAlias = _typing.Literal["_max_error_px", b"_max_error_px"]  # noqa: Y015
     _WhichOneofReturnType__min_inlier_ratio: _TypeAlias = _typing.Literal["min_inlier_ratio"]  # noqa: Y015
@@ -107,6 +113,8 @@ class LocalizeOptions(_message.Message):
     _WhichOneofArgType__seed: _TypeAlias = _typing.Literal["_seed", b"_seed"]  # noqa: Y015
     _WhichOneofReturnType__top_k: _TypeAlias = _typing.Literal["top_k"]  # noqa: Y015
     _WhichOneofArgType__top_k: _TypeAlias = _typing.Literal["_top_k", b"_top_k"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__extraction) -> _WhichOneofReturnType__extraction | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__max_error_px) -> _WhichOneofReturnType__max_error_px | None: ...
     @_typing.overload

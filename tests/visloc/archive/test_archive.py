@@ -94,8 +94,9 @@ def test_a_written_map_reads_back_as_it_was(folder: Path) -> None:
     assert opened.rigs["rig"]["cam"].translation.tolist() == [1.0, 2.0, 3.0]
     landmarks, descriptors = opened.observations(2)
     assert landmarks.tolist() == [0, 2, 3, 4]
+    assert descriptors.dtype == np.int8
     # eight bits: half a step of the largest value
-    assert descriptors == pytest.approx(
+    assert descriptors * opened.manifest.local_features.descriptor_scale == pytest.approx(
         np.concatenate(list(content.descriptors()))[3:], abs=0.5 / 127
     )
     assert len(opened.observations(1)[0]) == 0
@@ -281,7 +282,7 @@ def test_a_map_of_ready_made_features_with_colours_and_anchor_reads_back(tmp_pat
     folder = write_content(tmp_path / "incoming", make_ready_made_content())
     MapStore(tmp_path / "maps").publish(folder, "room", "v1")
     opened = MapStore(tmp_path / "maps").open("room")
-    assert opened.manifest.format_version == "1.3"
+    assert opened.manifest.format_version == "1.4"
     assert opened.manifest.world.anchor == ANCHOR
     assert opened.manifest.local_features.fingerprint.name == "kapture:D2-Net"
     assert opened.colors is not None
@@ -289,13 +290,16 @@ def test_a_map_of_ready_made_features_with_colours_and_anchor_reads_back(tmp_pat
     assert np.array_equal(opened.colors, COLORS)
     assert opened.track_lengths.tolist() == [2, 1, 1, 0, 1]
     assert list(opened.global_descriptors) == ["kapture:AP-GeM-LM18", "densevlad"]
-    assert np.array_equal(opened.global_descriptors["kapture:AP-GeM-LM18"], np.eye(3, 5))
+    rows = opened.global_descriptors["kapture:AP-GeM-LM18"][:]
+    np.testing.assert_allclose(rows, np.eye(3, 5), atol=1e-7)
     assert opened.global_models["kapture:AP-GeM-LM18"] == {}
     assert sorted(path.name for path in (opened.path / "global").iterdir()) == [
         "densevlad.model.npz",
         "densevlad.npy",
+        "densevlad.scales.npy",
         "kapture-AP-GeM-LM18.model.npz",
         "kapture-AP-GeM-LM18.npy",
+        "kapture-AP-GeM-LM18.scales.npy",
     ]
 
 

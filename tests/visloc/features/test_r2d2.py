@@ -7,19 +7,26 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
 
 from visloc.errors import WeightsError
 from visloc.features.checkpoint import read_checkpoint
 from visloc.features.r2d2 import (
     FAST_R2D2,
+    PATCH_PX,
     R2D2,
     R2D2Extractor,
-    R2D2Network,
+    Seen,
+    fold,
     load_faster2d2,
     load_r2d2,
+    pyramid,
     pyramid_sizes,
 )
+from visloc.features.r2d2_openvino import OpenVinoNetwork, make_openvino_network
+from visloc.features.r2d2_torch import R2D2Network, TorchNetwork
+from visloc.types import Extraction, Inference, LocalFeatures
 
 # The published networks, written down a second time: number of the convolution in the state
 # dict, kernel, dilation, outputs as a multiple of the first layer's, batch norm, ReLU.
@@ -109,7 +116,8 @@ def _reference(name: str, state: dict[str, Tensor], image: Tensor) -> tuple[Tens
 @BOTH
 def test_folded_strip_wise_network_equals_the_plain_one(name: str, tmp_path: Path) -> None:
     state = _random_state(name)
-    network = R2D2Network(ARCHITECTURES[name], read_checkpoint(_save(tmp_path, name, state))).eval()
+    checkpoint = read_checkpoint(_save(tmp_path, name, state))
+    network = R2D2Network(fold(ARCHITECTURES[name], checkpoint)).eval()
     image = torch.randn((1, 3, 151, 90), generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
         _, clf, sal, descriptors = _reference(name, state, image)
@@ -134,7 +142,7 @@ def test_own_trained_weights_of_another_width_load(
     name: str, base_width: int, prefix: str, tmp_path: Path
 ) -> None:
     path = _save(tmp_path, name, _random_state(name, base_width=base_width, prefix=prefix))
-    extractor = LOADERS[name](tmp_path)
+    extractor = LOADERS[name](tmp_path, Inference.FP32)
     assert extractor.fingerprint.name == name
     assert extractor.fingerprint.weights_sha256 == read_checkpoint(path).sha256
     assert extractor.descriptor_dim == 128
@@ -224,7 +232,7 @@ def test_published_weights_find_the_published_number_of_keypoints(
     path = next((shared_data / "redkitchen" / "query").rglob("frame-000110.color.jpg"))
     rgb = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
     assert rgb is not None
-    extractor = LOADERS[name](shared_weights)
+    extractor = LOADERS[name](shared_weights, Inference.FP32)
     features = extractor.extract(rgb.astype(np.uint8), max_keypoints=20_000)
     patch_sizes, counts = np.unique(features.scales, return_counts=True)
     np.testing.assert_allclose(patch_sizes, 32 * 2 ** (np.arange(6) / 4), rtol=1e-5)
@@ -234,18 +242,15 @@ def test_published_weights_find_the_published_number_of_keypoints(
     assert features.scores.max() < 1.0
 
 
-class _BrightnessNetwork(torch.nn.Module):
+class _BrightnessNetwork:
     """Finds keypoints at the brightest pixels, in place of a trained network."""
 
-    def forward(self, image: Tensor) -> Tensor:
-        return image
+    computed_with = "brightness"
 
-    def logits(self, features: Tensor) -> Tensor:
-        brightness = features[0].mean(dim=0)
-        return torch.stack([torch.full_like(brightness, 5.0), 2 * brightness])
-
-    def descriptors(self, _features: Tensor, x: Tensor, _y: Tensor) -> Tensor:
-        return F.normalize(torch.ones(len(x), 128), dim=1)
+    def look(self, image: NDArray[np.float32]) -> Seen:
+        brightness = (image / 255).mean(axis=2)
+        logits = np.stack([np.full_like(brightness, 5.0), 9 * brightness - 4])
+        return Seen(logits, lambda x, _: np.full((len(x), 128), 128**-0.5, np.float32))
 
 
 def test_keypoints_of_all_scales_lie_where_the_photo_has_them(tmp_path: Path) -> None:
@@ -262,7 +267,7 @@ def test_keypoints_of_all_scales_lie_where_the_photo_has_them(tmp_path: Path) ->
     _save(tmp_path, "r2d2", _random_state("r2d2"))
     extractor = load_r2d2(tmp_path)
     assert isinstance(extractor, R2D2Extractor)
-    extractor.network = _BrightnessNetwork()  # type: ignore[assignment]
+    extractor.network = _BrightnessNetwork()
     features = extractor.extract(rgb, max_keypoints=100_000)
 
     offsets = features.keypoints[:, None] - centers[None]
@@ -276,3 +281,111 @@ def test_keypoints_of_all_scales_lie_where_the_photo_has_them(tmp_path: Path) ->
         assert np.abs(errors[of_level]).max() < 1.1 * pixel
         # The reference's mapping x * W / w would be (pixel - 1) / 2 px off: 0.69 at the last.
         assert np.abs(errors[of_level].mean(axis=0)).max() < 0.08 * pixel
+
+
+def _picture(height: int, width: int) -> NDArray[np.uint8]:
+    generator = np.random.default_rng(0)
+    coarse = generator.uniform(0, 255, (height // 4 + 2, width // 4 + 2, 3)).astype(np.float32)
+    large = cv2.resize(coarse, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
+    return np.clip(large[:height, :width], 0, 255).astype(np.uint8)
+
+
+def _cosines(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray((first * second).sum(axis=1), np.float32)
+
+
+@BOTH
+@pytest.mark.parametrize("size", [(8, 8), (9, 8), (63, 101)])
+def test_openvino_computes_what_torch_does(
+    name: str, size: tuple[int, int], tmp_path: Path
+) -> None:
+    folded = fold(ARCHITECTURES[name], read_checkpoint(_save(tmp_path, name, _random_state(name))))
+    image = _picture(*size).astype(np.float32)
+    expected = TorchNetwork(folded).look(image)
+    ours = OpenVinoNetwork(folded, None, threads=1).look(image)
+    assert ours.logits.shape == expected.logits.shape
+    np.testing.assert_allclose(ours.logits, expected.logits, rtol=1e-3, atol=2e-3)
+    y, x = np.indices(ours.logits.shape[1:]).reshape(2, -1)
+    difference = ours.descriptors(x, y) - expected.descriptors(x, y)
+    assert np.abs(difference).max() < 1e-4
+
+
+@BOTH
+def test_8_bits_describe_nearly_the_same_and_twice_the_same(name: str, tmp_path: Path) -> None:
+    folded = fold(ARCHITECTURES[name], read_checkpoint(_save(tmp_path, name, _random_state(name))))
+    image = _picture(120, 161).astype(np.float32)
+    exact = OpenVinoNetwork(folded, None, threads=1).look(image)
+    rounded, again = (
+        make_openvino_network(folded, f"random-{name}", in_8_bits=True, threads=threads)
+        for threads in (1, 2)
+    )
+    assert "int8, calibration " in rounded.computed_with
+    assert rounded.computed_with == again.computed_with
+    y, x = np.indices(exact.logits.shape[1:]).reshape(2, -1)
+    seen, seen_again = rounded.look(image), again.look(image)
+    descriptors = seen.descriptors(x, y)
+    cosines = _cosines(descriptors, exact.descriptors(x, y))
+    assert 0.99 < np.median(cosines) < 0.99999  # equal would mean that nothing is in 8 bits
+    np.testing.assert_array_equal(seen.logits, seen_again.logits)
+    np.testing.assert_array_equal(descriptors, seen_again.descriptors(x, y))
+
+
+def test_8_bits_find_the_published_networks_features(
+    shared_weights: Path, shared_data: Path
+) -> None:
+    path = next((shared_data / "redkitchen" / "query").rglob("frame-000110.color.jpg"))
+    rgb = np.asarray(cv2.imread(str(path), cv2.IMREAD_COLOR_RGB), np.uint8)
+
+    def found(inference: Inference) -> LocalFeatures:
+        extractor = load_faster2d2(shared_weights, inference)
+        return extractor.extract(rgb, max_keypoints=5000, extraction=Extraction.FAST)
+
+    exact, rounded = found(Inference.FP32), found(Inference.INT8)
+    assert len(rounded) == pytest.approx(len(exact), rel=0.03)
+    offsets = np.linalg.norm(rounded.keypoints[:, None] - exact.keypoints[None], axis=2)
+    nearest = offsets.argmin(axis=0)
+    same = offsets.min(axis=0) < 0.01
+    assert same.mean() > 0.8
+    assert (offsets.min(axis=0) < 2).mean() > 0.95
+    cosines = _cosines(rounded.descriptors[nearest][same], exact.descriptors[same])
+    assert np.median(cosines) > 0.998
+    assert np.percentile(cosines, 1) > 0.97
+
+
+@pytest.mark.parametrize("size", [(480, 640), (479, 641), (301, 1500)])
+def test_pyramid_is_the_one_of_the_published_extraction(size: tuple[int, int]) -> None:
+    rgb = _picture(*size)
+    image = torch.tensor(rgb).permute(2, 0, 1)[None].float()
+    expected = {}
+    for scale, level_size, _ in pyramid_sizes(*size):
+        image = F.interpolate(image, level_size, mode="bilinear", align_corners=False)
+        expected[scale] = image[0].permute(1, 2, 0).numpy()
+    levels = list(pyramid(rgb, Extraction.ACCURATE))
+    assert len(levels) >= 6
+    for scale, level in levels:
+        np.testing.assert_allclose(level, expected[scale], atol=0.03)  # of 255
+
+
+@pytest.mark.parametrize("extraction", Extraction)
+@pytest.mark.parametrize("size", [(200, 256), (100, 120), (8, 8)])
+def test_photos_of_one_scale_are_looked_at_with_any_effort(
+    extraction: Extraction, size: tuple[int, int]
+) -> None:
+    assert [level.shape[:2] for _, level in pyramid(_picture(*size), extraction)] == [size]
+
+
+def test_less_effort_looks_at_some_of_the_scales(tmp_path: Path) -> None:
+    _save(tmp_path, "r2d2", _random_state("r2d2"))
+    extractor = load_r2d2(tmp_path, Inference.FP32, 1)
+    assert isinstance(extractor, R2D2Extractor)
+    extractor.network = _BrightnessNetwork()
+    rgb = _picture(480, 640)
+    scales = {
+        effort: set(
+            extractor.extract(rgb, max_keypoints=100_000, extraction=effort).scales.tolist()
+        )
+        for effort in Extraction
+    }
+    assert scales[Extraction.FAST] < scales[Extraction.DEFAULT] < scales[Extraction.ACCURATE]
+    assert len(scales[Extraction.FAST]) == 1
+    assert min(scales[Extraction.ACCURATE]) == PATCH_PX

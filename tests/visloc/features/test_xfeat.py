@@ -7,15 +7,27 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
 
 from visloc.errors import WeightsError
 from visloc.features.checkpoint import read_checkpoint
-from visloc.features.xfeat import XFeatExtractor, load_xfeat
+from visloc.features.xfeat import (
+    _BICUBIC,
+    _BILINEAR,
+    Kernel,
+    _sampled,
+    fold,
+    load_xfeat,
+    network_input,
+)
+from visloc.features.xfeat_torch import XFeatNetwork
+from visloc.types import Inference
 
 SHA256 = "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b"
 
@@ -56,13 +68,12 @@ def _reference(state: dict[str, Tensor], grey: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def test_network_equals_the_plain_one_of_the_paper() -> None:
-    extractor = load_xfeat()
-    assert isinstance(extractor, XFeatExtractor)
+    network = XFeatNetwork(fold(read_checkpoint(_weights_path())))
     grey = torch.rand((1, 1, 96, 160), generator=torch.Generator().manual_seed(0))
     grey = F.avg_pool2d(grey, 3, stride=1, padding=1)
     state = torch.load(_weights_path(), weights_only=True)
     with torch.inference_mode():
-        for ours, expected in zip(extractor.network(grey), _reference(state, grey), strict=True):
+        for ours, expected in zip(network(grey), _reference(state, grey), strict=True):
             torch.testing.assert_close(ours, expected, rtol=1e-4, atol=1e-4)
 
 
@@ -138,3 +149,64 @@ def test_reader_agrees_with_torch_on_the_packaged_file() -> None:
     tensors = read_checkpoint(_weights_path()).tensors
     assert set(tensors) == set(expected)
     assert all(np.array_equal(tensors[name], expected[name].numpy()) for name in expected)
+
+
+def _picture(height: int, width: int) -> NDArray[np.uint8]:
+    generator = np.random.default_rng(0)
+    coarse = generator.uniform(0, 255, (height // 4 + 2, width // 4 + 2, 3)).astype(np.float32)
+    large = cv2.resize(coarse, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
+    return np.clip(large[:height, :width], 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("size", [(96, 160), (95, 203)])
+def test_openvino_finds_what_torch_finds(size: tuple[int, int]) -> None:
+    rgb = _picture(*size)
+    expected = load_xfeat(None, Inference.TORCH).extract(rgb, max_keypoints=1000)
+    ours = load_xfeat(None, Inference.FP32, 1).extract(rgb, max_keypoints=1000)
+    assert len(ours) == len(expected) > 50
+    np.testing.assert_allclose(ours.scores, expected.scores, atol=1e-4)
+    order, expected_order = (np.lexsort(each.keypoints.T) for each in (ours, expected))
+    np.testing.assert_allclose(ours.keypoints[order], expected.keypoints[expected_order])
+    difference = ours.descriptors[order] - expected.descriptors[expected_order]
+    assert np.abs(difference).max() < 1e-4
+
+
+def test_8_bits_find_the_same_and_describe_it_nearly_so() -> None:
+    rgb = _picture(160, 224)
+    exact = load_xfeat(None, Inference.FP32, 1).extract(rgb, max_keypoints=2000)
+    extractor = load_xfeat(None, Inference.INT8, 1)
+    assert "int8, calibration " in extractor.computed_with
+    rounded = extractor.extract(rgb, max_keypoints=2000)
+    order, exact_order = (np.lexsort(each.keypoints.T) for each in (rounded, exact))
+    np.testing.assert_array_equal(rounded.keypoints[order], exact.keypoints[exact_order])
+    cosines = (rounded.descriptors[order] * exact.descriptors[exact_order]).sum(axis=1)
+    assert 0.99 < np.median(cosines) < 0.99999
+    again = load_xfeat(None, Inference.INT8, 2).extract(rgb, max_keypoints=2000)
+    np.testing.assert_array_equal(again.descriptors, rounded.descriptors)
+
+
+@pytest.mark.parametrize(("mode", "kernel"), [("bilinear", _BILINEAR), ("bicubic", _BICUBIC)])
+def test_sampling_is_that_of_torch(mode: str, kernel: Kernel) -> None:
+    generator = np.random.default_rng(0)
+    cells = generator.normal(size=(4, 6, 64)).astype(np.float32)
+    centers = np.stack(np.meshgrid(np.arange(48), np.arange(32)), axis=-1).reshape(-1, 2) + 0.5
+    grid = torch.tensor(2 * centers / (48, 32) - 1, dtype=torch.float32)[None, None]
+    expected = F.grid_sample(
+        torch.tensor(cells).permute(2, 0, 1)[None],
+        grid,
+        mode=mode,
+        padding_mode="border",
+        align_corners=False,
+    )[0, :, 0].T
+    ours = _sampled(cells, centers.astype(np.float32), kernel)
+    np.testing.assert_allclose(ours, expected.numpy(), atol=5e-5)
+    assert _sampled(cells, np.empty((0, 2), np.float32), kernel).shape == (0, 64)
+
+
+@pytest.mark.parametrize("size", [(479, 639), (33, 50), (700, 2000)])
+def test_photos_are_resized_as_torch_does(size: tuple[int, int]) -> None:
+    rgb = _picture(*size)
+    ours = network_input(rgb)
+    grey = torch.tensor(rgb.mean(axis=2, dtype=np.float32) / 255)[None, None]
+    expected = F.interpolate(grey, ours.shape, mode="bilinear", antialias=True)[0, 0]
+    np.testing.assert_allclose(ours, expected.numpy(), atol=1e-5)

@@ -2,81 +2,141 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
+from visloc.matching import products
 from visloc.matching.correspondences import match_landmarks, mutual_nearest_neighbours
+from visloc.matching.products import EightBitRows, in_eight_bits
 
 
 def unit_rows(rng: np.random.Generator, n: int, dim: int = 16) -> NDArray[np.float32]:
     rows = rng.normal(size=(n, dim))
-    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), np.float32)
+
+
+def whole(rows: list[list[int]] | NDArray[np.integer]) -> EightBitRows:
+    return EightBitRows(np.array(rows, dtype=np.int8), 1.0)
 
 
 def test_a_permuted_copy_is_matched_row_by_row() -> None:
     rng = np.random.default_rng(0)
     a = unit_rows(rng, 50)
     order = rng.permutation(50)
-    i, j, similarity = mutual_nearest_neighbours(a, a[order])
+    i, j, similarity = mutual_nearest_neighbours(in_eight_bits(a), in_eight_bits(a[order]))
     assert i.tolist() == list(range(50))
     assert order[j].tolist() == i.tolist()
-    assert similarity == pytest.approx(1.0, abs=1e-6)
+    assert similarity.dtype == np.float32
+    assert similarity == pytest.approx(1.0, abs=0.02)
 
 
 def test_the_nearest_neighbour_must_be_mutual() -> None:
     # b0 is nearest to both a0 and a1, but prefers a0
-    a = np.array([[1.0, 0.0], [0.8, 0.6]], dtype=np.float32)
-    b = np.array([[1.0, 0.0]], dtype=np.float32)
-    i, j, _ = mutual_nearest_neighbours(a, b)
-    assert (i.tolist(), j.tolist()) == ([0], [0])
+    i, j, similarity = mutual_nearest_neighbours(whole([[10, 0], [8, 6]]), whole([[10, 0]]))
+    assert (i.tolist(), j.tolist(), similarity.tolist()) == ([0], [0], [100.0])
 
 
 def test_duplicate_descriptors_give_one_pair_each() -> None:
-    same = np.tile(np.array([[1.0, 0.0]], dtype=np.float32), (3, 1))
-    i, j, _ = mutual_nearest_neighbours(same, same[:2])
+    i, j, _ = mutual_nearest_neighbours(whole([[1, 0]] * 3), whole([[1, 0]] * 2))
     assert (i.tolist(), j.tolist()) == ([0], [0])
 
 
 @pytest.mark.parametrize(("n", "m"), [(0, 5), (5, 0), (0, 0)])
 def test_nothing_matches_nothing(n: int, m: int) -> None:
     i, j, similarity = mutual_nearest_neighbours(
-        np.zeros((n, 4), np.float32), np.zeros((m, 4), np.float32)
+        whole(np.zeros((n, 4), np.int8)), whole(np.zeros((m, 4), np.int8))
     )
     assert len(i) == len(j) == len(similarity) == 0
+
+
+@pytest.mark.parametrize("has_integer_products", [True, False])
+@pytest.mark.parametrize("dim", [1, 2, 3, 64, 128, 1024, 1041])
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 30), (255, 3), (257, 40), (600, 520)])
+def test_pairs_are_those_of_the_definition(
+    monkeypatch: pytest.MonkeyPatch, n: int, m: int, dim: int, *, has_integer_products: bool
+) -> None:
+    if not has_integer_products:
+        monkeypatch.setattr(products, "_has_integer_products", lambda: False)
+    # Small numbers, so that many similarities are equal; one row of the largest, for overflows.
+    rng = np.random.default_rng(n + m + dim)
+    a, b = (rng.integers(-2, 3, (count, dim)).astype(np.int8) for count in (n, m))
+    a[-1], b[-1] = -128, -128
+    i, j, similarity = mutual_nearest_neighbours(EightBitRows(a, 0.5), EightBitRows(b, 0.25))
+    exact = a.astype(np.float64) @ b.T.astype(np.float64)
+    expected: dict[int, int] = {}
+    for row in range(n):
+        column = int(np.argmax(exact[row]))
+        if exact[row, column] == exact[:, column].max() and column not in expected.values():
+            expected[row] = column
+    assert dict(zip(i.tolist(), j.tolist(), strict=True)) == expected
+    assert np.array_equal(similarity, (exact[i, j] / 8).astype(np.float32))
 
 
 QUERY = np.array([[1.0, 0.0]], dtype=np.float32)
 NEAR = np.array([[0.9, np.sqrt(1 - 0.81)]], dtype=np.float32)
 
 
+def seen(landmark: int, descriptor: NDArray[np.float32]) -> tuple[NDArray[np.int64], EightBitRows]:
+    return np.array([landmark]), in_eight_bits(descriptor)
+
+
 def test_the_photo_most_like_the_query_wins_over_another_one() -> None:
-    pairs = match_landmarks(QUERY, [(np.array([3]), NEAR), (np.array([7]), QUERY)])
+    pairs = match_landmarks(in_eight_bits(QUERY), [seen(3, NEAR), seen(7, QUERY)])
     assert (pairs.landmarks.tolist(), pairs.support.tolist()) == ([3], [1.0])
-    assert pairs.similarities == pytest.approx([0.9])
+    assert pairs.similarities == pytest.approx([0.9], abs=0.005)
 
 
 def test_photos_that_agree_outvote_a_better_ranked_one() -> None:
     # 1 against 1/2 + 1/3 + 1/4
-    others = [(np.array([7]), NEAR), (np.array([7]), NEAR), (np.array([7]), QUERY)]
-    pairs = match_landmarks(QUERY, [(np.array([3]), QUERY), *others])
+    others = [seen(7, NEAR), seen(7, NEAR), seen(7, QUERY)]
+    pairs = match_landmarks(in_eight_bits(QUERY), [seen(3, QUERY), *others])
     assert pairs.landmarks.tolist() == [7]
     assert pairs.support == pytest.approx([13 / 12])
     assert pairs.similarities == pytest.approx([1.0])
 
 
-def test_each_keypoint_and_each_landmark_is_used_once() -> None:
-    rng = np.random.default_rng(1)
-    query = unit_rows(rng, 200)
+@pytest.fixture
+def photos() -> list[tuple[NDArray[np.int64], EightBitRows]]:
+    """Five photos that see noisy copies of QUERIES; two keypoints share each landmark."""
+    rng = np.random.default_rng(2)
     images = []
     for _ in range(5):
         rows = rng.permutation(200)[:120]
-        noisy = query[rows] + 0.2 * rng.normal(size=(120, 16)).astype(np.float32)
+        noisy = QUERIES[rows] + 0.2 * rng.normal(size=(120, 16)).astype(np.float32)
         noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
-        images.append((rows // 2, noisy))  # two keypoints share each landmark
-    pairs = match_landmarks(query, images)
+        images.append((rows // 2, in_eight_bits(noisy)))
+    return images
+
+
+QUERIES = unit_rows(np.random.default_rng(1), 200)
+
+
+def test_each_keypoint_and_each_landmark_is_used_once(
+    photos: list[tuple[NDArray[np.int64], EightBitRows]],
+) -> None:
+    pairs = match_landmarks(in_eight_bits(QUERIES), photos)
     assert len(set(pairs.keypoints.tolist())) == len(pairs)
     assert len(set(pairs.landmarks.tolist())) == len(pairs)
     assert (pairs.landmarks == pairs.keypoints // 2).mean() > 0.95
 
 
+def test_the_number_of_threads_changes_nothing(
+    photos: list[tuple[NDArray[np.int64], EightBitRows]],
+) -> None:
+    before, found = torch.get_num_threads(), []
+    try:
+        for num_threads in (1, 2, 3):
+            torch.set_num_threads(num_threads)
+            found.append(match_landmarks(in_eight_bits(QUERIES), photos))
+            assert torch.get_num_threads() == num_threads
+    finally:
+        torch.set_num_threads(before)
+    for pairs in found[1:]:
+        assert np.array_equal(pairs.keypoints, found[0].keypoints)
+        assert np.array_equal(pairs.landmarks, found[0].landmarks)
+        assert np.array_equal(pairs.support, found[0].support)
+        assert np.array_equal(pairs.similarities, found[0].similarities)
+
+
 def test_no_photos_give_no_pairs() -> None:
-    assert len(match_landmarks(np.ones((3, 4), np.float32), [])) == 0
+    assert len(match_landmarks(in_eight_bits(np.ones((3, 4), np.float32)), [])) == 0

@@ -12,7 +12,8 @@ from scipy.stats import chi2
 from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import normalized_rays, project
 from visloc.pose.covariance import pose_covariance, position_covariance, with_origin
-from visloc.pose.generalized import LOSS_SCALE_PX, estimate_generalized_pose
+from visloc.pose.generalized import estimate_generalized_pose
+from visloc.pose.refinement import LOSS_SCALE_PX
 from visloc.pose.views import MatchedView
 from visloc.synthetic.trajectories import stereo_rig
 

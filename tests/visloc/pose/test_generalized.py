@@ -11,11 +11,8 @@ from scipy.spatial.transform import Rotation
 from visloc.evaluation import pose_error
 from visloc.geometry import CAMERA_MODELS, Camera, Pose
 from visloc.pose.colmap import normalized_rays
-from visloc.pose.generalized import (
-    estimate_generalized_pose,
-    refine_generalized_pose,
-    reprojection_errors,
-)
+from visloc.pose.generalized import estimate_generalized_pose, refine_generalized_pose
+from visloc.pose.reprojection import reprojection_errors
 from visloc.pose.views import MatchedView
 
 CAMERA = Camera("PINHOLE", 640, 480, (500.0, 510.0, 322.0, 239.0))
@@ -137,6 +134,31 @@ def test_most_correspondences_may_be_wrong(
     assert angle < 0.2
     assert all(mask[num_wrong:].all() for mask in found.inliers)
     assert all(mask[:num_wrong].mean() < 0.05 for mask in found.inliers)
+
+
+@pytest.mark.parametrize("cams_from_rig", [ALONE, SURROUND])
+@pytest.mark.parametrize(
+    ("share_wrong", "order"), [(0.92, "random"), (0.92, "best first"), (0.8, "worst first")]
+)
+def test_a_pose_is_found_among_thousands_of_correspondences_in_any_order(
+    cams_from_rig: list[Pose], share_wrong: float, order: str
+) -> None:
+    """Of which RANSAC looks at a sample."""
+    n = 4000 // len(cams_from_rig)
+    num_wrong = int(n * share_wrong)
+    views, truth = look(18, cams_from_rig, [n] * len(cams_from_rig), num_wrong=num_wrong)
+    views = with_noise(views, 18, 0.5)
+    rows = np.arange(n)
+    if order == "best first":
+        rows = rows[::-1]
+    elif order == "random":
+        rows = np.random.default_rng(18).permutation(n)
+    found = estimate_generalized_pose([v.selected(rows) for v in views], max_error_px=8.0, seed=0)
+    assert found is not None
+    distance, angle = pose_error(found.rig_from_world, truth)
+    assert distance < 0.02
+    assert angle < 0.2
+    assert all(mask[rows >= num_wrong].all() for mask in found.inliers)
 
 
 @pytest.mark.parametrize("cams_from_rig", [ALONE, SURROUND])

@@ -17,8 +17,9 @@ from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import project
 from visloc.pose.covariance import pose_covariance
-from visloc.pose.generalized import LOSS_SCALE_PX, GeneralizedPose, refine_generalized_pose
+from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
 from visloc.pose.motion import RelativeMotion, default_motion_covariance
+from visloc.pose.refinement import LOSS_SCALE_PX
 from visloc.pose.views import MatchedView
 from visloc.pose.window import WindowInstant, WindowPose, solve_window
 from visloc.types import PRESETS, RegistrationPreset

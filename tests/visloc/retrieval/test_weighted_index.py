@@ -6,8 +6,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from visloc.retrieval.index import Retrieved, retrieve
+from visloc.retrieval.rows import GlobalRows
 
 Vectors = dict[str, NDArray[np.float32]]
+Index = dict[str, GlobalRows]
 
 
 def units(rng: np.random.Generator, *shape: int) -> NDArray[np.float32]:
@@ -16,14 +18,14 @@ def units(rng: np.random.Generator, *shape: int) -> NDArray[np.float32]:
 
 
 @st.composite
-def searches(draw: st.DrawFn) -> tuple[Vectors, Vectors, int]:
+def searches(draw: st.DrawFn) -> tuple[Vectors, Index, int]:
     """A query, an index with rows that repeat, and how many to return."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     num, dim = draw(st.integers(1, 30)), draw(st.integers(1, 4))
     names = draw(st.sampled_from([("a",), ("a", "b")]))
     rows = rng.integers(0, num, num)  # some photos look just the same
     query = {name: units(rng, dim) for name in names}
-    index = {name: units(rng, num, dim)[rows] for name in names}
+    index = {name: GlobalRows(units(rng, num, dim)[rows]) for name in names}
     return query, index, draw(st.integers(1, 40))
 
 
@@ -45,7 +47,7 @@ def same(a: Retrieved, b: Retrieved) -> bool:
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(search=searches(), seed=st.integers(0, 1000))
 def test_excluded_photos_never_come_and_all_others_may(
-    search: tuple[Vectors, Vectors, int], seed: int
+    search: tuple[Vectors, Index, int], seed: int
 ) -> None:
     query, index, top_k = search
     num = len(index["a"])
@@ -67,7 +69,7 @@ def test_excluded_photos_never_come_and_all_others_may(
 
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(search=searches(), weight=st.sampled_from([1.0, 0.5, 1e-3]))
-def test_equal_weights_change_nothing(search: tuple[Vectors, Vectors, int], weight: float) -> None:
+def test_equal_weights_change_nothing(search: tuple[Vectors, Index, int], weight: float) -> None:
     query, index, top_k = search
     num = len(index["a"])
     assert same(retrieve(query, index, top_k, np.full(num, weight)), retrieve(query, index, top_k))
@@ -76,7 +78,7 @@ def test_equal_weights_change_nothing(search: tuple[Vectors, Vectors, int], weig
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(search=searches(), seed=st.integers(0, 1000))
 def test_of_two_photos_the_one_that_looks_and_counts_more_comes_first(
-    search: tuple[Vectors, Vectors, int], seed: int
+    search: tuple[Vectors, Index, int], seed: int
 ) -> None:
     query, index, _ = search
     num = len(index["a"])
@@ -92,13 +94,14 @@ def test_of_two_photos_the_one_that_looks_and_counts_more_comes_first(
 
 def test_nothing_allowed_gives_nothing() -> None:
     rng = np.random.default_rng(0)
-    found = retrieve({"a": units(rng, 3)}, {"a": units(rng, 5, 3)}, 4, np.zeros(5))
+    found = retrieve({"a": units(rng, 3)}, {"a": GlobalRows(units(rng, 5, 3))}, 4, np.zeros(5))
     assert found.images.tolist() == found.scores.tolist() == found.similarities["a"].tolist() == []
 
 
 def test_a_photo_further_outside_must_look_better_by_as_much() -> None:
     angles = np.arccos([0.9, 0.8, 0.2])
-    index = {"a": np.column_stack([np.cos(angles), np.sin(angles)]).astype(np.float32)}
+    rows = np.column_stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
+    index = {"a": GlobalRows(rows)}
     query = {"a": np.array([1.0, 0.0], dtype=np.float32)}
     # (0.9 - 0.2) * 0.8 = 0.56 and (0.8 - 0.2) * 1 = 0.6.
     assert retrieve(query, index, 3, np.array([0.8, 1.0, 1.0])).images.tolist() == [1, 0, 2]

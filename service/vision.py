@@ -1,0 +1,308 @@
+"""What worker processes do: maps opened, photos looked at, poses solved."""
+
+from __future__ import annotations
+
+import ctypes
+import io
+import logging
+import pickle
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from time import perf_counter, time
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from service.instants import Target, check_images, check_priors, look_at, rig_in_map
+from service.jobs import (
+    ImageJob,
+    Instant,
+    InstantLocalization,
+    Localization,
+    LocalizeJob,
+    MatchPicture,
+    Rig,
+    RigJob,
+    SequenceStart,
+)
+from service.sequences import SequenceRun
+from service.worker import Abandoned, Loaded, MapFolder, Seen, WorkerSettings
+from visloc.archive.store import open_published
+from visloc.constraints import MapGeometry
+from visloc.errors import Conflict, InvalidInput, MapCorrupt, VislocError
+from visloc.features import LocalFeatureExtractor, make_local_features
+from visloc.features.readymade import is_ready_made
+from visloc.images import ImageLimits, read_photo
+from visloc.localizer import FeatureCache, Localizer
+from visloc.overlay import draw_overlay
+from visloc.priors import Priors
+from visloc.solving import Look, SeenImage
+from visloc.types import Answer, Localized, LocalizeOptions, QueryFeatures
+
+logger = logging.getLogger(__name__)
+
+
+class Vision:
+    """Localizes in maps that stay open. Its methods are the tasks of ``service.worker``.
+
+    Args:
+        settings: of the process.
+        abandoned: set when nobody waits for the task any more.
+    """
+
+    def __init__(self, settings: WorkerSettings, abandoned: ctypes.c_bool) -> None:
+        torch.set_num_threads(settings.threads)
+        cv2.setNumThreads(settings.threads)
+        self._settings = settings
+        self._limits = ImageLimits(settings.max_image_bytes, settings.max_image_pixels)
+        self._abandoned = abandoned
+        self._localizers: OrderedDict[str, Localizer] = OrderedDict()  # most recently used last
+        self._extractors: dict[str, LocalFeatureExtractor] = {}  # by name
+
+    @property
+    def loaded(self) -> tuple[Loaded, ...]:
+        """Maps that are open."""
+        return tuple(Loaded(ref, one.map.size_bytes) for ref, one in self._localizers.items())
+
+    def _step(self) -> None:
+        """Stop here when nobody waits any more."""
+        if self._abandoned.value:
+            raise Abandoned
+
+    def localizer(self, of: MapFolder) -> Localizer:
+        """Return the localizer of a map, opened now if it was not before.
+
+        Raises:
+            Conflict: for a map of features that are not here.
+            MapCorrupt: when it cannot be used.
+        """
+        found = self._localizers.get(of.ref)
+        if found is None:
+            found = self._localizers[of.ref] = self._open(of)
+        self._localizers.move_to_end(of.ref)
+        while len(self._localizers) > 1 and self._size > self._settings.max_loaded_bytes:
+            ref, _ = self._localizers.popitem(last=False)
+            logger.info("map %s closed, to keep to max_loaded_bytes", ref)
+        return found
+
+    def forget(self, ref: str) -> None:
+        """Close a map that is no longer served."""
+        self._localizers.pop(ref, None)
+
+    @property
+    def _size(self) -> int:
+        return sum(one.map.size_bytes for one in self._localizers.values())
+
+    def _open(self, of: MapFolder) -> Localizer:
+        start = perf_counter()
+        with _damage_named(of.ref):
+            opened = open_published(of.folder)
+            name = opened.manifest.local_features.fingerprint.name
+            try:
+                if name not in self._extractors and not is_ready_made(name):
+                    self._extractors[name] = make_local_features(
+                        name,
+                        self._settings.weights_dir,
+                        self._settings.inference,
+                        self._settings.threads,
+                    )
+                localizer = Localizer(opened, self._extractors.get(name))
+            except InvalidInput as error:  # features that are not here: not the caller's mistake
+                raise Conflict(
+                    error.code,
+                    error.message,
+                    field=error.field,
+                    expected=error.expected,
+                    got=error.got,
+                ) from error
+            localizer.warm_up()
+        logger.info("map %s loaded in %.1f s", opened.ref, perf_counter() - start)
+        return localizer
+
+    def localize(
+        self, job: LocalizeJob, maps: Sequence[MapFolder], submitted: float
+    ) -> Localization:
+        """As ``worker.localize``."""
+        started, queued = perf_counter(), time() - submitted
+        localizers = [self.localizer(of) for of in maps]
+        loaded = perf_counter()
+        before = {"queued": max(0.0, queued), "open_map": loaded - started}
+        found: list[tuple[Localizer, Look, Answer, NDArray[np.bool_]]] = []
+        cache: FeatureCache = {}
+        photo = None
+        if not isinstance(job.query, QueryFeatures):
+            photo = read_photo(job.query, self._limits)
+            before["decode"] = perf_counter() - loaded
+        for localizer in localizers:
+            self._step()
+            if isinstance(job.query, QueryFeatures):
+                look = localizer.look_at_features(job.query, job.camera, job.options, job.priors)
+            else:
+                assert photo is not None
+                look = localizer.look(photo, job.camera, job.options, job.priors, cache)
+            self._step()
+            answer, inliers = localizer.solve_look(look, job.options, job.priors)
+            found.append((localizer, look, answer, inliers))
+        localizer, look, answer, inliers = max(
+            found, key=lambda one: (isinstance(one[2], Localized), one[2].evidence.num_inliers)
+        )
+        picture = None
+        if job.debug and photo is not None:
+            self._step()
+            picture = MatchPicture(
+                look.matches.pixels,
+                look.matches.points + localizer.geometry.origin,
+                inliers,
+                draw_overlay(photo, localizer.map, look, answer, inliers),
+            )
+        evidence = replace(answer.evidence, seconds={**before, **answer.evidence.seconds})
+        manifest = localizer.map.manifest
+        return Localization(
+            replace(answer, evidence=evidence),
+            manifest.id,
+            manifest.version,
+            localizer.map.geodetic,
+            job.ypr,
+            picture,
+        )
+
+    def check_rig(self, job: RigJob, maps: Sequence[MapFolder]) -> None:
+        """As ``worker.check_rig``."""
+        targets = self._targets(maps, job.rig)
+        for target in targets:
+            check_images(job.images, target.rig, self._settings.max_images, "images")
+        check_priors(targets, job.priors)
+
+    def look_at_image(
+        self,
+        image: ImageJob,
+        maps: Sequence[MapFolder],
+        rig: Rig | None,
+        options: LocalizeOptions,
+        priors: Priors,
+        submitted: float,
+    ) -> Seen:
+        """As ``worker.look_at_image``."""
+        queued = max(0.0, time() - submitted)
+        self._step()
+        targets = self._targets(maps, rig)
+        return pickle.dumps(
+            look_at(image, targets, options, priors, self._limits, queued), pickle.HIGHEST_PROTOCOL
+        )
+
+    def solve_rig(
+        self, job: RigJob, maps: Sequence[MapFolder], seen: Sequence[Seen]
+    ) -> InstantLocalization:
+        """As ``worker.solve_rig``."""
+        found = []
+        for target, images in zip(
+            self._targets(maps, job.rig), _by_map(seen, len(maps)), strict=True
+        ):
+            self._step()
+            solved = target.localizer.solve(images, job.options, job.priors, job.timestamp)
+            found.append(target.localization(solved.answer, ypr=job.ypr))
+        return max(found, key=lambda one: (one.answer.pose is not None, one.answer.num_inliers))
+
+    def open_sequence(self, start: SequenceStart, maps: Sequence[MapFolder]) -> bytes:
+        """As ``worker.open_sequence``."""
+        settings = self._settings
+        targets = self._targets(maps, start.rig)
+        return _dumped(SequenceRun(start, targets, settings.max_images, settings.max_instants))
+
+    def check_instants(
+        self, state: bytes, maps: Sequence[MapFolder], first: int, instants: Sequence[Instant]
+    ) -> tuple[bytes, list[Priors]]:
+        """As ``worker.check_instants``."""
+        run = self._sequence(state, maps)
+        priors = [run.check(first + i, instant) for i, instant in enumerate(instants)]
+        return _dumped(run), priors
+
+    def add_instant(
+        self,
+        state: bytes,
+        maps: Sequence[MapFolder],
+        instant: Instant,
+        seen: Sequence[Seen],
+        priors: Priors,
+    ) -> tuple[bytes, tuple[str, ...], list[InstantLocalization]]:
+        """As ``worker.add_instant``."""
+        self._step()
+        run = self._sequence(state, maps)
+        found = run.add(instant, _by_map(seen, len(maps)), priors)
+        answers = [run.localization(answer) for answer in found]
+        return _dumped(run), tuple(target.localizer.map.ref for target in run.targets), answers
+
+    def finish_sequence(self, state: bytes, maps: Sequence[MapFolder]) -> list[InstantLocalization]:
+        """As ``worker.finish_sequence``."""
+        run = self._sequence(state, maps)
+        return [run.localization(answer) for answer in run.finish()]
+
+    def _sequence(self, state: bytes, maps: Sequence[MapFolder]) -> SequenceRun:
+        run = _Unpickler(state, {of.ref: self.localizer(of) for of in maps}).load()
+        assert isinstance(run, SequenceRun)
+        return run
+
+    def _targets(self, maps: Sequence[MapFolder], rig: Rig | None) -> list[Target]:
+        localizers = [self.localizer(of) for of in maps]
+        return [Target(found, rig_in_map(rig, found.map)) for found in localizers]
+
+
+class _Pickler(pickle.Pickler):
+    """Leaves maps where they are."""
+
+    def persistent_id(self, obj: Any) -> Any:
+        if isinstance(obj, Localizer):
+            return "localizer", obj.map.ref
+        if isinstance(obj, MapGeometry):
+            return "geometry", obj.ref
+        return None
+
+
+class _Unpickler(pickle.Unpickler):
+    """Puts this process's maps back in. Reads only what ``_Pickler`` wrote, in this service."""
+
+    def __init__(self, state: bytes, localizers: Mapping[str, Localizer]) -> None:
+        super().__init__(io.BytesIO(state))
+        self._localizers = localizers
+
+    def persistent_load(self, pid: Any) -> Any:
+        kind, ref = pid
+        localizer = self._localizers[ref]
+        return localizer if kind == "localizer" else localizer.geometry
+
+
+def _dumped(run: SequenceRun) -> bytes:
+    buffer = io.BytesIO()
+    _Pickler(buffer, pickle.HIGHEST_PROTOCOL).dump(run)
+    return buffer.getvalue()
+
+
+def _by_map(seen: Sequence[Seen], num_maps: int) -> list[tuple[SeenImage, ...]]:
+    """Return what ``look_at_image`` of this service found in the images of an instant, by map."""
+    looks: list[list[SeenImage]] = [pickle.loads(each) for each in seen]
+    return [tuple(look[i] for look in looks) for i in range(num_maps)]
+
+
+@contextmanager
+def _damage_named(ref: str) -> Iterator[None]:
+    """Turn what should not happen while a map is opened into MapCorrupt ``map.unusable``.
+
+    A damaged map can break the code that reads it in any way, and must not stop the others.
+    """
+    try:
+        yield
+    except VislocError:
+        raise
+    except Exception as error:
+        logger.exception("map %s cannot be used", ref)
+        raise MapCorrupt(
+            "map.unusable",
+            "the map cannot be used; rebuild it, or see the server's log for the cause",
+            field=ref,
+            got=type(error).__name__,
+        ) from error

@@ -1,0 +1,286 @@
+"""What format 1.4 stores in fewer bits, and that maps of formats before it mean the same."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import visloc.archive.writer
+from tests.fuzz.tiny_map import write_tiny_map
+from visloc.archive import GlobalFeatures, Map, MapContent, open_map, sha256_of, verify_map
+from visloc.archive import write_map as write_map_to
+from visloc.archive.checks import SCALES, content_hash, json_text, manifest_hash
+from visloc.errors import MapCorrupt
+from visloc.geometry import Camera, Pose
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_tiny_map(tmp_path / "map")
+    return tmp_path / "map"
+
+
+def content_of(opened: Map) -> MapContent:
+    """What a map was written from, as far as it is still known."""
+    manifest = opened.manifest
+    scale = np.float32(manifest.local_features.descriptor_scale)
+    return MapContent(
+        metric=True,
+        method="rgbd",
+        settings={},
+        notes=(),
+        cameras=opened.cameras,
+        rigs={},
+        images=opened.images,
+        image_poses=tuple(Pose.from_quaternion(p[:4], p[4:]) for p in opened.image_poses),
+        landmarks=visloc.archive.Landmarks(
+            origin=np.array(manifest.world.origin),
+            points=opened.landmarks,
+            track_lengths=opened.track_lengths,
+            errors_px=opened.errors_px.astype(np.float32),
+            angles_deg=opened.angles_deg.astype(np.float32),
+            offsets=opened.observation_offsets,
+            observed=opened.observation_landmarks,
+            keypoints=np.concatenate([opened.keypoints(i) for i in range(len(opened.images))]),
+        ),
+        local_fingerprint=manifest.local_features.fingerprint,
+        max_keypoints=100,
+        descriptor_dim=manifest.local_features.descriptor_dim,
+        descriptors=lambda: iter([opened.observation_descriptors.astype(np.float32) * scale]),
+        global_features=tuple(
+            GlobalFeatures(
+                record.fingerprint,
+                opened.global_descriptors[record.fingerprint.name][:],
+                opened.global_models[record.fingerprint.name],
+            )
+            for record in manifest.global_features
+        ),
+    )
+
+
+def rewritten(opened: Map, target: Path, **changes: object) -> Map:
+    target.mkdir()
+    content = replace(content_of(opened), **changes)  # type: ignore[arg-type]
+    write_map_to(target, content, map_id="room", version="v1", created="2026-01-02T03:04:05+00:00")
+    return verify_map(target)
+
+
+def make_right(folder: Path, manifest: dict[str, object]) -> None:
+    """Write a manifest with the checksums of the files that are there."""
+    manifest["files"] = {
+        path.relative_to(folder).as_posix(): {
+            "size": path.stat().st_size,
+            "sha256": sha256_of(path),
+        }
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != "manifest.json"
+    }
+    manifest["content_hash"] = content_hash(manifest)
+    manifest["manifest_hash"] = manifest_hash(manifest)
+    (folder / "manifest.json").write_text(json_text(manifest))
+
+
+def as_before_1_4(opened: Map, folder: Path, version: str) -> None:
+    """Store a map as programs before format 1.4 did, in a new folder."""
+    shutil.copytree(opened.path, folder)
+    keypoints = [opened.keypoints(image) for image in range(len(opened.images))]
+    rows = opened.global_descriptors["densevlad"][:]
+    np.save(folder / "observation_keypoints.npy", np.concatenate(keypoints))
+    np.save(folder / "landmark_error_px.npy", opened.errors_px.astype(np.float32))
+    np.save(folder / "landmark_angle_deg.npy", np.full(5, np.nan, np.float32))
+    np.save(folder / "global" / "densevlad.npy", rows)
+    (folder / "global" / "densevlad.scales.npy").unlink()
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["format_version"] = version
+    for name in ("keypoint_step_px", "computed_with"):
+        del manifest["local_features"][name]
+    for record in manifest["global_features"]:
+        del record["bits"], record["clusters"]
+    make_right(folder, manifest)
+
+
+@pytest.mark.parametrize("version", ["1.0", "1.1", "1.2", "1.3"])
+def test_a_map_of_a_format_before_opens_with_the_same_numbers(
+    folder: Path, tmp_path: Path, version: str
+) -> None:
+    new = open_map(folder)
+    expected = [new.keypoints(image) for image in range(len(new.images))]
+    rows = new.global_descriptors["densevlad"]
+    query = rows[1]
+    cosines = rows.cosines(query)
+    as_before_1_4(new, tmp_path / "old", version)
+    old = verify_map(tmp_path / "old")
+    assert old.manifest.format_version == version
+    assert old.observation_keypoints.dtype == np.float32
+    for image, keypoints in enumerate(expected):
+        assert np.array_equal(old.keypoints(image), keypoints)
+    assert np.array_equal(old.global_descriptors["densevlad"][:], rows[:])
+    np.testing.assert_allclose(old.global_descriptors["densevlad"].cosines(query), cosines, 1e-6)
+    assert np.array_equal(old.errors_px, new.errors_px)
+
+
+def test_keypoints_are_stored_in_small_steps(folder: Path, tmp_path: Path) -> None:
+    opened = open_map(folder)
+    wanted = np.random.default_rng(0).uniform(-2, 66, (7, 2)).astype(np.float32)
+    landmarks = replace(content_of(opened).landmarks, keypoints=wanted)
+    written = rewritten(opened, tmp_path / "new", landmarks=landmarks)
+    assert written.observation_keypoints.dtype == np.int16
+    step = written.manifest.local_features.keypoint_step_px
+    assert step is not None
+    assert step <= 1 / 256  # of photos of 64 x 48
+    found = np.concatenate([written.keypoints(image) for image in range(3)])
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=step / 2)
+
+
+@pytest.mark.parametrize("side", [640, 1600, 4032])
+def test_the_step_of_keypoints_follows_the_largest_photo(
+    folder: Path, tmp_path: Path, side: int
+) -> None:
+    camera = Camera("SIMPLE_PINHOLE", 48, side, (50.0, 32.0, 24.0))
+    written = rewritten(open_map(folder), tmp_path / "new", cameras={"cam": camera})
+    step = written.manifest.local_features.keypoint_step_px
+    assert step is not None
+    assert side / 30_000 <= step <= side / 15_000
+
+
+@pytest.mark.parametrize(("side", "keypoint"), [(20_000, 1.0), (64, 200.0), (64, -1e30)])
+def test_keypoints_of_huge_photos_or_far_away_are_stored_as_they_are(
+    folder: Path, tmp_path: Path, side: int, keypoint: float
+) -> None:
+    opened = open_map(folder)
+    keypoints = np.full((7, 2), keypoint, np.float32)
+    camera = Camera("SIMPLE_PINHOLE", side, 48, (50.0, 32.0, 24.0))
+    landmarks = replace(content_of(opened).landmarks, keypoints=keypoints)
+    written = rewritten(opened, tmp_path / "n", landmarks=landmarks, cameras={"cam": camera})
+    assert written.manifest.local_features.keypoint_step_px is None
+    assert np.array_equal(written.keypoints(2), keypoints[:4])
+
+
+def test_errors_beyond_16_bits_are_the_largest_there_is(folder: Path, tmp_path: Path) -> None:
+    opened = open_map(folder)
+    errors = np.array([0.1, 1e9, np.nan, 2.0, 0.0], np.float32)
+    landmarks = replace(content_of(opened).landmarks, errors_px=errors)
+    found = rewritten(opened, tmp_path / "new", landmarks=landmarks).errors_px
+    np.testing.assert_allclose(found, [0.1, 65504, np.nan, 2.0, 0.0], rtol=1e-3)
+
+
+def large_model(rng: np.random.Generator) -> dict[str, NDArray[np.float32]]:
+    return {
+        "axes": (rng.normal(size=(700, 100)) * np.linspace(0, 3, 100)).astype(np.float32),
+        "vocabulary": rng.normal(size=(20, 4)).astype(np.float32),
+    }
+
+
+def test_large_matrices_of_a_model_are_stored_in_8_bits(folder: Path, tmp_path: Path) -> None:
+    opened, model = open_map(folder), large_model(np.random.default_rng(0))
+    (features,) = content_of(opened).global_features
+    written = rewritten(opened, tmp_path / "new", global_features=(replace(features, model=model),))
+    found = written.global_models["densevlad"]
+    assert sorted(found) == ["axes", "vocabulary"]
+    assert np.array_equal(found["vocabulary"], model["vocabulary"])
+    steps = np.abs(model["axes"]).max(axis=0) / 127
+    assert (np.abs(found["axes"] - model["axes"]) <= steps / 2 + 1e-6).all()
+    assert (tmp_path / "new/global/densevlad.model.npz").stat().st_size < 80_000
+
+
+@pytest.mark.parametrize(
+    "scales",
+    [
+        np.full(100, np.nan, np.float32),
+        np.full(100, np.inf, np.float32),
+        np.full(100, 3e38, np.float32),
+        np.ones(99, np.float32),
+        np.ones(100),
+        np.ones((1, 100), np.float32),
+    ],
+)
+def test_scales_of_a_model_that_cannot_be_are_refused(
+    folder: Path, scales: NDArray[np.generic]
+) -> None:
+    values = np.full((700, 100), 127, np.int8)
+    np.savez(folder / "global" / "densevlad.model.npz", axes=values, **{"axes" + SCALES: scales})
+    make_right(folder, json.loads((folder / "manifest.json").read_text()))
+    with pytest.raises(MapCorrupt) as caught:
+        verify_map(folder)
+    assert caught.value.code == "map.array"
+
+
+def test_what_computed_the_features_is_told(folder: Path, tmp_path: Path) -> None:
+    opened = open_map(folder)
+    assert opened.manifest.local_features.computed_with is None
+    written = rewritten(opened, tmp_path / "new", computed_with="torch 2.13")
+    assert written.manifest.local_features.computed_with == "torch 2.13"
+
+
+@pytest.fixture
+def clustered(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A map of three photos, written as one of too many to compare all."""
+    monkeypatch.setattr(visloc.archive.writer, "MAX_EXACT", 2)
+    rewritten(open_map(folder), tmp_path / "clustered")
+    return tmp_path / "clustered"
+
+
+def test_a_map_of_very_many_photos_is_written_with_clusters(clustered: Path) -> None:
+    opened = verify_map(clustered)
+    rows = opened.global_descriptors["densevlad"]
+    assert rows.clusters is not None
+    assert sorted(rows.clusters.members.tolist()) == [0, 1, 2]
+    assert len(rows.clusters.centers) == opened.manifest.global_features[0].clusters
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "code"),
+    [
+        ("members", np.array([0, 1, 1], np.uint32), "map.range"),
+        ("members", np.array([0, 1, 3], np.uint32), "map.range"),
+        ("members", np.array([0, 1, 2**32 - 1], np.uint32), "map.range"),
+        ("members", np.array([0, 1, 2], np.int64), "map.array"),
+        ("members", np.array([0, 1], np.uint32), "map.array"),
+        ("offsets", np.array([0, 2, 1, 3]), "map.range"),
+        ("offsets", np.array([0, 1, 2, 2]), "map.range"),
+        ("offsets", np.array([-1, 1, 2, 3]), "map.range"),
+        ("centers", np.full((3, 4), np.nan, np.float32), "map.range"),
+    ],
+)
+def test_clusters_that_cannot_be_are_refused(
+    clustered: Path, name: str, array: NDArray[np.generic], code: str
+) -> None:
+    np.save(clustered / "index" / f"densevlad.{name}.npy", array)
+    make_right(clustered, json.loads((clustered / "manifest.json").read_text()))
+    with pytest.raises(MapCorrupt) as caught:
+        verify_map(clustered)
+    assert caught.value.code == code
+
+
+@pytest.mark.parametrize("scale", [np.nan, -1.0, np.inf])
+def test_scales_of_rows_that_cannot_be_are_refused(folder: Path, scale: float) -> None:
+    np.save(folder / "global" / "densevlad.scales.npy", np.full(3, scale, np.float32))
+    make_right(folder, json.loads((folder / "manifest.json").read_text()))
+    with pytest.raises(MapCorrupt) as caught:
+        verify_map(folder)
+    assert caught.value.code == "map.range"
+
+
+def test_a_listed_file_of_rows_that_is_missing_is_named(folder: Path) -> None:
+    (folder / "global" / "densevlad.scales.npy").unlink()
+    make_right(folder, json.loads((folder / "manifest.json").read_text()))
+    with pytest.raises(MapCorrupt) as caught:
+        open_map(folder)
+    assert caught.value.code == "map.file_missing"
+
+
+def test_angles_that_nobody_knows_are_not_stored(folder: Path, tmp_path: Path) -> None:
+    opened = open_map(folder)
+    assert not (folder / "landmark_angle_deg.npy").exists()
+    assert opened.angles_deg.shape == (5,)
+    assert np.isnan(opened.angles_deg).all()
+    angles = np.array([np.nan, 3.0, 179.5, 0.25, np.nan], np.float32)
+    landmarks = replace(content_of(opened).landmarks, angles_deg=angles)
+    found = rewritten(opened, tmp_path / "new", landmarks=landmarks).angles_deg
+    np.testing.assert_allclose(found, angles, rtol=1e-3)

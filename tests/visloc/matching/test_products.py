@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+import torch
+
+from visloc.matching import products
+from visloc.matching.products import in_eight_bits, in_threads, row_products
+
+
+def test_eight_bits_are_within_half_a_step() -> None:
+    rows = np.random.default_rng(0).uniform(-0.4, 0.4, (50, 8)).astype(np.float32)
+    rows[3, 4] = -0.5
+    quantized = in_eight_bits(rows)
+    assert quantized.scale == pytest.approx(0.5 / 127)
+    assert quantized.rows.min() == -127
+    assert np.abs(quantized.rows * quantized.scale - rows).max() <= 0.5001 * quantized.scale
+
+
+@pytest.mark.parametrize("shape", [(0, 4), (3, 4)])
+def test_nothing_and_zeros_stay_what_they_are(shape: tuple[int, int]) -> None:
+    quantized = in_eight_bits(np.zeros(shape, np.float32))
+    assert quantized.rows.shape == shape
+    assert not quantized.rows.any()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_descriptors_that_are_not_finite_are_a_bug(value: float) -> None:
+    with pytest.raises(AssertionError):
+        in_eight_bits(np.array([[0.5, value]], np.float32))
+
+
+@pytest.mark.parametrize("lost", ["_int_mm", "_is_vnni_supported"])
+def test_without_its_private_names_torch_multiplies_floats(
+    monkeypatch: pytest.MonkeyPatch, lost: str
+) -> None:
+    monkeypatch.delattr(torch if lost == "_int_mm" else torch.cpu, lost)
+    products._has_integer_products.cache_clear()
+    try:
+        assert not products._has_integer_products()
+        rows = np.full((2, 64), -128, np.int8)
+        assert (row_products(rows, rows, 2)(slice(0, 2)) == 2**20).all()
+    finally:
+        products._has_integer_products.cache_clear()
+
+
+@pytest.mark.parametrize("dim", [1024, 1025, 131_071, 131_072])
+def test_the_largest_sums_are_exact(monkeypatch: pytest.MonkeyPatch, dim: int) -> None:
+    rows = np.full((3, dim), -128, np.int8)
+    rows[0, 0] = 127
+    largest = dim * 2**14
+    expected = [largest - 128 * 255, largest]
+    assert row_products(rows[:2], rows[1:], 2)(slice(0, 2))[:, 0].tolist() == expected
+    monkeypatch.setattr(products, "_has_integer_products", lambda: False)
+    assert row_products(rows[:2], rows[1:], 2)(slice(0, 2))[:, 0].tolist() == expected
+
+
+def test_work_in_threads_keeps_its_order_and_leaves_torch_as_it_was() -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        both = threading.Barrier(2, timeout=10)
+
+        def work(item: int) -> tuple[int, int]:
+            both.wait()
+            return item, torch.get_num_threads()
+
+        assert in_threads(work, range(4)) == [(item, 1) for item in range(4)]
+        seen: list[int] = []
+        new = threading.Thread(target=lambda: seen.append(torch.get_num_threads()))
+        new.start()
+        new.join()
+        assert (torch.get_num_threads(), seen) == (2, [2])
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,130 @@
+"""Exact products of descriptors in 8 bits, the same on every machine."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+_LARGEST = 127
+# Whole numbers up to here are exact in single precision, as are sums of them that stay below.
+_EXACT_IN_FLOAT32 = 2**24
+_LARGEST_PRODUCT = 128**2
+_MOST_COLUMNS = (2**31 - 1) // _LARGEST_PRODUCT  # sums fit 32 bits
+
+T = TypeVar("T")
+S = TypeVar("S")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EightBitRows:
+    """Descriptors in 8 bits.
+
+    Attributes:
+        rows: (n, D) int8.
+        scale: what a step of them is; ``rows * scale`` are unit rows but for the rounding.
+    """
+
+    rows: NDArray[np.int8]
+    scale: float
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+
+def in_eight_bits(descriptors: NDArray[np.float32]) -> EightBitRows:
+    """Round descriptors (n, D), finite, to 8 bits, with one scale so that rows stay comparable."""
+    largest = float(max(descriptors.max(initial=0.0), -descriptors.min(initial=0.0)))
+    assert np.isfinite(largest)
+    scale = largest / _LARGEST or 1.0
+    rows = descriptors * np.float32(1 / scale)
+    return EightBitRows(np.rint(rows, out=rows).astype(np.int8), scale)
+
+
+class RowProducts(Protocol):
+    """Gives the products of some rows of one side with all rows of the other."""
+
+    def __call__(self, rows: slice) -> NDArray[np.int32] | NDArray[np.floating]:
+        """Return whole numbers (k, m), which the next call overwrites."""
+
+
+def row_products(a: NDArray[np.int8], b: NDArray[np.int8], most_rows: int) -> RowProducts:
+    """Multiply rows of a (n, D) with all rows of b (m, D), at most so many at once.
+
+    The products are exact, hence equal, whether 8-bit instructions or floats compute them.
+    """
+    import torch  # takes a second to load, which not everything that imports this needs
+
+    if 1 < a.shape[1] <= _MOST_COLUMNS and _has_integer_products():
+        multiply, operand, result = torch._int_mm, torch.int8, torch.int32
+    else:
+        exact = a.shape[1] * _LARGEST_PRODUCT <= _EXACT_IN_FLOAT32
+        operand = result = torch.float32 if exact else torch.float64
+        multiply = torch.mm
+    left, right = torch.tensor(a, dtype=operand), torch.tensor(b, dtype=operand).T
+    buffer = torch.empty((most_rows, len(b)), dtype=result)
+
+    def products(rows: slice) -> NDArray[np.int32] | NDArray[np.floating]:
+        block = left[rows]
+        out = buffer[: len(block)]
+        multiply(block, right, out=out)
+        return np.asarray(out.numpy())
+
+    return products
+
+
+@cache
+def _has_integer_products() -> bool:
+    """Whether torch's 8-bit product is there, fast and right on this processor.
+
+    Its name and that of the question are private to torch: they may go. Without VNNI the product is
+    no faster than that of floats, and sums may be cut off at 16 bits. (Of one column, D = 1, torch
+    2.13 gives wrong products in any case.)
+    """
+    import torch
+
+    has_vnni = getattr(torch.cpu, "_is_vnni_supported", None)
+    if not hasattr(torch, "_int_mm") or has_vnni is None or not has_vnni():
+        return False
+    extreme = torch.full((32, 64), -128, dtype=torch.int8)
+    return bool((torch._int_mm(extreme, extreme.T) == 64 * _LARGEST_PRODUCT).all())
+
+
+def in_threads(work: Callable[[S], T], items: Iterable[S]) -> list[T]:
+    """Do the work for each item, with as many threads as torch uses; results in their order.
+
+    Each thread computes its items alone. Threads that share one product wait for each other a
+    hundred times per query, which costs ten times the work when other processes take turns.
+    """
+    import torch
+
+    threads = torch.get_num_threads()
+    if threads == 1:
+        return [work(item) for item in items]
+    return list(_single_threads(threads).map(work, items))
+
+
+@cache
+def _single_threads(count: int) -> ThreadPoolExecutor:
+    import torch
+
+    started = threading.Barrier(count + 1)
+
+    def compute_alone() -> None:
+        torch.get_num_threads()  # a thread's first question would undo what was set before it
+        torch.set_num_threads(1)
+        started.wait()
+
+    pool = ThreadPoolExecutor(count, "matching", compute_alone)
+    for _ in range(count):
+        pool.submit(int)  # a thread is started for each: none is idle before all are
+    started.wait()
+    # What a thread sets for itself is also what new threads begin with.
+    torch.set_num_threads(count)
+    return pool

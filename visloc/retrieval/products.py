@@ -1,0 +1,40 @@
+"""Dot products of one vector with many rows."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Numbers that are turned into float32 at a time: 1 MiB of them stay in the cache of a core. It is
+# also small enough for BLAS not to wake other threads, which costs more than the product.
+_BLOCK_NUMBERS = 2**18
+
+
+def dot_products(
+    matrix: NDArray[np.int8] | NDArray[np.float32],
+    vector: NDArray[np.float32],
+    rows: NDArray[np.int64] | None = None,
+) -> NDArray[np.float32]:
+    """Multiply rows of a matrix (n, D) with a vector (D,).
+
+    8-bit rows are widened block by block: that takes less time than reading rows of 32 bits from
+    memory would, and no memory.
+
+    Args:
+        matrix: may be mapped from a file.
+        vector: of D numbers.
+        rows: (m,) which rows; None for all.
+
+    Returns:
+        (m,) products.
+    """
+    num = len(matrix) if rows is None else len(rows)
+    found = np.empty(num, np.float32)
+    block_rows = max(1, _BLOCK_NUMBERS // matrix.shape[1])
+    block = np.empty((min(num, block_rows), matrix.shape[1]), np.float32)
+    for start in range(0, num, block_rows):
+        some = slice(start, min(start + block_rows, num))
+        wide = block[: some.stop - some.start]
+        wide[...] = matrix[some if rows is None else rows[some]]
+        np.matmul(wide, vector, out=found[some])
+    return found
