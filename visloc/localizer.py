@@ -52,6 +52,8 @@ from visloc.types import (
 
 # For global descriptors that do not look at the photo.
 _NO_PIXELS = np.empty((0, 0, 3), np.uint8)
+# Strongest keypoints of a photo that are used; with the most effort as many as in the map's photos.
+_MOST_KEYPOINTS: Mapping[Extraction, int] = {Extraction.FAST: 1000, Extraction.DEFAULT: 2500}
 # Where priors narrow the search, photos elsewhere that would be among so many most similar ones are
 # asked too: they may show that the priors are wrong.
 _NUM_ELSEWHERE = 5
@@ -176,7 +178,8 @@ class Localizer:
         seconds: dict[str, float] = {}
         evidence = Evidence(used, source, photo.exif_orientation, options.read_as, seconds=seconds)
         with timed(seconds, "local_features"):
-            max_keypoints = self.map.manifest.local_features.max_keypoints
+            in_map = self.map.manifest.local_features.max_keypoints
+            max_keypoints = min(in_map, _MOST_KEYPOINTS.get(options.extraction, in_map))
             key = self._extractor, max_keypoints, options.read_as, options.extraction
             local, rgb = (found or {}).get(key) or _find_features(photo, *key)
             if found is not None:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import openvino
 import torch
-from openvino import opset13 as ov_ops
+
+from visloc.features.graph import import_openvino
 
 # What each rate is of, in the order of the table.
 RATES: Mapping[str, str] = {
@@ -124,6 +124,7 @@ def _int8_products() -> float:
 
 
 def _convolutions(network: Network, threads: int, precision: str, *, quantized: bool) -> float:
+    openvino, ov_ops = import_openvino()
     channels, height, width = network.channels, network.height, network.width
     random = np.random.default_rng(0)
     shape = [1, channels, height, width]

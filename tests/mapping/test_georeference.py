@@ -54,9 +54,7 @@ def far_apart(opened: Map) -> Map:
     centers = 100.0 * centers_of(opened)
     for row, center in zip(poses, centers, strict=True):
         row[4:] = -Pose.from_quaternion(row[:4], row[4:]).rotation @ center
-    images = tuple(
-        replace(image, timestamp=row) for row, image in enumerate(opened.images)
-    )
+    images = tuple(replace(image, timestamp=row) for row, image in enumerate(opened.images))
     return replace(opened, image_poses=poses, images=images)
 
 

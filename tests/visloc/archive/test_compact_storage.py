@@ -6,6 +6,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -204,7 +205,9 @@ def test_scales_of_a_model_that_cannot_be_are_refused(
     folder: Path, scales: NDArray[np.generic]
 ) -> None:
     values = np.full((700, 100), 127, np.int8)
-    np.savez(folder / "global" / "densevlad.model.npz", axes=values, **{"axes" + SCALES: scales})
+    # The savez stub takes no mapping of arrays as keywords beside allow_pickle.
+    arrays: dict[str, Any] = {"axes": values, "axes" + SCALES: scales}
+    np.savez(folder / "global" / "densevlad.model.npz", **arrays)
     make_right(folder, json.loads((folder / "manifest.json").read_text()))
     with pytest.raises(MapCorrupt) as caught:
         verify_map(folder)
