@@ -22,7 +22,7 @@ from visloc.fingerprints import check_fingerprint
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo, stored_from_upright, upright
 from visloc.matching.correspondences import match_landmarks
-from visloc.matching.products import EightBitRows, in_eight_bits
+from visloc.matching.products import EightBitRows, in_eight_bits, start_threads
 from visloc.priors import NO_PRIORS, Priors
 from visloc.query_camera import resolve_camera
 from visloc.query_features import (
@@ -95,6 +95,7 @@ class Localizer:
             manifest.global_features
         )
         self.geometry = MapGeometry(opened)
+        start_threads()
 
     def warm_up(self) -> None:
         """Run once on noise, so that the first query does not pay for the first use."""

@@ -123,6 +123,7 @@ def test_pycolmap_reads_the_same_cameras_poses_and_points(opened: Map, tmp_path:
         quaternion *= np.sign(quaternion[0])
         np.testing.assert_allclose(quaternion, opened.image_poses[row, :4], rtol=0, atol=1e-15)
         assert pose.translation.tolist() == opened.image_poses[row, 4:].tolist()
+        seen = slice(OFFSETS[row], OFFSETS[row + 1])
         assert [point.point3D_id - 1 for point in image.points2D] == OBSERVED[seen]
         xy = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
         assert np.array_equal(xy, opened.keypoints(row))
@@ -149,7 +150,6 @@ def test_our_reader_reads_the_same_dataset(opened: Map, tmp_path: Path) -> None:
         expected = opened.image_poses[row]
         np.testing.assert_allclose(pose.rotation_wxyz, expected[:4], rtol=0, atol=1e-15)
         assert pose.translation.tolist() == expected[4:].tolist()
-        seen = slice(OFFSETS[row], OFFSETS[row + 1])
         keypoints = open_features(output, "keypoints", "sift").read(record.path)
         descriptors = open_features(output, "descriptors", "sift").read(record.path)
         vector = open_features(output, "global_features", "AP-GeM").read(record.path)

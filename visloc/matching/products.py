@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -39,11 +40,16 @@ class EightBitRows:
 
 
 def in_eight_bits(descriptors: NDArray[np.float32]) -> EightBitRows:
-    """Round descriptors (n, D), finite, to 8 bits, with one scale so that rows stay comparable."""
+    """Round unit descriptors (n, D) to 8 bits, with one scale so that rows stay comparable.
+
+    Raises:
+        ValueError: entries are not finite.
+    """
     largest = float(max(descriptors.max(initial=0.0), -descriptors.min(initial=0.0)))
-    assert np.isfinite(largest)
+    if not np.isfinite(largest):
+        raise ValueError("descriptors are not finite")
     scale = largest / _LARGEST or 1.0
-    rows = descriptors * np.float32(1 / scale)
+    rows = descriptors / np.float32(scale)
     return EightBitRows(np.rint(rows, out=rows).astype(np.int8), scale)
 
 
@@ -110,8 +116,41 @@ def in_threads(work: Callable[[S], T], items: Iterable[S]) -> list[T]:
     return list(_single_threads(threads).map(work, items))
 
 
-@cache
+def start_threads() -> None:
+    """Start the threads of ``in_threads`` now rather than at its first call.
+
+    To be called before other threads use torch: while these start, a thread that asks torch for the
+    first time would be told to compute with one thread, and would do so for ever.
+    """
+    import torch
+
+    if (threads := torch.get_num_threads()) > 1:
+        _single_threads(threads)
+
+
+_pools: dict[int, ThreadPoolExecutor] = {}
+_pools_lock = threading.Lock()
+
+
+def _forget_threads() -> None:
+    """A forked child has none of its parent's threads."""
+    global _pools_lock
+    _pools.clear()
+    _pools_lock = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):  # Windows does not fork
+    os.register_at_fork(after_in_child=_forget_threads)
+
+
 def _single_threads(count: int) -> ThreadPoolExecutor:
+    with _pools_lock:
+        if count not in _pools:
+            _pools[count] = _start_single_threads(count)
+        return _pools[count]
+
+
+def _start_single_threads(count: int) -> ThreadPoolExecutor:
     import torch
 
     started = threading.Barrier(count + 1)
@@ -122,9 +161,14 @@ def _single_threads(count: int) -> ThreadPoolExecutor:
         started.wait()
 
     pool = ThreadPoolExecutor(count, "matching", compute_alone)
-    for _ in range(count):
-        pool.submit(int)  # a thread is started for each: none is idle before all are
-    started.wait()
-    # What a thread sets for itself is also what new threads begin with.
-    torch.set_num_threads(count)
+    try:
+        for _ in range(count):
+            pool.submit(int)  # a thread is started for each: none is idle before all are
+        started.wait()
+    except RuntimeError:  # no more threads can be started
+        started.abort()
+        raise
+    finally:
+        # What a thread sets for itself is also what new threads begin with.
+        torch.set_num_threads(count)
     return pool

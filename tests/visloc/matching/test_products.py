@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -28,7 +30,7 @@ def test_nothing_and_zeros_stay_what_they_are(shape: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_descriptors_that_are_not_finite_are_a_bug(value: float) -> None:
-    with pytest.raises(AssertionError):
+    with pytest.raises(ValueError, match="not finite"):
         in_eight_bits(np.array([[0.5, value]], np.float32))
 
 
@@ -75,3 +77,35 @@ def test_work_in_threads_keeps_its_order_and_leaves_torch_as_it_was() -> None:
         assert (torch.get_num_threads(), seen) == (2, [2])
     finally:
         torch.set_num_threads(before)
+
+
+def test_a_forked_child_starts_threads_of_its_own() -> None:
+    script = """
+import os, signal, torch
+from visloc.matching.products import in_threads
+torch.set_num_threads(2)
+assert in_threads(abs, [-1, -2]) == [1, 2]
+child = os.fork()
+if child == 0:
+    signal.alarm(60)  # ends a child that waits for its parent's threads
+    os._exit(in_threads(abs, [-3, -4]) != [3, 4])
+assert os.waitpid(child, 0)[1] == 0
+"""
+    subprocess.run([sys.executable, "-W", "ignore", "-c", script], check=True)
+
+
+def test_threads_that_ask_at_the_same_time_share_one_set_of_them() -> None:
+    torch_threads = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        started = [threading.Thread(target=products.start_threads) for _ in range(8)]
+        for thread in started:
+            thread.start()
+        for thread in started:
+            thread.join()
+        assert products._pools.keys() >= {3}
+        assert sum(t.name.startswith("matching") for t in threading.enumerate()) <= 3 * len(
+            products._pools
+        )
+    finally:
+        torch.set_num_threads(torch_threads)
