@@ -86,7 +86,7 @@ def read_imported_points(opened: Map) -> ImportedPoints | None:
         len(offsets) == len(opened.images) + 1
         and offsets[0] == 0
         and offsets[-1] == len(found["keypoints"])
-        and bool((counts >= 0).all())
+        and bool((offsets[1:] >= offsets[:-1]).all())  # differences may wrap round
         and bool(np.isfinite(points).all())
         and len(colors) in (0, len(points))
         and bool((observations >= 0).all())

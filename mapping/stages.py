@@ -14,7 +14,6 @@ import fcntl
 import hashlib
 import json
 import os
-import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,10 +23,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from visloc.archive.npz import read_npz
 from visloc.errors import Conflict, Unavailable
 
-# What NumPy raises for a damaged file.
-_DAMAGE = (zipfile.BadZipFile, EOFError, ValueError)
+# NumPy's letters of what items hold: numbers, truth values, text.
+_KINDS = "biufU"
 
 Item = Mapping[str, NDArray[Any]]
 
@@ -62,7 +62,7 @@ class WorkFolder:
         """
         try:
             return self._load(key)
-        except _DAMAGE as error:
+        except ValueError as error:
             self._path(key).unlink(missing_ok=True)
             raise Unavailable(
                 "build.damaged_item",
@@ -75,7 +75,7 @@ class WorkFolder:
         """Read an item, or compute and keep it."""
         try:
             return self._load(key)
-        except (FileNotFoundError, *_DAMAGE):
+        except (FileNotFoundError, ValueError):
             item = compute()
         path = self._path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -86,8 +86,9 @@ class WorkFolder:
         return item
 
     def _load(self, key: str) -> Item:
-        with self._path(key).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
+        arrays = read_npz(self._path(key), _KINDS)
+        # Copied, to be writable as what was computed is.
+        return {name: array.copy() for name, array in arrays.items()}
 
     def _path(self, key: str) -> Path:
         return self.root / f"{key}.npz"

@@ -39,7 +39,9 @@ _MAX_BATCH, _MIN_BATCHES = 16, 200
 class Workers:
     """Does work in ``count`` processes, which end with the ``with`` block; one means this process.
 
-    Every process uses one thread, so that their number does not change what comes out.
+    Every process uses one thread, so that their number does not change what comes out. Where a task
+    of this process is the first to load torch, it uses all: for products of whole numbers, which
+    are the same with any number of threads.
 
     A task and its items travel to other processes: the task is a module's function, a method of a
     dataclass or a ``functools.partial`` of one, and leaves its result in the work folder.
@@ -145,7 +147,7 @@ def _interrupted_later() -> Iterator[None]:
 def _one_thread_here() -> Iterator[None]:
     """Compute as a worker does: networks differ in the last bits with the number of threads."""
     # A network that torch computes was made before, with torch. Without one it would take seconds
-    # to load for nothing.
+    # to load for nothing; matching may load it later.
     torch = sys.modules.get("torch")
     before = cv2.getNumThreads(), torch.get_num_threads() if torch else 0
     cv2.setNumThreads(1)

@@ -35,8 +35,8 @@ MessageT = TypeVar("MessageT", bound=Message)
 def message_of(answer: BaseModel, message: MessageT) -> MessageT:
     """Fill a message from the model with the same fields: HTTP and gRPC answer the same.
 
-    Straight from one to the other: by way of JSON, an answer with its matches takes ten times as
-    long.
+    Straight from one to the other: by way of JSON, an answer with its matches takes several
+    times as long.
     """
     for name in type(answer).model_fields:
         value = getattr(answer, name)

@@ -124,7 +124,7 @@ def _accuracy_rows(bench: Bench, measured: Measured, *, with_peer: bool) -> Iter
 def _building_rows(measured: Measured) -> Iterator[list[str]]:
     if measured.peer:
         yield [
-            "peer: map from features, with the start of its processes",
+            "peer: map from features, less the start of its processes",
             _text(Spread.of(peer_map_seconds(entry) for entry in measured.peer), 2),
         ]
     parts = [landmark_seconds(built) for built in measured.builds]

@@ -7,6 +7,7 @@ looked into. Without it nothing altered may pass.
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +18,7 @@ from tests.fuzz.edits import Edit, EditedFolder, decode, encode
 from tests.fuzz.target import holds, refusal
 from tests.fuzz.tiny_map import write_tiny_map
 from visloc.archive import verify_map
-from visloc.archive.checks import content_hash, json_text, manifest_hash
+from visloc.archive.checks import SCALES, content_hash, json_text, manifest_hash
 from visloc.errors import MapCorrupt
 from visloc.geometry import Pose
 
@@ -66,6 +67,8 @@ class Archive:
             yield encode(names, [Edit(names[0], kind, b"\x10\0")])
             yield encode(names, [Edit("manifest.json", kind, b"\x10\0")])
         yield encode(names, [Edit(name, "content", good[name]) for name in names[:3]], _MADE_RIGHT)
+        for model in _models():
+            yield encode(names, [Edit("global/densevlad.model.npz", "content", model)], _MADE_RIGHT)
 
     def _verify(self) -> str:
         opened = verify_map(self._map.folder)
@@ -100,3 +103,17 @@ class Archive:
         except (ValueError, TypeError, LookupError, RecursionError, AttributeError):
             return  # not such a manifest that could be made right
         self._map.write("manifest.json", text)
+
+
+def _models() -> Iterator[bytes]:
+    """Yield models in 8 bits; in the last, scales have scales."""
+    matrix, scales = np.ones((3, 2), np.int8), np.ones(2, np.float32)
+    for arrays in (
+        {"a": matrix, "a" + SCALES: scales},
+        {"a" + SCALES: matrix, "a" + 2 * SCALES: scales},
+        {"a": matrix, "a" + SCALES: scales, "a" + 2 * SCALES: scales},
+    ):
+        file = io.BytesIO()
+        # The savez stub takes no mapping of arrays as keywords beside allow_pickle.
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+        yield file.getvalue()

@@ -98,7 +98,7 @@ def test_the_folder_of_maps_can_come_from_the_environment(
 def test_verify_passes_a_map_as_published(run: Run, built_maps: Path) -> None:
     status, out, err = run("verify", "room", "--maps-dir", built_maps)
     assert (status, err) == (0, "")
-    assert "15 files, every byte as published" in out
+    assert "16 files, every byte as published" in out
     assert "sift, densevlad, localvlad: the same features as here" in out
 
 

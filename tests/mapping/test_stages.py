@@ -63,6 +63,58 @@ def test_a_damaged_item_is_named_and_made_again_by_the_next_build(tmp_path: Path
     assert work.get(key, lambda: {"a": np.ones(1)})["a"].tolist() == [1.0]
 
 
+def _damaged(good: bytes, rng: np.random.Generator) -> bytes:
+    """Cut the file, or overwrite a piece of it, half of the time in its directory at the end."""
+    damaged = bytearray(good)
+    start = len(good) - int(rng.integers(1, rng.choice([300, len(good)])))
+    piece = slice(start, start + int(rng.choice([1, 8, 4096])))
+    match rng.integers(3):
+        case 0:
+            return good[:start]
+        case 1:
+            damaged[piece] = bytes(len(damaged[piece]))
+        case _:
+            damaged[piece] = rng.bytes(len(damaged[piece]))
+    return bytes(damaged)
+
+
+@pytest.mark.filterwarnings("ignore")  # of NumPy, about headers
+def test_whatever_happened_to_an_item_it_is_good_or_made_again(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    work, key = WorkFolder(tmp_path), key_of("stage", 1)
+    item: dict[str, np.ndarray] = {
+        "rows": rng.normal(size=(300, 8)).astype(np.float32),
+        "offsets": np.arange(700),
+        "models": np.array(["PINHOLE", "OPENCV"]),
+        "scale": np.array(3.0),
+    }
+    work.get(key, lambda: item)
+    path = next(tmp_path.rglob("*.npz"))
+    good = path.read_bytes()
+    made = 0
+    for _ in range(600):
+        path.write_bytes(_damaged(good, rng))
+        try:
+            found = work.read(key)
+        except Unavailable:
+            made += 1
+            assert not work.has(key)
+            path.write_bytes(_damaged(good, rng))
+            found = work.get(key, lambda: item)
+        assert found.keys() == item.keys()
+        assert all(np.array_equal(found[name], item[name]) for name in item)
+    assert made > 400
+
+
+def test_an_item_read_again_may_be_changed_as_one_just_made(tmp_path: Path) -> None:
+    work, key = WorkFolder(tmp_path), key_of("stage", 1)
+    work.get(key, lambda: {"a": np.zeros(3), "names": np.array(["b"])})
+    found = work.read(key)
+    found["a"][0] = 1.0
+    assert found["a"].tolist() == [1, 0, 0]
+    assert found["names"].tolist() == ["b"]
+
+
 def test_a_failing_computation_leaves_nothing(tmp_path: Path) -> None:
     work = WorkFolder(tmp_path)
 

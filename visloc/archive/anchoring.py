@@ -11,7 +11,7 @@ from pathlib import Path
 from visloc.archive.checks import content_hash, json_text, manifest_hash
 from visloc.archive.places import down_of
 from visloc.archive.reader import Map
-from visloc.archive.schema import FORMAT_MAJOR, FORMAT_MINOR, Anchor
+from visloc.archive.schema import Anchor
 
 # What says that a file system has no hard links, or not between these two folders.
 _NO_LINKS = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP)
@@ -36,8 +36,9 @@ def write_anchored(opened: Map, folder: Path, anchor: Anchor, *, version: str, c
         The version.
     """
     manifest = json.loads((opened.path / "manifest.json").read_text(encoding="utf-8"))
-    minor = int(manifest["format_version"].partition(".")[2])
-    manifest["format_version"] = f"{FORMAT_MAJOR}.{max(minor, FORMAT_MINOR)}"
+    major, minor = map(int, opened.manifest.format_version.split("."))
+    # The files stay as they are, and so does who can read them; such an anchor came with 1.3.
+    manifest["format_version"] = "{}.{}".format(*max((major, minor), (1, 3)))
     world = manifest["world"]
     if anchor.geodetic is not None and (world.get("gravity") is None or opened.geodetic):
         world["gravity"] = down_of(anchor.geodetic).tolist()

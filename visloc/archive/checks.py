@@ -77,7 +77,8 @@ def read_manifest(folder: Path) -> Manifest:
             "map.format_version",
             "the map was written by a newer visloc; upgrade visloc or rebuild the map",
             field=str(path),
-            expected=f"format {FORMAT_MAJOR}.x (this program writes {FORMAT_MAJOR}.{FORMAT_MINOR})",
+            expected=f"format {FORMAT_MAJOR}.x or older (this program writes "
+            f"{FORMAT_MAJOR}.{FORMAT_MINOR})",
             got=version,
         )
     return _parse(Manifest, text, path, "map.manifest")
@@ -217,7 +218,7 @@ def read_model(folder: Path, name: str) -> dict[str, NDArray[np.float32]]:
             expected="an .npz without compression",
             got=str(error),
         ) from error
-    for key in [key for key in model if key + SCALES in model]:
+    for key in [key for key in model if key + SCALES in model and not key.endswith(SCALES)]:
         model[key] = _widened(model[key], model.pop(key + SCALES))
     for key, array in model.items():
         if array.dtype != np.float32 or not np.isfinite(array).all():

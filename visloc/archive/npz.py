@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import tokenize
 import zipfile
@@ -13,13 +14,18 @@ from numpy.typing import NDArray
 
 _SUFFIX = ".npy"
 _ENCRYPTED = 0x1  # bit of a zip entry's flags
+_EMPTY_BYTES = 22  # a zip archive of nothing
 
 
-def read_npz(path: Path) -> dict[str, NDArray[Any]]:
+def read_npz(path: Path, kinds: str = "biuf") -> dict[str, NDArray[Any]]:
     """Read the arrays of an archive without compression; they are read-only.
 
     No more memory is taken than the file is long, whatever its headers announce: entries that are
     compressed, and arrays whose shape is not that of their entry, are refused before they are read.
+
+    Args:
+        path: the archive.
+        kinds: NumPy's letters of the types that are allowed: numbers and truth values.
 
     Raises:
         ValueError: not such an archive; the message says what is wrong.
@@ -32,10 +38,14 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
             arrays = {}
             for entry in entries:
                 with archive.open(entry) as file:
-                    arrays[entry.filename.removesuffix(_SUFFIX)] = _read_array(file, entry)
+                    arrays[entry.filename.removesuffix(_SUFFIX)] = _read_array(file, entry, kinds)
             return arrays
-    except (zipfile.BadZipFile, NotImplementedError, EOFError) as error:
+    except (zipfile.BadZipFile, NotImplementedError, EOFError, OverflowError) as error:
         raise ValueError(str(error) or "the archive is cut short") from error
+    except OSError as error:
+        if error.errno != errno.EINVAL:
+            raise
+        raise ValueError("an entry is said to be where no file can have one") from error
 
 
 def _check_entries(entries: list[zipfile.ZipInfo], size: int) -> None:
@@ -46,8 +56,12 @@ def _check_entries(entries: list[zipfile.ZipInfo], size: int) -> None:
             or entry.file_size != entry.compress_size
         ):
             raise ValueError(f"{entry.filename!r} is compressed or encrypted")
+        if entry.comment:  # a damaged length of it hides the entries that follow
+            raise ValueError(f"{entry.filename!r} has a comment")
         if not entry.filename.endswith(_SUFFIX):
             raise ValueError(f"{entry.filename!r} is not an array")
+    if not entries and size > _EMPTY_BYTES:
+        raise ValueError("the archive lists nothing of what it holds")
     if len({entry.filename for entry in entries}) != len(entries):
         raise ValueError("an array occurs twice")
     if sum(entry.file_size for entry in entries) > size:  # several could share the same bytes
@@ -83,14 +97,14 @@ def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[An
         raise ValueError("not an array") from error
 
 
-def _read_array(file: IO[bytes], entry: zipfile.ZipInfo) -> NDArray[Any]:
+def _read_array(file: IO[bytes], entry: zipfile.ZipInfo, kinds: str) -> NDArray[Any]:
     try:
         shape, fortran, dtype = read_npy_header(file)
     except ValueError as error:
         raise ValueError(f"{entry.filename!r} is not an array") from error
     num_bytes = entry.file_size - file.tell()
     if (
-        dtype.kind not in "biuf"
+        dtype.kind not in kinds
         or any(length < 0 for length in shape)
         or math.prod(shape) * dtype.itemsize != num_bytes
     ):

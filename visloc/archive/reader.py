@@ -94,7 +94,7 @@ class Map(MapOutline):
         image_poses: (n, 7) float64, cam_from_world as qw qx qy qz tx ty tz.
         landmarks: (P, 3) float32, relative to the manifest's origin.
         track_lengths: (P,) uint16, mapping photos that see each landmark.
-        errors_px: (P,) float16 (float32 before format 1.4), mean reprojection error; NaN where it
+        errors_px: (P,) float16 (float32 before format 2.0), mean reprojection error; NaN where it
             does not apply.
         angles_deg: (P,) as ``errors_px``, largest angle between viewing rays; NaN where not
             computed.
@@ -259,13 +259,10 @@ def verify_map(folder: Path) -> Map:
     opened = open_map(folder)
     check_checksums(folder, opened.manifest)
     counts = opened.manifest.counts
-    offsets = opened.observation_offsets
     fine = {
         "image_poses.npy": is_finite(opened.image_poses) and _are_unit(opened.image_poses[:, :4]),
         "landmarks.npy": is_finite(opened.landmarks),
-        "observation_offsets.npy": offsets[0] == 0
-        and offsets[-1] == counts.observations
-        and bool((np.diff(offsets) >= 0).all()),
+        "observation_offsets.npy": _lead_through(opened.observation_offsets, counts.observations),
         "observation_landmarks.npy": int(opened.observation_landmarks.max()) < counts.landmarks,
         "observation_keypoints.npy": is_finite(opened.observation_keypoints),
     }
@@ -313,14 +310,19 @@ def _beside_rows(
     return beside
 
 
+def _lead_through(offsets: NDArray[np.int64], num_rows: int) -> bool:
+    """Whether offsets lead from the first row to the last and never back."""
+    # Compared, not subtracted: differences of large numbers wrap around.
+    ascend = bool((offsets[1:] >= offsets[:-1]).all())
+    return ascend and int(offsets[0]) == 0 and int(offsets[-1]) == num_rows
+
+
 def _are_good(clusters: Clusters, num_images: int) -> bool:
     """Whether clusters hold every photo once."""
     offsets, members = clusters.offsets, clusters.members
     return (
         is_finite(clusters.centers)
-        and offsets[0] == 0
-        and offsets[-1] == num_images
-        and bool((np.diff(offsets) >= 0).all())
+        and _lead_through(offsets, num_images)
         and int(members.max()) < num_images
         and bool((np.bincount(members, minlength=num_images) == 1).all())
     )

@@ -12,7 +12,7 @@ from pydantic.dataclasses import dataclass
 from visloc.types import Fingerprint
 
 FORMAT = "visloc-map"
-FORMAT_MAJOR, FORMAT_MINOR = 1, 4
+FORMAT_MAJOR, FORMAT_MINOR = 2, 0
 
 ID_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -90,7 +90,7 @@ class LocalFeaturesRecord(_Record):
     descriptor_dim: Annotated[int, Field(ge=1)]
     # value = stored int8 x scale
     descriptor_scale: Annotated[float, Field(gt=0)]
-    # pixel = stored int16 x step; None: pixels are stored as float32, as in all maps before 1.4.
+    # pixel = stored int16 x step; None: pixels are stored as float32, as in all maps before 2.0.
     keypoint_step_px: Annotated[float, Field(gt=0, le=1)] | None = None
     computed_with: str | None = None
 
@@ -99,7 +99,7 @@ class GlobalFeaturesRecord(_Record):
     """One global descriptor of a map.
 
     Attributes:
-        bits: 8: int8 with a scale for each row; 32: float32, as in all maps before 1.4.
+        bits: 8: int8 with a scale for each row; 32: float32, as in all maps before 2.0.
         clusters: of the rows, in maps of so many photos that not all are compared with a query.
     """
 
@@ -184,7 +184,7 @@ class Manifest(_Record):
     """``manifest.json``."""
 
     format: Literal["visloc-map"]
-    format_version: Annotated[str, Field(pattern=r"^\d+\.\d+$")]
+    format_version: Annotated[str, Field(pattern=r"^[0-9]{1,8}\.[0-9]{1,8}$")]
     id: Annotated[str, Field(pattern=rf"^{ID_PATTERN.pattern}$")]
     version: Annotated[str, Field(pattern=rf"^{ID_PATTERN.pattern}$")]
     created: str

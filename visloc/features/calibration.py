@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -21,6 +20,8 @@ from visloc.synthetic import papers, surfaces
 
 _LOGGER = logging.getLogger(__name__)
 _REVISION = 1  # raised whenever the pictures or the way of measuring change
+# Those of published networks are 3 to 24 wide. Others may be, but then the file is no help.
+_NARROWEST, _WIDEST = 1e-3, 1e4
 _SIZE = (480, 640)
 _MIDDLE = (slice(120, 360), slice(160, 480))  # what is shown of a picture, as that takes time
 _PICTURES = (
@@ -80,7 +81,9 @@ def _measure(
     )
     # Four digits are plenty, and the same on machines that add up in another order.
     rounded = [float(f"{value:.4g}") for value in extremes]
-    return dict(zip(names, zip(rounded[::2], rounded[1::2], strict=True), strict=True))
+    # Zero is always among what a convolution sees: it is the padding.
+    lows, highs = [min(low, 0.0) for low in rounded[::2]], [max(h, 0.0) for h in rounded[1::2]]
+    return dict(zip(names, zip(lows, highs, strict=True), strict=True))
 
 
 def _cache_folder() -> Path | None:
@@ -99,11 +102,13 @@ def _read(path: Path, names: Sequence[str]) -> Ranges | None:
         ranges = {name: (float(held[name][0]), float(held[name][1])) for name in names}
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, TypeError, LookupError, RecursionError) as error:
+    except (OSError, ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
         _LOGGER.info("%s is not usable and made anew: %s", path, error)
         return None
-    if not all(-math.inf < low <= high < math.inf for low, high in ranges.values()):
-        _LOGGER.info("%s is not usable and made anew: no ranges", path)
+    if not all(
+        low <= 0 <= high and _NARROWEST < high - low < _WIDEST for low, high in ranges.values()
+    ):
+        _LOGGER.info("%s is not usable and made anew: not such ranges as networks have", path)
         return None
     return ranges
 

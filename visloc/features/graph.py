@@ -11,7 +11,8 @@ import importlib.metadata
 import json
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
 
@@ -32,6 +33,9 @@ def import_openvino() -> tuple[ModuleType, ModuleType]:
 
     Use this, never a plain import: the converter of models, which that would load as well, tells
     Google Analytics that it was loaded and keeps an identifier in the user's home.
+
+    Raises:
+        ImportError: it is not installed, or cannot be loaded.
     """
     with _IMPORT_LOCK:
         converter_was_hidden = _CONVERTER not in sys.modules
@@ -133,7 +137,10 @@ class GraphBuilder:
 
 
 class Graph:
-    """A graph, compiled for the processor; safe to call from several threads."""
+    """A graph, compiled for the processor.
+
+    Threads that use one take turns. It keeps room for the largest arrays that it computed.
+    """
 
     def __init__(self, inputs: Sequence[Any], outputs: Sequence[Any], threads: int | None) -> None:
         openvino, _ = import_openvino()
@@ -145,16 +152,25 @@ class Graph:
         }
         if threads is not None:
             settings["INFERENCE_NUM_THREADS"] = threads
-        self._compiled = openvino.Core().compile_model(model, "CPU", settings)
-        self._requests = threading.local()
+        compiled = openvino.Core().compile_model(model, "CPU", settings)
+        self._request = compiled.create_infer_request()
+        self._turn = threading.Lock()
 
     def __call__(self, *arrays: NDArray[Any]) -> list[NDArray[Any]]:
-        """Compute all outputs. They are overwritten when the same thread calls again."""
-        request = getattr(self._requests, "request", None)
-        if request is None:
-            request = self._requests.request = self._compiled.create_infer_request()
-        request.infer(list(arrays), share_inputs=True, share_outputs=True)
-        return [tensor.data for tensor in request.output_tensors]
+        """Compute all outputs."""
+        with self.computed(*arrays) as outputs:
+            return [output.copy() for output in outputs]
+
+    @contextmanager
+    def computed(self, *arrays: NDArray[Any]) -> Iterator[list[NDArray[Any]]]:
+        """Compute all outputs, for use within the ``with`` statement; other threads wait.
+
+        Afterwards their memory is used for something else, or freed. For large ones this saves
+        a copy; the same thread must not use the graph again within.
+        """
+        with self._turn:
+            self._request.infer(list(arrays), share_inputs=True, share_outputs=True)
+            yield [tensor.data for tensor in self._request.output_tensors]
 
 
 def _output(operation: Any) -> Any:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -295,7 +296,7 @@ def _folded(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """What a network makes of one image. Valid until the same thread shows it another.
+    """What a network makes of one image.
 
     Attributes:
         logits: (2, H, W) float32 of reliability and repeatability, for each pixel.
@@ -313,8 +314,8 @@ class Network(Protocol):
     def computed_with(self) -> str:
         """What computes it, for people."""
 
-    def look(self, image: NDArray[np.float32]) -> Seen:
-        """Look at RGB (H, W, 3) in 0 to 255."""
+    def look(self, image: NDArray[np.float32]) -> AbstractContextManager[Seen]:
+        """Look at RGB (H, W, 3) in 0 to 255; valid within the ``with`` statement only."""
 
 
 class R2D2Extractor:
@@ -380,13 +381,13 @@ class R2D2Extractor:
         self, image: NDArray[np.float32], max_keypoints: int
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Return array indices (x, y) (N, 2), descriptors and scores of one scale's best."""
-        seen = self.network.look(image)
-        x, y, scores = _peaks(seen.logits)
-        # Row by row, as they lie in memory, which makes sampling faster.
-        best = np.sort(np.argsort(-scores, kind="stable")[:max_keypoints])
-        x, y = x[best], y[best]
-        keypoints = np.stack([x, y], axis=1).astype(np.float32)
-        return keypoints, seen.descriptors(x, y), scores[best]
+        with self.network.look(image) as seen:
+            x, y, scores = _peaks(seen.logits)
+            # Row by row, as they lie in memory, which makes sampling faster.
+            best = np.sort(np.argsort(-scores, kind="stable")[:max_keypoints])
+            x, y = x[best], y[best]
+            keypoints = np.stack([x, y], axis=1).astype(np.float32)
+            return keypoints, seen.descriptors(x, y), scores[best]
 
 
 def _peaks(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -39,19 +41,22 @@ class OpenVinoNetwork:
         self._folded = folded
         self.computed_with = openvino_with(ranges)
 
-    def look(self, image: NDArray[np.float32]) -> Seen:
+    @contextmanager
+    def look(self, image: NDArray[np.float32]) -> Iterator[Seen]:
         """Look at RGB (H, W, 3) in 0 to 255."""
-        features = self._graph(_input(image))[0][0]
-        heads = squared_heads if self._folded.stride == 1 else squared_heads_at_double_resolution
-        logits = heads(features, self._folded.head_weight, self._folded.head_bias)
+        folded = self._folded
+        heads = squared_heads if folded.stride == 1 else squared_heads_at_double_resolution
+        # 39 MB at 640 x 480: copying them takes 2 to 4 % of the time.
+        with self._graph.computed(_input(image)) as (batch,):
+            features = batch[0]
 
-        def descriptors(x: NDArray[np.intp], y: NDArray[np.intp]) -> NDArray[np.float32]:
-            sampled = _sampled(features, x, y, self._folded.stride)
-            norms = np.maximum(np.linalg.norm(sampled, axis=1, keepdims=True), 1e-12)
-            unit: NDArray[np.float32] = sampled / norms
-            return unit
+            def descriptors(x: NDArray[np.intp], y: NDArray[np.intp]) -> NDArray[np.float32]:
+                sampled = _sampled(features, x, y, folded.stride)
+                norms = np.maximum(np.linalg.norm(sampled, axis=1, keepdims=True), 1e-12)
+                unit: NDArray[np.float32] = sampled / norms
+                return unit
 
-        return Seen(logits, descriptors)
+            yield Seen(heads(features, folded.head_weight, folded.head_bias), descriptors)
 
 
 def _input(image: NDArray[Any]) -> NDArray[np.float32]:

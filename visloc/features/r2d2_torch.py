@@ -92,7 +92,7 @@ class TorchNetwork:
         self.computed_with = computed_with(self._device)
 
     @torch.inference_mode()
-    def look(self, image: NDArray[np.float32]) -> Seen:
+    def look(self, image: NDArray[np.float32]) -> contextlib.AbstractContextManager[Seen]:
         """Look at RGB (H, W, 3) in 0 to 255."""
         pixels = torch.tensor(image, device=self._device).permute(2, 0, 1)[None]
         normalized = ((pixels - self._mean) / self._std).contiguous(
@@ -113,4 +113,4 @@ class TorchNetwork:
             )
             return found
 
-        return Seen(logits.cpu().numpy(), descriptors)
+        return contextlib.nullcontext(Seen(logits.cpu().numpy(), descriptors))

@@ -173,7 +173,7 @@ def _plain(checkpoint: Checkpoint, name: str) -> Layer:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """What the network makes of one image. Valid until the same thread shows it another.
+    """What the network makes of one image.
 
     Attributes:
         heat: (H, W) float32, probability that the keypoint of a cell is at this pixel.

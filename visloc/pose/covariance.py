@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.geometry import Pose, cross_matrix
-from visloc.pose.reprojection import linearized
+from visloc.pose.reprojection import has_derivative, linearized
 from visloc.pose.views import MatchedView
 
 _MIN_POINTS = 4
@@ -35,17 +35,22 @@ def pose_covariance(
     rotation in half-angles. Checked by Monte Carlo in tests/visloc/pose.
 
     Args:
-        views: inliers only; views without any are fine.
+        views: inliers only; views without any are fine. Those at the very edge of what their
+            camera sees, where errors have no derivative, count as none.
         rig_from_world: the refined pose.
-        loss_scale_px: scale c of the loss c^2 log(1 + r^2 / c^2).
+        loss_scale_px: scale c of the loss c^2 / 2 log(1 + r^2 / c^2).
 
     Returns:
         (6, 6) of ``rig_from_world``, or None when the inliers leave the pose undetermined.
     """
-    num_points = sum(len(view) for view in views)
-    if num_points < _MIN_POINTS:
+    if not views:
         return None
     residuals, jacobian = linearized(views, rig_from_world, about=rig_from_world.translation)
+    known = has_derivative(residuals, jacobian)
+    residuals, jacobian = residuals[known], jacobian[known]
+    num_points = len(residuals)
+    if num_points < _MIN_POINTS:
+        return None
     weight = 1.0 / (1.0 + np.sum(residuals**2, axis=1) / loss_scale_px**2)
     psi = weight[:, None] * residuals
     gradients = np.einsum("nai,na->ni", jacobian, psi)
@@ -57,7 +62,7 @@ def pose_covariance(
     num_residuals = 2 * num_points
     spare = num_residuals - 6
     slope = np.mean(weight**2)  # half the trace of the second derivative
-    if not (np.isfinite(jacobian).all() and slope > 0):
+    if slope == 0:  # all errors are huge
         return None
     common = _inverse(_squared(jacobian.reshape(-1, 6)))
     bread = _inverse(curvature)

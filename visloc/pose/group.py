@@ -18,7 +18,7 @@ from visloc.types import RegistrationPreset
 # Instants belong to one camera while drift, at one standard deviation, shifts pixels by less than
 # the largest error of an inlier.
 _DRIFT_SHARE = 1.0
-# RANSAC looks at no more than about this many correspondences.
+# A group has no more than about this many correspondences.
 _MAX_CORRESPONDENCES = 3000
 # Of thousands of wrong correspondences some dozen agree by chance: 0.6 % of 3000, measured. A group
 # needs more, whatever is demanded of single photos.

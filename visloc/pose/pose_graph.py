@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from visloc.geometry import Pose
 from visloc.pose.motion import UncertainPose, adjoint, difference, moved
-from visloc.pose.reprojection import linearized
+from visloc.pose.reprojection import has_derivative, linearized
 from visloc.pose.views import MatchedView
 
 _MAX_STEPS = 30
@@ -53,7 +53,7 @@ def solve_chain(
     Args:
         chain: what is known.
         start: N poses to begin with, close enough for the inliers to be inliers.
-        loss_scale_px: scale c of the Cauchy loss c^2 log(1 + r^2 / c^2) of a pixel's error.
+        loss_scale_px: scale c of the Cauchy loss c^2 / 2 log(1 + r^2 / c^2) of a pixel's error.
         error_scale_px2: what to divide that loss by, so that pixels count as much as they are
             worth beside motions and measured poses; see ``error_scale``.
 
@@ -136,8 +136,8 @@ class _PixelTerms:
     """The pixels of one instant, summed up: r errors (px), J their derivatives by the pose.
 
     Attributes:
-        count: of pixels.
-        loss: sum of c^2 log(1 + r^2 / c^2) / 2.
+        count: of pixels whose errors have a derivative; all but ``loss`` is of these.
+        loss: sum of c^2 / 2 log(1 + r^2 / c^2).
         gradient: (6,) its derivative.
         outer: (6, 6) J^T J.
         slope: mean derivative of psi(r), the weighted error, by r.
@@ -158,14 +158,18 @@ def _pixel_terms(
     error, jacobian = linearized(views, rig_from_world, about=np.zeros(3))
     # A step too far puts points behind the camera, where there is no error to speak of: infinite.
     squared = np.sum(error**2, axis=1) / loss_scale_px**2
-    weight = 1.0 / (1.0 + squared)
+    loss = float(np.nan_to_num(0.5 * loss_scale_px**2 * np.log1p(squared), nan=np.inf).sum())
+    known = has_derivative(error, jacobian)
+    error, jacobian = error[known], jacobian[known]
+    weight = 1.0 / (1.0 + squared[known])
     psi = weight[:, None] * error
     return _PixelTerms(
         count=len(error),
-        loss=float(np.nan_to_num(0.5 * loss_scale_px**2 * np.log1p(squared), nan=np.inf).sum()),
+        loss=loss,
         gradient=np.einsum("nai,na->i", jacobian, psi),
         outer=np.einsum("nai,naj->ij", jacobian, jacobian),
-        slope=float(np.mean(weight**2)),  # half the trace of the derivative of psi in two axes
+        # Half the trace of the derivative of psi in two axes.
+        slope=float(np.sum(weight**2)) / max(len(error), 1),
         psi_squared=float(np.sum(psi**2)),
     )
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from visloc.geometry import Pose
 from visloc.pose.motion import moved
-from visloc.pose.reprojection import linearized, reprojection_errors
+from visloc.pose.reprojection import has_derivative, linearized, reprojection_errors
 from visloc.pose.views import MatchedView
 
 # Scale of the Cauchy loss. Landmarks from depth maps scatter by a few pixels.
@@ -71,7 +71,8 @@ def refine(
         max_steps: evaluations of the loss, when the caller can do with less than convergence.
 
     Returns:
-        The pose, or None when fewer than four correspondences are inliers.
+        The pose, or None when fewer than four correspondences are inliers, or all but three of
+        the inliers lie at the very edge of what their cameras see, where errors have no derivative.
     """
     best = _explained(views, start, max_error_px)
     normal = None
@@ -81,9 +82,9 @@ def refine(
             return None
         if normal is None:
             normal = _normal_equations(views, best)
+        if normal is None:
+            return None
         information, gradient = normal
-        if not np.isfinite(information).all():  # a point at the very edge of what the camera sees
-            break
         # In units that make the diagonal 1; directions without any information stay put.
         units = np.sqrt(np.diag(information))
         units[units == 0] = 1.0
@@ -128,10 +129,17 @@ def _loss(error: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _normal_equations(
     views: Sequence[MatchedView], pose: RefinedPose
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The loss's second derivative (6, 6) and its first (6,) by (w, dt) of ``moved``."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """The loss's second derivative (6, 6) and its first (6,) by (w, dt) of ``moved``.
+
+    None when fewer than four inliers have a derivative.
+    """
     kept = [view.selected(mask) for view, mask in zip(views, pose.inliers, strict=True)]
     errors, jacobian = linearized(kept, pose.rig_from_world, about=np.zeros(3))
+    known = has_derivative(errors, jacobian)
+    errors, jacobian = errors[known], jacobian[known]
+    if len(errors) < MIN_INLIERS:
+        return None
     weight = 1.0 / (1.0 + np.sum(errors * errors, axis=1) / LOSS_SCALE_PX**2)
     # One row per parameter, all errors in a row. einsum, not a product of matrices: the sums of
     # the latter depend on the number of threads.

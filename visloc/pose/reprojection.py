@@ -11,6 +11,9 @@ from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import project
 from visloc.pose.views import MatchedView
 
+# No derivative of a point that a camera sees well is nearly as large, and its square is a number.
+_MAX_DERIVATIVE = 1e100
+
 
 def reprojection_errors(view: MatchedView, rig_from_world: Pose) -> NDArray[np.float64]:
     """Return the distances (n,) in pixels; NaN for points behind the camera."""
@@ -33,7 +36,7 @@ def linearized(
 
     Returns:
         (n, 2) errors in pixels, projected less seen, NaN behind the camera; (n, 2, 6) their
-        derivatives by w (rad), then dt.
+        derivatives by w (rad), then dt, NaN also at the very edge of what the camera sees.
     """
     errors, jacobians = [], []
     for view in views:
@@ -50,6 +53,16 @@ def linearized(
         jacobian[:, :, 2] = x * b - y * a
         jacobians.append(jacobian)
     return np.concatenate(errors), np.concatenate(jacobians)
+
+
+def has_derivative(errors: NDArray[np.float64], jacobian: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which (n,) of the rows of ``linearized`` are numbers.
+
+    Those that are not say nothing about how errors change with the pose. A camera of 180 degrees
+    sees points so close to its edge that a step of the difference leaves the view.
+    """
+    known = np.abs(jacobian).max(axis=(1, 2), initial=0.0) < _MAX_DERIVATIVE  # False for NaN
+    return np.asarray(known & np.isfinite(errors).all(axis=1))
 
 
 def _projected(

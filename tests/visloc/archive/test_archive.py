@@ -202,7 +202,8 @@ def replace_array(name: str, array: np.ndarray) -> Callable[[Path], None]:
         (lambda f: (f / "manifest.json").write_text("{"), "map.manifest"),
         (lambda f: (f / "manifest.json").write_text("[]"), "map.manifest"),
         (lambda f: (f / "manifest.json").write_bytes(b"\xff\xfe"), "map.manifest"),
-        (edit_manifest(format_version="2.0"), "map.format_version"),
+        (edit_manifest(format_version="3.0"), "map.format_version"),
+        (edit_manifest(format_version="9" * 9 + ".0"), "map.manifest"),
         (edit_manifest(format="zip"), "map.manifest"),
         (edit_manifest(files={}), "map.file_missing"),
         (edit_manifest(counts={"images": 3, "landmarks": 6, "observations": 7}), "map.array"),
@@ -222,8 +223,39 @@ def test_a_damaged_map_is_refused_at_opening_with_the_reason(
 
 
 def test_a_newer_minor_format_with_unknown_fields_opens(folder: Path) -> None:
-    edit_manifest(format_version="1.9", colours="yes")(folder)
-    assert open_map(folder).manifest.format_version == "1.9"
+    edit_manifest(format_version="2.9", colours="yes")(folder)
+    assert open_map(folder).manifest.format_version == "2.9"
+
+
+def test_programs_that_know_formats_1_call_this_one_newer(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("visloc.archive.checks.FORMAT_MAJOR", 1)
+    with pytest.raises(MapCorrupt, match="newer visloc; upgrade") as caught:
+        open_map(folder)
+    assert (caught.value.code, caught.value.got) == ("map.format_version", "2.0")
+
+
+@pytest.mark.parametrize(
+    "offsets",
+    [
+        [0, 4, 3, 7],
+        [1, 3, 3, 7],
+        [0, 3, 3, 6],
+        [0, -1, 3, 7],
+        [0, 2**63 - 1, -(2**63), 7],  # differences of these wrap around to 1 and 7
+    ],
+)
+def test_offsets_that_do_not_lead_through_the_rows_are_refused(
+    folder: Path, offsets: list[int]
+) -> None:
+    content = make_content()
+    content.landmarks.offsets[:] = offsets
+    target = folder.parent / "lying"
+    target.mkdir()
+    write_map(target, content, map_id="room", version="v1", created=CREATED)
+    with pytest.raises(MapCorrupt, match="observation_offsets"):
+        verify_map(target)
 
 
 def test_numbers_that_lie_are_found_even_when_checksums_agree(tmp_path: Path) -> None:
@@ -282,7 +314,7 @@ def test_a_map_of_ready_made_features_with_colours_and_anchor_reads_back(tmp_pat
     folder = write_content(tmp_path / "incoming", make_ready_made_content())
     MapStore(tmp_path / "maps").publish(folder, "room", "v1")
     opened = MapStore(tmp_path / "maps").open("room")
-    assert opened.manifest.format_version == "1.4"
+    assert opened.manifest.format_version == "2.0"
     assert opened.manifest.world.anchor == ANCHOR
     assert opened.manifest.local_features.fingerprint.name == "kapture:D2-Net"
     assert opened.colors is not None
@@ -311,7 +343,7 @@ def test_a_map_without_colours_and_anchor_says_so(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("version", ["1.0", "1.1"])
-def test_a_map_of_an_older_minor_format_opens(folder: Path, version: str) -> None:
+def test_a_map_of_an_older_format_opens(folder: Path, version: str) -> None:
     edit_manifest(format_version=version)(folder)
     opened = open_map(folder)
     assert opened.manifest.format_version == version

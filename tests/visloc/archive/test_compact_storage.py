@@ -1,4 +1,4 @@
-"""What format 1.4 stores in fewer bits, and that maps of formats before it mean the same."""
+"""What format 2.0 stores in fewer bits, and that maps of formats before it mean the same."""
 
 from __future__ import annotations
 
@@ -14,9 +14,20 @@ from numpy.typing import NDArray
 
 import visloc.archive.writer
 from tests.fuzz.tiny_map import write_tiny_map
-from visloc.archive import GlobalFeatures, Map, MapContent, open_map, sha256_of, verify_map
+from visloc.archive import (
+    Anchor,
+    Geodetic,
+    GlobalFeatures,
+    Map,
+    MapContent,
+    open_map,
+    sha256_of,
+    verify_map,
+    write_anchored,
+)
 from visloc.archive import write_map as write_map_to
-from visloc.archive.checks import SCALES, content_hash, json_text, manifest_hash
+from visloc.archive.checks import SCALES, content_hash, json_text, manifest_hash, read_model
+from visloc.archive.packed import pack_map, unpack_map
 from visloc.errors import MapCorrupt
 from visloc.geometry import Camera, Pose
 
@@ -87,8 +98,8 @@ def make_right(folder: Path, manifest: dict[str, object]) -> None:
     (folder / "manifest.json").write_text(json_text(manifest))
 
 
-def as_before_1_4(opened: Map, folder: Path, version: str) -> None:
-    """Store a map as programs before format 1.4 did, in a new folder."""
+def as_before_2_0(opened: Map, folder: Path, version: str) -> None:
+    """Store a map as programs before format 2.0 did, in a new folder."""
     shutil.copytree(opened.path, folder)
     keypoints = [opened.keypoints(image) for image in range(len(opened.images))]
     rows = opened.global_descriptors["densevlad"][:]
@@ -115,7 +126,7 @@ def test_a_map_of_a_format_before_opens_with_the_same_numbers(
     rows = new.global_descriptors["densevlad"]
     query = rows[1]
     cosines = rows.cosines(query)
-    as_before_1_4(new, tmp_path / "old", version)
+    as_before_2_0(new, tmp_path / "old", version)
     old = verify_map(tmp_path / "old")
     assert old.manifest.format_version == version
     assert old.observation_keypoints.dtype == np.float32
@@ -124,6 +135,47 @@ def test_a_map_of_a_format_before_opens_with_the_same_numbers(
     assert np.array_equal(old.global_descriptors["densevlad"][:], rows[:])
     np.testing.assert_allclose(old.global_descriptors["densevlad"].cosines(query), cosines, 1e-6)
     assert np.array_equal(old.errors_px, new.errors_px)
+
+
+@pytest.mark.parametrize(
+    ("before", "after"), [("1.0", "1.3"), ("1.3", "1.3"), ("2.0", "2.0"), ("2.7", "2.7")]
+)
+def test_another_anchor_leaves_a_map_to_the_programs_that_could_read_it(
+    folder: Path, tmp_path: Path, before: str, after: str
+) -> None:
+    if before.startswith("1."):
+        as_before_2_0(open_map(folder), tmp_path / "old", before)
+        folder = tmp_path / "old"
+    else:
+        make_right(
+            folder,
+            json.loads((folder / "manifest.json").read_text()) | {"format_version": before},
+        )
+    opened = verify_map(folder)
+    assert opened.manifest.format_version == before
+    place = Geodetic(latitude_deg=1.0, longitude_deg=2.0, altitude_m=3.0, scale=2.0)
+    anchor = Anchor(kind="correspondences", images=4, rms=0.1, geodetic=place)
+    (tmp_path / "new").mkdir()
+    write_anchored(
+        opened, tmp_path / "new", anchor, version="v2", created="2026-01-02T03:04:05+00:00"
+    )
+    found = verify_map(tmp_path / "new")
+    assert found.manifest.format_version == after
+    assert found.manifest.world.anchor == anchor
+    assert found.manifest.files == opened.manifest.files
+
+
+@pytest.mark.parametrize("version", ["1.3", "2.0"])
+def test_packed_maps_of_both_formats_come_back_as_they_were(
+    folder: Path, tmp_path: Path, version: str
+) -> None:
+    if version == "1.3":
+        as_before_2_0(open_map(folder), tmp_path / "old", version)
+        folder = tmp_path / "old"
+    pack_map(folder, tmp_path / "room.zip")
+    manifest = unpack_map(tmp_path / "room.zip", tmp_path / "unpacked", 2**20)
+    assert manifest.format_version == version
+    assert verify_map(tmp_path / "unpacked").manifest == open_map(folder).manifest
 
 
 def test_keypoints_are_stored_in_small_steps(folder: Path, tmp_path: Path) -> None:
@@ -214,6 +266,21 @@ def test_scales_of_a_model_that_cannot_be_are_refused(
     assert caught.value.code == "map.array"
 
 
+def test_scales_of_scales_widen_nothing(folder: Path) -> None:
+    arrays: dict[str, Any] = {
+        "axes": np.array([[1, 2], [3, 4]], np.int8),
+        "axes" + SCALES: np.array([2, 3], np.float32),
+        "axes" + 2 * SCALES: np.ones(2, np.float32),
+    }
+    np.savez(folder / "model.npz", **arrays)
+    found = read_model(folder, "model.npz")
+    assert found["axes"].tolist() == [[2, 6], [6, 12]]
+    arrays["axes" + SCALES] = np.ones((2, 2), np.int8)
+    np.savez(folder / "model.npz", **arrays)
+    with pytest.raises(MapCorrupt, match="'axes' of a model is not usable"):
+        read_model(folder, "model.npz")
+
+
 def test_what_computed_the_features_is_told(folder: Path, tmp_path: Path) -> None:
     opened = open_map(folder)
     assert opened.manifest.local_features.computed_with is None
@@ -247,6 +314,7 @@ def test_a_map_of_very_many_photos_is_written_with_clusters(clustered: Path) -> 
         ("members", np.array([0, 1], np.uint32), "map.array"),
         ("offsets", np.array([0, 2, 1, 3]), "map.range"),
         ("offsets", np.array([0, 1, 2, 2]), "map.range"),
+        ("offsets", np.array([0, 2**63 - 1, -(2**63), 3]), "map.range"),
         ("offsets", np.array([-1, 1, 2, 3]), "map.range"),
         ("centers", np.full((3, 4), np.nan, np.float32), "map.range"),
     ],

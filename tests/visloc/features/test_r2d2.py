@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import cv2
@@ -247,10 +248,11 @@ class _BrightnessNetwork:
 
     computed_with = "brightness"
 
-    def look(self, image: NDArray[np.float32]) -> Seen:
+    def look(self, image: NDArray[np.float32]) -> AbstractContextManager[Seen]:
         brightness = (image / 255).mean(axis=2)
         logits = np.stack([np.full_like(brightness, 5.0), 9 * brightness - 4])
-        return Seen(logits, lambda x, _: np.full((len(x), 128), 128**-0.5, np.float32))
+        unit = np.float32(128**-0.5)
+        return nullcontext(Seen(logits, lambda x, _: np.full((len(x), 128), unit)))
 
 
 def test_keypoints_of_all_scales_lie_where_the_photo_has_them(tmp_path: Path) -> None:
@@ -301,35 +303,44 @@ def test_openvino_computes_what_torch_does(
 ) -> None:
     folded = fold(ARCHITECTURES[name], read_checkpoint(_save(tmp_path, name, _random_state(name))))
     image = _picture(*size).astype(np.float32)
-    expected = TorchNetwork(folded).look(image)
-    ours = OpenVinoNetwork(folded, None, threads=1).look(image)
-    assert ours.logits.shape == expected.logits.shape
-    np.testing.assert_allclose(ours.logits, expected.logits, rtol=1e-3, atol=2e-3)
-    y, x = np.indices(ours.logits.shape[1:]).reshape(2, -1)
-    difference = ours.descriptors(x, y) - expected.descriptors(x, y)
+    by_torch, by_openvino = TorchNetwork(folded), OpenVinoNetwork(folded, None, threads=1)
+    with by_torch.look(image) as expected, by_openvino.look(image) as ours:
+        assert ours.logits.shape == expected.logits.shape
+        np.testing.assert_allclose(ours.logits, expected.logits, rtol=1e-3, atol=2e-3)
+        y, x = np.indices(ours.logits.shape[1:]).reshape(2, -1)
+        difference = ours.descriptors(x, y) - expected.descriptors(x, y)
     assert np.abs(difference).max() < 1e-4
 
 
 @BOTH
+@pytest.mark.usefixtures("eight_bits")
 def test_8_bits_describe_nearly_the_same_and_twice_the_same(name: str, tmp_path: Path) -> None:
     folded = fold(ARCHITECTURES[name], read_checkpoint(_save(tmp_path, name, _random_state(name))))
     image = _picture(120, 161).astype(np.float32)
-    exact = OpenVinoNetwork(folded, None, threads=1).look(image)
     rounded, again = (
         make_openvino_network(folded, f"random-{name}", in_8_bits=True, threads=threads)
         for threads in (1, 2)
     )
     assert "int8, calibration " in rounded.computed_with
     assert rounded.computed_with == again.computed_with
-    y, x = np.indices(exact.logits.shape[1:]).reshape(2, -1)
-    seen, seen_again = rounded.look(image), again.look(image)
-    descriptors = seen.descriptors(x, y)
-    cosines = _cosines(descriptors, exact.descriptors(x, y))
-    assert 0.99 < np.median(cosines) < 0.99999  # equal would mean that nothing is in 8 bits
-    np.testing.assert_array_equal(seen.logits, seen_again.logits)
-    np.testing.assert_array_equal(descriptors, seen_again.descriptors(x, y))
+    y, x = np.indices(image.shape[:2]).reshape(2, -1)
+
+    def logits_and_descriptors(
+        network: OpenVinoNetwork,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        with network.look(image) as seen:
+            return seen.logits.copy(), seen.descriptors(x, y)
+
+    _, exact = logits_and_descriptors(OpenVinoNetwork(folded, None, threads=1))
+    logits, descriptors = logits_and_descriptors(rounded)
+    logits_again, descriptors_again = logits_and_descriptors(again)
+    # Equal would mean that nothing is in 8 bits.
+    assert 0.99 < np.median(_cosines(descriptors, exact)) < 0.99999
+    np.testing.assert_array_equal(logits, logits_again)
+    np.testing.assert_array_equal(descriptors, descriptors_again)
 
 
+@pytest.mark.usefixtures("eight_bits")
 def test_8_bits_find_the_published_networks_features(
     shared_weights: Path, shared_data: Path
 ) -> None:

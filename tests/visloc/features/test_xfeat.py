@@ -171,6 +171,7 @@ def test_openvino_finds_what_torch_finds(size: tuple[int, int]) -> None:
     assert np.abs(difference).max() < 1e-4
 
 
+@pytest.mark.usefixtures("eight_bits")
 def test_8_bits_find_the_same_and_describe_it_nearly_so() -> None:
     rgb = _picture(160, 224)
     exact = load_xfeat(None, Inference.FP32, 1).extract(rgb, max_keypoints=2000)

@@ -176,6 +176,21 @@ def test_views_without_inliers_do_not_matter() -> None:
     assert pose_covariance([], truth, LOSS_SCALE_PX) is None
 
 
+def test_points_at_the_very_edge_of_a_fisheye_count_as_none() -> None:
+    camera = Camera("OPENCV_FISHEYE", 640, 640, (200.0, 200.0, 320.0, 320.0, 0.0, 0.0, 0.0, 0.0))
+    points = np.random.default_rng(6).uniform([-3.0, -3.0, 1.0], [3.0, 3.0, 5.0], (50, 3))
+    edge = np.vstack([points, [[5.0, 0.0, 2e-5]]])
+    clear, with_edge = (
+        MatchedView(camera, Pose.identity(), project(camera, seen) + 0.5, seen)
+        for seen in (points, edge)
+    )
+    expected = pose_covariance([clear], Pose.identity(), LOSS_SCALE_PX)
+    assert expected is not None
+    found = pose_covariance([with_edge], Pose.identity(), LOSS_SCALE_PX)
+    assert found is not None
+    assert np.array_equal(found, expected)
+
+
 @pytest.mark.parametrize("cams_from_rig", [ALONE, SURROUND[:1] * 2])
 def test_collinear_points_leave_the_covariance_undetermined(cams_from_rig: list[Pose]) -> None:
     points = np.column_stack([np.linspace(-1, 1, 20), np.zeros(20), np.full(20, 3.0)])

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from visloc.geometry import Pose
+from visloc.geometry import Camera, Pose
+from visloc.pose.colmap import project
 from visloc.pose.motion import (
     RelativeMotion,
     UncertainPose,
@@ -18,6 +19,7 @@ from visloc.pose.motion import (
     moved,
 )
 from visloc.pose.pose_graph import Chain, solve_chain
+from visloc.pose.views import MatchedView
 
 RNG = np.random.default_rng(0)
 
@@ -103,6 +105,19 @@ def test_a_pose_between_two_measured_ones_is_their_weighted_mean() -> None:
 def test_motion_alone_leaves_the_poses_undetermined() -> None:
     links = [UncertainPose(some_pose(), np.eye(6) * 1e-4)]
     assert solve_chain(Chain(links, {}, {}), [Pose.identity(), links[0].pose], 3.0, 1.0) is None
+
+
+def test_a_point_at_the_very_edge_of_a_fisheye_does_not_cost_the_poses() -> None:
+    camera = Camera("OPENCV_FISHEYE", 640, 640, (200.0, 200.0, 320.0, 320.0, 0.0, 0.0, 0.0, 0.0))
+    points = np.random.default_rng(4).uniform([-3.0, -3.0, 1.0], [3.0, 3.0, 5.0], (50, 3))
+    found = []
+    for seen in (points, np.vstack([points, [[5.0, 0.0, 2e-5]]])):
+        view = MatchedView(camera, Pose.identity(), project(camera, seen), seen)
+        link = UncertainPose(Pose.identity(), 1e-4 * np.eye(6))
+        solved = solve_chain(Chain([link], {}, {0: [view]}), [Pose.identity()] * 2, 3.0, 1.0)
+        assert solved is not None
+        found.append(solved)
+    assert np.array_equal(found[0][1], found[1][1])
 
 
 def test_motion_that_says_nothing_is_no_link() -> None:

@@ -113,6 +113,38 @@ def test_points_that_leave_the_view_are_no_inliers_and_do_no_harm() -> None:
     assert found.num_inliers == 48
 
 
+def at_the_edge(points: NDArray[np.float64]) -> tuple[MatchedView, Pose]:
+    """What a lens of 180 degrees sees of a hemisphere and of ``points``, and a pose nearby."""
+    camera = Camera("OPENCV_FISHEYE", 640, 640, (200.0, 200.0, 320.0, 320.0, 0.0, 0.0, 0.0, 0.0))
+    rng = np.random.default_rng(1)
+    directions = rng.normal(size=(300, 3))
+    directions[:, 2] = np.abs(directions[:, 2]) + 0.01
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    seen = np.vstack([directions * rng.uniform(3.0, 8.0, (300, 1)), points])
+    pixels = project(camera, seen) + 0.7 * np.random.default_rng(2).normal(size=(len(seen), 2))
+    view = MatchedView(camera, Pose.identity(), pixels, seen)
+    return view, Pose(np.eye(3), np.array([0.05, 0.03, 0.0]))
+
+
+@pytest.mark.parametrize("count", [1, 20])
+def test_points_at_the_very_edge_of_a_fisheye_do_not_stop_the_others(count: int) -> None:
+    """Their errors are numbers, but have no derivative."""
+    angle = np.arange(count)
+    edge = np.column_stack([5.0 * np.cos(angle), 5.0 * np.sin(angle), np.full(count, 2e-5)])
+    (plain, start), (view, _) = at_the_edge(np.empty((0, 3))), at_the_edge(edge)
+    without = refine([plain], start, max_error_px=12.0)
+    found = refine([view], start, max_error_px=12.0)
+    assert without is not None
+    assert found is not None
+    assert np.linalg.norm(without.rig_from_world.translation) < 0.005
+    assert np.linalg.norm(found.rig_from_world.translation) < 0.005
+
+
+def test_points_at_the_very_edge_alone_give_none() -> None:
+    view, start = at_the_edge(np.array([[5.0, 0.0, 2e-5]] * 10))
+    assert refine([view.selected(np.arange(297, 310))], start, max_error_px=12.0) is None
+
+
 def test_too_few_inliers_give_none() -> None:
     views, truth = look(6, 3)
     assert refine(views[:1], truth, max_error_px=12.0) is None
