@@ -386,7 +386,7 @@ def ready_made_maps(maps_dir: Path) -> Path:
     manifest["global_features"][0]["fingerprint"]["name"] = "kapture:Dense"
     with (folder / "global" / "densevlad.model.npz").open("wb") as file:
         np.savez(file)
-    for end in (".npy", ".model.npz"):
+    for end in (".npy", ".scales.npy", ".model.npz"):
         path = folder / "global" / f"kapture-Dense{end}"
         (folder / "global" / f"densevlad{end}").rename(path)
         entry = manifest["files"].pop(f"global/densevlad{end}")

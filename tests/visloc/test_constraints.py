@@ -27,6 +27,7 @@ from visloc.priors import (
     Priors,
     check_covariance,
 )
+from visloc.retrieval.rows import GlobalRows
 from visloc.trajectory import covariance_from_center
 from visloc.types import Answer, Localized, LocalizeOptions, NotLocalized, QueryFeatures, Reason
 
@@ -404,7 +405,7 @@ class Building:
                 observation_offsets=np.arange(2 * NUM_PHOTOS + 1) * num,
                 observation_landmarks=seen.astype(np.uint32),
                 observation_descriptors=self.descriptors.reshape(-1, dim)[seen],
-                global_descriptors={"kapture:B": self.globals.reshape(-1, 64)},
+                global_descriptors={"kapture:B": GlobalRows(self.globals.reshape(-1, 64))},
                 global_models={"kapture:B": {}},
             ),
             None,
