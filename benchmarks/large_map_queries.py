@@ -21,6 +21,7 @@ from visloc.archive import Map, open_map
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose
 from visloc.localizer import Localizer
+from visloc.matching.products import start_threads
 from visloc.retrieval.index import retrieve
 from visloc.types import Localized, LocalizeOptions, QueryFeatures
 
@@ -33,6 +34,7 @@ TOP_K = 20
 
 def main(folder: Path, queries: int = 100) -> None:
     """Open the map, ask it ``queries`` times, print."""
+    start_threads()  # loads torch, once in a process whatever it opens
     started, before = time.perf_counter(), anonymous_mb()
     opened = open_map(folder)
     localizer = Localizer(opened, None)
