@@ -443,7 +443,8 @@ def test_one_photo_too_many_is_refused_at_once(with_engine: WithEngine, query: Q
 
         answers = await asyncio.gather(*accepted)
         assert len(answers) == 3
-        assert answers[2].answer.evidence.seconds["queued"] > 0.1
+        # The sleep began before the third was accepted: it waited most of it, not all.
+        assert answers[2].answer.evidence.seconds["queued"] > 0.05
         await engine.localize(job_for(query))  # there is room again
 
     with_engine(play)
