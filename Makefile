@@ -16,7 +16,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "visloc needs Python 3.11 or newer")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-		--editable '.[mapping,service,s3,tracing,clients,dev]'
+		--editable '.[mapping,service,gem,s3,tracing,clients,compare,dev]'
 	touch $(INSTALLED)
 
 demo: install ## the main job on a synthetic sample: build, serve, localize, picture

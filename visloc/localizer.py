@@ -6,7 +6,7 @@ finds one pose from all images of an instant.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -71,12 +71,18 @@ class Localizer:
         opened: the map.
         extractor: of its local features; None when only features are to be localized, as in maps
             of ready-made features.
+        make_descriptor: of a global descriptor by name, for those that the map has.
 
     Raises:
         Conflict: ``map.features`` when the map was built with other features than those at hand.
     """
 
-    def __init__(self, opened: Map, extractor: LocalFeatureExtractor | None) -> None:
+    def __init__(
+        self,
+        opened: Map,
+        extractor: LocalFeatureExtractor | None,
+        make_descriptor: Callable[[str], GlobalDescriptor] = make_global_descriptor,
+    ) -> None:
         self.map = opened
         self._extractor = extractor
         manifest = opened.manifest
@@ -88,7 +94,7 @@ class Localizer:
         for record in manifest.global_features:
             name = record.fingerprint.name
             if not is_ready_made(name):
-                descriptor = make_global_descriptor(name)
+                descriptor = make_descriptor(name)
                 check_fingerprint(record.fingerprint, descriptor.fingerprint, opened.ref)
                 self._descriptors[name] = descriptor
         self._takes_photos = extractor is not None and len(self._descriptors) == len(

@@ -78,6 +78,7 @@ class CameraSource(StrEnum):
     GIVEN_SCALED = "given_scaled"  # given for another size of the same aspect
     EXIF = "exif"  # focal length from the photo's EXIF
     GUESS = "guess"  # nothing known: 1.2 times the longer side
+    ESTIMATED = "estimated"  # nothing known: found together with the pose
 
 
 class ReadAs(StrEnum):
@@ -108,6 +109,40 @@ class Inference(StrEnum):
     TORCH = "torch"  # the reference; on a CUDA GPU where there is one
 
 
+class Fusion(StrEnum):
+    """How similarities under several global descriptors become one ranking.
+
+    Section 3.2 of Humenberger et al. 2020; ``visloc.retrieval.fusion`` has the formulas.
+    """
+
+    GHARM = "gharm"  # generalized harmonic mean
+    MEAN = "mean"
+    POWER = "power"  # weighted geometric mean
+    MIN = "min"
+    MAX = "max"
+    MEAN_AND_POWER = "mean_and_power"
+    MIN_AND_MAX = "min_and_max"
+    MEAN_AND_MIN = "mean_and_min"
+    HARMONIC = "harmonic"
+    ROUND_ROBIN = "round_robin"
+
+
+class Matcher(StrEnum):
+    """How a query's keypoints are matched with those of a mapping photo."""
+
+    MUTUAL = "mutual"  # mutual nearest neighbours
+    RATIO = "ratio"  # those of them that are clearly nearer than the second nearest
+    LIGHTGLUE = "lightglue"  # the best photos again, by a network made for the local features
+
+
+class Solver(StrEnum):
+    """What searches for a pose among 2D-3D correspondences."""
+
+    PYCOLMAP = "pycolmap"
+    POSELIB = "poselib"
+    REGISTRATION = "registration"  # thresholds and refinement of COLMAP's image_registrator
+
+
 class Reason(StrEnum):
     """Why a photo was not localized."""
 
@@ -125,6 +160,27 @@ class Reason(StrEnum):
 
 # The stages that can give up.
 Stage = Literal["features", "retrieval", "matching", "pose", "gate"]
+
+
+def check_fusion_weights(weights: Mapping[str, float], field: str) -> None:
+    """Make sure that weights of global descriptors mean something.
+
+    Raises:
+        InvalidInput: named like the field.
+    """
+    for name, weight in weights.items():
+        if not 1e-6 <= weight <= 1e6:  # NaN fails too
+            raise InvalidInput(
+                field,
+                "not a weight; leave a descriptor away that shall not count",
+                field=f"{field}.{name}",
+                expected="0.000001 to 1000000",
+                got=weight,
+            )
+    if not weights:
+        raise InvalidInput(
+            field, "no weights", field=field, expected="a weight for one global descriptor or more"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +223,12 @@ class LocalizeOptions:
         read_as: whether to turn the photo upright by its EXIF orientation before finding
             features. Camera, pose and 2D points refer to the pixels as stored either way.
         extraction: the effort that goes into finding the photo's local features.
+        fusion: how similarities under several global descriptors become one ranking; None for the
+            map's way.
+        fusion_weights: positive weight by global descriptor; those without one are left out. None
+            for the map's weights.
+        matcher: how keypoints are matched.
+        solver: what searches for the pose.
         seed: of RANSAC; equal seeds give equal answers.
     """
 
@@ -177,6 +239,10 @@ class LocalizeOptions:
     min_inlier_ratio: float | None = None
     read_as: ReadAs = ReadAs.STORED
     extraction: Extraction = Extraction.DEFAULT
+    fusion: Fusion | None = None
+    fusion_weights: Mapping[str, float] | None = None
+    matcher: Matcher = Matcher.MUTUAL
+    solver: Solver = Solver.PYCOLMAP
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -204,6 +270,8 @@ class LocalizeOptions:
                     expected=f"{low} to {high}",
                     got=value,
                 )
+        if self.fusion_weights is not None:
+            check_fusion_weights(self.fusion_weights, "options.fusion_weights")
 
     @property
     def registration(self) -> RegistrationPreset:

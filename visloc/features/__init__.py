@@ -27,8 +27,8 @@ __all__ = [
     "make_local_features",
 ]
 
-# name -> module and function; functions of local features take the folder with weights or None, how
-# networks are computed, and with how many threads.
+# name -> module and function, which takes the folder with weights or None, how networks are
+# computed, and with how many threads.
 LOCAL_FEATURES: Mapping[str, tuple[str, str]] = {
     "faster2d2": ("visloc.features.r2d2", "load_faster2d2"),
     "r2d2": ("visloc.features.r2d2", "load_r2d2"),
@@ -36,8 +36,8 @@ LOCAL_FEATURES: Mapping[str, tuple[str, str]] = {
     "xfeat": ("visloc.features.xfeat", "load_xfeat"),
 }
 GLOBAL_FEATURES: Mapping[str, tuple[str, str]] = {
-    "densevlad": ("visloc.features.densevlad", "DenseVlad"),
-    "localvlad": ("visloc.features.localvlad", "LocalVlad"),
+    "densevlad": ("visloc.features.densevlad", "load_densevlad"),
+    "localvlad": ("visloc.features.localvlad", "load_localvlad"),
 }
 # XFeat is free for any use and fast; R2D2's published weights are for research only.
 DEFAULT_LOCAL_FEATURES = "xfeat"
@@ -69,14 +69,29 @@ def make_local_features(
     return load(weights_dir, inference, threads)
 
 
-def make_global_descriptor(name: str) -> GlobalDescriptor:
+def make_global_descriptor(
+    name: str,
+    weights_dir: Path | None = None,
+    inference: Inference = Inference.AUTO,
+    threads: int | None = None,
+) -> GlobalDescriptor:
     """Build the global descriptor that a command or a map names.
+
+    Args:
+        name: a name of ``GLOBAL_FEATURES``.
+        weights_dir: folder with network weights.
+        inference: how networks are computed.
+        threads: processor threads for one photo; None for all processors.
 
     Raises:
         InvalidInput: ``features.unknown``.
+        WeightsError: when its weights are missing or not its own.
     """
-    make = cast("Callable[[], GlobalDescriptor]", _find(GLOBAL_FEATURES, name, "global_features"))
-    return make()
+    load = cast(
+        "Callable[[Path | None, Inference, int | None], GlobalDescriptor]",
+        _find(GLOBAL_FEATURES, name, "global_features"),
+    )
+    return load(weights_dir, inference, threads)
 
 
 def _find(registry: Mapping[str, tuple[str, str]], name: str, field: str) -> object:

@@ -7,13 +7,15 @@ things everyone should know to improve object retrieval" (CVPR 2012).
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.features.base import Fingerprint
+from visloc.features.base import Fingerprint, GlobalDescriptor
 from visloc.features.vlad import VLAD_PARAMETERS, VladDescriptor
-from visloc.types import LocalFeatures
+from visloc.types import Inference, LocalFeatures
 
 ORIENTATIONS = 8
 CELLS_PER_SIDE = 4
@@ -26,6 +28,15 @@ CELL_PX = 4
 SMOOTHING_SIGMA_PX = 0.7
 # Grey levels between the neighbours of a pixel, averaged over a patch: below, it is mere noise.
 MIN_CONTRAST = 1.0
+
+
+def load_densevlad(
+    _weights_dir: Path | None = None,
+    _inference: Inference = Inference.AUTO,
+    _threads: int | None = None,
+) -> GlobalDescriptor:
+    """Make the descriptor, which needs no weights."""
+    return DenseVlad()
 
 
 class DenseVlad(VladDescriptor):

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.features.base import Fingerprint
+from visloc.features.base import Fingerprint, GlobalDescriptor
 from visloc.features.vlad import VLAD_PARAMETERS, VladDescriptor
-from visloc.types import LocalFeatures
+from visloc.types import Inference, LocalFeatures
+
+
+def load_localvlad(
+    _weights_dir: Path | None = None,
+    _inference: Inference = Inference.AUTO,
+    _threads: int | None = None,
+) -> GlobalDescriptor:
+    """Make the descriptor, which needs no weights."""
+    return LocalVlad()
 
 
 class LocalVlad(VladDescriptor):
