@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import GlobalFeatures, ImageRecord, Landmarks, Map, MapContent, write_map
-from visloc.features.vlad import VOCABULARY_SIZE, WHITENING_MAX_DIMS
+from visloc.features.vlad import VOCABULARY_SIZE
+from visloc.features.whitening import WHITENING_MAX_DIMS
 from visloc.geometry import Pose
 
 PITCH_M = 10.0

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -22,7 +23,7 @@ from mapping.build import BuildSettings, build_map
 from mapping.sfm import SfmSettings
 from visloc.archive import Map, open_map
 from visloc.evaluation import pose_error
-from visloc.features import DEFAULT_LOCAL_FEATURES, make_local_features
+from visloc.features import DEFAULT_LOCAL_FEATURES, make_global_descriptor, make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localizer import Localizer
@@ -51,7 +52,11 @@ class Stopwatch:
 def measure(opened: Map, query: Path, weights_dir: Path | None) -> tuple[int, np.ndarray]:
     """Localize the queries; return how many there are, and the errors (n, 2) in m and degrees."""
     name = opened.manifest.local_features.fingerprint.name
-    localizer = Localizer(opened, make_local_features(name, weights_dir))
+    localizer = Localizer(
+        opened,
+        make_local_features(name, weights_dir),
+        partial(make_global_descriptor, weights_dir=weights_dir),
+    )
     dataset = read_dataset(query)
     errors = []
     for record in dataset.images:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -22,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from visloc.archive import MapStore
 from visloc.evaluation import percentile, pose_error
-from visloc.features import make_local_features
+from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Camera, Pose
 from visloc.images import ImageLimits, read_photo
 from visloc.kapture import Dataset, read_dataset
@@ -318,7 +319,11 @@ def main(
     """Harm, localize, print."""
     opened = MapStore(maps_dir).open(map_ref)
     name = opened.manifest.local_features.fingerprint.name
-    localizer = Localizer(opened, make_local_features(name, weights_dir))
+    localizer = Localizer(
+        opened,
+        make_local_features(name, weights_dir),
+        partial(make_global_descriptor, weights_dir=weights_dir),
+    )
     rig, moments = read_moments(query)
     bench = Bench(localizer, rig, time_unit)
     _one_camera_harmed(bench, moments, harmed or next(iter(rig)))

@@ -152,6 +152,9 @@ def parse_map(raw: JsonObject) -> MapInfo:
         current=bool(raw["current"]),
         versions=tuple(VersionInfo(v["version"], bool(v["current"])) for v in raw["versions"]),
         content_hash=raw["content_hash"],
+        # A server that does not know them leaves them out.
+        fusion=raw.get("fusion") or None,
+        fusion_weights=_numbers_by_name(raw.get("fusion_weights") or {}),
     )
 
 

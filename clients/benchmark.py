@@ -13,7 +13,7 @@ import numpy as np
 from clients.modes import Mode
 from clients.queries import Query
 from clients.running import InstantOutcome, Outcome
-from clients.traced import estimate_of
+from clients.traced import estimate_of, measured
 from clients.types import MapInfo, ServerInfo
 from visloc.errors import InvalidInput
 from visloc.evaluation import (
@@ -118,7 +118,7 @@ def make_report(
         server: that answered.
         map_info: the map that was asked for.
     """
-    modes = {mode.value: _figures(run, poses[mode], thresholds) for mode, run in runs.items()}
+    modes = {mode.value: figures_of(run, poses[mode], thresholds) for mode, run in runs.items()}
     first = next(iter(modes.values()))
     return {
         **{name: first[name] for name in _FIGURES_OF_THE_FIRST},
@@ -140,9 +140,20 @@ _FIGURES_OF_THE_FIRST = (
 )
 
 
-def _figures(
+def known_poses(run: Run) -> list[TracedPose | None]:
+    """Return what the answers themselves tell: measured poses, and those filled from a rig's."""
+    return [
+        o.filled
+        if o.result is None or o.result.pose is None
+        else measured(o.result.pose, o.result.inliers)
+        for o in run.outcomes
+    ]
+
+
+def figures_of(
     run: Run, poses: Sequence[TracedPose | None], thresholds: Sequence[Threshold]
 ) -> dict[str, Any]:
+    """Summarize one run, as ``make_report`` says."""
     errors = pose_errors(run.outcomes, poses)
     num_with_truth = sum(outcome.query.truth is not None for outcome in run.outcomes)
     median_position_m, median_orientation_deg = median_errors_localized(errors)

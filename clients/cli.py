@@ -14,8 +14,9 @@ from rich.console import Console
 
 from clients.asking import Asking
 from clients.batch import Batch, finish_batch, open_batch, run_batch, run_instants
-from clients.benchmark import Run, make_report, parse_threshold
+from clients.benchmark import Run, known_poses, make_report
 from clients.client import DEFAULT_TIMEOUT_S, AsyncClient, Client
+from clients.compare_cli import compare
 from clients.connection_options import DEFAULT_SERVER, ApiKeyFile, Ca, Server, TimeoutS, api_key_of
 from clients.display import (
     UNKNOWN_UNIT,
@@ -32,15 +33,24 @@ from clients.modes import DEFAULT_MAX_GAP_S, Arrangement, Mode, arrange, parse_m
 from clients.priors import priors_from_text
 from clients.progress import run_with_progress
 from clients.queries import read_queries
+from clients.query_options import (
+    FeaturesDir,
+    MapRef,
+    Options,
+    Origin,
+    Seed,
+    Source,
+    Thresholds,
+    options_of,
+    thresholds_of,
+)
 from clients.results import check_can_be_written, write_poses, write_whole
 from clients.running import InstantOutcome, Outcome
 from clients.sending import choose_reader
-from clients.traced import measured
-from clients.types import LocalizeOptions, PoseEstimate
+from clients.types import PoseEstimate
 from visloc.errors import VislocError
-from visloc.evaluation import DEFAULT_THRESHOLDS
 from visloc.geometry import Camera, PixelOrigin
-from visloc.trajectory import TimeUnit, TracedPose
+from visloc.trajectory import TimeUnit
 
 EXIT_ERROR = 1  # 2 is wrong usage, by convention
 EXIT_NOT_LOCALIZED = 3
@@ -55,43 +65,8 @@ app = typer.Typer(
 _out = Console()
 _err = Console(stderr=True)
 
-MapRef = Annotated[str, typer.Option("--map", metavar="ID", help="id, or id@version.")]
-Options = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--option",
-        metavar="NAME=VALUE",
-        help="preset, top_k, max_error_px, min_inliers, min_inlier_ratio, read_as, extraction "
-        "(fast, default, accurate) or seed; can be repeated.",
-    ),
-]
-Seed = Annotated[int | None, typer.Option("--seed", min=0, help="The same as --option seed=...")]
 Concurrency = Annotated[
     int, typer.Option("--concurrency", min=1, max=1024, help="Photos asked about at once.")
-]
-Source = Annotated[
-    Path,
-    typer.Argument(
-        metavar="DATASET_OR_LIST",
-        help="A kapture folder, or a text file with lines 'image_name' or "
-        "'image_name MODEL width height params...', names relative to its folder.",
-    ),
-]
-FeaturesDir = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="DIR",
-        help="For a map of ready-made features (kapture:TYPE): the features of the photos, where "
-        "they are not in the dataset.",
-    ),
-]
-Origin = Annotated[
-    PixelOrigin,
-    typer.Option(
-        "--pixel-origin",
-        help="What the dataset's principal points and ready-made keypoints call the centre of the "
-        "top-left pixel: corner, (0.5, 0.5), or center, (0, 0).",
-    ),
 ]
 _MODES = (
     "single: each photo on its own. rig: a photo without a pose gets that of the best camera of "
@@ -124,12 +99,14 @@ RigOption = Annotated[
     ),
 ]
 app.add_typer(maps_app, name="maps")
+app.command()(compare)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command and exit; errors are one line, not a traceback."""
     try:
-        app(arguments)
+        # compare writes down how it was called.
+        app(arguments, obj=tuple(sys.argv[1:] if arguments is None else arguments))
     except VislocError as error:
         _fail(error.code, str(error))
     except OSError as error:  # a full disk, a folder without permission
@@ -145,7 +122,7 @@ def image(
         typer.Option(
             metavar="MODEL,W,H,PARAMS...",
             help="Intrinsics, such as PINHOLE,640,480,525,525,320,240. Without them the server "
-            "uses the focal length in EXIF, or guesses.",
+            "uses the focal length in EXIF, or estimates or guesses one.",
         ),
     ] = None,
     server: Server = DEFAULT_SERVER,
@@ -173,7 +150,7 @@ def image(
 
     Exits with 0 when localized, 3 when not localized, 1 on an error, 2 on wrong usage.
     """
-    options = _options(option, seed)
+    options = options_of(option, seed)
     intrinsics = None if camera is None else Camera.from_text(camera)
     known = None if priors is None else priors_from_text(priors)
     check_can_be_written([] if debug is None else [debug])
@@ -227,7 +204,7 @@ def localize_batch(
 
     Exits with 0 when every photo has its line, 1 on an error, 130 when stopped.
     """
-    options = _options(option, seed)
+    options = options_of(option, seed)
     queries = read_queries(source, pixel_origin)
     key = api_key_of(api_key_file)
     with Client(server, api_key=key, ca=ca, timeout_s=timeout_s) as client:
@@ -296,14 +273,7 @@ def benchmark(
     rig: RigOption = None,
     features_dir: FeaturesDir = None,
     pixel_origin: Origin = PixelOrigin.CORNER,
-    threshold: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="METRES/DEGREES",
-            help="A row of the accuracy table; can be repeated. Without it: "
-            "0.05/5, 0.25/2, 0.5/5, 5/10.",
-        ),
-    ] = None,
+    threshold: Thresholds = None,
     poses: Annotated[
         Path | None,
         typer.Option(
@@ -324,9 +294,9 @@ def benchmark(
 
     Exits with 0 when done, 1 on an error, 130 when stopped; then there is no report.
     """
-    options = _options(option, seed)
+    options = options_of(option, seed)
     modes = parse_modes(mode or ())
-    thresholds = [parse_threshold(text) for text in threshold or ()] or DEFAULT_THRESHOLDS
+    thresholds = thresholds_of(threshold)
     check_can_be_written([report] if poses is None else [report, poses])
     queries = read_queries(source, pixel_origin)
     key = api_key_of(api_key_file)
@@ -340,7 +310,7 @@ def benchmark(
     of_instants = ask.instants(arrangement) if Mode.GP3P in modes else None
     runs = {m: of_instants if m is Mode.GP3P else of_photos for m in modes}
     figures_of = {m: run for m, run in runs.items() if run is not None}
-    poses_of = {m: arrangement.fill(m, _known(run)) for m, run in figures_of.items()}
+    poses_of = {m: arrangement.fill(m, known_poses(run)) for m, run in figures_of.items()}
     figures = make_report(figures_of, poses_of, thresholds, about, info)
     write_whole(report, [json.dumps(figures, indent=2, allow_nan=False).encode() + b"\n"])
     if poses is not None:
@@ -352,16 +322,6 @@ def benchmark(
     num_with_truth = sum(query.truth is not None for query in queries.photos)
     print_report(_out, figures, num_with_truth, len(failed), unit_of(info))
     print_failed(_err, list(failed.values()))
-
-
-def _known(run: Run) -> list[TracedPose | None]:
-    """Return what the answers themselves tell: measured poses, and those filled from a rig's."""
-    return [
-        o.filled
-        if o.result is None or o.result.pose is None
-        else measured(o.result.pose, o.result.inliers)
-        for o in run.outcomes
-    ]
 
 
 def _measured_poses(run: Run) -> Iterator[tuple[str, PoseEstimate]]:
@@ -384,10 +344,6 @@ def _unit(client: Client, map_ref: str) -> str:
     except VislocError as error:  # the pose is here already, and worth more than its unit
         print_line(_err, "unit unknown", f"[{error.code}] {error}", "yellow")
         return UNKNOWN_UNIT
-
-
-def _options(texts: Sequence[str] | None, seed: int | None) -> LocalizeOptions:
-    return LocalizeOptions.from_texts([*(texts or ()), *([] if seed is None else [f"seed={seed}"])])
 
 
 def _fail(code: str, message: str) -> NoReturn:

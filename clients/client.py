@@ -125,7 +125,8 @@ class Client:
                 the features that were found in it, which need a camera.
             map: ``id`` or ``id@version``; of several, the best answer counts; or those that
                 are anchored around a place, as ``Near``.
-            camera: intrinsics; without them the server uses EXIF or guesses, and says so.
+            camera: intrinsics; without them the server uses EXIF, estimates or guesses, and says
+                so.
             options: choices for this photo.
             request_id: names the request in the server's logs; made up there when None.
             priors: what is known of the camera, also as the API's JSON.

@@ -20,6 +20,7 @@ _CAMERA_SOURCES: Mapping[str, str] = {
     "given": "as given",
     "given_scaled": "as given, scaled to the size of the photo",
     "exif": "from the focal length in EXIF",
+    "estimated": "estimated with the pose: give --camera for a better one",
     "guess": "a guess: give --camera for a better pose",
 }
 # What a filled pose rests on.

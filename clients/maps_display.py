@@ -32,6 +32,8 @@ def print_map(console: Console, info: MapInfo) -> None:
     print_line(console, "in use", "yes" if info.current else "no")
     print_line(console, "created", f"{info.created}, by {info.method}")
     print_line(console, "features", _features(info))
+    if info.fusion is not None:
+        print_line(console, "fusion", _fusion(info))
     print_line(
         console,
         "content",
@@ -48,6 +50,11 @@ def print_map(console: Console, info: MapInfo) -> None:
         used = "  in use" if version.current else ""
         print_line(console, "" if number else "versions", f"{version.version}{used}")
     print_line(console, "content hash", info.content_hash)
+
+
+def _fusion(info: MapInfo) -> str:
+    weights = ", ".join(f"{name} {weight:g}" for name, weight in info.fusion_weights.items())
+    return f"{info.fusion} ({weights})" if weights else f"{info.fusion}"
 
 
 def _features(info: MapInfo) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from google.protobuf.json_format import ParseDict
@@ -124,7 +124,10 @@ def _set_search(
     if search.ypr:
         message.ypr = True
     for name, value in search.options.given().items():
-        setattr(message.options, name, value)
+        if isinstance(value, Mapping):
+            getattr(message.options, name).update(value)
+        else:
+            setattr(message.options, name, value)
     if priors := priors_as_json(search.priors):
         ParseDict(priors, message.priors)
     if search.request_id is not None:

@@ -88,20 +88,32 @@ async def localize_all(
     """
 
     async def work(query: Query) -> None:
-        started = time.perf_counter()
-        try:
-            sent = await asyncio.to_thread(read, query)
-            started = time.perf_counter()
-            result = await _ask_patiently(
-                lambda: client.localize(sent, map_ref, query.camera, options)
-            )
-        except VislocError as error:
-            _raise_unless_of_one(error)
-            on_outcome(Outcome(query, None, error, time.perf_counter() - started))
-        else:
-            on_outcome(Outcome(query, result, None, time.perf_counter() - started))
+        on_outcome(await localize_one(client, query, map_ref, options, read))
 
     await _work_through(queries, concurrency, work)
+
+
+async def localize_one(
+    client: AsyncClient,
+    query: Query,
+    map_ref: str,
+    options: LocalizeOptions,
+    read: Callable[[Query], bytes | Features],
+) -> Outcome:
+    """Localize one photo, as ``localize_all`` does.
+
+    Raises:
+        VislocError: what would be refused with every photo, or makes going on pointless.
+    """
+    started = time.perf_counter()
+    try:
+        sent = await asyncio.to_thread(read, query)
+        started = time.perf_counter()
+        result = await _ask_patiently(lambda: client.localize(sent, map_ref, query.camera, options))
+    except VislocError as error:
+        _raise_unless_of_one(error)
+        return Outcome(query, None, error, time.perf_counter() - started)
+    return Outcome(query, result, None, time.perf_counter() - started)
 
 
 async def localize_instants(

@@ -74,6 +74,12 @@ class FeatureReader:
         )
 
 
+def takes_features(info: MapInfo) -> bool:
+    """Whether a map has ready-made features, and so takes no photos."""
+    names = (info.local_features, *info.global_features)
+    return any(name.startswith(READY_MADE_PREFIX) for name in names)
+
+
 def choose_reader(
     source: Path, info: MapInfo, features_dir: Path | None, origin: PixelOrigin
 ) -> Reader:
@@ -90,7 +96,7 @@ def choose_reader(
         DatasetError: ``kapture.*`` when the dataset has no such features.
     """
     ready_made = [name for name in info.global_features if name.startswith(READY_MADE_PREFIX)]
-    if not ready_made and not info.local_features.startswith(READY_MADE_PREFIX):
+    if not takes_features(info):
         if features_dir is not None:
             raise InvalidInput(
                 "queries.features_dir",

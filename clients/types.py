@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -14,11 +14,11 @@ from clients.geopose import GeoPose, GeoPoseYpr
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 
-OptionValue = int | float | str
+OptionValue = int | float | str | Mapping[str, float]
 
 # On the wire whole numbers are uint32. Narrower ranges are the server's to tell.
 _MAX_WHOLE = 2**32 - 1
-_OPTION_KINDS: Mapping[str, type[int] | type[float] | type[str]] = {
+_OPTION_KINDS: Mapping[str, type[OptionValue]] = {
     "preset": str,
     "top_k": int,
     "max_error_px": float,
@@ -26,9 +26,18 @@ _OPTION_KINDS: Mapping[str, type[int] | type[float] | type[str]] = {
     "min_inlier_ratio": float,
     "read_as": str,
     "extraction": str,
+    "fusion": str,
+    "fusion_weights": dict,
+    "matcher": str,
+    "solver": str,
     "seed": int,
 }
-_EXPECTED = {int: f"a whole number from 0 to {_MAX_WHOLE}", float: "a finite number", str: "a text"}
+_EXPECTED = {
+    int: f"a whole number from 0 to {_MAX_WHOLE}",
+    float: "a finite number",
+    str: "a text",
+    dict: "a number for each of some global descriptors, such as densevlad:1,localvlad:2",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +54,12 @@ class LocalizeOptions:
             features are found; the pose refers to the pixels as stored either way.
         extraction: the effort that goes into finding the photo's features: fast, default or
             accurate. Features that are sent are taken as they are.
+        fusion: how similarities under several global descriptors become one ranking, such as
+            gharm or mean; None for the map's way.
+        fusion_weights: positive weight by global descriptor; those without one are left out. None
+            for the map's weights.
+        matcher: how keypoints are matched: mutual, ratio or lightglue.
+        solver: what searches for the pose: pycolmap, poselib or registration.
         seed: of RANSAC; equal seeds give equal answers.
 
     Raises:
@@ -58,6 +73,10 @@ class LocalizeOptions:
     min_inlier_ratio: float | None = None
     read_as: str | None = None
     extraction: str | None = None
+    fusion: str | None = None
+    fusion_weights: Mapping[str, float] | None = None
+    matcher: str | None = None
+    solver: str | None = None
     seed: int | None = None
 
     def __post_init__(self) -> None:
@@ -78,7 +97,7 @@ class LocalizeOptions:
 
     @staticmethod
     def from_texts(texts: Iterable[str]) -> LocalizeOptions:
-        """Parse ``NAME=VALUE``, as the command line has them.
+        """Parse ``NAME=VALUE``, as the command line has them; weights are ``NAME:NUMBER,...``.
 
         Raises:
             InvalidInput: ``options.syntax``, ``request.unknown_field`` or ``options.NAME``.
@@ -96,15 +115,19 @@ class LocalizeOptions:
                 )
             _check_option_name(name)
             try:
-                values[name] = _OPTION_KINDS[name](value)
+                values[name] = _PARSERS[_OPTION_KINDS[name]](value)
             except ValueError:
                 raise _not_usable(name, value) from None
         return LocalizeOptions.from_mapping(values)
 
     def given(self) -> dict[str, OptionValue]:
         """The options that are not left to the server, by name."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: value for name, value in values.items() if value is not None}
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {
+            name: dict(value) if isinstance(value, Mapping) else value
+            for name, value in values.items()
+            if value is not None
+        }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,7 +192,7 @@ class CameraUsed:
 
     Attributes:
         camera: for the pixels as stored.
-        source: given, given_scaled (from another size), exif, or guess.
+        source: given, given_scaled (from another size), exif, estimated (with the pose), or guess.
     """
 
     camera: Camera
@@ -278,13 +301,13 @@ class Near:
     radius: float
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
+        for each in fields(self):
+            value = getattr(self, each.name)
             if not _can_be_sent(value, float):
                 raise InvalidInput(
-                    f"near.{field.name}",
+                    f"near.{each.name}",
                     "not usable",
-                    field=f"near.{field.name}",
+                    field=f"near.{each.name}",
                     expected=_EXPECTED[float],
                     got=value,
                 )
@@ -391,6 +414,9 @@ class MapInfo:
         current: whether this version is in use.
         versions: all published ones of the map, oldest first.
         content_hash: equal maps have equal ones, whatever they are called.
+        fusion: of the global features, unless a query says otherwise; None when an older server
+            does not say.
+        fusion_weights: by global feature; empty when all count alike.
     """
 
     id: str
@@ -412,6 +438,8 @@ class MapInfo:
     current: bool
     versions: tuple[VersionInfo, ...]
     content_hash: str
+    fusion: str | None = None
+    fusion_weights: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def ref(self) -> str:
@@ -441,6 +469,24 @@ def _check_option_name(name: str) -> None:
         )
 
 
+def _weights(text: str) -> dict[str, float]:
+    weights: dict[str, float] = {}
+    for part in text.split(","):
+        name, _, number = part.rpartition(":")  # a name may be kapture:TYPE
+        if not name or name in weights:
+            raise ValueError(part)
+        weights[name] = float(number)
+    return weights
+
+
+_PARSERS: Mapping[type, Callable[[str], OptionValue]] = {
+    int: int,
+    float: float,
+    str: str,
+    dict: _weights,
+}
+
+
 def _can_be_sent(value: object, kind: type) -> bool:
     if isinstance(value, bool):
         return False
@@ -448,6 +494,13 @@ def _can_be_sent(value: object, kind: type) -> bool:
         return isinstance(value, int) and 0 <= value <= _MAX_WHOLE
     if kind is float:
         return isinstance(value, int | float) and math.isfinite(value)
+    if kind is dict:
+        return (
+            isinstance(value, Mapping)
+            and len(value) > 0
+            and all(name and _can_be_sent(name, str) for name in value)
+            and all(_can_be_sent(weight, float) for weight in value.values())
+        )
     return isinstance(value, str) and value.isprintable()
 
 

@@ -2,18 +2,20 @@
 
 python examples/localize_in_process.py MAPS_DIR MAP PHOTO [MODEL,W,H,PARAMS...]
 
-Maps of r2d2 and faster2d2 find their weights in the folder that VISLOC_WEIGHTS_DIR names.
+Maps of features with weights of their own, such as r2d2, find them in the folder that
+VISLOC_WEIGHTS_DIR names.
 """
 
 from __future__ import annotations
 
 import os
 import sys
+from functools import partial
 from pathlib import Path
 
 from visloc import Camera
 from visloc.archive import MapStore
-from visloc.features import make_local_features
+from visloc.features import make_global_descriptor, make_local_features
 from visloc.images import read_photo_file
 from visloc.localizer import Localizer
 from visloc.types import Localized, LocalizeOptions
@@ -22,11 +24,14 @@ from visloc.types import Localized, LocalizeOptions
 def main(maps_dir: str, map_ref: str, photo_path: str, camera: str | None = None) -> None:
     """Print where the photo was taken, or why that is not known."""
     opened = MapStore(Path(maps_dir)).open(map_ref)
-    weights_dir = os.environ.get("VISLOC_WEIGHTS_DIR")
-    extractor = make_local_features(
-        opened.manifest.local_features.fingerprint.name, Path(weights_dir) if weights_dir else None
+    folder = os.environ.get("VISLOC_WEIGHTS_DIR")
+    weights_dir = Path(folder) if folder else None
+    name = opened.manifest.local_features.fingerprint.name
+    localizer = Localizer(
+        opened,
+        make_local_features(name, weights_dir),
+        partial(make_global_descriptor, weights_dir=weights_dir),
     )
-    localizer = Localizer(opened, extractor)
     answer = localizer.localize(
         read_photo_file(Path(photo_path)),
         Camera.from_text(camera) if camera else None,

@@ -21,6 +21,7 @@ from mapping.features import (
     ReadyMadeFeatures,
     describe_photos,
     find_local_features,
+    open_descriptor,
     open_extractor,
     read_global_features,
 )
@@ -51,15 +52,12 @@ from visloc.archive import (
     write_map,
 )
 from visloc.errors import Conflict, InvalidInput, Unavailable
-from visloc.features import (
-    DEFAULT_GLOBAL_FEATURES,
-    DEFAULT_LOCAL_FEATURES,
-    make_global_descriptor,
-)
+from visloc.features import DEFAULT_GLOBAL_FEATURES, DEFAULT_LOCAL_FEATURES
 from visloc.features.readymade import is_ready_made, ready_made_type
 from visloc.geometry import PixelOrigin, Pose
 from visloc.kapture import Dataset, open_features, open_local_features, read_dataset
-from visloc.types import Inference
+from visloc.retrieval.fusion import EQUAL_GHARM, LateFusion
+from visloc.types import Inference, check_fusion_weights
 
 # How landmarks are made: from depth, from matches, or from points that the dataset brings along.
 METHODS = ("rgbd", "sfm", "model")
@@ -81,6 +79,7 @@ class BuildSettings:
         local_features: a name of ``visloc.features.LOCAL_FEATURES``, or ``kapture:TYPE`` for
             features that the dataset brings along.
         global_features: names of ``visloc.features.GLOBAL_FEATURES``, or ``kapture:TYPE``.
+        fusion: how queries fuse them, unless they say otherwise.
         features_dir: where ready-made features lie, when not in the dataset.
         pixel_origin: what the dataset's principal points and ready-made keypoints count from.
         weights_dir: folder with network weights.
@@ -104,6 +103,7 @@ class BuildSettings:
     method: str = "rgbd"
     local_features: str = DEFAULT_LOCAL_FEATURES
     global_features: tuple[str, ...] = DEFAULT_GLOBAL_FEATURES
+    fusion: LateFusion = EQUAL_GHARM
     features_dir: Path | None = None
     pixel_origin: PixelOrigin = PixelOrigin.CORNER
     weights_dir: Path | None = None
@@ -226,10 +226,22 @@ def _check(settings: BuildSettings) -> None:
             expected="one or more names, each once",
             got=",".join(names),
         )
+    if settings.fusion.weights is not None:
+        check_fusion_weights(settings.fusion.weights, "build.fusion_weights")
+        unknown = [name for name in settings.fusion.weights if name not in names]
+        if unknown:
+            raise InvalidInput(
+                "build.fusion_weights",
+                "weights of global features that the map will not have",
+                field="--fusion-weights",
+                expected=f"of {', '.join(names)}",
+                got=",".join(unknown),
+            )
     for name in names:
         if is_ready_made(name):
             continue
-        if make_global_descriptor(name).needs_image and is_ready_made(settings.local_features):
+        descriptor = open_descriptor(name, settings.weights_dir, settings.inference)
+        if descriptor.needs_image and is_ready_made(settings.local_features):
             raise InvalidInput(
                 "build.global_features",
                 f"{name} is made of the photo, which is not there when features are sent instead",
@@ -321,7 +333,16 @@ def _build(
     global_features = [
         brought[name]
         if name in brought
-        else describe_photos(work, photos, features, name, workers, progress)
+        else describe_photos(
+            work,
+            photos,
+            features,
+            name,
+            settings.weights_dir,
+            settings.inference,
+            workers,
+            progress,
+        )
         for name in settings.global_features
     ]
     made = _make_landmarks(
@@ -491,6 +512,7 @@ def _content(
         ),
         anchor=made.anchor,
         gravity=gravity,
+        fusion=settings.fusion,
     )
 
 

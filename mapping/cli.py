@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -40,6 +41,8 @@ from mapping.options import (
     DatasetArgument,
     FarOption,
     FeaturesDirOption,
+    FusionOption,
+    FusionWeightsOption,
     GlobalFeaturesOption,
     InferenceOption,
     LocalFeaturesOption,
@@ -69,13 +72,15 @@ from visloc.archive import MapStore, open_map, verify_map
 from visloc.errors import InvalidInput, VislocError
 from visloc.features import (
     DEFAULT_LOCAL_FEATURES,
+    make_global_descriptor,
     make_local_features,
 )
 from visloc.features.readymade import is_ready_made
 from visloc.geometry import PixelOrigin
 from visloc.kapture import read_dataset
 from visloc.localizer import Localizer
-from visloc.types import Inference
+from visloc.retrieval.fusion import LateFusion
+from visloc.types import Fusion, Inference
 
 app = typer.Typer(
     name="mapping",
@@ -103,6 +108,8 @@ def build(
     ] = METHODS[0],
     local_features: BuildLocalFeaturesOption = DEFAULT_LOCAL_FEATURES,
     global_features: GlobalFeaturesOption = GLOBAL_DEFAULT,
+    fusion: FusionOption = Fusion.GHARM,
+    fusion_weights: FusionWeightsOption = None,
     features_dir: FeaturesDirOption = None,
     pixel_origin: PixelOriginOption = PixelOrigin.CORNER,
     weights_dir: WeightsDirOption = None,
@@ -199,6 +206,9 @@ def build(
         method=method,
         local_features=local_features,
         global_features=_names(global_features),
+        fusion=LateFusion(
+            fusion, None if fusion_weights is None else _parse_weights(fusion_weights)
+        ),
         features_dir=features_dir,
         pixel_origin=pixel_origin,
         weights_dir=weights_dir,
@@ -551,7 +561,8 @@ def verify(
     _out.print(f"{opened.ref}: {num_files} files, every byte as published", soft_wrap=True)
     name = opened.manifest.local_features.fingerprint.name
     extractor = None if is_ready_made(name) else make_local_features(name, weights_dir)
-    Localizer(opened, extractor)  # raises when they differ
+    make_descriptor = partial(make_global_descriptor, weights_dir=weights_dir)
+    Localizer(opened, extractor, make_descriptor)  # raises when they differ
     names = (name, *(record.fingerprint.name for record in opened.manifest.global_features))
     _out.print(f"{', '.join(names)}: the same features as here", soft_wrap=True)
 
@@ -627,6 +638,23 @@ def _fail(code: str, message: str) -> NoReturn:
 
 def _names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",")) if text.strip() else ()
+
+
+def _parse_weights(text: str) -> dict[str, float]:
+    items = [item.rpartition("=") for item in _names(text)]
+    try:
+        weights = {name: float(weight) for name, _, weight in items}
+    except ValueError:
+        weights = {}
+    if not weights or len(weights) < len(items) or "" in weights:
+        raise InvalidInput(
+            "build.fusion_weights",
+            "not weights of global features",
+            field="--fusion-weights",
+            expected="NAME=WEIGHT,... such as densevlad=1,localvlad=2, each name once",
+            got=text,
+        )
+    return weights
 
 
 def _parse_vector(option: str, text: str) -> tuple[float, float, float]:

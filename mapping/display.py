@@ -14,6 +14,7 @@ from mapping.georeference import Georeference
 from mapping.importers import ImportSummary
 from mapping.rig_calibration import OUTLIER_MULTIPLE, RigCalibration, Spread
 from visloc.archive import Map
+from visloc.retrieval.fusion import EQUAL_GHARM
 
 # More lines than anyone reads.
 _SHOWN_RESIDUALS = 20
@@ -56,6 +57,7 @@ def print_map(out: Console, opened: Map) -> None:
         "global features": ", ".join(
             f"{g['fingerprint']['name']} ({g['dim']})" for g in summary["global_features"]
         ),
+        **_retrieval(opened),
         "extent": " x ".join(f"{side:.2f}" for side in sides)
         + (" m" if summary["world"]["metric"] else " (not metric)"),
         "world": _world(opened),
@@ -74,6 +76,19 @@ def print_map(out: Console, opened: Map) -> None:
     out.print(table)
     for note in summary["notes"]:
         out.print(f"note: {note}", markup=False, soft_wrap=True)
+
+
+def _retrieval(opened: Map) -> dict[str, str]:
+    """How global features are fused, where the map was given another way than the usual."""
+    if opened.fusion == EQUAL_GHARM:
+        return {}
+    weights = opened.fusion.weights
+    counted = (
+        "equal weights"
+        if weights is None
+        else ", ".join(f"{name} x {weight:g}" for name, weight in weights.items())
+    )
+    return {"fused by": f"{opened.fusion.operator}, {counted}"}
 
 
 def _world(opened: Map) -> str:

@@ -77,7 +77,8 @@ def export_features(
             )
         for features in global_from.manifest.global_features:
             name = features.fingerprint.name
-            descriptors[name] = (make_global_descriptor(name), global_from.global_models[name])
+            descriptor = make_global_descriptor(name, weights_dir, inference)
+            descriptors[name] = (descriptor, global_from.global_models[name])
     _write_records(dataset, output)
     reconstruction = output / "reconstruction"
     settings = {

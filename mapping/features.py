@@ -44,6 +44,14 @@ Progress = Callable[[str, int, int], None]
 _VOCABULARY_PHOTOS, _PROJECTION_PHOTOS = 200, 2048
 # Raw vectors of this many photos are projected at a time: 64 MB of DenseVLAD.
 _PROJECTED_TOGETHER = 1024
+# What a descriptor is given that does not need them.
+_NO_PIXELS = np.empty((0, 0, 3), np.uint8)
+_NO_FEATURES = LocalFeatures(
+    keypoints=np.empty((0, 2), np.float32),
+    descriptors=np.empty((0, 1), np.float32),
+    scores=np.empty(0, np.float32),
+    scales=np.empty(0, np.float32),
+)
 # Raised when the code of a stage here changes what comes out.
 _REVISION = {"local_features": 1, "words": 1, "vocabulary": 1, "pooled": 1, "projection": 1}
 
@@ -227,6 +235,16 @@ def open_extractor(
     return make_local_features(name, weights_dir, inference, threads=1)
 
 
+@cache
+def open_descriptor(name: str, weights_dir: Path | None, inference: Inference) -> GlobalDescriptor:
+    """Return the global descriptor of this process; it uses one thread, as ``Workers`` has it.
+
+    Raises:
+        WeightsError, InvalidInput: what ``make_global_descriptor`` raises.
+    """
+    return make_global_descriptor(name, weights_dir, inference, threads=1)
+
+
 def find_local_features(
     source: LocalFeaturesSource,
     photos: Sequence[MappingPhoto],
@@ -242,25 +260,45 @@ def describe_photos(
     photos: Sequence[MappingPhoto],
     features: LocalFeaturesSource,
     name: str,
+    weights_dir: Path | None,
+    inference: Inference,
     workers: Workers,
     progress: Progress,
 ) -> GlobalFeatures:
-    """Learn one global descriptor's model on the photos, and describe them with it."""
-    descriptor = make_global_descriptor(name)
-    fingerprint = _json(descriptor.fingerprint)
-    task = _DescribeTask(work, features, name, fingerprint)
+    """Learn one global descriptor's model on the photos, and describe them with it.
+
+    Raises:
+        WeightsError, InvalidInput: what ``make_global_descriptor`` raises.
+    """
+    descriptor = open_descriptor(name, weights_dir, inference)
+    task = _DescribeTask(
+        work,
+        features,
+        name,
+        weights_dir,
+        inference,
+        _json(descriptor.fingerprint),
+        descriptor.computed_with,
+        descriptor.needs_image,
+        descriptor.needs_local_features,
+    )
 
     def read_all(entry: str, keys: Sequence[str]) -> list[NDArray[np.float32]]:
         return [work.read(key)[entry] for key in keys]
 
-    learned_from = _evenly(photos, _VOCABULARY_PHOTOS)
-    workers.run(task.find_words, learned_from, partial(progress, f"{name} words"))
-    word_keys = [task.words_key(photo) for photo in learned_from]
-    vocabulary_key = _key("vocabulary", fingerprint=fingerprint, words=word_keys)
-    vocabulary = work.get(
-        vocabulary_key,
-        lambda: descriptor.learn_vocabulary(np.concatenate(read_all("words", word_keys)), seed=0),
-    )
+    vocabulary_key: str | None = None
+    vocabulary: Item = {}
+    if descriptor.needs_vocabulary:
+        learned_from = _evenly(photos, _VOCABULARY_PHOTOS)
+        workers.run(task.find_words, learned_from, partial(progress, f"{name} words"))
+        word_keys = [task.words_key(photo) for photo in learned_from]
+        vocabulary_key = _key("vocabulary", fingerprint=task.fingerprint, words=word_keys)
+        vocabulary = work.get(
+            vocabulary_key,
+            lambda: descriptor.learn_vocabulary(
+                np.concatenate(read_all("words", word_keys)), seed=0
+            ),
+        )
     workers.run(partial(task.pool, vocabulary_key), photos, partial(progress, name))
     pooled_keys = [task.pooled_key(vocabulary_key, photo) for photo in photos]
     taught_by = _evenly(pooled_keys, _PROJECTION_PHOTOS)
@@ -316,45 +354,56 @@ def _errors_in(features: FeatureSet, photo: MappingPhoto) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class _DescribeTask:
-    """What workers do for one global descriptor."""
+    """What workers do for one global descriptor.
+
+    What is known of it travels along, so that who only wants keys need not load a network.
+    """
 
     work: WorkFolder
     features: LocalFeaturesSource
     name: str
+    weights_dir: Path | None
+    inference: Inference
     fingerprint: Mapping[str, object]
+    computed_with: str | None
+    needs_image: bool
+    needs_local_features: bool
 
     def words_key(self, photo: MappingPhoto) -> str:
-        return _key("words", fingerprint=self.fingerprint, local=self.features.key(photo))
+        return _key("words", **self._inputs(photo))
 
-    def pooled_key(self, vocabulary_key: str, photo: MappingPhoto) -> str:
-        return _key("pooled", vocabulary=vocabulary_key, local=self.features.key(photo))
+    def pooled_key(self, vocabulary_key: str | None, photo: MappingPhoto) -> str:
+        return _key("pooled", vocabulary=vocabulary_key, **self._inputs(photo))
 
     def find_words(self, photo: MappingPhoto) -> None:
         def compute() -> Item:
-            descriptor, local = _descriptor(self.name), self.features.read(photo)
-            rgb = _pixels(descriptor, photo)
-            return {"words": descriptor.training_words(rgb, local, seed=0)}
+            rgb, local = self._read(photo)
+            return {"words": self._descriptor.training_words(rgb, local, seed=0)}
 
         self.work.get(self.words_key(photo), compute)
 
-    def pool(self, vocabulary_key: str, photo: MappingPhoto) -> None:
+    def pool(self, vocabulary_key: str | None, photo: MappingPhoto) -> None:
         def compute() -> Item:
-            descriptor, local = _descriptor(self.name), self.features.read(photo)
-            vocabulary = _vocabulary(self.work, vocabulary_key)
-            return {"pooled": descriptor.pool(_pixels(descriptor, photo), local, vocabulary)}
+            vocabulary = {} if vocabulary_key is None else _vocabulary(self.work, vocabulary_key)
+            return {"pooled": self._descriptor.pool(*self._read(photo), vocabulary)}
 
         self.work.get(self.pooled_key(vocabulary_key, photo), compute)
 
+    @property
+    def _descriptor(self) -> GlobalDescriptor:
+        return open_descriptor(self.name, self.weights_dir, self.inference)
 
-def _pixels(descriptor: GlobalDescriptor, photo: MappingPhoto) -> NDArray[np.uint8]:
-    if descriptor.needs_image:
-        return read_photo_file(photo.path).rgb
-    return np.empty((0, 0, 3), dtype=np.uint8)
+    def _inputs(self, photo: MappingPhoto) -> Mapping[str, object]:
+        return {
+            "fingerprint": self.fingerprint,
+            "computed_with": self.computed_with,
+            "photo": photo.sha256 if self.needs_image else None,
+            "local": self.features.key(photo) if self.needs_local_features else None,
+        }
 
-
-@cache
-def _descriptor(name: str) -> GlobalDescriptor:
-    return make_global_descriptor(name)
+    def _read(self, photo: MappingPhoto) -> tuple[NDArray[np.uint8], LocalFeatures]:
+        rgb = read_photo_file(photo.path).rgb if self.needs_image else _NO_PIXELS
+        return rgb, self.features.read(photo) if self.needs_local_features else _NO_FEATURES
 
 
 @cache

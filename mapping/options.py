@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 from mapping.pairing import PAIRINGS
-from visloc.features import DEFAULT_GLOBAL_FEATURES, GLOBAL_FEATURES, LOCAL_FEATURES
+from visloc.features import DEFAULT_GLOBAL_FEATURES, global_feature_names, local_feature_names
 from visloc.geometry import PixelOrigin
-from visloc.types import Inference
+from visloc.types import Fusion, Inference
 
 GLOBAL_DEFAULT = ",".join(DEFAULT_GLOBAL_FEATURES)
 RGBD_PANEL, SFM_PANEL = "Method rgbd", "Method sfm"
@@ -35,18 +35,30 @@ InferenceOption = Annotated[
     ),
 ]
 LocalFeaturesOption = Annotated[
-    str, typer.Option(help=f"One of {', '.join(sorted(LOCAL_FEATURES))}.")
+    str, typer.Option(help=f"One of {', '.join(local_feature_names())}.")
 ]
 BuildLocalFeaturesOption = Annotated[
     str,
     typer.Option(
-        help=f"One of {', '.join(sorted(LOCAL_FEATURES))}, or kapture:TYPE for features that the "
+        help=f"One of {', '.join(local_feature_names())}, or kapture:TYPE for features that the "
         "dataset brings along."
     ),
 ]
 GlobalFeaturesOption = Annotated[
     str,
-    typer.Option(help=f"Comma-separated, of {', '.join(sorted(GLOBAL_FEATURES))}, kapture:TYPE."),
+    typer.Option(help=f"Comma-separated, of {', '.join(global_feature_names())}, kapture:TYPE."),
+]
+FusionOption = Annotated[
+    Fusion,
+    typer.Option(help="How queries fuse several global features, unless they say otherwise."),
+]
+FusionWeightsOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME=WEIGHT,...",
+        help="How much each global feature counts in that, such as densevlad=1,localvlad=2; those "
+        "not named are left out. All count the same when the option is left out.",
+    ),
 ]
 FeaturesDirOption = Annotated[
     Path | None,

@@ -132,6 +132,8 @@ MAP: dict[str, Any] = {
     "current": True,
     "versions": [{"version": "20261121T111436.881Z-7f9cafe0", "current": True}],
     "content_hash": "7f9cafe0f2a3c1d54d0d8f3a5f3be7cf13a3f0a4e6c8b5d90b1c2d3e4f506172",
+    "fusion": "gharm",
+    "fusion_weights": {},
     "anchor": {"kind": "dataset", "images": 60, "rms": None, "geodetic": None},
     "place": None,
 }

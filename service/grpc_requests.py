@@ -23,11 +23,12 @@ from visloc_api.v1 import localization_pb2 as pb2
 
 # A rig has one name in JSON.
 _RIG_NAMES = {"rig_id": "rig", "calibration": "rig"}
-# Lists that may be left out: protobuf cannot tell that from an empty one.
+# Lists and maps that may be left out: protobuf cannot tell that from an empty one.
 _OPTIONAL_LISTS = {
     "visloc.v1.LocalizeRequest.maps",
     "visloc.v1.LocalizeRigRequest.maps",
     "visloc.v1.SequenceStart.maps",
+    "visloc.v1.LocalizeOptions.fusion_weights",
     "visloc.v1.GravityPrior.world",
     "visloc.v1.Odometry.covariance",
 }
@@ -142,8 +143,8 @@ def _is_there(message: Message, name: str) -> bool:
 def _plain_value(value: Any) -> object:
     if isinstance(value, Message):
         return _plain(value)
-    if isinstance(value, Mapping):  # of all maps, the values are messages
-        return {name: _plain(value[name]) for name in sorted(value)}
+    if isinstance(value, Mapping):
+        return {name: _plain_value(value[name]) for name in sorted(value)}
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
         return [_plain_value(each) for each in value]
     return value

@@ -35,7 +35,12 @@ from service.worker import Abandoned, Loaded, MapFolder, Seen, WorkerSettings
 from visloc.archive.store import open_published
 from visloc.constraints import MapGeometry
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, VislocError
-from visloc.features import LocalFeatureExtractor, make_local_features
+from visloc.features import (
+    GlobalDescriptor,
+    LocalFeatureExtractor,
+    make_global_descriptor,
+    make_local_features,
+)
 from visloc.features.readymade import is_ready_made
 from visloc.images import ImageLimits, read_photo
 from visloc.localizer import FeatureCache, Localizer
@@ -62,7 +67,9 @@ class Vision:
         self._limits = ImageLimits(settings.max_image_bytes, settings.max_image_pixels)
         self._abandoned = abandoned
         self._localizers: OrderedDict[str, Localizer] = OrderedDict()  # most recently used last
-        self._extractors: dict[str, LocalFeatureExtractor] = {}  # by name
+        # By name, shared by all maps.
+        self._extractors: dict[str, LocalFeatureExtractor] = {}
+        self._descriptors: dict[str, GlobalDescriptor] = {}
 
     @property
     def loaded(self) -> tuple[Loaded, ...]:
@@ -104,14 +111,8 @@ class Vision:
             opened = open_published(of.folder)
             name = opened.manifest.local_features.fingerprint.name
             try:
-                if name not in self._extractors and not is_ready_made(name):
-                    self._extractors[name] = make_local_features(
-                        name,
-                        self._settings.weights_dir,
-                        self._settings.inference,
-                        self._settings.threads,
-                    )
-                localizer = Localizer(opened, self._extractors.get(name))
+                extractor = None if is_ready_made(name) else self._extractor(name)
+                localizer = Localizer(opened, extractor, self._descriptor)
             except InvalidInput as error:  # features that are not here: not the caller's mistake
                 raise Conflict(
                     error.code,
@@ -123,6 +124,20 @@ class Vision:
             localizer.warm_up()
         logger.info("map %s loaded in %.1f s", opened.ref, perf_counter() - start)
         return localizer
+
+    def _extractor(self, name: str) -> LocalFeatureExtractor:
+        if name not in self._extractors:
+            s = self._settings
+            made = make_local_features(name, s.weights_dir, s.inference, s.threads)
+            self._extractors[name] = made
+        return self._extractors[name]
+
+    def _descriptor(self, name: str) -> GlobalDescriptor:
+        if name not in self._descriptors:
+            s = self._settings
+            made = make_global_descriptor(name, s.weights_dir, s.inference, s.threads)
+            self._descriptors[name] = made
+        return self._descriptors[name]
 
     def localize(
         self, job: LocalizeJob, maps: Sequence[MapFolder], submitted: float

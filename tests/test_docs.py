@@ -44,7 +44,16 @@ from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.pose.covariance import position_covariance
 from visloc.priors import Priors
-from visloc.types import PRESETS, LocalizeOptions, Reason
+from visloc.types import (
+    PRESETS,
+    Extraction,
+    Fusion,
+    LocalizeOptions,
+    Matcher,
+    ReadAs,
+    Reason,
+    Solver,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 README, API = ROOT / "README.md", ROOT / "docs" / "api.md"
@@ -429,6 +438,15 @@ def test_the_fields_of_the_request_and_the_answer_are_listed() -> None:
             assert re.search(rf"`({name}|{name}\[\].*)`", text), name
 
 
+WORDS_OF_OPTIONS = {
+    "read_as": ReadAs,
+    "extraction": Extraction,
+    "fusion": Fusion,
+    "matcher": Matcher,
+    "solver": Solver,
+}
+
+
 def test_the_options_have_the_defaults_and_ranges_that_are_listed() -> None:
     rows = table("option")
     defaults = asdict(LocalizeOptions())
@@ -436,7 +454,10 @@ def test_the_options_have_the_defaults_and_ranges_that_are_listed() -> None:
     for name_cell, default, span, _ in rows:
         (name,) = words(name_cell)
         value = defaults[name]
-        assert default == ("the preset's" if value is None else str(value))
+        of_none = "the map's" if name.startswith("fusion") else "the preset's"
+        assert default == (of_none if value is None else str(value))
+        if name in WORDS_OF_OPTIONS:
+            assert span.split(", ") == list(WORDS_OF_OPTIONS[name])
         if " to " in span:
             low, high = (json.loads(end) for end in span.split(" to "))
             LocalizeOptions(**{name: low})

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +18,12 @@ from visloc.archive import Map
 from visloc.constraints import Constraints, MapGeometry
 from visloc.errors import InvalidInput
 from visloc.features import GlobalDescriptor, LocalFeatureExtractor, make_global_descriptor
+from visloc.features.lightglue import make_lightglue
 from visloc.features.readymade import is_ready_made
 from visloc.fingerprints import check_fingerprint
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo, stored_from_upright, upright
-from visloc.matching.correspondences import match_landmarks
+from visloc.matching.correspondences import CLEAR_RATIO, match_landmarks
 from visloc.matching.products import EightBitRows, in_eight_bits, start_threads
 from visloc.priors import NO_PRIORS, Priors
 from visloc.query_camera import resolve_camera
@@ -30,6 +32,8 @@ from visloc.query_features import (
     checked_local_features,
     max_sent_keypoints,
 )
+from visloc.rematching import Rematching, seen_as_found
+from visloc.retrieval.fusion import LateFusion, chosen_fusion
 from visloc.retrieval.index import Retrieved, retrieve
 from visloc.solving import Look, Matches, SeenImage, Solved, solve_instant
 from visloc.timing import timed
@@ -41,6 +45,7 @@ from visloc.types import (
     LocalFeatures,
     Localized,
     LocalizeOptions,
+    Matcher,
     NotLocalized,
     QueryFeatures,
     ReadAs,
@@ -49,6 +54,9 @@ from visloc.types import (
     RetrievedImage,
     Stage,
 )
+
+if TYPE_CHECKING:
+    from visloc.features.lightglue_torch import LightGlue
 
 # For global descriptors that do not look at the photo.
 _NO_PIXELS = np.empty((0, 0, 3), np.uint8)
@@ -72,6 +80,8 @@ class Localizer:
         extractor: of its local features; None when only features are to be localized, as in maps
             of ready-made features.
         make_descriptor: of a global descriptor by name, for those that the map has.
+        make_matcher: of the network of ``Matcher.LIGHTGLUE`` by the name of local features, asked
+            by each query that wants it.
 
     Raises:
         Conflict: ``map.features`` when the map was built with other features than those at hand.
@@ -82,8 +92,10 @@ class Localizer:
         opened: Map,
         extractor: LocalFeatureExtractor | None,
         make_descriptor: Callable[[str], GlobalDescriptor] = make_global_descriptor,
+        make_matcher: Callable[[str], LightGlue] = make_lightglue,
     ) -> None:
         self.map = opened
+        self._make_matcher = make_matcher
         self._extractor = extractor
         manifest = opened.manifest
         if extractor is not None:
@@ -97,16 +109,13 @@ class Localizer:
                 descriptor = make_descriptor(name)
                 check_fingerprint(record.fingerprint, descriptor.fingerprint, opened.ref)
                 self._descriptors[name] = descriptor
-        self._takes_photos = extractor is not None and len(self._descriptors) == len(
-            manifest.global_features
-        )
         self.geometry = MapGeometry(opened)
         start_threads()
 
     def warm_up(self) -> None:
         """Run once on noise, so that the first query does not pay for the first use."""
         random = np.random.default_rng(0)
-        if self._takes_photos:
+        if self._takes_photos(self.map.fusion):
             noise = random.integers(0, 255, (480, 640, 3), dtype=np.uint8)
             self.localize(Photo(noise), None, LocalizeOptions())
             return
@@ -140,7 +149,8 @@ class Localizer:
 
         Raises:
             InvalidInput: ``camera.size_mismatch``; ``features.required`` when features of the map
-                are not computed here; ``priors.*`` that mean nothing in this map.
+                are not computed here; ``options.fusion_weights`` of global descriptors that it
+                does not have; ``priors.*`` that mean nothing in this map.
         """
         return self.solve_look(self.look(photo, camera, options, priors, found), options, priors)[0]
 
@@ -154,14 +164,15 @@ class Localizer:
         """Estimate the pose of the photo whose features these are.
 
         Args:
-            features: of the map's kind; with every global descriptor of the map, but for those
-                that are made of local features, which are computed when they are not sent.
+            features: of the map's kind; with every global descriptor of the map that counts, but
+                for those that are made of local features, which are computed when not sent.
             camera: the intrinsics of the photo that the keypoints are of.
             options: thresholds and the like.
             priors: what is known of the camera.
 
         Raises:
-            InvalidInput: ``camera.required``, ``options.read_as``, ``features.kind``,
+            InvalidInput: ``camera.required``, ``options.read_as``, ``options.fusion_weights``,
+                ``features.kind``,
                 ``features.keypoints``, ``features.descriptors``, ``features.global_descriptors``,
                 ``priors.*``.
             TooLarge: ``features.too_many``.
@@ -178,7 +189,8 @@ class Localizer:
         found: FeatureCache | None = None,
     ) -> Look:
         """Find what one photo shows of the map; arguments and errors as of ``localize``."""
-        if self._extractor is None or not self._takes_photos:
+        fusion = self._fusion(options)
+        if self._extractor is None or not self._takes_photos(fusion):
             raise self._features_required()
         constraints = Constraints(self.geometry, priors)
         used, source = resolve_camera(photo, camera)
@@ -191,7 +203,7 @@ class Localizer:
             local, rgb = (found or {}).get(key) or _find_features(photo, *key)
             if found is not None:
                 found[key] = local, rgb
-        return self._match(local, rgb, {}, evidence, seconds, options, constraints)
+        return self._match(local, rgb, {}, evidence, seconds, options, fusion, constraints)
 
     def look_at_features(
         self,
@@ -216,14 +228,18 @@ class Localizer:
                 expected=ReadAs.STORED,
                 got=options.read_as,
             )
+        fusion = self._fusion(options)
         constraints = Constraints(self.geometry, priors)
         seconds: dict[str, float] = {}
         evidence = Evidence(camera, CameraSource.GIVEN, 1, ReadAs.STORED, seconds=seconds)
         optional = {name for name, d in self._descriptors.items() if not d.needs_image}
+        optional |= set(self.map.global_descriptors).difference(
+            fusion.counted(self.map.global_descriptors)
+        )
         with timed(seconds, "local_features"):
             local = checked_local_features(features, camera, self.map.manifest)
             sent = checked_global_descriptors(features, self.map.manifest, optional)
-        return self._match(local, _NO_PIXELS, sent, evidence, seconds, options, constraints)
+        return self._match(local, _NO_PIXELS, sent, evidence, seconds, options, fusion, constraints)
 
     def solve(
         self,
@@ -253,7 +269,9 @@ class Localizer:
         answer, pose = solved.answer, solved.answer.pose
         none = np.zeros(len(look.matches.pixels), dtype=np.bool_)
         inliers = solved.inliers[0] if solved.inliers else none
-        evidence = replace(look.evidence, num_inliers=answer.num_inliers, seconds=answer.seconds)
+        (image,) = answer.images
+        assert image.evidence is not None  # it was looked at
+        evidence = replace(image.evidence, seconds=answer.seconds)
         if answer.refusal is not None or pose is None or solved.pose is None:
             assert answer.refusal is not None  # without a pose there is a reason
             refusal = answer.refusal
@@ -278,9 +296,14 @@ class Localizer:
         evidence: Evidence,
         seconds: dict[str, float],
         options: LocalizeOptions,
+        fusion: LateFusion,
         constraints: Constraints,
     ) -> Look:
         """Match local features with the map; global descriptors not ``sent`` are computed."""
+        rematching = None
+        if options.matcher is Matcher.LIGHTGLUE:
+            network = self._make_matcher(self.map.manifest.local_features.fingerprint.name)
+            rematching = Rematching(network, self.map, seen_as_found(local, evidence))
         evidence = replace(evidence, num_keypoints=len(local))
         if len(local) == 0:
             return _nothing(
@@ -292,12 +315,12 @@ class Localizer:
         with timed(seconds, "global_features"):
             query = {
                 name: sent[name] if name in sent else self._describe(name, rgb, local)
-                for name in self.map.global_descriptors
+                for name in fusion.counted(self.map.global_descriptors)
             }
         with timed(seconds, "retrieval"):
-            weights = constraints.photo_weights
-            retrieved = retrieve(query, self.map.global_descriptors, options.top_k, weights)
-            elsewhere = self._elsewhere(query, retrieved, weights)
+            index, weights = self.map.global_descriptors, constraints.photo_weights
+            retrieved = retrieve(query, index, options.top_k, weights, fusion)
+            elsewhere = self._elsewhere(query, retrieved, weights, fusion)
         if len(retrieved.images) == 0:
             return _nothing(
                 evidence,
@@ -307,13 +330,17 @@ class Localizer:
             )
         evidence = replace(evidence, retrieved=tuple(self._describe_retrieved(retrieved)))
         with timed(seconds, "matching"):
-            matches, landmarks = self._match_photos(local, retrieved.images)
-            others, _ = self._match_photos(local, elsewhere)
+            matches, landmarks = self._match_photos(local, retrieved.images, options, rematching)
+            others, _ = self._match_photos(local, elsewhere, options, rematching)
         evidence = replace(evidence, num_correspondences=len(matches.pixels))
         return Look(evidence, matches, landmarks, others)
 
     def _match_photos(
-        self, local: LocalFeatures, photos: NDArray[np.int64]
+        self,
+        local: LocalFeatures,
+        photos: NDArray[np.int64],
+        options: LocalizeOptions,
+        rematching: Rematching | None,
     ) -> tuple[Matches, NDArray[np.int64]]:
         """Match with the landmarks that photos of the map, most similar first, see; say which."""
         scale = self.map.manifest.local_features.descriptor_scale
@@ -321,6 +348,8 @@ class Localizer:
         pairs = match_landmarks(
             in_eight_bits(local.descriptors),
             ((landmarks, EightBitRows(rows, scale)) for landmarks, rows in observed),
+            CLEAR_RATIO if options.matcher is Matcher.RATIO else None,
+            None if rematching is None else lambda rank: rematching.match(int(photos[rank])),
         )
         matches = Matches(
             local.keypoints[pairs.keypoints].astype(np.float64),
@@ -333,6 +362,7 @@ class Localizer:
         query: Mapping[str, NDArray[np.float32]],
         retrieved: Retrieved,
         weights: NDArray[np.float64] | None,
+        fusion: LateFusion,
     ) -> NDArray[np.int64]:
         """Photos that the priors exclude, though few others look as much like the query.
 
@@ -342,15 +372,26 @@ class Localizer:
         if weights is None:
             return np.empty(0, dtype=np.int64)
         excluded = np.asarray(weights == 0, dtype=np.float64)
-        others = retrieve(query, self.map.global_descriptors, _NUM_ELSEWHERE, excluded)
-        best = np.sort(retrieved.scores)[::-1][:_NUM_ELSEWHERE]
-        close = others.scores > best.min(initial=np.inf)
+        others = retrieve(query, self.map.global_descriptors, _NUM_ELSEWHERE, excluded, fusion)
+        # Fused anew, together: scores that are ranks compare those only that were ranked together.
+        found, num = (retrieved.similarities, others.similarities), len(retrieved.images)
+        scores = fusion.scores({name: np.concatenate([f[name] for f in found]) for name in query})
+        best = np.sort(scores[:num])[::-1][:_NUM_ELSEWHERE]
+        close = scores[num:] > best.min(initial=np.inf)
         return np.asarray(others.images[close])
 
     def _describe(
         self, name: str, rgb: NDArray[np.uint8], local: LocalFeatures
     ) -> NDArray[np.float32]:
         return self._descriptors[name].describe(rgb, local, self.map.global_models[name])
+
+    def _fusion(self, options: LocalizeOptions) -> LateFusion:
+        return chosen_fusion(options, self.map.fusion, self.map.global_descriptors)
+
+    def _takes_photos(self, fusion: LateFusion) -> bool:
+        """Whether all features of photos that count can be computed here."""
+        counted = fusion.counted(self.map.global_descriptors)
+        return self._extractor is not None and set(counted) <= set(self._descriptors)
 
     def _features_required(self) -> InvalidInput:
         manifest = self.map.manifest

@@ -26,10 +26,10 @@ from visloc.priors import Priors
 from visloc.solving import (
     SeenImage,
     Solved,
-    image_answers,
     registration_for,
     rig_pose,
     solve_instant,
+    with_inliers,
 )
 from visloc.timing import timed
 from visloc.trajectory import (
@@ -253,7 +253,7 @@ class SequenceSolver:
             source = PoseSource.ESTIMATED if pose.measured else PoseSource.MOTION
             answers.append(
                 self._with_pose(
-                    replace(alone, images=image_answers(entry.seen.images, pose.inliers)),
+                    replace(alone, images=with_inliers(alone.images, pose.inliers)),
                     TracedPose(pose.rig_from_world, covariance, source),
                     entry.seen.priors,
                 )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.constraints import Constraints, MapGeometry
-from visloc.errors import VislocError
+from visloc.errors import InvalidInput, VislocError
 from visloc.geometry import Camera, Pose
 from visloc.pose.covariance import position_covariance, with_origin
 from visloc.pose.distance import mahalanobis2
@@ -24,6 +24,7 @@ from visloc.timing import timed
 from visloc.trajectory import PoseSource
 from visloc.types import (
     DEFAULT_PRESET,
+    CameraSource,
     Evidence,
     ImageAnswer,
     InstantAnswer,
@@ -32,6 +33,7 @@ from visloc.types import (
     Refusal,
     RegistrationPreset,
     RigPose,
+    Solver,
 )
 
 # The default max_error_px holds for photos of this longer side and more; for smaller ones it
@@ -129,6 +131,10 @@ def solve_instant(
 ) -> Solved:
     """Find one pose from all images of an instant; a photo on its own is a rig of one camera.
 
+    Where the camera of a photo on its own is a guess, its focal length is found with the pose,
+    unless the solver is ``registration``, which takes cameras as they are. The answer has the
+    guess when the pose is refused. Cameras of a rig that are a guess stay one.
+
     Args:
         images: each of another camera of the rig.
         geometry: of the map.
@@ -137,50 +143,81 @@ def solve_instant(
         timestamp: for the answer.
 
     Raises:
-        InvalidInput: ``priors.*`` that mean nothing in this map.
+        InvalidInput: ``priors.*`` that mean nothing in this map; ``options.solver`` for several
+            images with ``registration``.
     """
+    if options.solver is Solver.REGISTRATION and len(images) > 1:
+        raise InvalidInput(
+            "options.solver",
+            "registration finds the pose of one photo, not of several together",
+            field="options.solver",
+            expected=f"{Solver.PYCOLMAP} or {Solver.POSELIB} for a rig",
+            got=options.solver,
+        )
     constraints = Constraints(geometry, priors)
     looks = [image.look for image in images if image.look is not None]
-    views = views_of(images, [look.matches for look in looks])
+    views = _views_of(images, [look.matches for look in looks], options)
     seconds = _summed([look.evidence.seconds for look in looks])
     with timed(seconds, "pose"):
         found, refusal = _find_pose(images, views, options, constraints)
         if refusal is None or refusal.reason is not Reason.CONTRADICTS_PRIOR:
-            elsewhere = views_of(images, [look.elsewhere for look in looks])
+            elsewhere = _views_of(images, [look.elsewhere for look in looks], options)
             refusal = _better_elsewhere(elsewhere, found, options) or refusal
     pose = None
     if refusal is None and found is not None and found.covariance is not None:
         pose = rig_pose(found.rig_from_world, found.covariance, geometry, PoseSource.ESTIMATED)
     inliers = () if found is None else tuple(found.inliers)
-    answer = InstantAnswer(timestamp, image_answers(images, inliers), pose, refusal, seconds)
+    camera = None if refusal is not None or found is None else found.camera
+    shown = with_inliers([_shown(image, camera) for image in images], inliers)
+    answer = InstantAnswer(timestamp, shown, pose, refusal, seconds)
+    views = tuple(
+        replace(view, camera=camera or view.camera, focal_unknown=False) for view in views
+    )
     return Solved(answer, views, found if refusal is None else None, inliers)
 
 
-def views_of(images: Sequence[SeenImage], matches: Sequence[Matches]) -> tuple[MatchedView, ...]:
-    """Return the views of the images that could be used, with their ``matches`` in order."""
+def _views_of(
+    images: Sequence[SeenImage], matches: Sequence[Matches], options: LocalizeOptions
+) -> tuple[MatchedView, ...]:
+    """The views of the images that could be used, with their ``matches`` in order."""
     usable = [(image.cam_from_rig, image.look) for image in images if image.look is not None]
+    finds_focal = len(usable) == 1 and options.solver is not Solver.REGISTRATION
     return tuple(
-        MatchedView(look.evidence.camera, cam_from_rig, of_image.pixels, of_image.points)
+        MatchedView(
+            look.evidence.camera,
+            cam_from_rig,
+            of_image.pixels,
+            of_image.points,
+            focal_unknown=finds_focal and look.evidence.camera_source is CameraSource.GUESS,
+        )
         for (cam_from_rig, look), of_image in zip(usable, matches, strict=True)
     )
 
 
-def image_answers(
-    images: Sequence[SeenImage], inliers: Sequence[NDArray[np.bool_]]
+def _shown(image: SeenImage, found: Camera | None) -> ImageAnswer:
+    """What an image shows, with the camera that was ``found`` together with the pose."""
+    evidence = None if image.look is None else image.look.evidence
+    if evidence is not None and found is not None:
+        evidence = replace(evidence, camera=found, camera_source=CameraSource.ESTIMATED)
+    return ImageAnswer(image.sensor, image.cam_from_rig, evidence, image.error)
+
+
+def with_inliers(
+    images: Sequence[ImageAnswer], inliers: Sequence[NDArray[np.bool_]]
 ) -> tuple[ImageAnswer, ...]:
     """Say what each image contributed to a pose with these ``inliers``, one mask per usable image.
 
     No masks mean no inliers.
     """
     masks = iter(inliers)
-    answers = []
+    counted = []
     for image in images:
-        evidence = None
-        if image.look is not None:
+        evidence = image.evidence
+        if evidence is not None:
             num_inliers = int(next(masks).sum()) if inliers else 0
-            evidence = replace(image.look.evidence, num_inliers=num_inliers)
-        answers.append(ImageAnswer(image.sensor, image.cam_from_rig, evidence, image.error))
-    return tuple(answers)
+            evidence = replace(evidence, num_inliers=num_inliers)
+        counted.append(replace(image, evidence=evidence))
+    return tuple(counted)
 
 
 def rig_pose(
@@ -259,6 +296,7 @@ def _estimate(
         max_error_px=registration.max_error_px,
         seed=options.seed,
         gravity=constraints.gravity,
+        solver=options.solver,
     )
 
 
@@ -290,7 +328,10 @@ def _gate(
         return Refusal(
             "gate",
             Reason.UNCERTAIN_POSE,
-            "the matched landmarks leave the pose undetermined: they lie in a line or a spot",
+            "the matched landmarks leave the pose undetermined: they lie in a line or a spot"
+            if found.camera is None
+            else "the matched landmarks, in a plane or a spot, leave focal length and distance "
+            "undetermined: send the camera",
         )
     contradiction = constraints.contradiction(found.rig_from_world, found.covariance)
     if contradiction is not None:
@@ -312,7 +353,8 @@ def _halves_disagree(
     """Refuse a pose of few inliers when two halves of the matches give poses that differ.
 
     Matches of a blurred photo agree within 12 pixels by the dozen and with a pose metres off, whose
-    covariance cannot know (docs/decisions/0012-halves-must-agree.md).
+    covariance cannot know (docs/decisions/0012-halves-must-agree.md). With a focal length to find,
+    two halves agree too easily: such a pose is not believed.
     """
     if (
         found.num_inliers >= _SURE_INLIERS
@@ -320,6 +362,13 @@ def _halves_disagree(
         or options.min_inliers is not None
     ):
         return None
+    if found.camera is not None:
+        return Refusal(
+            "gate",
+            Reason.UNCERTAIN_POSE,
+            f"the best pose, with a focal length found together with it, explains only "
+            f"{found.num_inliers} matches, {_SURE_INLIERS} are needed: send the camera",
+        )
     # Of two places that explain the photo, a pose prior may have decided for one.
     views = constraints.near_pose_prior(views, registration.max_error_px) or views
     random = np.random.default_rng(options.seed)
@@ -354,6 +403,8 @@ def _near_pose_prior(
     start = _estimate(near, registration, options, constraints)
     if start is None:
         return None
+    if start.camera is not None:
+        views = [replace(view, camera=start.camera) for view in views]
     found = refine_generalized_pose(
         views, start.rig_from_world, max_error_px=registration.max_error_px
     )
@@ -373,7 +424,7 @@ def _better_without_gravity(
     if found.num_inliers >= _AMBIGUOUS_SHARE * num_others:  # it cannot
         return None
     other = estimate_generalized_pose(
-        views, max_error_px=registration.max_error_px, seed=options.seed
+        views, max_error_px=registration.max_error_px, seed=options.seed, solver=options.solver
     )
     if other is None or found.num_inliers >= _AMBIGUOUS_SHARE * other.num_inliers:
         return None
@@ -396,7 +447,10 @@ def _better_elsewhere(
         return None
     registration = registration_for(options, [view.camera for view in elsewhere])
     other = estimate_generalized_pose(
-        elsewhere, max_error_px=registration.max_error_px, seed=options.seed
+        elsewhere,
+        max_error_px=registration.max_error_px,
+        seed=options.seed,
+        solver=options.solver,
     )
     num_inliers = 0 if found is None else found.num_inliers
     if (

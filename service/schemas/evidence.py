@@ -44,7 +44,8 @@ class CameraUsed(BaseModel):
         visloc.types.CameraSource,
         Field(
             description="given; given_scaled, for another size of the same aspect; exif, its "
-            "focal length; or guess, 1.2 times the longer side"
+            "focal length; estimated, found together with the pose; or guess, 1.2 times the longer "
+            "side"
         ),
     ]
 

@@ -100,7 +100,7 @@ class LocalizeRequest(IncomingMessage):
         GivenCamera,
         Field(
             description="an object, or MODEL,width,height,params...; left out: the focal length "
-            "of the photo's EXIF, else a guess that the answer marks"
+            "of the photo's EXIF, else one estimated or guessed, which the answer marks"
         ),
     ] = None
     options: GivenOptions = Field(default_factory=LocalizeOptions)

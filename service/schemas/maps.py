@@ -9,6 +9,7 @@ from pydantic import BaseModel, Field
 
 import visloc.archive
 from service.incoming import IncomingMessage
+from visloc.types import Fusion
 
 if TYPE_CHECKING:
     from service.catalog import ServedMap
@@ -123,6 +124,12 @@ class MapInfo(BaseModel):
         str,
         Field(description="sha256 over all that localizes: equal maps have equal ones"),
     ]
+    fusion: Annotated[
+        str, Field(description="of the global features, unless a query says otherwise")
+    ] = Fusion.GHARM.value
+    fusion_weights: Annotated[
+        dict[str, float], Field(description="by global feature; empty when all count alike")
+    ] = {}
 
     @staticmethod
     def from_served(served: ServedMap) -> MapInfo:
@@ -149,6 +156,8 @@ class MapInfo(BaseModel):
             current=served.current,
             versions=[VersionInfo(version=name, current=used) for name, used in served.versions],
             content_hash=manifest.content_hash,
+            fusion=manifest.retrieval.fusion.value,
+            fusion_weights=manifest.retrieval.weights or {},
         )
 
 

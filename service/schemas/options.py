@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import StrEnum
-from typing import Annotated, ClassVar, TypeVar
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
@@ -11,7 +12,32 @@ import visloc.types
 from service.incoming import IncomingMessage, converted
 from visloc.errors import InvalidInput
 
-WordT = TypeVar("WordT", bound=StrEnum)
+# More global descriptors than any map has, and longer names.
+_MAX_WEIGHTS = 16
+_MAX_NAME = 100
+
+
+def _check_names(value: object) -> object:
+    """Refuse too many or too long names before any weight is looked at."""
+    if isinstance(value, Mapping):
+        if len(value) > _MAX_WEIGHTS:
+            raise InvalidInput(
+                "options.fusion_weights",
+                "too many weights",
+                field="fusion_weights",
+                expected=f"at most {_MAX_WEIGHTS}",
+                got=len(value),
+            )
+        for name in value:
+            if not isinstance(name, str) or not 0 < len(name) <= _MAX_NAME:
+                raise InvalidInput(
+                    "options.fusion_weights",
+                    "not the name of a global descriptor",
+                    field="fusion_weights",
+                    expected=f"a text of 1 to {_MAX_NAME} characters",
+                    got=f"{len(name)} characters" if isinstance(name, str) else type(name).__name__,
+                )
+    return value
 
 
 class LocalizeOptions(IncomingMessage):
@@ -60,6 +86,35 @@ class LocalizeOptions(IncomingMessage):
             "accurate; features that are sent are taken as they are"
         ),
     ] = None
+    fusion: Annotated[
+        str | None,
+        Field(
+            description="how similarities under several global descriptors become one ranking: "
+            f"{', '.join(visloc.types.Fusion)}; by default the map's"
+        ),
+    ] = None
+    fusion_weights: Annotated[
+        dict[str, float] | None,
+        converted(_check_names),
+        Field(
+            description="positive weight by global descriptor; those without one are left out; by "
+            "default the map's"
+        ),
+    ] = None
+    matcher: Annotated[
+        str | None,
+        Field(
+            description=f"how keypoints are matched: {', '.join(visloc.types.Matcher)}; by default "
+            "mutual"
+        ),
+    ] = None
+    solver: Annotated[
+        str | None,
+        Field(
+            description="what searches for the pose: "
+            f"{', '.join(visloc.types.Solver)}; by default pycolmap"
+        ),
+    ] = None
     seed: Annotated[int | None, Field(description="of RANSAC: 0 to 2147483647, by default 0")] = (
         None
     )
@@ -67,18 +122,22 @@ class LocalizeOptions(IncomingMessage):
     def to_core(self) -> visloc.types.LocalizeOptions:
         """Return the options, checked."""
         given = self.model_dump(exclude_none=True)
-        if self.read_as is not None:
-            given["read_as"] = _known_word(
-                visloc.types.ReadAs, self.read_as, "read_as", "unknown orientation to read in"
-            )
-        if self.extraction is not None:
-            given["extraction"] = _known_word(
-                visloc.types.Extraction, self.extraction, "extraction", "unknown effort"
-            )
+        for name, (words, message) in _WORDS.items():
+            if name in given:
+                given[name] = _known_word(words, given[name], name, message)
         return visloc.types.LocalizeOptions(**given)
 
 
-def _known_word(words: type[WordT], given: str, name: str, message: str) -> WordT:
+_WORDS: Mapping[str, tuple[type[StrEnum], str]] = {
+    "read_as": (visloc.types.ReadAs, "unknown orientation to read in"),
+    "extraction": (visloc.types.Extraction, "unknown effort"),
+    "fusion": (visloc.types.Fusion, "unknown way of fusing"),
+    "matcher": (visloc.types.Matcher, "unknown way of matching"),
+    "solver": (visloc.types.Solver, "unknown solver"),
+}
+
+
+def _known_word(words: type[StrEnum], given: str, name: str, message: str) -> StrEnum:
     if given not in list(words):
         raise InvalidInput(
             f"options.{name}",

@@ -194,7 +194,7 @@ class RigImage(IncomingMessage):
         GivenCamera,
         Field(
             description="left out: the rig's for this sensor; of a rig given by its id, the map's "
-            "for this sensor; else EXIF, else a guess that the answer marks"
+            "for this sensor; else EXIF, else one estimated or guessed, which the answer marks"
         ),
     ] = None
     timestamp: Annotated[

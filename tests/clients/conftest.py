@@ -291,6 +291,8 @@ class CannedService:
             "current": True,
             "versions": [{"version": self.version, "current": True}],
             "content_hash": "ab" * 32,
+            "fusion": "mean",
+            "fusion_weights": {"densevlad": 1 / 3},
         }
 
 

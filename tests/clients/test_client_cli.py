@@ -45,6 +45,16 @@ def test_a_photo_gives_a_readable_answer(
     assert service.seen[0]["options"] == {"read_as": "stored"}
 
 
+def test_weights_are_names_and_numbers(http_url: str, photo: Path, service: Any) -> None:
+    weights = "fusion_weights=densevlad:1,kapture:AP-GeM:0.5"
+    code = localize("image", photo, "--map", "room", "--server", http_url, "--option", weights)
+
+    assert code == 0
+    assert service.seen[0]["options"] == {
+        "fusion_weights": {"densevlad": 1.0, "kapture:AP-GeM": 0.5}
+    }
+
+
 def test_a_photo_that_is_not_localized_has_its_own_exit_code_and_says_why(
     url: str, photo: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -95,6 +105,10 @@ def test_json_is_the_answer_as_received(
         (("--server", "http://127.0.0.1:1"), "server.unreachable"),
         (("--server", "grpc://127.0.0.1:1"), "server.unreachable"),
         (("--option", "top_k=1.5"), "options.top_k"),
+        *(
+            (("--option", f"fusion_weights={text}"), "options.fusion_weights")
+            for text in ("", "densevlad", "densevlad:", ":1", "a:1,", "a:1,a:2", "a:nan", "a:1:x")
+        ),
     ],
 )
 def test_an_error_is_one_clear_line(

@@ -87,6 +87,10 @@ def test_all_clients_send_the_same_request(
         min_inlier_ratio=0.0,
         read_as="upright",
         extraction="accurate",
+        fusion="mean",
+        fusion_weights={"densevlad": 2, "kapture:AP-GeM": 0.1},
+        matcher="ratio",
+        solver="poselib",
         seed=0,
     )
     ask_all(http_url, grpc_url, lambda c: c.localize(photo, "room@v1", CAMERA, options, "id-1"))

@@ -331,10 +331,11 @@ def test_all_clients_send_the_same_sequence(http_url: str, grpc_url: str, servic
         Instant(6, (RigImage("camera", b"photo"),), None, Priors(height=HeightBand(-0.5, 1.0))),
         Instant(7, (), Odometry(Pose.identity())),
     ]
+    options = {"top_k": 5, "fusion_weights": {"densevlad": 0.5}, "solver": "poselib"}
     answers = ask_all(
         *(http_url, grpc_url),
         lambda c: c.localize_sequence(
-            instants, "room@v1", None, "ms", 0.0, {"top_k": 5}, "id-1", priors={"gravity": None}
+            *(instants, "room@v1", None, "ms", 0.0, options, "id-1"), priors={"gravity": None}
         ),
     )
     assert [len(answer) for answer in answers] == [3] * 4
@@ -347,7 +348,7 @@ def test_all_clients_send_the_same_sequence(http_url: str, grpc_url: str, servic
     for request in firsts:
         assert (request["time_unit"], request["max_gap_s"]) == ("ms", 0.0)
         assert request["rig"] is None
-        assert request["options"] == {"top_k": 5}
+        assert request["options"] == options
         assert request["request_id"] == "id-1"
 
 

@@ -144,7 +144,7 @@ def test_verify_tells_that_the_features_of_a_map_are_others(
         (("build", "nowhere", "--map", "room"), "[map.exists] --map: map 'room' exists"),
         (
             ("build", "nowhere", "--map", "new", "--local-features", "surf"),
-            "[features.unknown] local_features: unknown feature (expected one of faster2d2, r2d2,",
+            "[features.unknown] local_features: unknown feature; if a package brings it",
         ),
         (
             ("build", "nowhere", "--map", "new", "--local-features", "r2d2"),

@@ -105,7 +105,7 @@ def test_a_request_without_a_camera_is_answered_with_where_the_intrinsics_come_f
 ) -> None:
     answer = doors.stub.Localize(pb2.LocalizeRequest(map="room", image=query.image))
 
-    assert answer.camera.source == "guess"
+    assert answer.camera.source == "estimated"
 
 
 def test_a_request_id_comes_back_and_one_is_made_when_it_is_missing(doors: Any, query: Any) -> None:
@@ -168,6 +168,30 @@ def test_every_answer_carries_the_servers_version(doors: Any) -> None:
             "INVALID_ARGUMENT",
             "options.extraction",
             "options.extraction",
+        ),
+        (
+            {"options": pb2.LocalizeOptions(fusion="vote")},
+            "INVALID_ARGUMENT",
+            "options.fusion",
+            "options.fusion",
+        ),
+        (
+            {"options": pb2.LocalizeOptions(fusion_weights={"densevlad": float("nan")})},
+            "INVALID_ARGUMENT",
+            "options.fusion_weights",
+            "options.fusion_weights.densevlad",
+        ),
+        (
+            {"options": pb2.LocalizeOptions(matcher="")},
+            "INVALID_ARGUMENT",
+            "options.matcher",
+            "options.matcher",
+        ),
+        (
+            {"options": pb2.LocalizeOptions(solver="p3p")},
+            "INVALID_ARGUMENT",
+            "options.solver",
+            "options.solver",
         ),
     ],
 )

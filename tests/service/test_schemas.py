@@ -14,7 +14,7 @@ from service import schemas
 from service.schemas import LocalizeOptions, LocalizeRequest
 from visloc.errors import InvalidInput, TooLarge
 from visloc.priors import NO_PRIORS, HeightBand
-from visloc.types import Extraction, ReadAs
+from visloc.types import Extraction, Fusion, Matcher, ReadAs, Solver
 from visloc.types import LocalizeOptions as CoreOptions
 from visloc_api.v1 import localization_pb2 as pb2
 
@@ -43,6 +43,10 @@ def test_a_full_request_becomes_the_job_that_it_says() -> None:
         "min_inlier_ratio": 0.5,
         "read_as": "upright",
         "extraction": "fast",
+        "fusion": "mean",
+        "fusion_weights": {"densevlad": 1, "kapture:AP-GeM": 0.5},
+        "matcher": "ratio",
+        "solver": "poselib",
         "seed": 9,
     }
 
@@ -52,7 +56,11 @@ def test_a_full_request_becomes_the_job_that_it_says() -> None:
     assert job.camera is not None
     assert job.camera.params == (525.0, 525.5, 320.0, 240.0)
     assert job.options == CoreOptions(
-        "config1", 5, 8.0, 12, 0.5, ReadAs.UPRIGHT, Extraction.FAST, 9
+        *("config1", 5, 8.0, 12, 0.5, ReadAs.UPRIGHT, Extraction.FAST, Fusion.MEAN),
+        fusion_weights={"densevlad": 1.0, "kapture:AP-GeM": 0.5},
+        matcher=Matcher.RATIO,
+        solver=Solver.POSELIB,
+        seed=9,
     )
 
 
@@ -92,7 +100,7 @@ def test_options_may_be_text() -> None:
             "request.unknown_field",
             "options.topk",
             "one of preset, top_k, max_error_px, min_inliers, min_inlier_ratio, read_as, "
-            "extraction, seed",
+            "extraction, fusion, fusion_weights, matcher, solver, seed",
         ),
         (
             request(camera=CAMERA | {"fov": 60}),
@@ -122,6 +130,45 @@ def test_options_may_be_text() -> None:
             "options.read_as",
             "options.read_as",
             "one of stored, upright",
+        ),
+        (
+            request(options={"fusion": "vote"}),
+            "options.fusion",
+            "options.fusion",
+            f"one of {', '.join(Fusion)}",
+        ),
+        (
+            request(options={"matcher": "guess"}),
+            "options.matcher",
+            "options.matcher",
+            "one of mutual, ratio, lightglue",
+        ),
+        (
+            request(options={"solver": "p3p"}),
+            "options.solver",
+            "options.solver",
+            "one of pycolmap, poselib, registration",
+        ),
+        *(
+            (
+                request(options={"fusion_weights": given}),
+                *(code, f"options.fusion_weights{below}", expected),
+            )
+            for given, code, below, expected in [
+                ([1], "request.invalid", "", None),
+                ({}, "options.fusion_weights", "", None),
+                ({"a": True}, "request.invalid", ".a", None),
+                ({"a": "1"}, "request.invalid", ".a", None),
+                ({"a": None}, "request.invalid", ".a", None),
+                ({"a": 0}, "options.fusion_weights", ".a", "0.000001 to 1000000"),
+                ({"a": -1.5}, "options.fusion_weights", ".a", "0.000001 to 1000000"),
+                ({"a": float("nan")}, "options.fusion_weights", ".a", "0.000001 to 1000000"),
+                ({"a": float("inf")}, "options.fusion_weights", ".a", "0.000001 to 1000000"),
+                ({"a": 10**400}, "request.invalid", ".a", None),
+                (dict.fromkeys(map(str, range(17)), 1), "options.fusion_weights", "", "at most 16"),
+                ({"": 1}, "options.fusion_weights", "", "a text of 1 to 100 characters"),
+                ({"a" * 101: 1}, "options.fusion_weights", "", "a text of 1 to 100 characters"),
+            ]
         ),
         (
             request(camera=CAMERA | {"params": [525, float("nan"), 320, 240]}),

@@ -31,6 +31,7 @@ from visloc.archive.schema import (
 )
 from visloc.errors import InvalidInput, MapCorrupt
 from visloc.geometry import Camera, Pose
+from visloc.retrieval.fusion import LateFusion
 from visloc.retrieval.rows import GlobalRows
 from visloc.retrieval.shortlist import Clusters
 
@@ -66,6 +67,11 @@ class MapOutline:
         if world.gravity is not None:
             return np.array(world.gravity)
         return None if self.geodetic is None else down_of(self.geodetic)
+
+    @property
+    def fusion(self) -> LateFusion:
+        """How queries rank its photos unless they say otherwise."""
+        return self.manifest.retrieval.late_fusion
 
     @property
     def geodetic(self) -> Geodetic | None:

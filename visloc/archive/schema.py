@@ -6,13 +6,23 @@ import math
 import re
 from typing import Annotated, Literal, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    JsonValue,
+    ValidationInfo,
+    field_validator,
+)
 from pydantic.dataclasses import dataclass
 
-from visloc.types import Fingerprint
+from visloc.errors import InvalidInput
+from visloc.retrieval.fusion import LateFusion
+from visloc.types import Fingerprint, Fusion, check_fusion_weights
 
 FORMAT = "visloc-map"
-FORMAT_MAJOR, FORMAT_MINOR = 2, 0
+FORMAT_MAJOR, FORMAT_MINOR = 2, 1
 
 ID_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -109,6 +119,24 @@ class GlobalFeaturesRecord(_Record):
     clusters: Annotated[int, Field(ge=1)] | None = None
 
 
+class RetrievalRecord(_Record):
+    """How queries rank the map's photos unless they say otherwise; ``LateFusion`` as JSON."""
+
+    fusion: Fusion = Fusion.GHARM
+    weights: dict[str, float] | None = None
+
+    @staticmethod
+    def of(fusion: LateFusion) -> RetrievalRecord:
+        """Return the same as a record."""
+        weights = None if fusion.weights is None else dict(fusion.weights)
+        return RetrievalRecord(fusion=fusion.operator, weights=weights)
+
+    @property
+    def late_fusion(self) -> LateFusion:
+        """The same as retrieval takes it."""
+        return LateFusion(self.fusion, self.weights)
+
+
 class Extent(_Record):
     """Smallest box along the world's axes that holds all landmarks."""
 
@@ -192,11 +220,28 @@ class Manifest(_Record):
     method: Method
     local_features: LocalFeaturesRecord
     global_features: Annotated[tuple[GlobalFeaturesRecord, ...], Field(min_length=1)]
+    # Maps of formats before 2.1 have none, and are asked by what it says then.
+    retrieval: RetrievalRecord = RetrievalRecord()
     counts: Counts
     notes: tuple[str, ...] = ()
     content_hash: Sha256
     manifest_hash: Sha256
     files: dict[str, FileEntry]
+
+    @field_validator("retrieval")
+    @classmethod
+    def _weighs_what_there_is(
+        cls, retrieval: RetrievalRecord, info: ValidationInfo
+    ) -> RetrievalRecord:
+        if retrieval.weights is not None:
+            try:
+                check_fusion_weights(retrieval.weights, "weights")
+            except InvalidInput as error:
+                raise ValueError(str(error)) from error
+            known = {g.fingerprint.name for g in info.data.get("global_features", ())}
+            if not retrieval.weights.keys() <= known:
+                raise ValueError(f"weights of others than the map's {', '.join(sorted(known))}")
+        return retrieval
 
 
 class CameraRecord(_Record):

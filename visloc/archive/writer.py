@@ -24,9 +24,11 @@ from visloc.archive.schema import (
     Anchor,
     FingerprintRecord,
     ImageRecord,
+    RetrievalRecord,
     Vector,
 )
 from visloc.geometry import Camera, Pose
+from visloc.retrieval.fusion import EQUAL_GHARM, LateFusion
 from visloc.retrieval.index import MAX_EXACT
 from visloc.retrieval.rows import in_8_bits
 from visloc.retrieval.shortlist import make_clusters
@@ -84,7 +86,8 @@ class MapContent:
     ``descriptors()`` yields, photo by photo, the unit descriptors (m_i, D) float32 of that photo's
     observations in the order of ``landmarks``; it is read twice. ``gravity`` is the unit vector
     that points down in the world, None where that is not known. ``computed_with`` tells what
-    computed the local features, for people. Arrays may be mapped from files: none is copied whole.
+    computed the local features, for people. ``fusion`` is how queries rank the photos unless they
+    say otherwise. Arrays may be mapped from files: none is copied whole.
     """
 
     metric: bool
@@ -104,6 +107,7 @@ class MapContent:
     anchor: Anchor | None = None
     gravity: Vector | None = None
     computed_with: str | None = None
+    fusion: LateFusion = EQUAL_GHARM
 
 
 def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, created: str) -> str:
@@ -186,6 +190,7 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
             }
             for f, count in zip(content.global_features, clusters, strict=True)
         ],
+        "retrieval": RetrievalRecord.of(content.fusion).model_dump(mode="json"),
         "counts": {
             "images": len(content.images),
             "landmarks": len(landmarks.points),

@@ -1,18 +1,25 @@
 """Local features and global descriptors, by name.
 
-A further one is one file and one line in a registry below. Nothing here loads torch or OpenCV
-until a feature is made.
+A further one is one file and one line in a registry below, or a package of its own
+(``visloc.features.plugins``). Nothing here loads torch or OpenCV until a feature is made.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import cast
 
 from visloc.errors import InvalidInput
 from visloc.features.base import Fingerprint, GlobalDescriptor, LocalFeatureExtractor
+from visloc.features.image_descriptor import ImageDescriptor
+from visloc.features.plugins import (
+    GLOBAL_FEATURES_GROUP,
+    LOCAL_FEATURES_GROUP,
+    make_plugin,
+    plugin_names,
+)
 from visloc.types import Inference
 
 __all__ = [
@@ -22,7 +29,10 @@ __all__ = [
     "LOCAL_FEATURES",
     "Fingerprint",
     "GlobalDescriptor",
+    "ImageDescriptor",
     "LocalFeatureExtractor",
+    "global_feature_names",
+    "local_feature_names",
     "make_global_descriptor",
     "make_local_features",
 ]
@@ -30,18 +40,35 @@ __all__ = [
 # name -> module and function, which takes the folder with weights or None, how networks are
 # computed, and with how many threads.
 LOCAL_FEATURES: Mapping[str, tuple[str, str]] = {
+    "aliked": ("visloc.features.aliked", "load_aliked"),
+    "aliked-t16": ("visloc.features.aliked", "load_aliked_t16"),
     "faster2d2": ("visloc.features.r2d2", "load_faster2d2"),
     "r2d2": ("visloc.features.r2d2", "load_r2d2"),
     "sift": ("visloc.features.sift", "load_sift"),
     "xfeat": ("visloc.features.xfeat", "load_xfeat"),
 }
 GLOBAL_FEATURES: Mapping[str, tuple[str, str]] = {
+    "apgem": ("visloc.features.apgem", "load_apgem"),
+    "convvlad": ("visloc.features.convvlad", "load_convvlad"),
+    "delg": ("visloc.features.delg", "load_delg"),
     "densevlad": ("visloc.features.densevlad", "load_densevlad"),
+    "gem": ("visloc.features.gem", "load_gem"),
     "localvlad": ("visloc.features.localvlad", "load_localvlad"),
+    "netvlad": ("visloc.features.netvlad", "load_netvlad"),
 }
 # XFeat is free for any use and fast; R2D2's published weights are for research only.
 DEFAULT_LOCAL_FEATURES = "xfeat"
 DEFAULT_GLOBAL_FEATURES = ("densevlad", "localvlad")
+
+
+def local_feature_names() -> list[str]:
+    """Return the names of all local features at hand, those of other packages included."""
+    return sorted({*LOCAL_FEATURES, *plugin_names(LOCAL_FEATURES_GROUP)})
+
+
+def global_feature_names() -> list[str]:
+    """Return the names of all global descriptors at hand, those of other packages included."""
+    return sorted({*GLOBAL_FEATURES, *plugin_names(GLOBAL_FEATURES_GROUP)})
 
 
 def make_local_features(
@@ -53,20 +80,18 @@ def make_local_features(
     """Build the extractor that a command or a map names.
 
     Args:
-        name: a name of ``LOCAL_FEATURES``.
+        name: of ``local_feature_names``. Where a package offers a name of ``LOCAL_FEATURES``, the
+            package's is never used.
         weights_dir: folder with network weights.
         inference: how networks are computed.
         threads: processor threads for one photo; None for all processors.
 
     Raises:
-        InvalidInput: ``features.unknown``.
+        InvalidInput: ``features.unknown``, ``features.plugin``, ``inference.unavailable``.
         WeightsError: when its weights are missing or not its own.
     """
-    load = cast(
-        "Callable[[Path | None, Inference, int | None], LocalFeatureExtractor]",
-        _find(LOCAL_FEATURES, name, "local_features"),
-    )
-    return load(weights_dir, inference, threads)
+    made = _make(LOCAL_FEATURES, LOCAL_FEATURES_GROUP, name, weights_dir, inference, threads)
+    return cast("LocalFeatureExtractor", made)
 
 
 def make_global_descriptor(
@@ -78,30 +103,38 @@ def make_global_descriptor(
     """Build the global descriptor that a command or a map names.
 
     Args:
-        name: a name of ``GLOBAL_FEATURES``.
+        name: of ``global_feature_names``. Where a package offers a name of ``GLOBAL_FEATURES``, the
+            package's is never used.
         weights_dir: folder with network weights.
         inference: how networks are computed.
         threads: processor threads for one photo; None for all processors.
 
     Raises:
-        InvalidInput: ``features.unknown``.
+        InvalidInput: ``features.unknown``, ``features.plugin``, ``inference.unavailable``.
         WeightsError: when its weights are missing or not its own.
     """
-    load = cast(
-        "Callable[[Path | None, Inference, int | None], GlobalDescriptor]",
-        _find(GLOBAL_FEATURES, name, "global_features"),
-    )
-    return load(weights_dir, inference, threads)
+    made = _make(GLOBAL_FEATURES, GLOBAL_FEATURES_GROUP, name, weights_dir, inference, threads)
+    return cast("GlobalDescriptor", made)
 
 
-def _find(registry: Mapping[str, tuple[str, str]], name: str, field: str) -> object:
-    if name not in registry:
+def _make(
+    registry: Mapping[str, tuple[str, str]],
+    group: str,
+    name: str,
+    weights_dir: Path | None,
+    inference: Inference,
+    threads: int | None,
+) -> object:
+    if name in registry:
+        module, function = registry[name]
+        return getattr(import_module(module), function)(weights_dir, inference, threads)
+    others = plugin_names(group)
+    if name not in others:
         raise InvalidInput(
             "features.unknown",
-            "unknown feature",
-            field=field,
-            expected=f"one of {', '.join(sorted(registry))}",
+            "unknown feature; if a package brings it, install that package",
+            field=group.removeprefix("visloc."),
+            expected=f"one of {', '.join(sorted({*registry, *others}))}",
             got=name,
         )
-    module, function = registry[name]
-    return getattr(import_module(module), function)
+    return make_plugin(group, name, weights_dir, inference, threads)

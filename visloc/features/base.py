@@ -54,8 +54,27 @@ class GlobalDescriptor(Protocol):
         """Name and parameters; kept in the manifest of every map."""
 
     @property
+    def computed_with(self) -> str | None:
+        """What computes it, for instance ``torch 2.13.0 on cpu``; None for plain code.
+
+        Other ways of computing give other bits, but alike vectors.
+        """
+
+    @property
     def needs_image(self) -> bool:
         """Whether it looks at the pixels; if not, ``rgb`` may be an image without any."""
+
+    @property
+    def needs_local_features(self) -> bool:
+        """Whether it is made of local features; if not, ``local`` may be empty."""
+
+    @property
+    def needs_vocabulary(self) -> bool:
+        """Whether it learns from words of the map's photos.
+
+        If not, ``training_words`` and ``learn_vocabulary`` are never called, and the vocabulary is
+        empty.
+        """
 
     def training_words(
         self, rgb: NDArray[np.uint8], local: LocalFeatures, seed: int

@@ -7,10 +7,11 @@ PyTorch saves a pickle that describes tensors, beside the raw numbers, in one of
   each storage as its int64 length and its numbers.
 
 Why not ``torch.load(weights_only=True)``: it refuses the published Fast-R2D2 file, whose training
-log is made of ``defaultdict``. The unpickler below knows the four names that such files need
-(OrderedDict, defaultdict, list, torch's _rebuild_tensor_v2) and the names of storage types, and
-puts harmless stand-ins in their place. Before it runs, the opcodes are compared with those of a
-state dict, so that no declared size or index can allocate more than a small multiple of the file.
+log is made of ``defaultdict``, and the AP-GeM files, which hold an object of scikit-learn. The
+unpickler below knows the four names that a state dict needs (OrderedDict, defaultdict, list,
+torch's _rebuild_tensor_v2), the names of storage types and those of ``pickled_pca``, and puts
+harmless stand-ins in their place. Before it runs, the opcodes are compared with those that such
+files need, so that no declared size or index can allocate more than a small multiple of the file.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import pickletools
 import zipfile
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.errors import WeightsError
+from visloc.features.pickled_pca import PickledPca, stand_in
 
 MAX_FILE_BYTES = 256 * 2**20
 _MAX_TUPLES = 10_000  # bounds how deep tuples can nest: hashing one recurses in C
@@ -40,13 +42,15 @@ _MAX_DIMENSIONS = 8
 _OLD_LAYOUT_START = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03."
 _OPCODES = frozenset(
     (
-        *("PROTO", "STOP", "MARK", "GLOBAL", "REDUCE", "BUILD", "BINPERSID"),
+        *("PROTO", "STOP", "MARK", "GLOBAL", "REDUCE", "NEWOBJ", "BUILD", "BINPERSID"),
         *("NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT"),
         *("BINUNICODE", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3"),
         *("EMPTY_LIST", "APPEND", "APPENDS", "EMPTY_DICT", "SETITEM", "SETITEMS"),
         *("BINPUT", "LONG_BINPUT", "BINGET", "LONG_BINGET"),
     )
 )
+# Where training programs keep the state dict, beside what they know about the training.
+_STATE_DICT_KEYS = ("state_dict", "model_state")
 _STORAGE_DTYPES: Mapping[str, np.dtype[Any]] = {
     "FloatStorage": np.dtype("<f4"),
     "DoubleStorage": np.dtype("<f8"),
@@ -75,11 +79,14 @@ class Checkpoint:
         path: where it was read from.
         sha256: of the file, lower-case hexadecimal.
         tensors: arrays by their names in the state dict; views of the file's bytes, read-only.
+        pca: what the file holds under ``pca`` beside the state dict, for
+            ``pickled_pca.principal_components``; empty without.
     """
 
     path: Path
     sha256: str
     tensors: Mapping[str, NDArray[Any]]
+    pca: Mapping[str, PickledPca] = field(default_factory=dict)
 
 
 class _Storage(NamedTuple):
@@ -95,30 +102,37 @@ class _Tensor(NamedTuple):
     strides: tuple[int, ...]
 
 
-def read_checkpoint(path: Path) -> Checkpoint:
-    """Read a state dict, bare or under the key ``state_dict`` of a dict.
+def read_checkpoint(path: Path, max_bytes: int = MAX_FILE_BYTES) -> Checkpoint:
+    """Read a state dict, bare or under the key ``state_dict`` or ``model_state`` of a dict.
+
+    Whatever else the dict holds (the state of an optimizer, options, scores) is not looked at,
+    except for scikit-learn's PCAs by name under ``pca``.
+
+    Args:
+        path: the file.
+        max_bytes: how large it may be.
 
     Raises:
         WeightsError: ``weights.unreadable`` when the file cannot be read, ``weights.too_large``
-            when it exceeds 256 MiB, ``weights.format`` when it is not a PyTorch file of plain
-            tensors, is damaged, or names anything that a state dict does not need.
+            when it exceeds ``max_bytes``, ``weights.format`` when it is not a PyTorch file of
+            plain tensors, is damaged, or names anything that a state dict does not need.
     """
     try:
         with path.open("rb") as file:
-            data = file.read(MAX_FILE_BYTES + 1)
+            data = file.read(max_bytes + 1)
     except OSError as error:
         raise WeightsError(
             "weights.unreadable", "cannot be read", field=str(path), got=error.strerror
         ) from error
-    if len(data) > MAX_FILE_BYTES:
+    if len(data) > max_bytes:
         raise WeightsError(
             "weights.too_large",
             "too large for weights",
             field=str(path),
-            expected=f"at most {MAX_FILE_BYTES} bytes",
+            expected=f"at most {max_bytes} bytes",
         )
     try:
-        tensors = _tensors_of_zip(data) if data[:2] == b"PK" else _tensors_of_old_layout(data)
+        content, tensors = _read_zip(data) if data[:2] == b"PK" else _read_old_layout(data)
     except _MALFORMED as error:
         raise WeightsError(
             "weights.format",
@@ -127,19 +141,29 @@ def read_checkpoint(path: Path) -> Checkpoint:
             expected="a state dict saved by torch.save",
             got=f"{type(error).__name__}: {error}",
         ) from error
-    return Checkpoint(path, hashlib.sha256(data).hexdigest(), tensors)
+    return Checkpoint(path, hashlib.sha256(data).hexdigest(), tensors, _pca_of(content))
 
 
-def _tensors_of_old_layout(data: bytes) -> dict[str, NDArray[Any]]:
+def _pca_of(content: object) -> dict[str, PickledPca]:
+    found = content.get("pca") if type(content) is dict else None
+    if type(found) is not dict:
+        return {}
+    return {
+        name: pca
+        for name, pca in found.items()
+        if isinstance(name, str) and isinstance(pca, PickledPca)
+    }
+
+
+def _read_old_layout(data: bytes) -> tuple[object, dict[str, NDArray[Any]]]:
     if not data.startswith(_OLD_LAYOUT_START):
         raise ValueError("neither a zip archive nor PyTorch's older layout")
-    system, position = _unpickle(data, len(_OLD_LAYOUT_START))
+    system, position, _ = _unpickle(data, len(_OLD_LAYOUT_START))
     if not (isinstance(system, dict) and system.get("little_endian") is True):
         raise ValueError("not written by a little-endian machine")
-    content, position = _unpickle(data, position)
-    keys, position = _unpickle(data, position)
+    content, position, storages = _unpickle(data, position)
+    keys, position, _ = _unpickle(data, position)
     references = _tensor_references(content)
-    storages = {tensor.storage.key: tensor.storage for tensor in references.values()}
     starts: dict[str, int] = {}
     for key in keys:
         storage = storages[key]
@@ -151,10 +175,11 @@ def _tensors_of_old_layout(data: bytes) -> dict[str, NDArray[Any]]:
     def storage_bytes(storage: _Storage) -> memoryview:
         return memoryview(data)[starts[storage.key] :]
 
-    return {name: _view(reference, storage_bytes) for name, reference in references.items()}
+    tensors = {name: _view(reference, storage_bytes) for name, reference in references.items()}
+    return content, tensors
 
 
-def _tensors_of_zip(data: bytes) -> dict[str, NDArray[Any]]:
+def _read_zip(data: bytes) -> tuple[object, dict[str, NDArray[Any]]]:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = archive.infolist()
         # torch.save never compresses; members that unpack to more than the file are an attack.
@@ -174,14 +199,16 @@ def _tensors_of_zip(data: bytes) -> dict[str, NDArray[Any]]:
         def storage_bytes(storage: _Storage) -> memoryview:
             return memoryview(archive.read(f"{roots[0]}data/{storage.key}"))
 
-        content, _ = _unpickle(archive.read(f"{roots[0]}data.pkl"), 0)
+        content, _, _ = _unpickle(archive.read(f"{roots[0]}data.pkl"), 0)
         references = _tensor_references(content)
-        return {name: _view(reference, storage_bytes) for name, reference in references.items()}
+        tensors = {name: _view(reference, storage_bytes) for name, reference in references.items()}
+        return content, tensors
 
 
 def _tensor_references(content: object) -> dict[str, _Tensor]:
-    if isinstance(content, dict) and "state_dict" in content:
-        content = content["state_dict"]
+    if isinstance(content, dict):
+        key = next((key for key in _STATE_DICT_KEYS if key in content), None)
+        content = content if key is None else content[key]
     if not (isinstance(content, dict) and content):
         raise ValueError("no state dict")
     references = dict(content)  # before the check: a file can replace methods of an OrderedDict
@@ -204,10 +231,11 @@ def _view(tensor: _Tensor, storage_bytes: Callable[[_Storage], memoryview]) -> N
     )
 
 
-def _unpickle(data: bytes, start: int) -> tuple[Any, int]:
-    """Return the object pickled at ``start`` and the position after it."""
+def _unpickle(data: bytes, start: int) -> tuple[Any, int, dict[str, _Storage]]:
+    """Return the object pickled at ``start``, the position after it, and the storages it names."""
     end = _end_of_harmless_pickle(data, start)
-    return _Unpickler(io.BytesIO(data[start:end])).load(), end
+    unpickler = _Unpickler(io.BytesIO(data[start:end]))
+    return unpickler.load(), end, unpickler.storages
 
 
 def _end_of_harmless_pickle(data: bytes, start: int) -> int:
@@ -229,9 +257,14 @@ def _end_of_harmless_pickle(data: bytes, start: int) -> int:
 class _Unpickler(pickle.Unpickler):
     """Knows the names below and no other; nothing is imported.
 
-    What it returns for them are stand-ins that can only make an empty dict or take a note, new
-    ones each time: a file can neither call anything else nor leave anything behind in them.
+    What it returns for them are stand-ins that can only make an empty dict or take a note, and
+    that are new each time or cannot be changed: a file can neither call anything else nor leave
+    anything behind in them.
     """
+
+    def __init__(self, file: io.BytesIO) -> None:
+        super().__init__(file)
+        self.storages: dict[str, _Storage] = {}
 
     def find_class(self, module: str, name: str) -> Any:
         match module, name:
@@ -245,6 +278,9 @@ class _Unpickler(pickle.Unpickler):
                 return lambda *arguments: _note_tensor(*arguments)
             case "torch", _ if name in _STORAGE_DTYPES:
                 return name
+        known = stand_in(module, name)
+        if known is not None:
+            return known
         raise pickle.UnpicklingError(f"{module}.{name} is no name that a state dict needs")
 
     def persistent_load(self, pid: Any) -> _Storage:
@@ -257,7 +293,10 @@ class _Unpickler(pickle.Unpickler):
             and all(part is None for part in view)
         ):
             raise pickle.UnpicklingError("a reference to something that is no storage")
-        return _Storage(key, dtype_name, num_values)
+        storage = _Storage(key, dtype_name, num_values)
+        if self.storages.setdefault(key, storage) != storage:
+            raise pickle.UnpicklingError("one storage with two descriptions")
+        return storage
 
 
 def _note_tensor(storage: Any, offset: Any, shape: Any, strides: Any, *_autograd: Any) -> _Tensor:

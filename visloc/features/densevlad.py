@@ -63,6 +63,11 @@ class DenseVlad(VladDescriptor):
         """True: its words lie on a grid, not at keypoints."""
         return True
 
+    @property
+    def needs_local_features(self) -> bool:
+        """False: its words lie on a grid."""
+        return False
+
     def words(
         self,
         rgb: NDArray[np.uint8],

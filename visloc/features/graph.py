@@ -87,10 +87,15 @@ class GraphBuilder:
         *,
         stride: int = 1,
         dilation: int = 1,
-        padding: int = 0,
+        padding: int | tuple[int, int] = 0,
+        groups: int = 1,
         relu: bool = False,
     ) -> Any:
-        """Convolve x (1, I, h, w); weight (O, I, k, k), bias (O,)."""
+        """Convolve x (1, I, h, w); weight (O, I / groups, k, k), bias (O,).
+
+        Padding is added on all sides, or as many pixels (before, after) in both directions.
+        Convolutions in groups are computed in floats.
+        """
         self.inputs[name] = x
         kernel = self.constant(weight)
         if name in self._ranges:
@@ -98,9 +103,12 @@ class GraphBuilder:
             largest = np.abs(weight).max(axis=(1, 2, 3), keepdims=True)
             largest = np.maximum(largest, np.finfo(np.float32).tiny)
             kernel = self._in_levels(kernel, -largest, largest, _WEIGHT_LEVELS)
-        x = self._operations.convolution(
-            x, kernel, [stride] * 2, [padding] * 2, [padding] * 2, [dilation] * 2
-        )
+        before, after = (padding, padding) if isinstance(padding, int) else padding
+        convolve = self._operations.convolution
+        if groups > 1:
+            convolve = self._operations.group_convolution
+            kernel = self.constant(weight.reshape(groups, -1, *weight.shape[1:]))
+        x = convolve(x, kernel, [stride] * 2, [before] * 2, [after] * 2, [dilation] * 2)
         x = self._operations.add(x, self.constant(bias[None, :, None, None]))
         return self._operations.relu(x) if relu else x
 

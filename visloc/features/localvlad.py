@@ -34,6 +34,11 @@ class LocalVlad(VladDescriptor):
         """False: the local features say it all."""
         return False
 
+    @property
+    def needs_local_features(self) -> bool:
+        """True: its words are their descriptors."""
+        return True
+
     def words(
         self,
         rgb: NDArray[np.uint8],  # noqa: ARG002 - not needed

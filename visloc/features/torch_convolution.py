@@ -16,11 +16,18 @@ def fixed_convolution(
     stride: int = 1,
     dilation: int = 1,
     padding: int = 0,
+    groups: int = 1,
 ) -> nn.Conv2d:
-    """Return a float32 convolution that will not be trained; weight (O, I, k, k), bias (O,)."""
-    outputs, inputs, kernel, _ = weight.shape
+    """Return a float32 convolution that will not be trained; weight (O, I / groups, k, k)."""
+    outputs, inputs_of_group, kernel, _ = weight.shape
     convolution = nn.Conv2d(
-        inputs, outputs, kernel, stride=stride, dilation=dilation, padding=padding
+        inputs_of_group * groups,
+        outputs,
+        kernel,
+        stride=stride,
+        dilation=dilation,
+        padding=padding,
+        groups=groups,
     )
     # channels_last is a quarter faster on CPUs when the input has the same layout.
     fast_weight = torch.tensor(weight, dtype=torch.float32).contiguous(

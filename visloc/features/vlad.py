@@ -15,19 +15,18 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from visloc.features.base import Fingerprint
+from visloc.features.whitening import (
+    WHITENING_PARAMETERS,
+    learn_whitening,
+    unit_rows,
+    whiten,
+)
 from visloc.types import LocalFeatures
 
 VOCABULARY_SIZE = 128
 KMEANS_ITERATIONS = 20
 KMEANS_MAX_WORDS = 100_000
 TRAINING_WORDS_PER_PHOTO = 1000
-
-# Full whitening (1) learns the noise of a small map. On maps of 20 to 60 photos it lost up to 40 %
-# of the mapping photos nearest to a query from its first ten; 0.5 lost up to 10 %, 0.25 almost
-# none, and it still tones down what all photos of a map share.
-WHITENING_EXPONENT = 0.25
-WHITENING_MAX_DIMS = 1024
-WHITENING_MAX_PHOTOS = 2048
 
 
 def learn_words(words: NDArray[np.float32], count: int, seed: int) -> NDArray[np.float32]:
@@ -69,58 +68,7 @@ def aggregate(words: NDArray[np.float32], centres: NDArray[np.float32]) -> NDArr
     residuals: NDArray[np.float32] = sums - counts[:, None] * centres
     # What words right at their centre leave is rounding, not a direction.
     floor = np.float32(1e-5) * np.linalg.norm(sums, axis=1, keepdims=True)
-    return _unit_rows(_unit_rows(residuals, floor).ravel())
-
-
-def learn_whitening(
-    pooled: NDArray[np.float32],
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the mean (R,) and the axes (R, D) of partial PCA whitening.
-
-    Axis i is an eigenvector of the covariance, scaled by its variance to the power
-    ``-WHITENING_EXPONENT / 2``: 0 would only rotate, 1 would make all variances equal. D is at
-    most ``WHITENING_MAX_DIMS`` and at most the rank of the centred vectors, so n - 1.
-
-    Vectors that do not differ (one photo, or the same photo again and again) have no covariance:
-    then the mean is zero and their common direction the only axis. Without any vector but zeros,
-    the only axis is zero.
-
-    Args:
-        pooled: (n, R), rows of unit length; zero rows, of blank photos, teach nothing and are
-            left out. Of more than ``WHITENING_MAX_PHOTOS`` rows evenly spaced ones are used.
-    """
-    rows = pooled[pooled.any(axis=1)]
-    if len(rows) > WHITENING_MAX_PHOTOS:
-        rows = rows[np.linspace(0, len(rows) - 1, WHITENING_MAX_PHOTOS).astype(np.int64)]
-    size = pooled.shape[1]
-    if len(rows) == 0:
-        return np.zeros(size, np.float32), np.zeros((size, 1), np.float32)
-    mean = rows.mean(axis=0, dtype=np.float64)
-    centred = rows - mean
-    # Photos are fewer than the thousands of dimensions R: the n x n Gram matrix has the same
-    # eigenvalues as the R x R covariance, and its eigenvectors lead to those of the other.
-    variances, vectors = np.linalg.eigh(centred @ centred.T / len(rows))
-    variances, vectors = variances[::-1], vectors[:, ::-1]
-    # Rows are of unit length, so variances below 1e-10 are rounding; those far below the largest
-    # are of photos so alike that their difference means nothing.
-    significant = variances > max(1e-10, 1e-6 * variances[0])
-    variances = variances[significant][:WHITENING_MAX_DIMS]
-    vectors = vectors[:, significant][:, :WHITENING_MAX_DIMS]
-    if len(variances) == 0:
-        return np.zeros(size, np.float32), mean[:, None].astype(np.float32)
-    axes = centred.T @ vectors / np.sqrt(len(rows) * variances)
-    axes *= variances ** (-WHITENING_EXPONENT / 2.0)
-    return mean.astype(np.float32), np.ascontiguousarray(axes, dtype=np.float32)
-
-
-def whiten(
-    pooled: NDArray[np.float32], mean: NDArray[np.float32], axes: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Project raw vectors (..., R) to rows (..., D) of unit length; zero rows stay zero."""
-    projected: NDArray[np.float32] = np.matmul(pooled - mean, axes)
-    projected[~pooled.any(axis=-1)] = 0.0
-    # A vector at the very mean has no direction but rounding.
-    return _unit_rows(projected, 1e-6)
+    return unit_rows(unit_rows(residuals, floor).ravel())
 
 
 class VladDescriptor(ABC):
@@ -138,6 +86,18 @@ class VladDescriptor(ABC):
     @abstractmethod
     def needs_image(self) -> bool:
         """Whether it looks at the pixels; if not, ``rgb`` may be an image without any."""
+
+    @property
+    @abstractmethod
+    def needs_local_features(self) -> bool:
+        """Whether it is made of local features; if not, ``local`` may be empty."""
+
+    @property
+    def needs_vocabulary(self) -> bool:
+        """True: the centres that words are compared with."""
+        return True
+
+    computed_with: str | None = None  # plain code
 
     @abstractmethod
     def words(self, rgb: NDArray[np.uint8], local: LocalFeatures) -> NDArray[np.float32]:
@@ -195,9 +155,7 @@ VLAD_PARAMETERS: Mapping[str, int | float | str] = {
     "kmeans_iterations": KMEANS_ITERATIONS,
     "kmeans_max_words": KMEANS_MAX_WORDS,
     "training_words_per_photo": TRAINING_WORDS_PER_PHOTO,
-    "whitening_exponent": WHITENING_EXPONENT,
-    "whitening_max_dims": WHITENING_MAX_DIMS,
-    "whitening_max_photos": WHITENING_MAX_PHOTOS,
+    **WHITENING_PARAMETERS,
 }
 
 
@@ -213,13 +171,3 @@ def _sum_by_nearest(
     membership = sparse.csr_array((np.ones(n, np.float32), nearest, np.arange(n + 1)), shape=(n, k))
     counts = np.bincount(nearest, minlength=k).astype(np.float32)
     return np.asarray(membership.T @ words, dtype=np.float32), counts
-
-
-def _unit_rows(
-    rows: NDArray[np.float32], floor: NDArray[np.float32] | float = 0.0
-) -> NDArray[np.float32]:
-    """Scale rows (..., d) to unit length; those not longer than ``floor`` become zero."""
-    lengths = np.linalg.norm(rows, axis=-1, keepdims=True)
-    unit = np.zeros_like(rows)
-    np.divide(rows, lengths, out=unit, where=lengths > floor)
-    return unit

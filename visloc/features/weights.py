@@ -6,6 +6,7 @@ the software downloads them and says in which folder they lie.
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from visloc.errors import WeightsError
-from visloc.features.checkpoint import Checkpoint, read_checkpoint
+from visloc.features.checkpoint import MAX_FILE_BYTES, Checkpoint, read_checkpoint
 
 Shapes = Mapping[str, tuple[int, ...]]
 
@@ -27,14 +28,16 @@ class PublishedWeights:
         network: the network it belongs to, for people.
         source: where to download it.
         licence: under which licence, with what it means.
-        sha256: of the file as published.
+        sha256: of the file as published; None where no published file was at hand.
+        max_bytes: how large a file is read at most.
     """
 
     file_name: str
     network: str
     source: str
     licence: str
-    sha256: str
+    sha256: str | None = None
+    max_bytes: int = MAX_FILE_BYTES
 
 
 def _of_r2d2(file_name: str, network: str, sha256: str) -> PublishedWeights:
@@ -81,7 +84,28 @@ def read_weights(weights_dir: Path | None, published: PublishedWeights) -> Check
             expected=f"a folder with {published.file_name}",
             got="no weights folder" if weights_dir is None else f"no such file in {weights_dir}",
         )
-    return read_checkpoint(path)
+    return read_checkpoint(path, published.max_bytes)
+
+
+def find_weights(
+    file_name: str, weights_dir: Path | None, package: str, folder: str
+) -> Path | None:
+    """Look for a file in the weights folder, then in an installed package that carries it.
+
+    Args:
+        file_name: of the weights, as published.
+        weights_dir: the weights folder.
+        package: a package's name in Python; it is located, never imported.
+        folder: where the package has the file.
+
+    Returns:
+        The file, or None.
+    """
+    folders = [] if weights_dir is None else [weights_dir]
+    found = importlib.util.find_spec(package)
+    if found is not None:
+        folders += [Path(place) / folder for place in found.submodule_search_locations or ()]
+    return next((f / file_name for f in folders if (f / file_name).is_file()), None)
 
 
 def check_shapes(checkpoint: Checkpoint, expected: Shapes, *, network: str, held: str) -> None:

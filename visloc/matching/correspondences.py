@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,15 @@ from visloc.matching.products import EightBitRows, in_threads, row_products
 
 # With 2000 to 5000 keypoints, 2 to 5 MB of products.
 _BLOCK_ROWS = 256
+# Lowe's test of ambiguity: how much nearer than the second nearest the nearest must be. His 0.8 is
+# for SIFT; learned descriptors of unlike points lie closer together, and 0.9 is what Jin et al.
+# 2020 (Image Matching across Wide Baselines, arXiv:2003.01587) find for those trained like ours.
+CLEAR_RATIO = 0.9
+# Photos matched again by a network: each costs more than all others together.
+NUM_REMATCHED = 3
+
+# Rows of one side, rows of the other, and the similarity of their descriptors.
+Pairs = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,9 +44,15 @@ class Correspondences:
 
 
 def mutual_nearest_neighbours(
-    a: EightBitRows, b: EightBitRows
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
+    a: EightBitRows, b: EightBitRows, max_ratio: float | None = None
+) -> Pairs:
     """Pair the rows of a (n, D) and b (m, D) that are each other's most similar.
+
+    Args:
+        a: unit rows but for the rounding.
+        b: as a.
+        max_ratio: pairs are left out unless their distance is below this part of the distance of
+            the row of a to the second nearest row of b (Lowe 2004, section 7.1); None keeps all.
 
     Returns:
         Rows of a, rows of b and their dot products. Ties go to the lower row of b, and of a.
@@ -48,6 +63,8 @@ def mutual_nearest_neighbours(
     products = row_products(a.rows, b.rows, _BLOCK_ROWS)
     best_b = np.empty(len(a), dtype=np.int64)
     best = np.empty(len(a), dtype=np.float64)
+    second = None if max_ratio is None else np.empty(len(a), dtype=np.float64)
+    lowest = -a.rows.shape[1] * 128**2  # of all products; the distance where there is no second
     column_best = np.full(len(b), -np.inf)
     # Blocks are looked through while they are in the cache.
     for start in range(0, len(a), _BLOCK_ROWS):
@@ -56,16 +73,27 @@ def mutual_nearest_neighbours(
         np.argmax(similarity, axis=1, out=best_b[rows])
         best[rows] = similarity[np.arange(len(similarity)), best_b[rows]]
         np.maximum(column_best, similarity.max(axis=0), out=column_best)
+        if second is not None:
+            similarity[np.arange(len(similarity)), best_b[rows]] = lowest
+            np.max(similarity, axis=1, out=second[rows])
     # Equality with the column's maximum replaces a second, slower arg-max over the columns.
     mutual = np.flatnonzero(best == column_best[best_b])
     # Rows with equal similarity to one column (duplicate descriptors): the first one keeps it.
     _, first = np.unique(best_b[mutual], return_index=True)
     mutual = mutual[np.sort(first)]
+    if second is not None and max_ratio is not None:
+        # The squared distance of unit vectors is 2 - 2 cos.
+        half_squares = (1 - np.clip(s[mutual] * (a.scale * b.scale), -1, 1) for s in (best, second))
+        nearest, second_nearest = half_squares
+        mutual = mutual[nearest < max_ratio**2 * second_nearest]
     return mutual, best_b[mutual], (best[mutual] * (a.scale * b.scale)).astype(np.float32)
 
 
 def match_landmarks(
-    query: EightBitRows, photos: Iterable[tuple[NDArray[np.integer], EightBitRows]]
+    query: EightBitRows,
+    photos: Iterable[tuple[NDArray[np.integer], EightBitRows]],
+    max_ratio: float | None = None,
+    rematch: Callable[[int], Pairs] | None = None,
 ) -> Correspondences:
     """Match a query against several mapping photos and settle conflicts by vote.
 
@@ -80,19 +108,25 @@ def match_landmarks(
         query: (n, D) descriptors of the query.
         photos: of each mapping photo, most similar first, the landmarks (m,) that it observes
             and their descriptors (m, D).
+        max_ratio: of each photo's nearest neighbours, as of ``mutual_nearest_neighbours``.
+        rematch: a better and slower way to match the query with a photo, given its position in
+            ``photos``: keypoints, landmarks and similarities. What it says of the photos with the
+            most pairs replaces those.
     """
 
-    def match(
-        photo: tuple[NDArray[np.integer], EightBitRows],
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
+    def match(photo: tuple[NDArray[np.integer], EightBitRows]) -> Pairs:
         landmarks, descriptors = photo
-        i, j, similarity = mutual_nearest_neighbours(query, descriptors)
+        i, j, similarity = mutual_nearest_neighbours(query, descriptors, max_ratio)
         return i, landmarks[j].astype(np.int64), similarity
 
     found = in_threads(match, photos)
     if not found:
         none = np.empty(0, dtype=np.int64)
         return Correspondences(none, none, np.empty(0), np.empty(0, dtype=np.float32))
+    if rematch is not None:
+        best = sorted(range(len(found)), key=lambda photo: -len(found[photo][0]))[:NUM_REMATCHED]
+        for photo, pairs in zip(best, in_threads(rematch, best), strict=True):
+            found[photo] = pairs
     keypoints, landmarks, similarities = map(np.concatenate, zip(*found, strict=True))
     ranks = np.repeat(np.arange(1, len(found) + 1), [len(i) for i, _, _ in found])
     return _settle(keypoints, landmarks, 1.0 / ranks, similarities)

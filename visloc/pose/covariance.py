@@ -20,6 +20,11 @@ _MIN_VARIANCE_PX2 = 1e-12
 # Smallest eigenvalue of the unit-free information matrix, of largest diagonal 1.
 _MIN_INFORMATION = 1e-9
 _SANDWICH_SCATTER = 2.0
+# Standard deviation of the logarithm of an unknown focal length.
+_MAX_FOCAL_STD = 0.1
+# Who does not know the focal length does not know either by how much the principal point is off
+# the centre: so much of the longer side.
+_PRINCIPAL_POINT_STD = 0.01
 
 
 def pose_covariance(
@@ -36,12 +41,16 @@ def pose_covariance(
 
     Args:
         views: inliers only; views without any are fine. Those at the very edge of what their
-            camera sees, where errors have no derivative, count as none.
+            camera sees, where errors have no derivative, count as none. For one of unknown focal
+            length the covariance has what that leaves open, and a principal point that may be
+            off by a hundredth of the longer side.
         rig_from_world: the refined pose.
         loss_scale_px: scale c of the loss c^2 / 2 log(1 + r^2 / c^2).
 
     Returns:
-        (6, 6) of ``rig_from_world``, or None when the inliers leave the pose undetermined.
+        (6, 6) of ``rig_from_world``, or None when the inliers leave the pose undetermined, or an
+        unknown focal length by more than a tenth: then the distance is a guess, and where it is
+        no longer linear in the errors a covariance does not tell.
     """
     if not views:
         return None
@@ -57,14 +66,15 @@ def pose_covariance(
     scatter = _squared(gradients)
     # The second derivative of the loss is weight - 2 psi psi^T / c^2.
     by_weight = np.sqrt(weight)[:, None, None] * jacobian
-    curvature = _squared(by_weight.reshape(-1, 6)) - 2.0 / loss_scale_px**2 * scatter
+    num_parameters = jacobian.shape[2]
+    curvature = _squared(by_weight.reshape(-1, num_parameters)) - 2.0 / loss_scale_px**2 * scatter
 
     num_residuals = 2 * num_points
-    spare = num_residuals - 6
+    spare = num_residuals - num_parameters
     slope = np.mean(weight**2)  # half the trace of the second derivative
     if slope == 0:  # all errors are huge
         return None
-    common = _inverse(_squared(jacobian.reshape(-1, 6)))
+    common = _inverse(_squared(jacobian.reshape(-1, num_parameters)))
     bread = _inverse(curvature)
     if common is None or bread is None:
         return None
@@ -73,7 +83,18 @@ def pose_covariance(
     sandwich = bread @ scatter @ bread * (num_residuals / spare)
     # The sandwich scatters by about 1 / sqrt(n) in each direction: the largest of both would be
     # too wide by that in half of them, were it not taken off first.
-    return _wider(common, sandwich / (1.0 + _SANDWICH_SCATTER / math.sqrt(num_points)))
+    wider = _wider(common, sandwich / (1.0 + _SANDWICH_SCATTER / math.sqrt(num_points)))
+    if num_parameters == 6:
+        return wider
+    if wider[6, 6] > _MAX_FOCAL_STD**2:
+        return None
+    (view,) = (view for view in views if len(view))
+    # Projections move as the principal point does; the pose that is best for them by this.
+    by_point = bread @ np.einsum("n,nai->ia", weight, jacobian)
+    longer_side = max(view.camera.width, view.camera.height)
+    return np.asarray(
+        (wider + (_PRINCIPAL_POINT_STD * longer_side) ** 2 * by_point @ by_point.T)[:6, :6]
+    )
 
 
 def position_covariance(
@@ -106,7 +127,7 @@ def with_origin(
 
 
 def _squared(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The product rows^T rows (6, 6) of rows (n, 6)."""
+    """The product rows^T rows (k, k) of rows (n, k)."""
     # Unlike a product of matrices, equal bits however many threads the linear algebra has.
     columns = np.ascontiguousarray(rows.T)
     return np.asarray(np.einsum("in,jn->ij", columns, columns))

@@ -6,32 +6,29 @@ one camera finds the same inliers, and is not more accurate.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
-import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
-import pycolmap
 from numpy.typing import NDArray
 
-from visloc.geometry import Pose
-from visloc.pose.colmap import colmap_camera, pose_from_colmap
+from visloc.geometry import Camera, Pose
 from visloc.pose.covariance import pose_covariance
 from visloc.pose.gravity import KnownGravity, find_upright_poses
-from visloc.pose.refinement import LOSS_SCALE_PX, MIN_INLIERS, RefinedPose, refine
+from visloc.pose.refinement import LOSS_SCALE_PX, RefinedPose, refine
+from visloc.pose.registration import REGISTRATION_LOSS_SCALE_PX, register
+from visloc.pose.search import (
+    search_with_focal_length,
+    search_with_poselib,
+    search_with_pycolmap,
+)
 from visloc.pose.views import MatchedView
+from visloc.types import Solver
 
-# Beyond this many trials a pose with 8 % inliers has been found with 99 % probability; a photo
-# of another place should not cost seconds.
-MAX_TRIALS = 10_000
-# pycolmap's own for one camera; those that it has for rigs take twice as long when half of
-# the correspondences are right, and find no more when few are.
-_CONFIDENCE = 0.99999
-_MIN_TRIALS = 100
-# RANSAC looks at no more than this many correspondences: what explains them explains the others,
-# and a photo of another place costs a third of the time. Of 4000 in no
-# order, poses that explain 5 % are found as often as among all, those of 3 % more rarely.
-_MAX_SEARCHED = 1_000
+# Focal lengths in units of the longer side, from 136 degrees across to 6: all that photos are
+# taken with. What lies beyond explains wrong matches, in a spot or in a flat picture.
+MIN_FOCAL, MAX_FOCAL = 0.2, 10.0
 # Steps of refinement that tell which of several poses is the best.
 _STEPS_TO_COMPARE = 5
 
@@ -46,16 +43,23 @@ class GeneralizedPose:
         covariance: (6, 6) of ``rig_from_world``, rotation (rad) then translation, for
             R <- Exp(w) R and t <- t + dt; None when the inliers leave the pose undetermined
             (collinear points, for one).
+        camera: with the focal length that was found together with the pose; None where it was
+            known.
     """
 
     rig_from_world: Pose
     inliers: tuple[NDArray[np.bool_], ...]
     covariance: NDArray[np.float64] | None
+    camera: Camera | None = None
 
     @property
     def num_inliers(self) -> int:
         """Inliers of all views."""
         return sum(int(mask.sum()) for mask in self.inliers)
+
+
+# Of views, with max_error_px and seed.
+PoseSolver = Callable[[Sequence[MatchedView], float, int], GeneralizedPose | None]
 
 
 def estimate_generalized_pose(
@@ -64,42 +68,46 @@ def estimate_generalized_pose(
     max_error_px: float,
     seed: int,
     gravity: KnownGravity | None = None,
+    solver: Solver = Solver.PYCOLMAP,
 ) -> GeneralizedPose | None:
     """Solve for the pose of a rig and refine it on the inliers of all its cameras.
 
-    Without gravity by LO-RANSAC with GP3P (pycolmap), over a sample of 1000 where there are more:
-    poses that explain less than about 4 % of the correspondences are not searched for. With
-    gravity by RANSAC with two correspondences (see ``visloc.pose.gravity``); gravity only guides
-    the search, the refinement leaves all six degrees of freedom.
+    Without gravity by the solver. ``pycolmap`` and ``poselib`` are LO-RANSAC with P3P or GP3P, over
+    a sample of 1000 where there are more: poses that explain less than about 4 % of the
+    correspondences are not searched for; the refinement is the same for both. ``registration`` has
+    a search and a refinement of its own (``visloc.pose.registration``).
+
+    With gravity by RANSAC with two correspondences (see ``visloc.pose.gravity``), whatever the
+    solver; gravity only guides the search, the refinement, the same as above, leaves all six
+    degrees of freedom.
+
+    With an unknown focal length by pycolmap's LO-RANSAC with P4Pf and P3P, whatever the solver and
+    without gravity; the refinement finds the focal length, too.
 
     Args:
         views: what each camera sees; some may have no correspondences.
         max_error_px: largest reprojection error of an inlier, in each camera's pixels.
         seed: equal seeds give equal bits.
         gravity: when it is known which way is down.
+        solver: a key of ``SOLVERS``.
 
     Returns:
         The pose, or None when there are fewer than four correspondences or none was found that
-        explains four. The solver finds a pose in almost anything: the caller must judge the
-        inliers, and, with gravity, ``gravity_deviation``.
+        explains four, or with no focal length that a camera has. The solver finds a pose in
+        almost anything: the caller must judge the inliers, and, with gravity,
+        ``gravity_deviation``.
 
     Raises:
-        ValueError: a view has not as many pixels as points.
+        ValueError: a view has not as many pixels as points; there are several with an unknown
+            focal length or for ``registration``.
     """
     checked = _checked(views)
+    if any(view.focal_unknown for view in checked):
+        return _with_focal_length(checked, max_error_px, seed)
     if gravity is None:
-        starts = _search(checked, max_error_px, seed)
-    else:
-        starts = find_upright_poses(checked, gravity, max_error_px=max_error_px, seed=seed)
-    if len(starts) > 1:
-        tried = [
-            refine(checked, start, max_error_px=max_error_px, max_steps=_STEPS_TO_COMPARE)
-            for start in starts
-        ]
-        found = [pose for pose in tried if pose is not None]
-        starts = [max(found, key=lambda pose: pose.num_inliers).rig_from_world] if found else []
-    best = refine(checked, starts[0], max_error_px=max_error_px) if starts else None
-    return None if best is None else _judged(checked, best)
+        return SOLVERS[solver](checked, max_error_px, seed)
+    starts = find_upright_poses(checked, gravity, max_error_px=max_error_px, seed=seed)
+    return _best_refined(checked, starts, max_error_px)
 
 
 def refine_generalized_pose(
@@ -109,19 +117,17 @@ def refine_generalized_pose(
 
     Args:
         views: what each camera sees; some may have no correspondences.
-        rig_from_world: where to start.
+        rig_from_world: where to start. An unknown focal length starts with the view's.
         max_error_px: largest reprojection error of an inlier, in each camera's pixels.
 
     Returns:
         The pose, or None when fewer than four correspondences are inliers of the start or of the
-        refined pose.
+        refined pose, or the focal length is none that a camera has.
 
     Raises:
         ValueError: a view has not as many pixels as points.
     """
-    checked = _checked(views)
-    best = refine(checked, rig_from_world, max_error_px=max_error_px)
-    return None if best is None else _judged(checked, best)
+    return _best_refined(_checked(views), [rig_from_world], max_error_px)
 
 
 def _checked(views: Sequence[MatchedView]) -> list[MatchedView]:
@@ -142,51 +148,82 @@ def _checked(views: Sequence[MatchedView]) -> list[MatchedView]:
     ]
 
 
-def _search(views: Sequence[MatchedView], max_error_px: float, seed: int) -> list[Pose]:
-    """The best pose by RANSAC, or none."""
-    share = _MAX_SEARCHED / max(sum(len(view) for view in views), _MAX_SEARCHED)
-    searched = [_sample(view, round(share * len(view))) for view in views]
-    pixels = np.concatenate([np.empty((0, 2)), *(view.pixels for view in searched)])
-    points = np.concatenate([np.empty((0, 3)), *(view.points for view in searched)])
-    camera_of = np.repeat(np.arange(len(searched)), [len(view) for view in searched])
-    finite = np.isfinite(pixels).all(axis=1) & np.isfinite(points).all(axis=1)
-    if np.count_nonzero(finite) < MIN_INLIERS:
-        return []
-    options = pycolmap.RANSACOptions()  # those that the call has by default are refused by it
-    options.max_error = max_error_px
-    options.confidence = _CONFIDENCE
-    options.min_num_trials = _MIN_TRIALS
-    options.max_num_trials = MAX_TRIALS
-    options.random_seed = seed
-    solved = pycolmap.estimate_generalized_absolute_pose(
-        pixels[finite],
-        points[finite],
-        camera_of[finite].tolist(),
-        [_rigid(view.cam_from_rig) for view in searched],
-        [colmap_camera(view.camera) for view in searched],
-        options,
+def _search_and_refine(
+    search: Callable[..., list[Pose]],
+    views: Sequence[MatchedView],
+    max_error_px: float,
+    seed: int,
+) -> GeneralizedPose | None:
+    starts = search(views, max_error_px=max_error_px, seed=seed)
+    return _best_refined(views, starts, max_error_px)
+
+
+def _register(
+    views: Sequence[MatchedView], max_error_px: float, seed: int
+) -> GeneralizedPose | None:
+    if len(views) != 1:
+        raise ValueError(f"{len(views)} views for a solver of one")
+    found = register(views[0], max_error_px=max_error_px, seed=seed)
+    if found is None:
+        return None
+    pose, inliers = found
+    kept = [views[0].selected(inliers)]
+    return GeneralizedPose(
+        pose, (inliers,), pose_covariance(kept, pose, REGISTRATION_LOSS_SCALE_PX)
     )
-    return [] if solved is None else [pose_from_colmap(solved["rig_from_world"])]
 
 
-def _sample(view: MatchedView, count: int) -> MatchedView:
-    """The first half of ``count`` correspondences, the best, and as many evenly from the others.
-
-    The best alone would find a pose in fewer trials, but nothing where they are wrong together.
-    """
-    num_best = count // 2
-    num_others = count - num_best
-    others = len(view) - num_best
-    rows = num_best + np.arange(num_others) * others // max(num_others, 1)
-    return view.selected(np.concatenate([np.arange(num_best), rows]))
+SOLVERS: Mapping[Solver, PoseSolver] = {
+    Solver.PYCOLMAP: partial(_search_and_refine, search_with_pycolmap),
+    Solver.POSELIB: partial(_search_and_refine, search_with_poselib),
+    Solver.REGISTRATION: _register,
+}
 
 
-def _judged(views: Sequence[MatchedView], best: RefinedPose) -> GeneralizedPose:
-    """Add the covariance."""
+def _with_focal_length(
+    views: Sequence[MatchedView], max_error_px: float, seed: int
+) -> GeneralizedPose | None:
+    if len(views) != 1:
+        raise ValueError(f"{len(views)} views, one of unknown focal length")
+    tried = []
+    for camera, start in search_with_focal_length(views[0], max_error_px=max_error_px, seed=seed):
+        if _is_usable(camera):
+            seen = [replace(views[0], camera=camera)]
+            pose = refine(seen, start, max_error_px=max_error_px)
+            if pose is not None:
+                tried.append((seen, pose))
+    return _judged(*min(tried, key=lambda each: each[1].loss)) if tried else None
+
+
+def _is_usable(camera: Camera) -> bool:
+    """Whether photos are taken with a focal length that was found together with a pose."""
+    longer_side = max(camera.width, camera.height)
+    return MIN_FOCAL <= camera.focal_length / longer_side <= MAX_FOCAL
+
+
+def _best_refined(
+    views: Sequence[MatchedView], starts: Sequence[Pose], max_error_px: float
+) -> GeneralizedPose | None:
+    """The pose that explains most, of those that the starts lead to."""
+    if len(starts) > 1:
+        tried = [
+            refine(views, start, max_error_px=max_error_px, max_steps=_STEPS_TO_COMPARE)
+            for start in starts
+        ]
+        found = [pose for pose in tried if pose is not None]
+        starts = [max(found, key=lambda pose: pose.num_inliers).rig_from_world] if found else []
+    best = refine(views, starts[0], max_error_px=max_error_px) if starts else None
+    return None if best is None else _judged(views, best)
+
+
+def _judged(views: Sequence[MatchedView], best: RefinedPose) -> GeneralizedPose | None:
+    """Add the covariance, and the camera whose focal length was found, unless there is no such."""
+    camera = None
+    if any(view.focal_unknown for view in views):
+        views = [view.zoomed(best.zoom) for view in views]
+        camera = views[0].camera
+        if not _is_usable(camera):
+            return None
     kept = [view.selected(mask) for view, mask in zip(views, best.inliers, strict=True)]
     covariance = pose_covariance(kept, best.rig_from_world, LOSS_SCALE_PX)
-    return GeneralizedPose(best.rig_from_world, best.inliers, covariance)
-
-
-def _rigid(pose: Pose) -> pycolmap.Rigid3d:
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation), pose.translation)
+    return GeneralizedPose(best.rig_from_world, best.inliers, covariance, camera)

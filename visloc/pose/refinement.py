@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -31,12 +32,14 @@ class RefinedPose:
 
     Attributes:
         rig_from_world: in the frame of the views' points.
+        zoom: the focal length in units of the view's; 1 where that is known.
         inliers: (n,) bool for each view, reprojection error within the threshold.
         loss: sum over all correspondences, in px^2.
         mean_loss: of an inlier, in px^2.
     """
 
     rig_from_world: Pose
+    zoom: float
     inliers: tuple[NDArray[np.bool_], ...]
     loss: float
     mean_loss: float
@@ -54,7 +57,7 @@ def refine(
     max_error_px: float,
     max_steps: int = _MAX_STEPS,
 ) -> RefinedPose | None:
-    """Minimize a robust reprojection error over the pose of a rig.
+    """Minimize a robust reprojection error over the pose of a rig, and an unknown focal length.
 
     The loss of an error r is the Cauchy loss c^2 / 2 log(1 + r^2 / c^2), and constant beyond the
     largest error of an inlier: inliers are chosen anew in every step, and those of the result are
@@ -65,7 +68,8 @@ def refine(
     The same bits come out however many threads the linear algebra has.
 
     Args:
-        views: what each camera sees; some may have no correspondences.
+        views: what each camera sees; some may have no correspondences. Where the focal length is
+            unknown, it is refined with the pose.
         start: ``rig_from_world`` so close that its inliers are right.
         max_error_px: largest reprojection error of an inlier, in each camera's pixels.
         max_steps: evaluations of the loss, when the caller can do with less than convergence.
@@ -74,7 +78,7 @@ def refine(
         The pose, or None when fewer than four correspondences are inliers, or all but three of
         the inliers lie at the very edge of what their cameras see, where errors have no derivative.
     """
-    best = _explained(views, start, max_error_px)
+    best = _explained(views, start, 1.0, max_error_px)
     normal = None
     damping = _MIN_DAMPING
     for _ in range(max_steps):
@@ -88,11 +92,12 @@ def refine(
         # In units that make the diagonal 1; directions without any information stay put.
         units = np.sqrt(np.diag(information))
         units[units == 0] = 1.0
-        damped = information / np.outer(units, units) + damping * np.eye(6)
+        damped = information / np.outer(units, units) + damping * np.eye(len(gradient))
         step = -np.linalg.solve(damped, gradient / units) / units
         expected_gain = -0.5 * float(gradient @ step)
         enough = _CONVERGED * max(best.mean_loss, _MIN_LOSS_PX2)
-        tried = _explained(views, moved(best.rig_from_world, step), max_error_px)
+        zoom = best.zoom * math.exp(np.clip(step[6:], -1.0, 1.0).sum())  # one, or none: exactly 1
+        tried = _explained(views, moved(best.rig_from_world, step[:6]), zoom, max_error_px)
         if tried.loss <= best.loss:
             best, normal = tried, None
             damping = max(damping / 10.0, _MIN_DAMPING)
@@ -104,9 +109,10 @@ def refine(
 
 
 def _explained(
-    views: Sequence[MatchedView], rig_from_world: Pose, max_error_px: float
+    views: Sequence[MatchedView], rig_from_world: Pose, zoom: float, max_error_px: float
 ) -> RefinedPose:
     """A pose with its inliers and its loss."""
+    views = _zoomed(views, zoom)
     errors = [reprojection_errors(view, rig_from_world) for view in views]
     # False for NaN: behind the camera.
     inliers = tuple(np.asarray(of_view <= max_error_px) for of_view in errors)
@@ -116,10 +122,15 @@ def _explained(
     total = float(losses.sum())
     return RefinedPose(
         rig_from_world,
+        zoom,
         inliers,
         loss=total + num_outliers * float(_loss(np.array(max_error_px))),
         mean_loss=total / max(len(losses), 1),
     )
+
+
+def _zoomed(views: Sequence[MatchedView], zoom: float) -> Sequence[MatchedView]:
+    return [view.zoomed(zoom) for view in views] if zoom != 1.0 else views
 
 
 def _loss(error: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -130,11 +141,14 @@ def _loss(error: NDArray[np.float64]) -> NDArray[np.float64]:
 def _normal_equations(
     views: Sequence[MatchedView], pose: RefinedPose
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """The loss's second derivative (6, 6) and its first (6,) by (w, dt) of ``moved``.
+    """The loss's second derivative (k, k) and its first (k,) by (w, dt) of ``moved``.
+
+    k is six, or seven with the logarithm of an unknown focal length.
 
     None when fewer than four inliers have a derivative.
     """
-    kept = [view.selected(mask) for view, mask in zip(views, pose.inliers, strict=True)]
+    zoomed = _zoomed(views, pose.zoom)
+    kept = [view.selected(mask) for view, mask in zip(zoomed, pose.inliers, strict=True)]
     errors, jacobian = linearized(kept, pose.rig_from_world, about=np.zeros(3))
     known = has_derivative(errors, jacobian)
     errors, jacobian = errors[known], jacobian[known]
@@ -143,6 +157,8 @@ def _normal_equations(
     weight = 1.0 / (1.0 + np.sum(errors * errors, axis=1) / LOSS_SCALE_PX**2)
     # One row per parameter, all errors in a row. einsum, not a product of matrices: the sums of
     # the latter depend on the number of threads.
-    weighted = np.ascontiguousarray((weight[:, None, None] * jacobian).reshape(-1, 6).T)
+    weighted = np.ascontiguousarray(
+        (weight[:, None, None] * jacobian).reshape(2 * len(errors), -1).T
+    )
     information = np.einsum("in,jn->ij", weighted, weighted)
     return information, np.einsum("in,n->i", weighted, errors.ravel())

@@ -36,21 +36,25 @@ def linearized(
 
     Returns:
         (n, 2) errors in pixels, projected less seen, NaN behind the camera; (n, 2, 6) their
-        derivatives by w (rad), then dt, NaN also at the very edge of what the camera sees.
+        derivatives by w (rad), then dt, NaN also at the very edge of what the camera sees. Where a
+        focal length is unknown (n, 2, 7), with those by its logarithm.
     """
     errors, jacobians = [], []
+    num_parameters = 7 if any(view.focal_unknown for view in views) else 6
     for view in views:
         in_rig = rig_from_world.apply(view.points)
         pixels, by_point = _projected(view.camera, view.cam_from_rig.apply(in_rig))
         errors.append(pixels - view.pixels)
-        jacobian = np.empty((len(view), 2, 6))
-        jacobian[:, :, 3:] = by_point @ view.cam_from_rig.rotation
+        jacobian = np.empty((len(view), 2, num_parameters))
+        jacobian[:, :, 3:6] = by_point @ view.cam_from_rig.rotation
         # a . (w x arm) = w . (arm x a)
-        a, b, c = np.moveaxis(jacobian[:, :, 3:], 2, 0)
+        a, b, c = np.moveaxis(jacobian[:, :, 3:6], 2, 0)
         x, y, z = (in_rig - about).T[:, :, None]
         jacobian[:, :, 0] = y * c - z * b
         jacobian[:, :, 1] = z * a - x * c
         jacobian[:, :, 2] = x * b - y * a
+        if view.focal_unknown:  # every model multiplies by it at last, then adds the centre
+            jacobian[:, :, 6] = pixels - view.principal_point
         jacobians.append(jacobian)
     return np.concatenate(errors), np.concatenate(jacobians)
 

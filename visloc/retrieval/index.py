@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.retrieval.fusion import gharm
+from visloc.retrieval.fusion import EQUAL_GHARM, LateFusion
 from visloc.retrieval.rows import GlobalRows
 from visloc.retrieval.shortlist import united
 
@@ -38,7 +38,8 @@ def retrieve(
     query: Mapping[str, NDArray[np.float32]],
     index: Mapping[str, GlobalRows],
     top_k: int,
-    weights: NDArray[np.float64] | None = None,
+    photo_weights: NDArray[np.float64] | None = None,
+    fusion: LateFusion = EQUAL_GHARM,
 ) -> Retrieved:
     """Rank the photos of a map by fused similarity to a query.
 
@@ -46,26 +47,31 @@ def retrieve(
     clusters most like the query, and all that any of them proposes are compared under all.
 
     Args:
-        query: unit vector (D,) by global descriptor; a zero vector is similar to nothing.
+        query: unit vector (D,) by global descriptor, of all that count; a zero vector is similar
+            to nothing.
         index: unit rows of the map's photos by the same global descriptors.
         top_k: how many to return; fewer when the map has fewer photos.
-        weights: (n,) from 0, never to be returned, to 1; they scale how much better a photo is
-            than the worst that was compared. The scores that are returned stay as they are.
+        photo_weights: (n,) from 0, never to be returned, to 1; they scale how much better a photo
+            is than the worst that was compared. The scores that are returned stay as they are.
+        fusion: how similarities become scores; of which global descriptors. It leaves one or more.
     """
-    compared = _compared(query, index, top_k, weights)
-    cosines = np.stack([rows.cosines(query[name], compared) for name, rows in index.items()])
-    scores = gharm(cosines)
+    index = {name: index[name] for name in fusion.counted(index)}
+    compared = _compared(query, index, top_k, photo_weights)
+    cosines = {name: rows.cosines(query[name], compared) for name, rows in index.items()}
+    scores = fusion.scores(cosines)
     photos = np.arange(len(scores)) if compared is None else compared
-    candidates = np.arange(len(scores)) if weights is None else np.flatnonzero(weights[photos])
-    ranked = scores[candidates]
-    if weights is not None and len(candidates):
-        ranked = (ranked - ranked.min()) * weights[photos[candidates]]
+    candidates = np.arange(len(scores))
+    ranked = scores
+    if photo_weights is not None:
+        candidates = np.flatnonzero(photo_weights[photos])
+        ranked = scores[candidates]
+        ranked = (ranked - ranked.min(initial=np.inf)) * photo_weights[photos[candidates]]
     # A stable sort: of equal scores the earlier photo comes first, on every machine.
     best = candidates[np.argsort(-ranked, kind="stable")[:top_k]]
     return Retrieved(
         images=photos[best],
         scores=scores[best],
-        similarities={name: row[best] for name, row in zip(index, cosines, strict=True)},
+        similarities={name: row[best] for name, row in cosines.items()},
     )
 
 
@@ -73,13 +79,13 @@ def _compared(
     query: Mapping[str, NDArray[np.float32]],
     index: Mapping[str, GlobalRows],
     top_k: int,
-    weights: NDArray[np.float64] | None,
+    photo_weights: NDArray[np.float64] | None,
 ) -> NDArray[np.int64] | None:
     """The photos to compare with the query, in the order of the map; None for all."""
     clusters = {name: rows.clusters for name, rows in index.items() if rows.clusters is not None}
     if len(clusters) < len(index):
         return None
-    allowed = None if weights is None else weights > 0
+    allowed = None if photo_weights is None else photo_weights > 0
     if allowed is not None and np.count_nonzero(allowed) <= MAX_EXACT:
         return np.flatnonzero(allowed)
     count = max(_NUM_PROPOSED, _PROPOSED_PER_RESULT * top_k)

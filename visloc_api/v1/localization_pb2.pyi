@@ -57,6 +57,26 @@ Global___Camera: _TypeAlias = Camera  # noqa: Y015
 class LocalizeOptions(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
+    @_typing.final
+    class FusionWeightsEntry(_message.Message):
+        DESCRIPTOR: _descriptor.Descriptor
+
+        KEY_FIELD_NUMBER: _builtins.int
+        VALUE_FIELD_NUMBER: _builtins.int
+        key: _builtins.str
+        value: _builtins.float
+        def __init__(
+            self,
+            *,
+            key: _builtins.str = ...,
+            value: _builtins.float = ...,
+        ) -> None: ...
+        _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+        def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+        _ClearFieldArgType: _TypeAlias = _typing.Literal["key", b"key", "value", b"value"]  # noqa: Y015
+        def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+        def WhichOneof(self, oneof_group: _Never) -> None: ...
+
     PRESET_FIELD_NUMBER: _builtins.int
     TOP_K_FIELD_NUMBER: _builtins.int
     MAX_ERROR_PX_FIELD_NUMBER: _builtins.int
@@ -64,6 +84,10 @@ class LocalizeOptions(_message.Message):
     MIN_INLIER_RATIO_FIELD_NUMBER: _builtins.int
     READ_AS_FIELD_NUMBER: _builtins.int
     EXTRACTION_FIELD_NUMBER: _builtins.int
+    FUSION_FIELD_NUMBER: _builtins.int
+    FUSION_WEIGHTS_FIELD_NUMBER: _builtins.int
+    MATCHER_FIELD_NUMBER: _builtins.int
+    SOLVER_FIELD_NUMBER: _builtins.int
     SEED_FIELD_NUMBER: _builtins.int
     preset: _builtins.str
     """default, config1 or config2"""
@@ -79,8 +103,20 @@ class LocalizeOptions(_message.Message):
     """stored (default) or upright (by EXIF orientation)"""
     extraction: _builtins.str
     """effort to find features: fast, default or accurate"""
+    fusion: _builtins.str
+    """How similarities under several global descriptors become one ranking: gharm, mean, power, min,
+    max, mean_and_power, min_and_max, mean_and_min, harmonic or round_robin; the map's by default.
+    """
+    matcher: _builtins.str
+    """of keypoints: mutual (default), ratio or lightglue"""
+    solver: _builtins.str
+    """of the pose: pycolmap (default), poselib, registration"""
     seed: _builtins.int
     """of RANSAC"""
+    @_builtins.property
+    def fusion_weights(self) -> _containers.ScalarMap[_builtins.str, _builtins.float]:
+        """By global descriptor; those without one are left out. Left out: the map's."""
+
     def __init__(
         self,
         *,
@@ -91,14 +127,22 @@ class LocalizeOptions(_message.Message):
         min_inlier_ratio: _builtins.float | None = ...,
         read_as: _builtins.str | None = ...,
         extraction: _builtins.str | None = ...,
+        fusion: _builtins.str | None = ...,
+        fusion_weights: _abc.Mapping[_builtins.str, _builtins.float] | None = ...,
+        matcher: _builtins.str | None = ...,
+        solver: _builtins.str | None = ...,
         seed: _builtins.int | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_top_k", b"_top_k", "extraction", b"extraction", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "top_k", b"top_k"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fusion", b"_fusion", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fusion", b"fusion", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_top_k", b"_top_k", "extraction", b"extraction", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "top_k", b"top_k"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fusion", b"_fusion", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fusion", b"fusion", "fusion_weights", b"fusion_weights", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__extraction: _TypeAlias = _typing.Literal["extraction"]  # noqa: Y015
     _WhichOneofArgType__extraction: _TypeAlias = _typing.Literal["_extraction", b"_extraction"]  # noqa: Y015
+    _WhichOneofReturnType__fusion: _TypeAlias = _typing.Literal["fusion"]  # noqa: Y015
+    _WhichOneofArgType__fusion: _TypeAlias = _typing.Literal["_fusion", b"_fusion"]  # noqa: Y015
+    _WhichOneofReturnType__matcher: _TypeAlias = _typing.Literal["matcher"]  # noqa: Y015
+    _WhichOneofArgType__matcher: _TypeAlias = _typing.Literal["_matcher", b"_matcher"]  # noqa: Y015
     _WhichOneofReturnType__max_error_px: _TypeAlias = _typing.Literal["max_error_px"]  # noqa: Y015
     _WhichOneofArgType__max_error_px: _TypeAlias = _typing.Literal["_max_error_px", b"_max_error_px"]  # noqa: Y015
     _WhichOneofReturnType__min_inlier_ratio: _TypeAlias = _typing.Literal["min_inlier_ratio"]  # noqa: Y015
@@ -111,10 +155,16 @@ class LocalizeOptions(_message.Message):
     _WhichOneofArgType__read_as: _TypeAlias = _typing.Literal["_read_as", b"_read_as"]  # noqa: Y015
     _WhichOneofReturnType__seed: _TypeAlias = _typing.Literal["seed"]  # noqa: Y015
     _WhichOneofArgType__seed: _TypeAlias = _typing.Literal["_seed", b"_seed"]  # noqa: Y015
+    _WhichOneofReturnType__solver: _TypeAlias = _typing.Literal["solver"]  # noqa: Y015
+    _WhichOneofArgType__solver: _TypeAlias = _typing.Literal["_solver", b"_solver"]  # noqa: Y015
     _WhichOneofReturnType__top_k: _TypeAlias = _typing.Literal["top_k"]  # noqa: Y015
     _WhichOneofArgType__top_k: _TypeAlias = _typing.Literal["_top_k", b"_top_k"]  # noqa: Y015
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__extraction) -> _WhichOneofReturnType__extraction | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__fusion) -> _WhichOneofReturnType__fusion | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__matcher) -> _WhichOneofReturnType__matcher | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__max_error_px) -> _WhichOneofReturnType__max_error_px | None: ...
     @_typing.overload
@@ -127,6 +177,8 @@ class LocalizeOptions(_message.Message):
     def WhichOneof(self, oneof_group: _WhichOneofArgType__read_as) -> _WhichOneofReturnType__read_as | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__seed) -> _WhichOneofReturnType__seed | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__solver) -> _WhichOneofReturnType__solver | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__top_k) -> _WhichOneofReturnType__top_k | None: ...
 
@@ -461,7 +513,7 @@ class LocalizeRequest(_message.Message):
 
     @_builtins.property
     def camera(self) -> Global___Camera:
-        """left out: EXIF focal length, else a guess that the answer marks"""
+        """Left out: EXIF focal length, else one estimated with the pose or guessed, which the answer marks."""
 
     @_builtins.property
     def options(self) -> Global___LocalizeOptions: ...
@@ -600,8 +652,8 @@ class RigImage(_message.Message):
     def features(self) -> Global___Features: ...
     @_builtins.property
     def camera(self) -> Global___Camera:
-        """Left out: the rig's for this sensor; of a rig_id, the map's for this sensor; else EXIF, else a
-        guess that the answer marks.
+        """Left out: the rig's for this sensor; of a rig_id, the map's for this sensor; else EXIF, else
+        one estimated or guessed, which the answer marks.
         """
 
     def __init__(
@@ -1029,7 +1081,7 @@ class CameraUsed(_message.Message):
     width: _builtins.int
     height: _builtins.int
     source: _builtins.str
-    """given, given_scaled, exif or guess"""
+    """given, given_scaled, exif, estimated (with the pose) or guess"""
     @_builtins.property
     def params(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
     def __init__(
@@ -1736,6 +1788,26 @@ Global___Extent: _TypeAlias = Extent  # noqa: Y015
 class MapInfo(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
+    @_typing.final
+    class FusionWeightsEntry(_message.Message):
+        DESCRIPTOR: _descriptor.Descriptor
+
+        KEY_FIELD_NUMBER: _builtins.int
+        VALUE_FIELD_NUMBER: _builtins.int
+        key: _builtins.str
+        value: _builtins.float
+        def __init__(
+            self,
+            *,
+            key: _builtins.str = ...,
+            value: _builtins.float = ...,
+        ) -> None: ...
+        _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+        def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+        _ClearFieldArgType: _TypeAlias = _typing.Literal["key", b"key", "value", b"value"]  # noqa: Y015
+        def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+        def WhichOneof(self, oneof_group: _Never) -> None: ...
+
     ID_FIELD_NUMBER: _builtins.int
     VERSION_FIELD_NUMBER: _builtins.int
     CREATED_FIELD_NUMBER: _builtins.int
@@ -1755,6 +1827,8 @@ class MapInfo(_message.Message):
     CURRENT_FIELD_NUMBER: _builtins.int
     VERSIONS_FIELD_NUMBER: _builtins.int
     CONTENT_HASH_FIELD_NUMBER: _builtins.int
+    FUSION_FIELD_NUMBER: _builtins.int
+    FUSION_WEIGHTS_FIELD_NUMBER: _builtins.int
     id: _builtins.str
     version: _builtins.str
     created: _builtins.str
@@ -1770,6 +1844,8 @@ class MapInfo(_message.Message):
     current: _builtins.bool
     """whether this version is in use"""
     content_hash: _builtins.str
+    fusion: _builtins.str
+    """of the global features, unless a query says otherwise"""
     @_builtins.property
     def global_features(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]: ...
     @_builtins.property
@@ -1789,6 +1865,10 @@ class MapInfo(_message.Message):
     @_builtins.property
     def versions(self) -> _containers.RepeatedCompositeFieldContainer[Global___VersionInfo]:
         """all published ones, oldest first"""
+
+    @_builtins.property
+    def fusion_weights(self) -> _containers.ScalarMap[_builtins.str, _builtins.float]:
+        """empty: all alike"""
 
     def __init__(
         self,
@@ -1812,10 +1892,12 @@ class MapInfo(_message.Message):
         current: _builtins.bool = ...,
         versions: _abc.Iterable[Global___VersionInfo] | None = ...,
         content_hash: _builtins.str = ...,
+        fusion: _builtins.str = ...,
+        fusion_weights: _abc.Mapping[_builtins.str, _builtins.float] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_anchor", b"_anchor", "_place", b"_place", "anchor", b"anchor", "extent", b"extent", "place", b"place"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_anchor", b"_anchor", "_place", b"_place", "anchor", b"anchor", "content_hash", b"content_hash", "created", b"created", "current", b"current", "down", b"down", "extent", b"extent", "global_features", b"global_features", "id", b"id", "images", b"images", "landmarks", b"landmarks", "local_features", b"local_features", "method", b"method", "metric", b"metric", "observations", b"observations", "place", b"place", "rigs", b"rigs", "size_bytes", b"size_bytes", "version", b"version", "versions", b"versions"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_anchor", b"_anchor", "_place", b"_place", "anchor", b"anchor", "content_hash", b"content_hash", "created", b"created", "current", b"current", "down", b"down", "extent", b"extent", "fusion", b"fusion", "fusion_weights", b"fusion_weights", "global_features", b"global_features", "id", b"id", "images", b"images", "landmarks", b"landmarks", "local_features", b"local_features", "method", b"method", "metric", b"metric", "observations", b"observations", "place", b"place", "rigs", b"rigs", "size_bytes", b"size_bytes", "version", b"version", "versions", b"versions"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__anchor: _TypeAlias = _typing.Literal["anchor"]  # noqa: Y015
     _WhichOneofArgType__anchor: _TypeAlias = _typing.Literal["_anchor", b"_anchor"]  # noqa: Y015

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from visloc.features.aliked import load_aliked, load_aliked_t16
 from visloc.features.base import LocalFeatureExtractor
 from visloc.features.r2d2 import load_faster2d2, load_r2d2
 from visloc.features.sift import load_sift
@@ -18,12 +19,14 @@ from visloc.features.xfeat import load_xfeat
 from visloc.types import LocalFeatures
 
 LOADERS = {
+    "aliked": load_aliked,
+    "aliked-t16": load_aliked_t16,
     "faster2d2": load_faster2d2,
     "r2d2": load_r2d2,
     "sift": load_sift,
     "xfeat": load_xfeat,
 }
-NEEDS_WEIGHTS = {"faster2d2", "r2d2"}
+NEEDS_WEIGHTS = {"aliked", "aliked-t16", "faster2d2", "r2d2"}
 HEIGHT, WIDTH = 192, 256
 
 
@@ -171,7 +174,14 @@ def _scale_residuals(
 
 # px of the small image. The networks find a corner to about a pixel, and not quite the same
 # one at another scale; the tests below and the one of R2D2's scales are exact to half a pixel.
-SCALE_TOLERANCE_PX = {"faster2d2": 0.2, "r2d2": 0.2, "sift": 0.02, "xfeat": 0.25}
+SCALE_TOLERANCE_PX = {
+    "aliked": 0.2,
+    "aliked-t16": 0.2,
+    "faster2d2": 0.2,
+    "r2d2": 0.2,
+    "sift": 0.02,
+    "xfeat": 0.25,
+}
 
 
 def test_keypoints_follow_a_change_of_scale(extractor: LocalFeatureExtractor) -> None:

@@ -6,7 +6,11 @@ import torch
 from numpy.typing import NDArray
 
 from visloc.matching import products
-from visloc.matching.correspondences import match_landmarks, mutual_nearest_neighbours
+from visloc.matching.correspondences import (
+    Pairs,
+    match_landmarks,
+    mutual_nearest_neighbours,
+)
 from visloc.matching.products import EightBitRows, in_eight_bits
 
 
@@ -70,6 +74,50 @@ def test_pairs_are_those_of_the_definition(
             expected[row] = column
     assert dict(zip(i.tolist(), j.tolist(), strict=True)) == expected
     assert np.array_equal(similarity, (exact[i, j] / 8).astype(np.float32))
+
+
+def at(*angles_deg: float) -> EightBitRows:
+    """Unit vectors in the plane; a step of 1/127 is 0.45 degrees at most."""
+    angles = np.radians(angles_deg)
+    return in_eight_bits(np.column_stack([np.cos(angles), np.sin(angles)]).astype(np.float32))
+
+
+@pytest.mark.parametrize(("second_deg", "clear"), [(40.0, True), (23.5, True), (21.0, False)])
+def test_the_second_nearest_must_be_clearly_further(second_deg: float, *, clear: bool) -> None:
+    # 20 degrees of turn are a distance of 0.347; 0.347 / 0.9 is one of 22.3 degrees
+    i, j, similarity = mutual_nearest_neighbours(at(0), at(second_deg, -20), 0.9)
+    assert (i.tolist(), j.tolist()) == (([0], [1]) if clear else ([], []))
+    assert similarity == pytest.approx([np.cos(np.radians(20))] if clear else [], abs=0.01)
+
+
+def test_of_equal_descriptors_none_is_clearly_nearest() -> None:
+    assert len(mutual_nearest_neighbours(at(0), at(0, 0, 90), 0.9)[0]) == 0
+
+
+def test_a_photo_with_one_landmark_has_no_second_nearest() -> None:
+    assert len(mutual_nearest_neighbours(at(0), at(60), 0.9)[0]) == 1
+
+
+@pytest.mark.parametrize("has_integer_products", [True, False])
+@pytest.mark.parametrize(("n", "m", "dim"), [(600, 520, 8), (257, 2, 128), (30, 1, 3), (5, 9, 1)])
+def test_pairs_under_a_ratio_are_those_of_the_definition(
+    monkeypatch: pytest.MonkeyPatch, n: int, m: int, dim: int, *, has_integer_products: bool
+) -> None:
+    if not has_integer_products:
+        monkeypatch.setattr(products, "_has_integer_products", lambda: False)
+    rng = np.random.default_rng(n)
+    a, b = in_eight_bits(unit_rows(rng, n, dim)), in_eight_bits(unit_rows(rng, m, dim))
+    i, j, similarity = mutual_nearest_neighbours(a, b)
+    cosines = a.rows[i].astype(np.float64) @ b.rows.T.astype(np.float64) * (a.scale * b.scale)
+    distances = np.sqrt(2 - 2 * np.clip(cosines, -1, 1))
+    nearest = distances[np.arange(len(i)), j]
+    distances[np.arange(len(i)), j] = np.inf
+    second = np.minimum(distances.min(axis=1), 2.0)
+    clear = nearest < 0.9 * second
+    found = mutual_nearest_neighbours(a, b, 0.9)
+    assert np.array_equal(found[0], i[clear])
+    assert np.array_equal(found[1], j[clear])
+    assert np.array_equal(found[2], similarity[clear])
 
 
 QUERY = np.array([[1.0, 0.0]], dtype=np.float32)
@@ -140,3 +188,29 @@ def test_the_number_of_threads_changes_nothing(
 
 def test_no_photos_give_no_pairs() -> None:
     assert len(match_landmarks(in_eight_bits(np.ones((3, 4), np.float32)), [])) == 0
+
+
+def test_the_photos_with_most_pairs_are_matched_again() -> None:
+    # of five photos, the second, third and fourth have two pairs each, the others one
+    one, two = (in_eight_bits(QUERIES[:n]) for n in (1, 2))
+    photos = [(np.arange(len(rows)), rows) for rows in (one, two, two, two, one)]
+    asked: list[int] = []
+
+    def rematch(photo: int) -> Pairs:
+        asked.append(photo)
+        return np.array([5]), np.array([9 + photo]), np.array([0.5], np.float32)
+
+    pairs = match_landmarks(in_eight_bits(QUERIES[:6]), photos, rematch=rematch)
+    assert sorted(asked) == [1, 2, 3]
+    # what was found before in those photos does not count any more; of three for one keypoint the
+    # best ranked photo's wins
+    found = list(zip(pairs.keypoints.tolist(), pairs.landmarks.tolist(), strict=True))
+    assert found == [(0, 0), (5, 10)]
+    assert pairs.support == pytest.approx([1 + 1 / 5, 1 / 2])
+
+
+def test_ambiguous_pairs_do_not_vote() -> None:
+    double = in_eight_bits(np.concatenate([QUERY, QUERY]))
+    photos = [(np.array([3, 4]), double), (np.array([7]), in_eight_bits(NEAR))]
+    assert match_landmarks(in_eight_bits(QUERY), photos).landmarks.tolist() == [3]
+    assert match_landmarks(in_eight_bits(QUERY), photos, 0.9).landmarks.tolist() == [7]

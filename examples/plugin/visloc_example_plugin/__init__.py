@@ -1,0 +1,1 @@
+"""ORB and thumbnails as features for visloc."""

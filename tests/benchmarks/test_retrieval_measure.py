@@ -1,0 +1,78 @@
+"""What counts as seen by a query, in scenes whose answer is known."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.retrieval import Query, recalls, shared_landmarks, visible_landmarks
+from visloc.geometry import Camera, Pose
+from visloc.retrieval.fusion import EQUAL_GHARM
+from visloc.retrieval.rows import GlobalRows
+
+CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
+HERE = Pose.identity()
+
+
+def visible(points: list[list[float]]) -> list[bool]:
+    return visible_landmarks(np.array(points), CAMERA, HERE).tolist()
+
+
+def test_only_what_projects_into_the_image_from_in_front_is_visible() -> None:
+    points = [[0.0, 0, 5], [0, 0, -5], [3.19, 0, 5], [3.21, 0, 5], [0, 2.39, 5], [0, -2.41, 5]]
+    assert visible(points) == [True, False, True, False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("hiding", "depth", "seen"), [(3, 3.9, False), (2, 3.9, True), (3, 4.1, True)]
+)
+def test_three_landmarks_that_are_clearly_nearer_hide_one(
+    hiding: int, depth: float, seen: bool
+) -> None:
+    assert visible([[0.01, 0.01, 5.0], *[[0.01, 0.01, depth]] * hiding])[0] is seen
+    assert all(visible([[0.01, 0.01, 5.0], *[[0.01, 0.01, depth]] * hiding])[1:])
+    # In another cell nothing is hidden.
+    assert visible([[1.0, 0.01, 5.0], *[[0.01, 0.01, depth]] * hiding])[0]
+
+
+def looking_from(center: list[float]) -> list[float]:
+    return [1.0, 0, 0, 0, *(-np.array(center)).tolist()]
+
+
+def test_landmarks_are_shared_within_an_angle_and_a_ratio_of_distances() -> None:
+    origin = np.array([1e6, 2e6, 50.0])
+    point = np.array([[0.0, 0.0, 10.0]])
+    centers = [
+        *([0.0, 0, 0], [0, 0, 4.9], [0, 0, 5.1], [0, 0, -9.9], [0, 0, -10.1]),
+        *(
+            [16.0, 0, 10.0 - 16 / np.tan(np.radians(61))],
+            [16.0, 0, 10 - 16 / np.tan(np.radians(59))],
+        ),
+    ]
+    opened: Any = SimpleNamespace(
+        manifest=SimpleNamespace(world=SimpleNamespace(origin=tuple(origin))),
+        landmarks=point.astype(np.float32),
+        images=centers,
+        image_poses=np.array([looking_from(list(np.array(c) + origin)) for c in centers]),
+        observations=lambda _: (np.array([0, 0], np.uint32), None),
+    )
+    shared = shared_landmarks(opened, CAMERA, Pose(np.eye(3), -origin))
+    assert shared.tolist() == [1, 1, 0, 1, 0, 0, 1]
+
+
+def test_recall_is_of_the_best_k_and_of_what_was_possible() -> None:
+    angles = np.radians([0.0, 10, 20, 30])
+    rows = np.column_stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
+    opened: Any = SimpleNamespace(global_descriptors={"a": GlobalRows(rows)}, images=[None] * 4)
+    asked = [
+        Query({"a": rows[0]}, np.array([True, False, True, False])),
+        Query({"a": rows[3]}, np.array([True, False, False, False])),
+    ]
+    assert recalls(asked, opened, EQUAL_GHARM, [1, 3, 50]) == [
+        pytest.approx((0.5, 0.5)),
+        pytest.approx(((2 / 3 + 0) / 2, 0.5)),
+        pytest.approx(((2 / 4 + 1 / 4) / 2, 1.0)),
+    ]

@@ -1,0 +1,76 @@
+"""Features of other Python packages, found by their entry points.
+
+A package names a function that takes the folder with weights or None, how networks are computed,
+and with how many threads (None for all), and returns a ``LocalFeatureExtractor`` or a
+``GlobalDescriptor``. Its code is run when its name is asked for, not before.
+"""
+
+from __future__ import annotations
+
+import re
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any
+
+from visloc.errors import InvalidInput, VislocError
+from visloc.types import Fingerprint, Inference
+
+LOCAL_FEATURES_GROUP = "visloc.local_features"
+GLOBAL_FEATURES_GROUP = "visloc.global_features"
+# What a map can name, in its manifest and in file names.
+_NAME = re.compile(r"[a-z0-9][a-z0-9_.-]{0,63}")
+
+
+def plugin_names(group: str) -> set[str]:
+    """Return the names that installed packages offer and that a map can have."""
+    return {entry.name for entry in entry_points(group=group) if _NAME.fullmatch(entry.name)}
+
+
+def make_plugin(
+    group: str, name: str, weights_dir: Path | None, inference: Inference, threads: int | None
+) -> Any:
+    """Make what a package offers under a name of ``plugin_names``.
+
+    Raises:
+        InvalidInput: ``features.plugin`` when several packages offer the name, when the code of the
+            package fails, or when what it makes has another name.
+        VislocError: what the package itself raises of this kind.
+    """
+    entries = list(entry_points(group=group, name=name))
+    packages = sorted(_package(entry) for entry in entries)
+    if len(entries) > 1:
+        raise InvalidInput(
+            "features.plugin",
+            "several installed packages offer features of this name; uninstall all but one",
+            field=name,
+            expected="one package",
+            got=", ".join(packages),
+        )
+    try:
+        made = entries[0].load()(weights_dir, inference, threads)
+        fingerprint = made.fingerprint
+    except VislocError:
+        raise
+    except Exception as error:
+        raise InvalidInput(
+            "features.plugin",
+            f"the package {packages[0]} cannot make these features; repair or uninstall it",
+            field=name,
+            expected=f"{entries[0].value} makes them",
+            got=f"{type(error).__name__}: {error}",
+        ) from error
+    if not isinstance(fingerprint, Fingerprint) or fingerprint.name != name:
+        raise InvalidInput(
+            "features.plugin",
+            f"what the package {packages[0]} makes has another name, so that nothing could open "
+            "the map again",
+            field=name,
+            expected=f"a fingerprint with the name of the entry point, {name}",
+            got=getattr(fingerprint, "name", fingerprint),
+        )
+    return made
+
+
+def _package(entry: EntryPoint) -> str:
+    distribution = entry.dist
+    return entry.module if distribution is None else distribution.name
