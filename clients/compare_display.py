@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -13,6 +14,7 @@ from rich.table import Table
 from clients.display import print_line
 
 _MAX_LINE = 100
+_NUM_OF_COST = 3  # columns of time and size
 _NOTHING = "-"
 
 
@@ -44,12 +46,23 @@ def mebibytes(size_bytes: int) -> str:
 def print_comparison(console: Console, comparison: Mapping[str, Any]) -> None:
     """Print a row for each value, then what explains them."""
     header, rows = _cells(comparison)
-    table = Table()
-    for number, title in enumerate(header):
-        table.add_column(escape(clean(title)), justify="left" if number == 0 else "right")
     for row in rows:
-        table.add_row(*(escape(clean(cell)) for cell in row))
-    console.print(table)
+        row[1] = row[1].partition(":")[0]  # why something is refused is said below
+    # Two tables, so that they fit into 80 columns.
+    num_accuracy = len(header) - _NUM_OF_COST
+    for columns in (range(num_accuracy), (0, *range(num_accuracy, len(header)))):
+        table = Table(box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
+        for column in columns:
+            table.add_column(
+                escape(header[column]),
+                justify="right" if column else "left",
+                overflow="fold",
+                # Only titles are broken.
+                width=max(map(len, (*header[column].split(), *(row[column] for row in rows)))),
+            )
+        for row in rows:
+            table.add_row(*(escape(clean(row[column])) for column in columns))
+        console.print(table)
     for value in comparison["values"]:
         if value["refusal"] is not None:
             print_line(console, "refused", _refusal(value), "yellow")
@@ -76,7 +89,8 @@ def _cells(comparison: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     header = [
         *(comparison["axis"], "localized"),
         *(threshold_text(comparison, threshold) for threshold in thresholds),
-        *("median error", "p50", "p90", "map"),
+        "median error",
+        *("p50", "p90", "map"),
     ]
     return header, [_row(comparison, value, len(thresholds)) for value in comparison["values"]]
 

@@ -10,6 +10,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from time import perf_counter, time
 from typing import Any
 
@@ -41,6 +42,7 @@ from visloc.features import (
     make_global_descriptor,
     make_local_features,
 )
+from visloc.features.lightglue import make_lightglue
 from visloc.features.readymade import is_ready_made
 from visloc.images import ImageLimits, read_photo
 from visloc.localizer import FeatureCache, Localizer
@@ -112,7 +114,8 @@ class Vision:
             name = opened.manifest.local_features.fingerprint.name
             try:
                 extractor = None if is_ready_made(name) else self._extractor(name)
-                localizer = Localizer(opened, extractor, self._descriptor)
+                matcher = partial(make_lightglue, weights_dir=self._settings.weights_dir)
+                localizer = Localizer(opened, extractor, self._descriptor, matcher)
             except InvalidInput as error:  # features that are not here: not the caller's mistake
                 raise Conflict(
                     error.code,

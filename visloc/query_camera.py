@@ -15,7 +15,8 @@ GUESSED_FOCAL = 1.2
 def resolve_camera(photo: Photo, given: Camera | None) -> tuple[Camera, CameraSource]:
     """Choose the intrinsics of a photo: given, else EXIF's focal length, else a guess.
 
-    A camera given for another size of the same aspect is scaled to the photo.
+    A camera given for another size of the same aspect is scaled to the photo. A guess is where the
+    search for the focal length of a photo on its own starts (``visloc.solving``).
 
     Raises:
         InvalidInput: ``camera.size_mismatch``.

@@ -112,7 +112,7 @@ def test_a_blank_photo_is_an_answer_without_a_pose(doors: Any) -> None:
 
     assert (answer["status"], answer["pose"]) == ("not_localized", None)
     assert answer["refusal"]["reason"] == "no_keypoints"
-    assert answer["camera"]["source"] == "estimated"
+    assert answer["camera"]["source"] == "guess"
 
 
 @pytest.mark.parametrize("mode", ["L", "RGBA", "P", "I;16"])

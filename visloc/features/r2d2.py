@@ -23,6 +23,7 @@ from visloc.features.base import Fingerprint, LocalFeatureExtractor
 from visloc.features.checkpoint import Checkpoint
 from visloc.features.convolution import fold_batch_norm
 from visloc.features.inference import choose_inference
+from visloc.features.subpixel import peak_offsets
 from visloc.features.weights import (
     FASTER2D2_WASF_N16,
     R2D2_WASF_N16,
@@ -39,6 +40,9 @@ MIN_LONG_SIDE_PX = 256
 MIN_RELIABILITY = 0.7
 MIN_REPEATABILITY = 0.7
 PATCH_PX = 32  # nominal diameter of what one descriptor describes, at scale 1
+# Repeatability is trained to be high in blobs of some pixels, and Fast-R2D2's is interpolated from
+# half the resolution: the pixels next to a peak alone say little about where it is.
+PEAK_REACH_PX = 2
 _MIN_SHORT_SIDE_PX = 8  # below, a network of 51 px receptive field sees mostly padding
 # Of the scales at which features could be looked for: first, last, step.
 _LEVELS: Mapping[Extraction, tuple[int, int | None, int]] = {
@@ -327,13 +331,14 @@ class R2D2Extractor:
         self.network = network
         self.fingerprint = Fingerprint(
             name=architecture.name,
-            revision=1,
+            revision=2,
             parameters={
                 "scale_step": SCALE_STEP,
                 "max_long_side_px": MAX_LONG_SIDE_PX,
                 "min_long_side_px": MIN_LONG_SIDE_PX,
                 "min_reliability": MIN_RELIABILITY,
                 "min_repeatability": MIN_REPEATABILITY,
+                "peak_reach_px": PEAK_REACH_PX,
             },
             weights_sha256=checkpoint.sha256,
         )
@@ -358,6 +363,7 @@ class R2D2Extractor:
         """Return the strongest keypoints over all scales; see ``LocalFeatureExtractor``.
 
         Score: reliability times repeatability. The same corner may come from several scales.
+        Keypoints are placed below the pixel, descriptors are those of the pixel.
         """
         height, width = rgb.shape[:2]
         found = [_no_features()]
@@ -380,13 +386,19 @@ class R2D2Extractor:
     def _detect(
         self, image: NDArray[np.float32], max_keypoints: int
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Return array indices (x, y) (N, 2), descriptors and scores of one scale's best."""
+        """Return places (x, y) (N, 2), descriptors and scores of one scale's best.
+
+        A place counts from the centre of the first pixel.
+        """
         with self.network.look(image) as seen:
             x, y, scores = _peaks(seen.logits)
             # Row by row, as they lie in memory, which makes sampling faster.
             best = np.sort(np.argsort(-scores, kind="stable")[:max_keypoints])
             x, y = x[best], y[best]
             keypoints = np.stack([x, y], axis=1).astype(np.float32)
+            keypoints += peak_offsets(
+                seen.logits[1], x, y, reach=PEAK_REACH_PX, log_odds=_log_odds_of_repeatability
+            )
             return keypoints, seen.descriptors(x, y), scores[best]
 
 
@@ -408,6 +420,12 @@ def _peaks(
     softplus = np.logaddexp(np.float32(0), repeatability.ravel()[found])
     scores = softplus / (1 + softplus) / (1 + np.exp(-reliability.ravel()[found]))
     return x, y, scores
+
+
+def _log_odds_of_repeatability(logits: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return log(p / (1 - p)) of p = softplus / (1 + softplus): the logarithm of softplus."""
+    # The softplus of less would be zero.
+    return np.asarray(np.log(np.logaddexp(0, np.maximum(logits, -700))))
 
 
 def pyramid_sizes(height: int, width: int) -> Iterator[tuple[float, tuple[int, int], bool]]:

@@ -27,6 +27,7 @@ from visloc.features.base import Fingerprint, LocalFeatureExtractor
 from visloc.features.checkpoint import Checkpoint, read_checkpoint
 from visloc.features.convolution import fold_batch_norm
 from visloc.features.inference import choose_inference
+from visloc.features.subpixel import peak_offsets
 from visloc.features.weights import check_shapes
 from visloc.types import Extraction, Inference, LocalFeatures
 
@@ -36,6 +37,7 @@ MIN_HEAT = 0.05
 CELL_PX = 8  # one cell of the feature map
 _SIZE_MULTIPLE_PX = 32  # the coarsest layers have a 32nd of the resolution
 _NMS_PX = 5
+PEAK_REACH_PX = 1  # each cell has one peak, which is narrow
 # (inputs, outputs, kernel, stride) of the convolutions, each with batch norm and ReLU.
 _BLOCKS: Mapping[str, tuple[tuple[int, int, int, int], ...]] = {
     "block1": ((1, 4, 3, 1), (4, 8, 3, 2), (8, 8, 3, 1), (8, 24, 3, 2)),
@@ -204,11 +206,12 @@ class XFeatExtractor:
         self.network = network
         self.fingerprint = Fingerprint(
             name="xfeat",
-            revision=1,
+            revision=2,
             parameters={
                 "max_long_side_px": MAX_LONG_SIDE_PX,
                 "min_heat": MIN_HEAT,
                 "nms_px": _NMS_PX,
+                "peak_reach_px": PEAK_REACH_PX,
             },
             weights_sha256=checkpoint.sha256,
         )
@@ -232,7 +235,8 @@ class XFeatExtractor:
     ) -> LocalFeatures:
         """Return the strongest keypoints; see ``LocalFeatureExtractor``.
 
-        Score: probability of the keypoint within its cell times reliability.
+        Score: probability of the keypoint within its cell times reliability. Keypoints are
+        placed below the pixel, descriptors are those of the pixel.
         """
         grey = network_input(rgb)
         seen = self.network.look(grey)
@@ -243,18 +247,25 @@ class XFeatExtractor:
         reliability = _sampled(seen.reliability[:, :, None], centers, _BILINEAR)[:, 0]
         scores = seen.heat.ravel()[found] * reliability
         best = np.argsort(-scores, kind="stable")[:max_keypoints]
-        centers = centers[best]
+        x, y, centers = x[best], y[best], centers[best]
         descriptors = _sampled(seen.features, centers, _BICUBIC)
+        offsets = peak_offsets(seen.heat, x, y, reach=PEAK_REACH_PX, log_odds=_log_odds)
         descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-12)
         size_ratio = np.array(
             [rgb.shape[1] / grey.shape[1], rgb.shape[0] / grey.shape[0]], np.float32
         )
         return LocalFeatures(
-            keypoints=centers * size_ratio,
+            keypoints=(centers + offsets) * size_ratio,
             descriptors=descriptors,
             scores=scores[best],
             scales=np.full(len(best), CELL_PX * size_ratio.max(), np.float32),
         )
+
+
+def _log_odds(heat: NDArray[np.float64]) -> NDArray[np.float64]:
+    # Where the odds are nothing or everything in single precision.
+    heat = np.clip(heat, 1e-30, 1 - 1e-7)
+    return np.asarray(np.log(heat) - np.log1p(-heat))
 
 
 def network_input(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -13,8 +13,8 @@ from visloc.matching.products import EightBitRows, in_threads, row_products
 # With 2000 to 5000 keypoints, 2 to 5 MB of products.
 _BLOCK_ROWS = 256
 # Lowe's test of ambiguity: how much nearer than the second nearest the nearest must be. His 0.8 is
-# for SIFT; learned descriptors of unlike points lie closer together, and 0.9 is what Jin et al.
-# 2020 (Image Matching across Wide Baselines, arXiv:2003.01587) find for those trained like ours.
+# for SIFT; learned descriptors of unlike points lie closer together, so 0.9, which was chosen
+# before it was measured (docs/results.md).
 CLEAR_RATIO = 0.9
 # Photos matched again by a network: each costs more than all others together.
 NUM_REMATCHED = 3

@@ -20,8 +20,10 @@ _MIN_VARIANCE_PX2 = 1e-12
 # Smallest eigenvalue of the unit-free information matrix, of largest diagonal 1.
 _MIN_INFORMATION = 1e-9
 _SANDWICH_SCATTER = 2.0
-# Standard deviation of the logarithm of an unknown focal length.
-_MAX_FOCAL_STD = 0.1
+# Standard deviation of the logarithm of an unknown focal length. Beyond, as with a plane nearly
+# parallel to the image, the error is no longer linear in those of the pixels: by Monte Carlo, the
+# stated 95 % held 20 to 80 % of the errors.
+_MAX_FOCAL_STD = 0.03
 # Who does not know the focal length does not know either by how much the principal point is off
 # the centre: so much of the longer side.
 _PRINCIPAL_POINT_STD = 0.01
@@ -49,8 +51,7 @@ def pose_covariance(
 
     Returns:
         (6, 6) of ``rig_from_world``, or None when the inliers leave the pose undetermined, or an
-        unknown focal length by more than a tenth: then the distance is a guess, and where it is
-        no longer linear in the errors a covariance does not tell.
+        unknown focal length, and with it the distance, by more than 3 %.
     """
     if not views:
         return None

@@ -154,6 +154,29 @@ def test_keypoints_follow_a_shift_by_whole_pixels(
     assert np.abs(residuals[good].mean(axis=0)).max() < 0.2
 
 
+# On whole pixels the medians would be 0.25 and 0.5 px, on either axis.
+SHIFT_TOLERANCE_PX = {"faster2d2": 0.15, "r2d2": 0.15, "sift": 0.03, "xfeat": 0.32}
+
+
+@pytest.mark.parametrize("quarters", [(1, 2), (2, 3)])
+def test_keypoints_follow_a_shift_by_fractions_of_a_pixel(
+    extractor: LocalFeatureExtractor, quarters: tuple[int, int]
+) -> None:
+    enlarged = cv2.resize(_texture(HEIGHT + 16, WIDTH + 16), None, fx=4, fy=4)
+    fine = cv2.GaussianBlur(enlarged, (0, 0), 2)
+
+    def window(x: int, y: int) -> NDArray[np.uint8]:
+        return np.ascontiguousarray(fine[y : y + 4 * HEIGHT : 4, x : x + 4 * WIDTH : 4], np.uint8)
+
+    found = [extractor.extract(window(*at), max_keypoints=1000) for at in ((0, 0), quarters)]
+    first, second = _matches(*found)
+    residuals = second - (first - np.float32(quarters) / 4)
+    good = np.abs(residuals).max(axis=1) < 3
+    assert good.sum() > 0.5 * len(good) > 100
+    errors = np.median(np.abs(residuals[good]), axis=0)
+    assert (errors < SHIFT_TOLERANCE_PX[extractor.fingerprint.name]).all()
+
+
 def _resized(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
     # Given a size, OpenCV maps the image's corners on each other, as our convention does.
     resized = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_CUBIC)

@@ -19,6 +19,7 @@ from visloc.features.r2d2 import (
     R2D2,
     R2D2Extractor,
     Seen,
+    _log_odds_of_repeatability,
     fold,
     load_faster2d2,
     load_r2d2,
@@ -280,9 +281,19 @@ def test_keypoints_of_all_scales_lie_where_the_photo_has_them(tmp_path: Path) ->
         of_level = np.isclose(features.scales, patch_px)
         assert len(set(nearest[of_level])) == len(centers)
         pixel = patch_px / 32
-        assert np.abs(errors[of_level]).max() < 1.1 * pixel
+        assert np.abs(errors[of_level]).max() < 0.15 * pixel
+        # Whole pixels would be 0.41 px off.
+        assert np.sqrt((errors[of_level] ** 2).sum(axis=1).mean()) < 0.04 * pixel
         # The reference's mapping x * W / w would be (pixel - 1) / 2 px off: 0.69 at the last.
-        assert np.abs(errors[of_level].mean(axis=0)).max() < 0.08 * pixel
+        assert np.abs(errors[of_level].mean(axis=0)).max() < 0.01 * pixel
+
+
+def test_log_odds_are_those_of_the_published_repeatability() -> None:
+    logits = np.array([-30.0, -2.0, 0.0, 3.0, 646.0])
+    softplus = np.log1p(np.exp(-np.abs(logits))) + np.maximum(logits, 0)
+    p = softplus / (1 + softplus)
+    np.testing.assert_allclose(_log_odds_of_repeatability(logits), np.log(p / (1 - p)), rtol=1e-6)
+    assert np.isfinite(_log_odds_of_repeatability(np.array([-1e30, 1e30]))).all()
 
 
 def _picture(height: int, width: int) -> NDArray[np.uint8]:
@@ -355,7 +366,7 @@ def test_8_bits_find_the_published_networks_features(
     assert len(rounded) == pytest.approx(len(exact), rel=0.03)
     offsets = np.linalg.norm(rounded.keypoints[:, None] - exact.keypoints[None], axis=2)
     nearest = offsets.argmin(axis=0)
-    same = offsets.min(axis=0) < 0.01
+    same = offsets.min(axis=0) < 0.5
     assert same.mean() > 0.8
     assert (offsets.min(axis=0) < 2).mean() > 0.95
     cosines = _cosines(rounded.descriptors[nearest][same], exact.descriptors[same])
