@@ -1,9 +1,9 @@
 """How many of the retrieved photos see what a query sees: retrieval measured by itself.
 
-    python -m benchmarks.retrieval MAP_FOLDER QUERY_DATASET [--top-k 1,5,10,20,50]
+    python -m benchmarks.retrieval MAP QUERY_DATASET [--top-k 1,5,10,20,50]
         [--weights-dir DIR] [--min-shared N]
 
-MAP_FOLDER is one version of a map, QUERY_DATASET a kapture dataset whose photos have true poses. A
+MAP is the folder of a map, such as maps/ID, QUERY_DATASET a kapture dataset with true poses. A
 photo of the map is co-visible with a query when at least N of the landmarks that it observes are
 shared. A landmark is shared when, under the query's true pose,
 
@@ -35,7 +35,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from visloc.archive import Map, open_map
+from visloc.archive import Map, MapStore
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
@@ -163,14 +163,16 @@ def recalls(
 
 
 def main(
-    map_folder: Annotated[Path, typer.Argument(help="One version of a map.")],
+    map_folder: Annotated[
+        Path, typer.Argument(metavar="MAP", help="The folder of a map, such as maps/ID.")
+    ],
     query_dataset: Annotated[Path, typer.Argument(help="kapture folder with true poses.")],
     top_k: str = "1,5,10,20,50",
     weights_dir: Path | None = None,
     min_shared: Annotated[int, typer.Option(min=1)] = 30,
 ) -> None:
     """Measure, print."""
-    opened = open_map(map_folder)
+    opened = MapStore(map_folder.parent).open(map_folder.name)
     numbers = [int(k) for k in top_k.split(",")]
     every = list(queries(opened, query_dataset, weights_dir, min_shared))
     asked = [query for query in every if query.covisible.any()]

@@ -422,10 +422,11 @@ def _peaks(
     return x, y, scores
 
 
-def _log_odds_of_repeatability(logits: NDArray[np.float64]) -> NDArray[np.float64]:
+def _log_odds_of_repeatability(logits: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return log(p / (1 - p)) of p = softplus / (1 + softplus): the logarithm of softplus."""
-    # The softplus of less would be zero.
-    return np.asarray(np.log(np.logaddexp(0, np.maximum(logits, -700))))
+    logits = np.maximum(logits, np.float32(-80))  # the softplus of less would be zero
+    softplus = np.maximum(logits, 0) + np.log1p(np.exp(-np.abs(logits)))
+    return np.asarray(np.log(softplus))
 
 
 def pyramid_sizes(height: int, width: int) -> Iterator[tuple[float, tuple[int, int], bool]]:

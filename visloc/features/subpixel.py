@@ -18,7 +18,7 @@ def peak_offsets(
     y: NDArray[np.intp],
     *,
     reach: int,
-    log_odds: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    log_odds: Callable[[NDArray[np.float32]], NDArray[np.float32]],
 ) -> NDArray[np.float32]:
     """Return offsets (N, 2), x and y in pixels, of the peaks from the pixels that hold them.
 
@@ -42,7 +42,7 @@ def peak_offsets(
     steps = np.arange(-reach, reach + 1)
     down, right = (each.ravel() for each in np.meshgrid(steps, steps, indexing="ij"))
     around = (y[within] * width + x[within])[:, None] + (down * width + right)
-    heights = log_odds(response.ravel()[around].astype(np.float64))
+    heights = log_odds(response.ravel()[around]).astype(np.float64)
     finite = np.isfinite(heights).all(axis=1)
     within, heights = within[finite], heights[finite]
     fit = np.linalg.pinv(_monomials(right.astype(np.float64), down.astype(np.float64)))

@@ -262,10 +262,10 @@ class XFeatExtractor:
         )
 
 
-def _log_odds(heat: NDArray[np.float64]) -> NDArray[np.float64]:
+def _log_odds(heat: NDArray[np.float32]) -> NDArray[np.float32]:
     # Where the odds are nothing or everything in single precision.
-    heat = np.clip(heat, 1e-30, 1 - 1e-7)
-    return np.asarray(np.log(heat) - np.log1p(-heat))
+    heat = np.clip(heat, np.float32(1e-30), np.float32(1 - 1e-7))
+    return np.asarray(np.log(heat / (1 - heat)))
 
 
 def network_input(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:

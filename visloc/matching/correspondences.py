@@ -129,15 +129,16 @@ def match_landmarks(
             found[photo] = pairs
     keypoints, landmarks, similarities = map(np.concatenate, zip(*found, strict=True))
     ranks = np.repeat(np.arange(1, len(found) + 1), [len(i) for i, _, _ in found])
-    return _settle(keypoints, landmarks, 1.0 / ranks, similarities)
+    return settled(keypoints, landmarks, 1.0 / ranks, similarities)
 
 
-def _settle(
+def settled(
     keypoints: NDArray[np.int64],
     landmarks: NDArray[np.int64],
     votes: NDArray[np.float64],
     similarity: NDArray[np.float32],
 ) -> Correspondences:
+    """Choose among proposed pairs (n,): the most votes first, then the most similar."""
     if len(keypoints) == 0:
         return Correspondences(keypoints, landmarks, votes, similarity)
     # One row per distinct pair, with its support and its best similarity.

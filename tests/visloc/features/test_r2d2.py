@@ -292,8 +292,9 @@ def test_log_odds_are_those_of_the_published_repeatability() -> None:
     logits = np.array([-30.0, -2.0, 0.0, 3.0, 646.0])
     softplus = np.log1p(np.exp(-np.abs(logits))) + np.maximum(logits, 0)
     p = softplus / (1 + softplus)
-    np.testing.assert_allclose(_log_odds_of_repeatability(logits), np.log(p / (1 - p)), rtol=1e-6)
-    assert np.isfinite(_log_odds_of_repeatability(np.array([-1e30, 1e30]))).all()
+    found = _log_odds_of_repeatability(logits.astype(np.float32))
+    np.testing.assert_allclose(found, np.log(p / (1 - p)), rtol=1e-5)
+    assert np.isfinite(_log_odds_of_repeatability(np.float32([-1e30, 1e30]))).all()
 
 
 def _picture(height: int, width: int) -> NDArray[np.uint8]:
@@ -366,8 +367,9 @@ def test_8_bits_find_the_published_networks_features(
     assert len(rounded) == pytest.approx(len(exact), rel=0.03)
     offsets = np.linalg.norm(rounded.keypoints[:, None] - exact.keypoints[None], axis=2)
     nearest = offsets.argmin(axis=0)
-    same = offsets.min(axis=0) < 0.5
-    assert same.mean() > 0.8
+    same = offsets.min(axis=0) < 0.1
+    assert same.mean() > 0.65
+    assert (offsets.min(axis=0) < 0.5).mean() > 0.9
     assert (offsets.min(axis=0) < 2).mean() > 0.95
     cosines = _cosines(rounded.descriptors[nearest][same], exact.descriptors[same])
     assert np.median(cosines) > 0.998

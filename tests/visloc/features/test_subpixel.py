@@ -11,7 +11,7 @@ from visloc.features.subpixel import MAX_OFFSET_PX, peak_offsets
 REACHES = pytest.mark.parametrize("reach", [1, 2, 3])
 
 
-def _same(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _same(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return values
 
 
