@@ -1,7 +1,7 @@
 """How many of the retrieved photos see what a query sees: retrieval measured by itself.
 
     python -m benchmarks.retrieval MAP QUERY_DATASET [--top-k 1,5,10,20,50]
-        [--weights-dir DIR] [--min-shared N]
+        [--weights-dir DIR] [--min-shared N] [--global-features densevlad,localvlad]
 
 MAP is the folder of a map, such as maps/ID, QUERY_DATASET a kapture dataset with true poses. A
 photo of the map is co-visible with a query when at least N of the landmarks that it observes are
@@ -19,9 +19,10 @@ shared. A landmark is shared when, under the query's true pose,
 Local features need not have been found there in the query: this is what could be matched.
 
 Prints a table in Markdown: each global descriptor of the map alone, and all fused by every
-operator. Columns by k: the share of co-visible photos among the best k, in percent, averaged over
-the queries; in brackets the same divided by the best that was possible, min(k, co-visible photos)
-of k. Queries without a co-visible photo are left out, and counted above the table.
+operator; with ``--global-features`` as if the map had only those. Columns by k: the share of
+co-visible photos among the best k, in percent, averaged over the queries; in brackets the same
+divided by the best that was possible, min(k, co-visible photos) of k. Queries without a co-visible
+photo are left out, and counted above the table.
 """
 
 from __future__ import annotations
@@ -116,13 +117,28 @@ class Query:
     covisible: NDArray[np.bool_]
 
 
-def queries(opened: Map, root: Path, weights_dir: Path | None, min_shared: int) -> Iterator[Query]:
-    """Yield every photo of a kapture dataset that has a camera and a pose."""
+def chosen(global_features: str | None, known: Sequence[str]) -> list[str]:
+    """Return the global descriptors named with commas between, each once; None names all."""
+    names = list(known) if global_features is None else global_features.split(",")
+    for name in names:
+        if name not in known:
+            raise typer.BadParameter(
+                f"the map has no global descriptor {name!r}, only {', '.join(known)}",
+                param_hint="--global-features",
+            )
+    return list(dict.fromkeys(names))
+
+
+def queries(
+    opened: Map, names: Sequence[str], root: Path, weights_dir: Path | None, min_shared: int
+) -> Iterator[Query]:
+    """Yield every photo of a kapture dataset that has a camera and a pose, described by these."""
     descriptors = {
         name: make_global_descriptor(name, weights_dir) for name in opened.global_descriptors
     }
     extractor = make_local_features(opened.manifest.local_features.fingerprint.name, weights_dir)
     localizer = Localizer(opened, extractor, descriptors.__getitem__)
+    options = LocalizeOptions(top_k=1, fusion_weights=dict.fromkeys(names, 1.0))
     dataset = read_dataset(root)
     for record in dataset.images:
         camera, pose = dataset.sensors[record.sensor_id].camera, dataset.pose(record)
@@ -131,12 +147,12 @@ def queries(opened: Map, root: Path, weights_dir: Path | None, min_shared: int) 
         # The local features that a query has in service; some descriptors are made of them.
         found: FeatureCache = {}
         photo = read_photo_file(dataset.path_of(record))
-        localizer.look(photo, camera, LocalizeOptions(top_k=1), found=found)
+        localizer.look(photo, camera, options, found=found)
         ((local, rgb),) = found.values()
         yield Query(
             {
-                name: descriptor.describe(rgb, local, opened.global_models[name])
-                for name, descriptor in descriptors.items()
+                name: descriptors[name].describe(rgb, local, opened.global_models[name])
+                for name in names
             },
             shared_landmarks(opened, camera, pose) >= min_shared,
         )
@@ -170,11 +186,15 @@ def main(
     top_k: str = "1,5,10,20,50",
     weights_dir: Path | None = None,
     min_shared: Annotated[int, typer.Option(min=1)] = 30,
+    global_features: Annotated[
+        str | None, typer.Option(help="Global descriptors, with commas; default: all.")
+    ] = None,
 ) -> None:
     """Measure, print."""
     opened = MapStore(map_folder.parent).open(map_folder.name)
+    names = chosen(global_features, list(opened.global_descriptors))
     numbers = [int(k) for k in top_k.split(",")]
-    every = list(queries(opened, query_dataset, weights_dir, min_shared))
+    every = list(queries(opened, names, query_dataset, weights_dir, min_shared))
     asked = [query for query in every if query.covisible.any()]
     counts = [np.count_nonzero(query.covisible) for query in asked]
     typer.echo(
@@ -184,10 +204,10 @@ def main(
     )
     typer.echo(f"| retrieval by | {' | '.join(f'top {k}' for k in numbers)} |")
     typer.echo("|---" * (1 + len(numbers)) + "|")
-    names = list(opened.global_descriptors)
     rows = {f"`{name}`": LateFusion(weights={name: 1.0}) for name in names}
     if len(names) > 1:
-        rows |= {f"all, `{operator}`": LateFusion(operator) for operator in FUSION_OPERATORS}
+        equal = dict.fromkeys(names, 1.0)
+        rows |= {f"all, `{operator}`": LateFusion(operator, equal) for operator in FUSION_OPERATORS}
     for label, fusion in rows.items():
         means = recalls(asked, opened, fusion, numbers)
         cells = " | ".join(f"{100 * share:.1f} ({100 * best:.1f})" for share, best in means)

@@ -23,7 +23,8 @@ WeightsDirOption = Annotated[
     typer.Option(
         "--weights-dir",
         envvar="VISLOC_WEIGHTS_DIR",
-        help="Folder with network weights; r2d2 and faster2d2 need it.",
+        help="Folder with network weights, of features whose weights no package brings "
+        "(docs/features.md).",
     ),
 ]
 InferenceOption = Annotated[

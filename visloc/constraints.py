@@ -20,6 +20,7 @@ from visloc.geometry import Pose
 from visloc.pose.colmap import normalized_rays
 from visloc.pose.covariance import position_covariance, with_origin
 from visloc.pose.distance import mahalanobis2
+from visloc.pose.generalized import MAX_FOCAL, MIN_FOCAL
 from visloc.pose.gravity import KnownGravity, gravity_deviation
 from visloc.pose.views import MatchedView
 from visloc.priors import Priors
@@ -40,6 +41,7 @@ _OWN_STDS = 3.0
 _MAX_MAHALANOBIS2 = 27.86
 # What is sent for down and what the map knows may differ by so much.
 _MAX_DOWN_DIFFERENCE = math.radians(5.0)
+_LEAST_TANGENT = 1e-12  # of the angle between a ray and the camera's axis
 _NUM_REACH_PHOTOS, _NUM_REACH_LANDMARKS = 100, 200
 
 
@@ -205,6 +207,8 @@ class Constraints:
     ) -> list[MatchedView] | None:
         """Keep the correspondences that a pose within the pose prior can explain.
 
+        Where the focal length is unknown, with any that photos are taken with.
+
         Returns:
             The views with fewer correspondences; None without a pose prior.
         """
@@ -218,13 +222,38 @@ class Constraints:
             seen = (view.cam_from_rig @ pose).apply(view.points)
             # The angle between where the landmark should be and where it was seen.
             expected = seen / np.linalg.norm(seen, axis=1, keepdims=True)
-            rays = normalized_rays(view.camera, view.pixels)
+            if view.focal_unknown:
+                rays = _nearest_rays(view, expected)
+            else:
+                rays = normalized_rays(view.camera, view.pixels)
             angle = _angles(expected, rays / np.linalg.norm(rays, axis=1, keepdims=True))
             depth = np.linalg.norm(seen, axis=1)
             slack = max_error_px / view.camera.focal_length
             near = angle <= turn + slack + np.arctan2(move, depth)
             kept.append(replace(view, pixels=view.pixels[near], points=view.points[near]))
         return kept
+
+
+def _nearest_rays(view: MatchedView, expected: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of the rays that pixels have with one focal length or another, those nearest to others.
+
+    Args:
+        view: of an unknown focal length.
+        expected: (n, 3) of length 1, in the camera's frame.
+
+    Returns:
+        (n, 3) of length 1. A pixel's ray turns in a plane, from the axis to the side.
+    """
+    across = normalized_rays(view.camera, view.pixels)[:, :2]
+    tangent = np.linalg.norm(across, axis=1)
+    side = across / np.maximum(tangent, _LEAST_TANGENT)[:, None]
+    focal = view.camera.focal_length / max(view.camera.width, view.camera.height)
+    angle = np.clip(
+        np.arctan2(np.einsum("ni,ni->n", side, expected[:, :2]), expected[:, 2]),
+        np.arctan(tangent * focal / MAX_FOCAL),
+        np.arctan(tangent * focal / MIN_FOCAL),
+    )
+    return np.column_stack([np.sin(angle)[:, None] * side, np.cos(angle)])
 
 
 def _largest_std(pose: Pose, covariance: NDArray[np.float64]) -> float:

@@ -191,7 +191,7 @@ class Localizer:
         """Find what one photo shows of the map; arguments and errors as of ``localize``."""
         fusion = self._fusion(options)
         if self._extractor is None or not self._takes_photos(fusion):
-            raise self._features_required()
+            raise self._features_required(fusion)
         constraints = Constraints(self.geometry, priors)
         used, source = resolve_camera(photo, camera)
         seconds: dict[str, float] = {}
@@ -393,15 +393,14 @@ class Localizer:
         counted = fusion.counted(self.map.global_descriptors)
         return self._extractor is not None and set(counted) <= set(self._descriptors)
 
-    def _features_required(self) -> InvalidInput:
-        manifest = self.map.manifest
-        names = (g.fingerprint.name for g in manifest.global_features)
+    def _features_required(self, fusion: LateFusion) -> InvalidInput:
+        kind = self.map.manifest.local_features.fingerprint.name
+        names = fusion.counted(self.map.global_descriptors)
         return InvalidInput(
             "features.required",
             "the map's features are not computed here: send the features of the photo instead",
             field="image",
-            expected=f"features of kind {manifest.local_features.fingerprint.name}, with "
-            + ", ".join(names),
+            expected=f"features of kind {kind}, with {', '.join(names)}",
             got="a photo",
         )
 

@@ -354,6 +354,9 @@ def _window_instant(solved: Solved) -> WindowInstant:
     if refusal is not None and refusal.reason is Reason.CONTRADICTS_PRIOR:
         # Matches that lying priors allowed would pass together the gate that refused each alone.
         return WindowInstant((), None)
+    if any(view.focal_unknown for view in solved.views):
+        # A window takes cameras as they are: such pixels would fit a wrong pose.
+        return WindowInstant((), solved.pose)
     return WindowInstant(solved.views, solved.pose)
 
 

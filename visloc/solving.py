@@ -110,7 +110,9 @@ class Solved:
 
     Attributes:
         answer: for the caller.
-        views: what each usable image contributed, relative to the map's origin.
+        views: what each usable image contributed, relative to the map's origin; nothing where its
+            camera was left out. A ``focal_unknown`` was found where there is a pose, and is still a
+            guess where there is none.
         pose: the accepted pose, relative to the map's origin; None when there is none.
         inliers: of each view, (n,) whether the best pose explains the match, were the pose
             accepted or not; () when no pose was found.
@@ -131,9 +133,11 @@ def solve_instant(
 ) -> Solved:
     """Find one pose from all images of an instant; a photo on its own is a rig of one camera.
 
-    Where the camera of a photo on its own is a guess, its focal length is found with the pose,
-    unless the solver is ``registration``, which takes cameras as they are. The answer has the
-    guess when the pose is refused. Cameras of a rig that are a guess stay one.
+    Where the camera of a photo on its own is a guess, its focal length is found with the pose. The
+    answer has the guess when the pose is refused. Otherwise nothing rests on a guess, whose poses
+    are metres off with centimetres of covariance: beside other images of a rig, one whose camera
+    is a guess is left out; ``registration``, which takes cameras as they are, leaves it out, too.
+    Where that leaves too few matches, the pose is refused: ``uncertain_pose``, "send the camera".
 
     Args:
         images: each of another camera of the rig.
@@ -170,28 +174,33 @@ def solve_instant(
     camera = None if refusal is not None or found is None else found.camera
     shown = with_inliers([_shown(image, camera) for image in images], inliers)
     answer = InstantAnswer(timestamp, shown, pose, refusal, seconds)
-    views = tuple(
-        replace(view, camera=camera or view.camera, focal_unknown=False) for view in views
-    )
+    views = tuple(replace(view, camera=camera or view.camera) for view in views)
     return Solved(answer, views, found if refusal is None else None, inliers)
 
 
 def _views_of(
     images: Sequence[SeenImage], matches: Sequence[Matches], options: LocalizeOptions
 ) -> tuple[MatchedView, ...]:
-    """The views of the images that could be used, with their ``matches`` in order."""
+    """The views of the images that could be used, with their ``matches`` in order.
+
+    One whose camera is a guess is empty unless its focal length will be found.
+    """
     usable = [(image.cam_from_rig, image.look) for image in images if image.look is not None]
     finds_focal = len(usable) == 1 and options.solver is not Solver.REGISTRATION
-    return tuple(
-        MatchedView(
-            look.evidence.camera,
-            cam_from_rig,
-            of_image.pixels,
-            of_image.points,
-            focal_unknown=finds_focal and look.evidence.camera_source is CameraSource.GUESS,
+    views = []
+    for (cam_from_rig, look), of_image in zip(usable, matches, strict=True):
+        guessed = look.evidence.camera_source is CameraSource.GUESS
+        counted = of_image if finds_focal or not guessed else Matches.none()
+        views.append(
+            MatchedView(
+                look.evidence.camera,
+                cam_from_rig,
+                counted.pixels,
+                counted.points,
+                focal_unknown=guessed and finds_focal,
+            )
         )
-        for (cam_from_rig, look), of_image in zip(usable, matches, strict=True)
-    )
+    return tuple(views)
 
 
 def _shown(image: SeenImage, found: Camera | None) -> ImageAnswer:
@@ -264,11 +273,20 @@ def _find_pose(
         return None, refusals[0]
     registration = registration_for(options, [view.camera for view in views])
     num_pairs = sum(len(view) for view in views)
-    if num_pairs < registration.min_inliers:
+    num_matches = sum(len(look.matches.pixels) for look in looks)
+    if num_matches < registration.min_inliers:
         return None, Refusal(
             "matching",
             Reason.TOO_FEW_MATCHES,
-            f"only {num_pairs} keypoints match the map, {registration.min_inliers} are needed",
+            f"only {num_matches} keypoints match the map, {registration.min_inliers} are needed",
+        )
+    if num_pairs < registration.min_inliers:
+        return None, Refusal(
+            "gate",
+            Reason.UNCERTAIN_POSE,
+            f"{num_matches - num_pairs} of {num_matches} matches do not count: the focal length "
+            "of their photo is a guess, and found only for a photo on its own, by a solver other "
+            f"than {Solver.REGISTRATION}: send the camera",
         )
     found = _estimate(views, registration, options, constraints)
     if found is None:
@@ -420,6 +438,8 @@ def _better_without_gravity(
     options: LocalizeOptions,
 ) -> Refusal | None:
     """Refuse a pose that was only looked for upright when another explains the images better."""
+    if found.camera is not None:  # gravity took no part
+        return None
     num_others = sum(len(view) for view in views) - found.num_inliers
     if found.num_inliers >= _AMBIGUOUS_SHARE * num_others:  # it cannot
         return None

@@ -240,7 +240,7 @@ class LocalizeOptions:
     read_as: ReadAs = ReadAs.STORED
     extraction: Extraction = Extraction.DEFAULT
     fusion: Fusion | None = None
-    fusion_weights: Mapping[str, float] | None = None
+    fusion_weights: Mapping[str, float] | None = field(default=None, hash=False)  # a dict
     matcher: Matcher = Matcher.MUTUAL
     solver: Solver = Solver.PYCOLMAP
     seed: int = 0

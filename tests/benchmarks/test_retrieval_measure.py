@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer
 
-from benchmarks.retrieval import Query, recalls, shared_landmarks, visible_landmarks
+from benchmarks.retrieval import Query, chosen, recalls, shared_landmarks, visible_landmarks
 from visloc.geometry import Camera, Pose
 from visloc.retrieval.fusion import EQUAL_GHARM
 from visloc.retrieval.rows import GlobalRows
@@ -76,3 +77,15 @@ def test_recall_is_of_the_best_k_and_of_what_was_possible() -> None:
         pytest.approx(((2 / 3 + 0) / 2, 0.5)),
         pytest.approx(((2 / 4 + 1 / 4) / 2, 1.0)),
     ]
+
+
+def test_global_features_are_chosen_by_name() -> None:
+    known = ["densevlad", "localvlad", "gem"]
+    assert chosen(None, known) == known
+    assert chosen("gem,densevlad,gem", known) == ["gem", "densevlad"]
+
+
+@pytest.mark.parametrize("unknown", ["netvlad", ""])
+def test_unknown_global_features_are_refused_with_those_of_the_map(unknown: str) -> None:
+    with pytest.raises(typer.BadParameter, match="only densevlad, localvlad"):
+        chosen(f"densevlad,{unknown}", ["densevlad", "localvlad"])

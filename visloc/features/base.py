@@ -108,4 +108,4 @@ class GlobalDescriptor(Protocol):
         local: LocalFeatures,
         model: Mapping[str, NDArray[np.float32]],
     ) -> NDArray[np.float32]:
-        """Return ``project(pool(...))``: (D,), unit length, or zero for a blank photo."""
+        """Return ``project(pool(...))``: (D,), unit length, or zero where nothing was seen."""

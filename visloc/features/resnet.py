@@ -75,18 +75,14 @@ class _Step:
     def make(self, tensors: _Tensors) -> nn.Conv2d:
         """Return one convolution: g (w * x - mean) / sqrt(variance + 1e-5) + b."""
         convolution, norm = self.names
-        gain, offset, mean, variance = (
-            tensors[f"{norm}.{part}"].astype(np.float64)
-            for part in ("weight", "bias", "running_mean", "running_var")
+        gain, shift, mean, variance = (
+            tensors[f"{norm}.{part}"] for part in ("weight", "bias", "running_mean", "running_var")
         )
         plain = tensors[f"{convolution}.weight"]
-        weight, bias = fold_batch_norm(plain, np.zeros(self.outputs), mean, variance)
-        return fixed_convolution(
-            weight * gain[:, None, None, None],
-            bias * gain + offset,
-            stride=self.stride,
-            padding=self.kernel // 2,
+        weight, bias = fold_batch_norm(
+            plain, np.zeros(self.outputs), mean, variance, gain=gain, shift=shift
         )
+        return fixed_convolution(weight, bias, stride=self.stride, padding=self.kernel // 2)
 
 
 def expected_shapes(depth: int, layout: Layout) -> dict[str, tuple[int, ...]]:

@@ -7,7 +7,7 @@ about VLAD" (CVPR 2013). Vocabulary and whitening are learned on the photos of t
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping
 
 import numpy as np
@@ -15,12 +15,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from visloc.features.base import Fingerprint
-from visloc.features.whitening import (
-    WHITENING_PARAMETERS,
-    learn_whitening,
-    unit_rows,
-    whiten,
-)
+from visloc.features.whitening import WHITENING_PARAMETERS, WhitenedDescriptor, unit_rows
 from visloc.types import LocalFeatures
 
 VOCABULARY_SIZE = 128
@@ -71,7 +66,7 @@ def aggregate(words: NDArray[np.float32], centres: NDArray[np.float32]) -> NDArr
     return unit_rows(unit_rows(residuals, floor).ravel())
 
 
-class VladDescriptor(ABC):
+class VladDescriptor(WhitenedDescriptor):
     """A ``GlobalDescriptor`` by VLAD; a subclass says what the words of a photo are.
 
     Its model holds ``vocabulary`` (K, d), ``mean`` (R,) and ``axes`` (R, D), R = K * d.
@@ -125,28 +120,8 @@ class VladDescriptor(ABC):
         local: LocalFeatures,
         vocabulary: Mapping[str, NDArray[np.float32]],
     ) -> NDArray[np.float32]:
-        """Aggregate one photo to a raw vector (R,) of unit length; zero for a blank photo."""
+        """Aggregate one photo to a raw vector (R,) of unit length; zero where no word was found."""
         return aggregate(self.words(rgb, local), vocabulary["vocabulary"])
-
-    def learn_projection(self, pooled: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
-        """Learn ``mean`` (R,) and ``axes`` (R, D) from the raw vectors (n, R) of a map."""
-        mean, axes = learn_whitening(pooled)
-        return {"mean": mean, "axes": axes}
-
-    def project(
-        self, pooled: NDArray[np.float32], model: Mapping[str, NDArray[np.float32]]
-    ) -> NDArray[np.float32]:
-        """Whiten raw vectors (..., R) to rows (..., D) of unit length; zero rows stay zero."""
-        return whiten(pooled, model["mean"], model["axes"])
-
-    def describe(
-        self,
-        rgb: NDArray[np.uint8],
-        local: LocalFeatures,
-        model: Mapping[str, NDArray[np.float32]],
-    ) -> NDArray[np.float32]:
-        """Return ``project(pool(...))``: (D,), unit length, or zero for a blank photo."""
-        return self.project(self.pool(rgb, local, model), model)
 
 
 # What every VLAD descriptor's fingerprint holds.

@@ -1,7 +1,7 @@
 """Published network weights: where they come from, and whether a file holds the right ones.
 
-The weights of R2D2 are for non-commercial use and are never shipped nor fetched: whoever runs
-the software downloads them and says in which folder they lie.
+None are shipped nor fetched: they come with a package, or whoever runs the software downloads
+them and says in which folder they lie. Some, R2D2's for one, are for non-commercial use.
 """
 
 from __future__ import annotations
@@ -88,8 +88,14 @@ def read_weights(weights_dir: Path | None, published: PublishedWeights) -> Check
 
 
 def find_weights(
-    file_name: str, weights_dir: Path | None, package: str, folder: str
-) -> Path | None:
+    file_name: str,
+    weights_dir: Path | None,
+    package: str,
+    folder: str,
+    *,
+    missing: str,
+    field: str,
+) -> Path:
     """Look for a file in the weights folder, then in an installed package that carries it.
 
     Args:
@@ -97,15 +103,27 @@ def find_weights(
         weights_dir: the weights folder.
         package: a package's name in Python; it is located, never imported.
         folder: where the package has the file.
+        missing: what to tell people where there is no such file.
+        field: of the error.
 
-    Returns:
-        The file, or None.
+    Raises:
+        WeightsError: ``weights.missing``.
     """
     folders = [] if weights_dir is None else [weights_dir]
     found = importlib.util.find_spec(package)
     if found is not None:
         folders += [Path(place) / folder for place in found.submodule_search_locations or ()]
-    return next((f / file_name for f in folders if (f / file_name).is_file()), None)
+    for path in (each / file_name for each in folders):
+        if path.is_file():
+            return path
+    got = "no such package" if found is None else "a package without that file"
+    raise WeightsError(
+        "weights.missing",
+        missing,
+        field=field,
+        expected=f"the installed package {package} with {folder}/{file_name}",
+        got=got if weights_dir is None else f"{got}; no such file in {weights_dir} either",
+    )
 
 
 def check_shapes(checkpoint: Checkpoint, expected: Shapes, *, network: str, held: str) -> None:

