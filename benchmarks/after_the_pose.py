@@ -1,19 +1,20 @@
 """What matching all landmarks that the first pose predicts visible would bring.
 
-    python benchmarks/after_the_pose.py MAP QUERY [--weights-dir DIR] [--top-k 20]
+    python -m benchmarks.after_the_pose MAP QUERY [--weights-dir DIR] [--top-k 20]
 
 MAP is a folder of a map's versions, QUERY a kapture dataset. Each photo is localized as always.
 Then the landmarks of all photos of the map that looked in a similar direction are projected with
 the pose found, and matched with the keypoints near by: mutual nearest neighbours within a window,
 voted for as in ``visloc.matching.correspondences``, photos with the nearest viewpoint first. Two
 ways of using them are shown: instead of the first matches, and only added to their inliers. The
-product does neither (docs/decisions/0018). Prints a table in Markdown.
+product does neither (docs/decisions/0019). Prints a table in Markdown.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -24,7 +25,7 @@ from scipy.spatial import cKDTree
 
 from visloc.archive import Map, MapStore
 from visloc.evaluation import pose_error
-from visloc.features import make_local_features
+from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
@@ -154,8 +155,15 @@ def main(
     """Localize, match again, print."""
     opened = MapStore(map_folder.parent).open(map_folder.name)
     name = opened.manifest.local_features.fingerprint.name
-    localizer = Localizer(opened, make_local_features(name, weights_dir))
+    localizer = Localizer(
+        opened,
+        make_local_features(name, weights_dir),
+        partial(make_global_descriptor, weights_dir=weights_dir),
+    )
     photos = list(measure(localizer, query, LocalizeOptions(top_k=top_k)))
+    if not photos:
+        typer.echo("No photo with a true pose was localized: nothing to measure.", err=True)
+        raise typer.Exit(1)
     typer.echo("| way | median | 90 % | worst | nearer than the first | inliers |")
     typer.echo("|---|---|---|---|---|---|")
     errors = np.array([of_photo for of_photo, _, _ in photos])

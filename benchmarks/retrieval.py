@@ -23,6 +23,9 @@ operator; with ``--global-features`` as if the map had only those. Columns by k:
 co-visible photos among the best k, in percent, averaged over the queries; in brackets the same
 divided by the best that was possible, min(k, co-visible photos) of k. Queries without a co-visible
 photo are left out, and counted above the table.
+
+Ready-made descriptors (``kapture:TYPE``) cannot be measured here: those of the queries are not
+computed. ``localize compare --axis global-features --features-dir DIR`` sends them.
 """
 
 from __future__ import annotations
@@ -38,6 +41,7 @@ from numpy.typing import NDArray
 
 from visloc.archive import Map, MapStore
 from visloc.features import make_global_descriptor, make_local_features
+from visloc.features.readymade import is_ready_made
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
@@ -121,6 +125,11 @@ def chosen(global_features: str | None, known: Sequence[str]) -> list[str]:
     """Return the global descriptors named with commas between, each once; None names all."""
     names = list(known) if global_features is None else global_features.split(",")
     for name in names:
+        if is_ready_made(name):
+            raise typer.BadParameter(
+                f"{name} cannot be measured here, because a query's is not computed; name others",
+                param_hint="--global-features",
+            )
         if name not in known:
             raise typer.BadParameter(
                 f"the map has no global descriptor {name!r}, only {', '.join(known)}",
@@ -129,12 +138,22 @@ def chosen(global_features: str | None, known: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
+def whole_numbers(text: str) -> list[int]:
+    """Parse positive whole numbers with commas between."""
+    numbers = [int(k) if k.strip().isdecimal() else 0 for k in text.split(",")]
+    if min(numbers) < 1:
+        raise typer.BadParameter(f"not numbers from 1: {text!r}", param_hint="--top-k")
+    return numbers
+
+
 def queries(
     opened: Map, names: Sequence[str], root: Path, weights_dir: Path | None, min_shared: int
 ) -> Iterator[Query]:
     """Yield every photo of a kapture dataset that has a camera and a pose, described by these."""
     descriptors = {
-        name: make_global_descriptor(name, weights_dir) for name in opened.global_descriptors
+        name: make_global_descriptor(name, weights_dir)
+        for name in opened.global_descriptors
+        if not is_ready_made(name)
     }
     extractor = make_local_features(opened.manifest.local_features.fingerprint.name, weights_dir)
     localizer = Localizer(opened, extractor, descriptors.__getitem__)
@@ -193,9 +212,20 @@ def main(
     """Measure, print."""
     opened = MapStore(map_folder.parent).open(map_folder.name)
     names = chosen(global_features, list(opened.global_descriptors))
-    numbers = [int(k) for k in top_k.split(",")]
+    numbers = whole_numbers(top_k)
+    if is_ready_made(opened.manifest.local_features.fingerprint.name):
+        raise typer.BadParameter(
+            "its local features are ready-made, so photos cannot be looked at", param_hint="MAP"
+        )
     every = list(queries(opened, names, query_dataset, weights_dir, min_shared))
     asked = [query for query in every if query.covisible.any()]
+    if not asked:
+        typer.echo(
+            f"None of {len(every)} queries shares {min_shared} landmarks with a photo of "
+            f"{opened.ref}: nothing to measure.",
+            err=True,
+        )
+        raise typer.Exit(1)
     counts = [np.count_nonzero(query.covisible) for query in asked]
     typer.echo(
         f"{len(asked)} of {len(every)} queries share {min_shared} landmarks or more with a photo "

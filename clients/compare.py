@@ -112,7 +112,7 @@ def parse_values(text: str | None) -> tuple[str, ...]:
     """
     if text is None:
         return ()
-    values = tuple(text.split(","))
+    values = tuple(value.strip() for value in text.split(","))
     if not all(values) or len(set(values)) < len(values):
         raise InvalidInput(
             "compare.values",
@@ -163,10 +163,15 @@ def make_variants(
     if axis is Axis.GLOBAL_FEATURES:
         known = info.global_features
         values = values or (*known, *([ALL_TOGETHER] if len(known) > 1 else []))
+        named = {value: known if value == ALL_TOGETHER else value.split("+") for value in values}
+        for names in named.values():
+            _check_words(names, known)
         return [
-            Variant(value, info, replace(fixed, fusion_weights=_weights(value, known)))
-            for value in values
+            Variant(value, info, replace(fixed, fusion_weights=dict.fromkeys(names, 1.0)))
+            for value, names in named.items()
         ]
+    if axis is not Axis.TOP_K:
+        _check_words(values, DEFAULT_VALUES[axis])
     return [
         Variant(value, info, replace(fixed, **_parsed(name, value)))
         for value in values or DEFAULT_VALUES[axis]
@@ -329,9 +334,17 @@ def _variants_of_maps(
     ]
 
 
-def _weights(value: str, known: Sequence[str]) -> dict[str, float]:
-    """Return equal weights of the descriptors that are named, such as ``densevlad+localvlad``."""
-    return dict.fromkeys(known if value == ALL_TOGETHER else value.split("+"), 1.0)
+def _check_words(words: Sequence[str], known: Sequence[str]) -> None:
+    """Refuse what the server would, after everything else was measured."""
+    for word in words:
+        if word not in known:
+            raise InvalidInput(
+                "compare.values",
+                "unknown value of the axis",
+                field="values",
+                expected=f"of {', '.join(known)}",
+                got=word,
+            )
 
 
 def _parsed(name: str, value: str) -> Mapping[str, Any]:

@@ -104,9 +104,6 @@ def compare(
     draw = _drawing()
     options, thresholds = options_of(option, seed), thresholds_of(threshold)
     words = parse_values(values)
-    output.mkdir(parents=True, exist_ok=True)
-    table, picture, figures = (output / f"compare.{kind}" for kind in ("md", "png", "json"))
-    check_can_be_written([table, picture, figures])
     queries = read_queries(source, pixel_origin).photos
     key = api_key_of(api_key_file)
     with Client(server, api_key=key, ca=ca, timeout_s=timeout_s) as client:
@@ -121,6 +118,9 @@ def compare(
         )
         for info in maps
     }
+    _make_folder(output)
+    table, picture, figures = (output / f"compare.{kind}" for kind in ("md", "png", "json"))
+    check_can_be_written([table, picture, figures])
     order = options.seed or 0
     asked: list[Asked] = []
 
@@ -147,6 +147,19 @@ def compare(
     outcomes = (outcome for each in asked for outcome in each.outcomes.values())
     failed = {outcome.query.name: outcome for outcome in outcomes if outcome.error is not None}
     print_failed(_err, list(failed.values()))
+
+
+def _make_folder(output: Path) -> None:
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInput(
+            "output.folder",
+            "cannot be made; choose another folder",
+            field="output",
+            expected="a folder, or a path where one can be made",
+            got=f"{output}: {error.strerror}",
+        ) from error
 
 
 def _drawing() -> Callable[[Mapping[str, Any]], bytes]:

@@ -53,7 +53,7 @@ def print_map(console: Console, info: MapInfo) -> None:
 
 
 def _fusion(info: MapInfo) -> str:
-    weights = ", ".join(f"{name} {weight:g}" for name, weight in info.fusion_weights.items())
+    weights = ", ".join(f"{name}={weight:g}" for name, weight in info.fusion_weights.items())
     return f"{info.fusion} ({weights})" if weights else f"{info.fusion}"
 
 

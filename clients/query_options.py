@@ -21,7 +21,7 @@ Options = Annotated[
         metavar="NAME=VALUE",
         help="preset, top_k, max_error_px, min_inliers, min_inlier_ratio, read_as, extraction "
         "(fast, default, accurate), fusion (such as mean), fusion_weights (such as "
-        "densevlad:1,localvlad:2), matcher (mutual, ratio, lightglue), solver (pycolmap, poselib, "
+        "densevlad=1,localvlad=2), matcher (mutual, ratio, lightglue), solver (pycolmap, poselib, "
         "registration) or seed; can be repeated.",
     ),
 ]

@@ -36,7 +36,7 @@ _EXPECTED = {
     int: f"a whole number from 0 to {_MAX_WHOLE}",
     float: "a finite number",
     str: "a text",
-    dict: "a number for each of some global descriptors, such as densevlad:1,localvlad:2",
+    dict: "a number for each of some global descriptors, such as densevlad=1,localvlad=2",
 }
 
 
@@ -97,7 +97,7 @@ class LocalizeOptions:
 
     @staticmethod
     def from_texts(texts: Iterable[str]) -> LocalizeOptions:
-        """Parse ``NAME=VALUE``, as the command line has them; weights are ``NAME:NUMBER,...``.
+        """Parse ``NAME=VALUE``, as the command line has them; weights are ``NAME=NUMBER,...``.
 
         Raises:
             InvalidInput: ``options.syntax``, ``request.unknown_field`` or ``options.NAME``.
@@ -472,7 +472,8 @@ def _check_option_name(name: str) -> None:
 def _weights(text: str) -> dict[str, float]:
     weights: dict[str, float] = {}
     for part in text.split(","):
-        name, _, number = part.rpartition(":")  # a name may be kapture:TYPE
+        name, _, number = part.rpartition("=")
+        name = name.strip()
         if not name or name in weights:
             raise ValueError(part)
         weights[name] = float(number)

@@ -218,7 +218,7 @@ def _check(settings: BuildSettings) -> None:
             got=settings.method,
         )
     names = settings.global_features
-    if not names or len(set(names)) < len(names):
+    if not names or "" in names or len(set(names)) < len(names):
         raise InvalidInput(
             "build.global_features",
             "not a set of global features",
@@ -227,7 +227,7 @@ def _check(settings: BuildSettings) -> None:
             got=",".join(names),
         )
     if settings.fusion.weights is not None:
-        check_fusion_weights(settings.fusion.weights, "build.fusion_weights")
+        check_fusion_weights(settings.fusion.weights, "build.fusion_weights", "--fusion-weights")
         unknown = [name for name in settings.fusion.weights if name not in names]
         if unknown:
             raise InvalidInput(

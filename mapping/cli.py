@@ -643,7 +643,7 @@ def _names(text: str) -> tuple[str, ...]:
 def _parse_weights(text: str) -> dict[str, float]:
     items = [item.rpartition("=") for item in _names(text)]
     try:
-        weights = {name: float(weight) for name, _, weight in items}
+        weights = {name.strip(): float(weight) for name, _, weight in items}
     except ValueError:
         weights = {}
     if not weights or len(weights) < len(items) or "" in weights:

@@ -86,7 +86,7 @@ def _retrieval(opened: Map) -> dict[str, str]:
     counted = (
         "equal weights"
         if weights is None
-        else ", ".join(f"{name} x {weight:g}" for name, weight in weights.items())
+        else ", ".join(f"{name}={weight:g}" for name, weight in weights.items())
     )
     return {"fused by": f"{opened.fusion.operator}, {counted}"}
 

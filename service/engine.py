@@ -208,7 +208,7 @@ class Engine:
         The caller holds a place (``admit_batch``).
 
         Raises:
-            InvalidInput: ``rig.*``, ``priors.*``.
+            InvalidInput: ``rig.*``, ``options.*``, ``priors.*``.
             Unavailable: ``server.worker_died``.
             VislocError: what the store raises.
         """
@@ -230,7 +230,7 @@ class Engine:
         With several maps, nothing is answered until an instant is localized: its map is kept.
 
         Raises:
-            InvalidInput: ``sequence.*``, ``rig.*``, ``priors.*``.
+            InvalidInput: ``sequence.*``, ``rig.*``, ``options.*``, ``priors.*``.
             TooLarge: ``sequence.too_many_instants``, ``rig.too_many_images``.
             Unavailable: ``server.worker_died``.
             VislocError: what the store raises.

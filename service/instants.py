@@ -19,8 +19,8 @@ from visloc.solving import Look, SeenImage
 from visloc.types import InstantAnswer, LocalizeOptions, QueryFeatures
 
 _MAX_LISTED = 500  # characters of names from outside
-# What is wrong with all images is wrong with the request.
-_CODES_OF_ALL_IMAGES = ("features.required", "options.read_as")
+# Codes that begin so say what is wrong with all images: that is wrong with the request.
+_OF_ALL_IMAGES = ("features.required", "options.", "priors.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,6 +116,35 @@ def check_images(
         )
 
 
+def check_options(targets: Sequence[Target], options: LocalizeOptions) -> None:
+    """Refuse options that do not fit all maps, before any image is looked at.
+
+    Raises:
+        InvalidInput: as ``Localizer.check``; of several maps, with the names of those that the
+            options do not fit, and what is wrong in the first of them.
+        WeightsError: likewise.
+    """
+    refused: dict[str, InvalidInput] = {}
+    for target in targets:
+        try:
+            target.localizer.check(options, len(target.rig))
+        except InvalidInput as error:
+            refused[target.localizer.map.ref] = error
+    if not refused:
+        return
+    ref, first = next(iter(refused.items()))
+    if len(targets) == 1:
+        raise first
+    names = ", ".join(refused)[:_MAX_LISTED]
+    raise type(first)(
+        first.code,
+        f"not for every map that is searched ({names}); in {ref}: {first.message}",
+        field=first.field,
+        expected=first.expected,
+        got=first.got,
+    ) from first
+
+
 def check_priors(targets: Sequence[Target], priors: Priors) -> None:
     """Refuse priors that mean nothing in a map, before anything is computed.
 
@@ -174,7 +203,7 @@ def _look(
         else:
             look = target.localizer.look(photo, camera, options, priors, found)
     except InvalidInput as error:
-        if error.code in _CODES_OF_ALL_IMAGES or error.code.startswith("priors."):
+        if error.code.startswith(_OF_ALL_IMAGES):
             raise
         return SeenImage(image.sensor, sensor.cam_from_rig, None, error)
     evidence = replace(look.evidence, seconds={**seconds, **look.evidence.seconds})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from service.incoming import inside
-from service.instants import Target, check_images, check_priors
+from service.instants import Target, check_images, check_options, check_priors
 from service.jobs import Instant, InstantLocalization, SequenceStart
 from visloc.errors import InvalidInput, TooLarge
 from visloc.priors import Priors
@@ -28,13 +28,14 @@ class SequenceRun:
         targets: the maps that are still searched.
 
     Raises:
-        InvalidInput: ``sequence.max_gap``, ``priors.*``.
+        InvalidInput: ``sequence.max_gap``, ``options.*``, ``priors.*``.
     """
 
     def __init__(
         self, start: SequenceStart, targets: Sequence[Target], max_images: int, max_instants: int
     ) -> None:
         check_max_gap(start.max_gap_s)
+        check_options(targets, start.options)
         check_priors(targets, start.priors)
         self.targets = targets
         self._start = start

@@ -19,7 +19,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from service.instants import Target, check_images, check_priors, look_at, rig_in_map
+from service.instants import (
+    Target,
+    check_images,
+    check_options,
+    check_priors,
+    look_at,
+    rig_in_map,
+)
 from service.jobs import (
     ImageJob,
     Instant,
@@ -147,7 +154,8 @@ class Vision:
     ) -> Localization:
         """As ``worker.localize``."""
         started, queued = perf_counter(), time() - submitted
-        localizers = [self.localizer(of) for of in maps]
+        targets = self._targets(maps, None)
+        check_options(targets, job.options)
         loaded = perf_counter()
         before = {"queued": max(0.0, queued), "open_map": loaded - started}
         found: list[tuple[Localizer, Look, Answer, NDArray[np.bool_]]] = []
@@ -156,8 +164,9 @@ class Vision:
         if not isinstance(job.query, QueryFeatures):
             photo = read_photo(job.query, self._limits)
             before["decode"] = perf_counter() - loaded
-        for localizer in localizers:
+        for target in targets:
             self._step()
+            localizer = target.localizer
             if isinstance(job.query, QueryFeatures):
                 look = localizer.look_at_features(job.query, job.camera, job.options, job.priors)
             else:
@@ -194,6 +203,7 @@ class Vision:
         targets = self._targets(maps, job.rig)
         for target in targets:
             check_images(job.images, target.rig, self._settings.max_images, "images")
+        check_options(targets, job.options)
         check_priors(targets, job.priors)
 
     def look_at_image(
@@ -310,13 +320,14 @@ def _by_map(seen: Sequence[Seen], num_maps: int) -> list[tuple[SeenImage, ...]]:
 def _damage_named(ref: str) -> Iterator[None]:
     """Turn what should not happen while a map is opened into MapCorrupt ``map.unusable``.
 
-    A damaged map can break the code that reads it in any way, and must not stop the others.
+    A damaged map can break the code that reads it in any way, and must not stop the others. Nor
+    must a plug-in that exits when it is first used.
     """
     try:
         yield
     except VislocError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         logger.exception("map %s cannot be used", ref)
         raise MapCorrupt(
             "map.unusable",

@@ -172,10 +172,10 @@ def localize(job: LocalizeJob, maps: Sequence[MapFolder], submitted: float) -> L
 
 
 def check_rig(job: RigJob, maps: Sequence[MapFolder]) -> None:
-    """Refuse a rig's images, not read yet, that do not fit.
+    """Refuse a rig's images, not read yet, or options that do not fit.
 
     Raises:
-        InvalidInput: ``rig.*``, ``priors.*``.
+        InvalidInput: ``rig.*``, ``options.*``, ``priors.*``.
         VislocError: what maps raise.
     """
     _here().check_rig(job, maps)
@@ -216,7 +216,7 @@ def open_sequence(start: SequenceStart, maps: Sequence[MapFolder]) -> bytes:
     """Begin a sequence.
 
     Raises:
-        InvalidInput: ``sequence.*``, ``rig.*``, ``priors.*``.
+        InvalidInput: ``sequence.*``, ``rig.*``, ``options.*``, ``priors.*``.
         VislocError: what maps raise.
     """
     return _here().open_sequence(start, maps)

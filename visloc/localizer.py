@@ -35,7 +35,7 @@ from visloc.query_features import (
 from visloc.rematching import Rematching, seen_as_found
 from visloc.retrieval.fusion import LateFusion, chosen_fusion
 from visloc.retrieval.index import Retrieved, retrieve
-from visloc.solving import Look, Matches, SeenImage, Solved, solve_instant
+from visloc.solving import Look, Matches, SeenImage, Solved, check_solver, solve_instant
 from visloc.timing import timed
 from visloc.types import (
     Answer,
@@ -129,6 +129,24 @@ class Localizer:
         )
         camera = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
         self.localize_features(features, camera, LocalizeOptions())
+
+    def check(self, options: LocalizeOptions, num_cameras: int = 1) -> None:
+        """Refuse options that do not fit the map, before anything is looked at.
+
+        Args:
+            options: of a query.
+            num_cameras: of the rig that is to be localized; 1 for a camera on its own.
+
+        Raises:
+            InvalidInput: ``options.fusion_weights`` of global descriptors that the map does not
+                have; ``options.matcher`` when there is none for its local features;
+                ``options.solver`` for a rig of several cameras with ``registration``.
+            WeightsError: when the weights of the matcher are not here, or damaged.
+        """
+        self._fusion(options)
+        check_solver(options, num_cameras)
+        if options.matcher is Matcher.LIGHTGLUE:
+            self._make_matcher(self.map.manifest.local_features.fingerprint.name)
 
     def localize(
         self,

@@ -150,14 +150,7 @@ def solve_instant(
         InvalidInput: ``priors.*`` that mean nothing in this map; ``options.solver`` for several
             images with ``registration``.
     """
-    if options.solver is Solver.REGISTRATION and len(images) > 1:
-        raise InvalidInput(
-            "options.solver",
-            "registration finds the pose of one photo, not of several together",
-            field="options.solver",
-            expected=f"{Solver.PYCOLMAP} or {Solver.POSELIB} for a rig",
-            got=options.solver,
-        )
+    check_solver(options, len(images))
     constraints = Constraints(geometry, priors)
     looks = [image.look for image in images if image.look is not None]
     views = _views_of(images, [look.matches for look in looks], options)
@@ -176,6 +169,22 @@ def solve_instant(
     answer = InstantAnswer(timestamp, shown, pose, refusal, seconds)
     views = tuple(replace(view, camera=camera or view.camera) for view in views)
     return Solved(answer, views, found if refusal is None else None, inliers)
+
+
+def check_solver(options: LocalizeOptions, num_cameras: int) -> None:
+    """Refuse a solver that does not take so many images at once.
+
+    Raises:
+        InvalidInput: ``options.solver``.
+    """
+    if options.solver is Solver.REGISTRATION and num_cameras > 1:
+        raise InvalidInput(
+            "options.solver",
+            "registration finds the pose of one photo, not of several together",
+            field="options.solver",
+            expected=f"{Solver.PYCOLMAP} or {Solver.POSELIB} for a rig",
+            got=options.solver,
+        )
 
 
 def _views_of(

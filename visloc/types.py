@@ -162,16 +162,22 @@ class Reason(StrEnum):
 Stage = Literal["features", "retrieval", "matching", "pose", "gate"]
 
 
-def check_fusion_weights(weights: Mapping[str, float], field: str) -> None:
+def check_fusion_weights(weights: Mapping[str, float], code: str, field: str | None = None) -> None:
     """Make sure that weights of global descriptors mean something.
 
+    Args:
+        weights: by name.
+        code: of the error.
+        field: what the weights are called where they were given; None for what the code says.
+
     Raises:
-        InvalidInput: named like the field.
+        InvalidInput: with the code.
     """
+    field = code if field is None else field
     for name, weight in weights.items():
         if not 1e-6 <= weight <= 1e6:  # NaN fails too
             raise InvalidInput(
-                field,
+                code,
                 "not a weight; leave a descriptor away that shall not count",
                 field=f"{field}.{name}",
                 expected="0.000001 to 1000000",
@@ -179,7 +185,11 @@ def check_fusion_weights(weights: Mapping[str, float], field: str) -> None:
             )
     if not weights:
         raise InvalidInput(
-            field, "no weights", field=field, expected="a weight for one global descriptor or more"
+            code,
+            "no weights",
+            field=field,
+            expected="a weight for one global descriptor or more",
+            got="{}",
         )
 
 

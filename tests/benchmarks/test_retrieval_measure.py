@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 import typer
 
-from benchmarks.retrieval import Query, chosen, recalls, shared_landmarks, visible_landmarks
+from benchmarks.retrieval import (
+    Query,
+    chosen,
+    recalls,
+    shared_landmarks,
+    visible_landmarks,
+    whole_numbers,
+)
 from visloc.geometry import Camera, Pose
 from visloc.retrieval.fusion import EQUAL_GHARM
 from visloc.retrieval.rows import GlobalRows
@@ -89,3 +96,17 @@ def test_global_features_are_chosen_by_name() -> None:
 def test_unknown_global_features_are_refused_with_those_of_the_map(unknown: str) -> None:
     with pytest.raises(typer.BadParameter, match="only densevlad, localvlad"):
         chosen(f"densevlad,{unknown}", ["densevlad", "localvlad"])
+
+
+def test_ready_made_descriptors_are_refused_because_no_query_has_them() -> None:
+    known = ["densevlad", "kapture:AP-GeM"]
+    with pytest.raises(typer.BadParameter, match="kapture:AP-GeM cannot be measured"):
+        chosen(None, known)
+    assert chosen("densevlad", known) == ["densevlad"]
+
+
+@pytest.mark.parametrize("text", ["", "0", "5,-1", "5,x"])
+def test_ranks_are_counted_from_one(text: str) -> None:
+    with pytest.raises(typer.BadParameter, match="not numbers from 1"):
+        whole_numbers(text)
+    assert whole_numbers("1, 20") == [1, 20]

@@ -80,9 +80,9 @@ def test_every_axis_but_the_map_varies_an_option_of_the_server() -> None:
 def test_only_the_option_of_the_axis_varies() -> None:
     fixed = LocalizeOptions(top_k=7, seed=3)
 
-    variants = make_variants(Axis.SOLVER, ["poselib", "magic"], [ROOM], fixed)
+    variants = make_variants(Axis.SOLVER, ["poselib", "pycolmap"], [ROOM], fixed)
 
-    assert [variant.value for variant in variants] == ["poselib", "magic"]
+    assert [variant.value for variant in variants] == ["poselib", "pycolmap"]
     assert [v.options for v in variants] == [replace(fixed, solver=v.value) for v in variants]
     top_k = make_variants(Axis.TOP_K, (), [ROOM], LocalizeOptions())
     assert [variant.options.top_k for variant in top_k] == [1, 5, 10, 20, 50]
@@ -98,7 +98,8 @@ def test_global_features_are_compared_alone_then_all_together() -> None:
         "localvlad": {"localvlad": 1},
         "all": {"densevlad": 1, "localvlad": 1},
     }
-    assert weights(["localvlad+gem"]) == {"localvlad+gem": {"localvlad": 1, "gem": 1}}
+    three = replace(ROOM, global_features=("densevlad", "localvlad", "gem"))
+    assert weights(["localvlad+gem"], three) == {"localvlad+gem": {"localvlad": 1, "gem": 1}}
     assert weights((), replace(ROOM, global_features=("gem",))) == {"gem": {"gem": 1}}
 
 
@@ -120,7 +121,9 @@ def test_maps_are_named_by_their_local_features_as_far_as_these_differ() -> None
         (Axis.FUSION, (), [ROOM], {"fusion": "mean"}, "compare.option"),
         (Axis.GLOBAL_FEATURES, (), [ROOM], {"fusion_weights": {"a": 1}}, "compare.option"),
         (Axis.TOP_K, ("many",), [ROOM], {}, "options.top_k"),
-        (Axis.GLOBAL_FEATURES, ("gem+",), [ROOM], {}, "options.fusion_weights"),
+        (Axis.GLOBAL_FEATURES, ("densevlad+",), [ROOM], {}, "compare.values"),
+        (Axis.GLOBAL_FEATURES, ("all", "densevlad+gem"), [ROOM], {}, "compare.values"),
+        (Axis.FUSION, ("mean", "powr"), [ROOM], {}, "compare.values"),
     ],
 )
 def test_what_cannot_be_compared_is_refused(
@@ -140,7 +143,7 @@ def test_values_are_different_words(text: str) -> None:
     with pytest.raises(InvalidInput) as caught:
         parse_values(text)
     assert caught.value.code == "compare.values"
-    assert parse_values("a,b") == ("a", "b")
+    assert parse_values(" a, b") == ("a", "b")
 
 
 # A run
@@ -382,6 +385,22 @@ def test_several_maps_for_another_axis_are_refused_before_any_photo_is_asked_abo
 
     assert compare(make_dataset({"a": b"photo"}), *maps, *arguments) == 1
     assert "compare.maps" in capsys.readouterr().err
+    assert service.seen == []
+
+
+@pytest.mark.parametrize("values", ["mean,powr", "mean"])
+def test_a_refusal_leaves_no_folder_and_a_file_in_its_way_is_named(
+    values: str, http_url: str, make_dataset: Dataset, tmp_path: Path, service: Any, capsys: Any
+) -> None:
+    (tmp_path / "file").write_text("mine")
+    output = tmp_path / ("new" if "powr" in values else "file")
+    common = ("--map", "room", "--axis", "fusion", "--server", http_url, "--output", output)
+
+    assert compare(make_dataset({"a": b"photo"}), *common, "--values", values) == 1
+
+    code = "compare.values" if "powr" in values else "output.folder"
+    assert capsys.readouterr().err.startswith(f"error [{code}] ")
+    assert not (tmp_path / "new").exists()
     assert service.seen == []
 
 

@@ -24,6 +24,12 @@ from visloc_api.v1 import localization_pb2 as pb2
 
 IDENTITY = {"rotation_wxyz": [1.0, 0.0, 0.0, 0.0], "translation": [0.0, 0.0, 0.0]}
 FAST = {"top_k": 4}
+# Options that do not fit the map, or not a rig, by the field and code of the error.
+NOT_OF_THE_MAP: dict[str, dict[str, Any]] = {
+    "options.fusion_weights": {"fusion_weights": {"gem": 1}},
+    "options.matcher": {"matcher": "lightglue"},
+    "options.solver": {"solver": "registration"},
+}
 
 
 @pytest.fixture(scope="module")
@@ -281,6 +287,7 @@ def test_one_camera_of_the_rig_is_enough(
             *(422, "rig.rotation", "rig.sensors.left.cam_from_rig.rotation_wxyz"),
         ),
         ({"options": {"top_k": 0}}, 422, "options.top_k", "options.top_k"),
+        *(({"options": options}, 422, field, field) for field, options in NOT_OF_THE_MAP.items()),
     ],
 )
 def test_a_wrong_rig_is_refused_alike_at_both_doors(
@@ -481,6 +488,13 @@ def instant(timestamp: int = 5, *sensors: str) -> dict[str, Any]:
             *(422, "rig.sensor", "instants[0].images[0].sensor"),
         ),
         ({"rig": "front", "instants": [instant(1, "left")]}, 404, "rig.unknown", "rig"),
+        *(
+            (
+                {"rig": "rig", "instants": [instant(1, "left")], "options": options},
+                *(422, field, field),
+            )
+            for field, options in NOT_OF_THE_MAP.items()
+        ),
     ],
 )
 def test_a_wrong_sequence_is_refused_alike_at_both_doors(

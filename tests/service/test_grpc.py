@@ -188,6 +188,18 @@ def test_every_answer_carries_the_servers_version(doors: Any) -> None:
             "options.matcher",
         ),
         (
+            {"image": b"?", "options": pb2.LocalizeOptions(fusion_weights={"gem": 1})},
+            "INVALID_ARGUMENT",
+            "options.fusion_weights",
+            "options.fusion_weights",
+        ),
+        (
+            {"image": b"?", "options": pb2.LocalizeOptions(matcher="lightglue")},
+            "INVALID_ARGUMENT",
+            "options.matcher",
+            "options.matcher",
+        ),
+        (
             {"options": pb2.LocalizeOptions(solver="p3p")},
             "INVALID_ARGUMENT",
             "options.solver",

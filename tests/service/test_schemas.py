@@ -156,7 +156,7 @@ def test_options_may_be_text() -> None:
             )
             for given, code, below, expected in [
                 ([1], "request.invalid", "", None),
-                ({}, "options.fusion_weights", "", None),
+                ({}, "options.fusion_weights", "", "a weight for one global descriptor or more"),
                 ({"a": True}, "request.invalid", ".a", None),
                 ({"a": "1"}, "request.invalid", ".a", None),
                 ({"a": None}, "request.invalid", ".a", None),

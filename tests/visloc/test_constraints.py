@@ -15,9 +15,9 @@ from visloc.archive import MapStore
 from visloc.constraints import Constraints, MapGeometry
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
-from visloc.geometry import Pose
+from visloc.geometry import Camera, Pose
 from visloc.localizer import Localizer
-from visloc.pose.colmap import project
+from visloc.pose.colmap import normalized_rays, project
 from visloc.priors import (
     NO_PRIORS,
     GravityPrior,
@@ -238,6 +238,26 @@ def test_near_a_pose_prior_only_what_it_explains_is_kept(place: Any) -> None:
     again = Constraints(place.geometry, prior).near_pose_prior([view], 8.0)
     assert again is not None
     assert len(again[0]) in (len(near[0]) - 1, len(near[0]))
+
+
+@pytest.mark.parametrize("focal", [200.0, 500.0, 4000.0])
+def test_without_a_focal_length_a_pose_prior_keeps_what_any_focal_length_explains(
+    place: Any, focal: float
+) -> None:
+    camera = Camera("SIMPLE_PINHOLE", 640, 480, (focal, 320.0, 240.0))
+    guess = Camera("SIMPLE_PINHOLE", 640, 480, (768.0, 320.0, 240.0))
+    rng = np.random.default_rng(4)
+    pixels = np.vstack([[[320.0, 240.0]], rng.uniform([0, 0], [640, 480], (279, 2))])
+    points = TURNED.inverse().apply(
+        normalized_rays(camera, pixels) * rng.uniform(2.0, 10.0, (280, 1))
+    )
+    points[80:] = TURNED.center + rng.uniform(-8.0, 8.0, (200, 3))
+    prior = Priors(pose=PosePrior(TURNED, np.diag([1e-6] * 3 + [1e-6] * 3)))
+    view = MatchedView(guess, Pose.identity(), pixels, points, focal_unknown=True)
+    near = Constraints(place.geometry, prior).near_pose_prior([view], 4.0)
+    assert near is not None
+    assert np.array_equal(near[0].points[:80], points[:80])
+    assert len(near[0]) < 100
 
 
 # What cannot be a prior

@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from visloc import sequence as sequence_module
 from visloc.errors import InvalidInput
-from visloc.geometry import Pose
+from visloc.geometry import Camera, Pose
 from visloc.priors import NO_PRIORS, HeightBand, PositionPrior, Priors
 from visloc.sequence import MAX_WAITING, SeenInstant, SequenceSolver
 from visloc.solving import Matches, SeenImage, solve_instant
 from visloc.trajectory import MAX_GAP_S, Odometry, PoseSource, TimeUnit, center_covariance
-from visloc.types import InstantAnswer, LocalizeOptions, Reason
+from visloc.types import CameraSource, InstantAnswer, LocalizeOptions, Reason
 
 OPTIONS = LocalizeOptions()
 ODOMETRY_FROM_LOCAL = Pose(
@@ -134,6 +134,31 @@ def same(a: InstantAnswer, b: InstantAnswer) -> bool:
             (a.pose.position_std, b.pose.position_std),
         )
     )
+
+
+# Focal lengths that are a guess
+
+
+def without_camera(place: Any, step: float, right: int) -> tuple[SeenImage, ...]:
+    image = place.image(place.matches(rig_at(step), right, 20, seed=int(step)))
+    assert image.look is not None
+    camera = Camera("SIMPLE_PINHOLE", 640, 480, (768.0, 320.0, 240.0))
+    evidence = replace(image.look.evidence, camera=camera, camera_source=CameraSource.GUESS)
+    return (replace(image, look=replace(image.look, evidence=evidence)),)
+
+
+@pytest.mark.parametrize(("around", "expected"), [(60, "---"), (300, "EME")])
+def test_photos_refused_for_their_guessed_camera_have_no_say(
+    place: Any, around: int, expected: str
+) -> None:
+    instants = [
+        SeenInstant(100 * i, without_camera(place, i, right), odometry(i), NO_PRIORS)
+        for i, right in enumerate((around, 60, around))
+    ]
+    answers = answers_to(solver(place, 10.0), instants)
+    assert sources(answers) == expected
+    check_answers(answers, place, [rig_at(i) for i in range(3)])
+    assert answers[1].num_inliers == (0 if answers[1].pose else 60)
 
 
 # What holds for every sequence

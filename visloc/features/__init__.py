@@ -18,6 +18,7 @@ from visloc.features.plugins import (
     GLOBAL_FEATURES_GROUP,
     LOCAL_FEATURES_GROUP,
     make_plugin,
+    passed_over,
     plugin_names,
 )
 from visloc.types import Inference
@@ -130,9 +131,16 @@ def _make(
         return getattr(import_module(module), function)(weights_dir, inference, threads)
     others = plugin_names(group)
     if name not in others:
+        message = "unknown feature; if a package brings it, install that package"
+        unusable = passed_over(group)
+        if unusable:
+            message += (
+                f". Passed over, because a name has only lower-case letters, digits, '_', '.' and "
+                f"'-', at most 64: {', '.join(unusable)}"
+            )
         raise InvalidInput(
             "features.unknown",
-            "unknown feature; if a package brings it, install that package",
+            message,
             field=group.removeprefix("visloc."),
             expected=f"one of {', '.join(sorted({*registry, *others}))}",
             got=name,

@@ -11,7 +11,8 @@ log is made of ``defaultdict``, and the AP-GeM files, which hold an object of sc
 unpickler below knows the four names that a state dict needs (OrderedDict, defaultdict, list,
 torch's _rebuild_tensor_v2), the names of storage types and those of ``pickled_pca``, and puts
 harmless stand-ins in their place. Before it runs, the opcodes are compared with those that such
-files need, so that no declared size or index can allocate more than a small multiple of the file.
+files need, so that no declared size or index can allocate more than a small multiple of the file;
+and there may be at most a million, because a byte of a pickle can make an object of a hundred.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ from visloc.errors import WeightsError
 from visloc.features.pickled_pca import PickledPca, stand_in
 
 MAX_FILE_BYTES = 256 * 2**20
+# A state dict with the state of an optimizer has some 10,000, a long training log 150,000.
+_MAX_OPCODES = 1_000_000
 _MAX_TUPLES = 10_000  # bounds how deep tuples can nest: hashing one recurses in C
 _MAX_DIMENSIONS = 8
 
@@ -243,6 +246,8 @@ def _end_of_harmless_pickle(data: bytes, start: int) -> int:
     stream.seek(start)
     num_tuples = 0
     for count, (opcode, argument, _) in enumerate(pickletools.genops(stream)):
+        if count >= _MAX_OPCODES:
+            raise ValueError(f"a pickle of more than {_MAX_OPCODES} opcodes")
         if opcode.name not in _OPCODES:
             raise ValueError(f"pickle opcode {opcode.name}, which a state dict does not need")
         # The C unpickler allocates its memo up to the index asked for.

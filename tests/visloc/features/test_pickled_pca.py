@@ -266,7 +266,7 @@ def test_bytes_asked_for_again_and_again_take_no_memory(tmp_path: Path) -> None:
 
 
 def test_deeply_nested_objects_end_in_an_answer(tmp_path: Path) -> None:
-    depth = 300_000
+    depth = 240_000
     nested = b"csklearn.decomposition.pca\nPCA\nq\x01)\x81" + b"h\x01)\x81" * depth + b"b" * depth
     checkpoint = _read_pickle(
         tmp_path / "w.pt", _string(b"pca") + b"}" + _string(b"a") + nested + b"ss"

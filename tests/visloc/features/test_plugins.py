@@ -24,10 +24,18 @@ from visloc.types import Fingerprint
 
 def load(weights_dir, inference, threads):
     made = Fingerprint("grid", 1, {"asked": f"{weights_dir} {inference} {threads}"})
-    return SimpleNamespace(fingerprint=made)
+    members = "computed_with descriptor_dim extract needs_image needs_local_features"
+    members += " needs_vocabulary training_words learn_vocabulary pool learn_projection project"
+    return SimpleNamespace(fingerprint=made, **dict.fromkeys([*members.split(), "describe"]))
 
 def refuse(weights_dir, inference, threads):
     raise WeightsError("weights.missing", "no weights of grid")
+
+def unfinished(weights_dir, inference, threads):
+    return SimpleNamespace(fingerprint=Fingerprint("grid", 1, {}), computed_with="nothing")
+
+def leave(weights_dir, inference, threads):
+    raise SystemExit("gone")
 
 def break_down(weights_dir, inference, threads):
     return 1 // 0
@@ -82,6 +90,7 @@ def test_names_that_no_map_can_have_are_no_features(install: Install, name: str)
         make_local_features(name)
     assert caught.value.code == "features.unknown"
     assert caught.value.expected == f"one of {', '.join(local_feature_names())}"
+    assert f"{name!r} of the package grid-features" in str(caught.value)
 
 
 def test_two_packages_that_offer_the_same_name_are_named(install: Install) -> None:
@@ -101,6 +110,7 @@ def test_two_packages_that_offer_the_same_name_are_named(install: Install) -> No
         ("grid_features:break_down", "ZeroDivisionError"),
         ("grid_features:SOURCE.x", "AttributeError"),
         ("grid_features:SimpleNamespace", "TypeError"),
+        ("grid_features:leave", "SystemExit: gone"),
     ],
 )
 def test_a_plugin_that_fails_is_named(install: Install, value: str, got: str) -> None:
@@ -109,6 +119,14 @@ def test_a_plugin_that_fails_is_named(install: Install, value: str, got: str) ->
         make_local_features("grid")
     assert (caught.value.code, caught.value.field) == ("features.plugin", "grid")
     assert str(caught.value.got).startswith(got)
+
+
+def test_a_plugin_that_makes_something_else_is_told_what_is_lacking(install: Install) -> None:
+    install("grid", "grid_features:unfinished")
+    with pytest.raises(InvalidInput, match="repair or uninstall") as caught:
+        make_local_features("grid")
+    assert caught.value.code == "features.plugin"
+    assert caught.value.got == "SimpleNamespace without descriptor_dim, extract"
 
 
 def test_a_plugin_speaks_for_itself_about_its_weights(install: Install) -> None:

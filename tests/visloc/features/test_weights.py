@@ -174,7 +174,9 @@ def test_names_beside_the_known_ones_are_refused(
         (_dict_of(b"cbuiltins\nlist\n(]tR"), "not callable"),
         (_dict_of(b"ccollections\nOrderedDict\n(]tR"), "positional argument"),
         # hashing a tuple as deep as this ends the process
-        (b"\x80\x02})" + b"\x85" * 1_000_000 + b"K\x01s.", "tuples"),
+        (b"\x80\x02})" + b"\x85" * 100_000 + b"K\x01s.", "tuples"),
+        # an empty list is one byte here and 56 in memory
+        (b"\x80\x02(" + b"]" * 1_000_000 + b"t.", "more than 1000000 opcodes"),
     ],
 )
 def test_malformed_content_is_refused_with_the_reason(
