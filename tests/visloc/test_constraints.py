@@ -18,6 +18,7 @@ from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
 from visloc.localizer import Localizer
 from visloc.pose.colmap import normalized_rays, project
+from visloc.pose.views import MatchedView
 from visloc.priors import (
     NO_PRIORS,
     GravityPrior,
@@ -223,8 +224,6 @@ def test_a_pose_prior_is_compared_in_units_of_both_uncertainties(place: Any) -> 
 
 
 def test_near_a_pose_prior_only_what_it_explains_is_kept(place: Any) -> None:
-    from visloc.pose.views import MatchedView
-
     right = place.matches(TURNED, 80, 200, seed=3)
     view = MatchedView(place.camera, Pose.identity(), right.pixels, right.points)
     prior = Priors(pose=PosePrior(TURNED, np.diag([1e-4] * 3 + [1e-2] * 3)))

@@ -197,7 +197,7 @@ def _with_focal_length(
                 tried.append((seen, pose))
     if not tried:
         return None
-    (seen, pose) = min(tried, key=lambda each: each[1].loss)
+    seen, pose = min(tried, key=lambda each: each[1].loss)
     seen = [view.zoomed(pose.zoom) for view in seen]
     best = refine(seen, pose.rig_from_world, max_error_px=max_error_px, max_steps=_STEPS_WITH_FOCAL)
     return None if best is None else _judged(seen, best)

@@ -20,7 +20,8 @@ class MatchedView:
         pixels: (n, 2) float64 in the camera's image; those matched best come first, where that is
             known.
         points: (n, 3) float64 in a world frame whose numbers are not large.
-        focal_unknown: the camera's focal length is a guess, to be found together with the pose.
+        focal_unknown: the camera's focal length is a guess to be found together with the pose, or
+            was found so.
     """
 
     camera: Camera
