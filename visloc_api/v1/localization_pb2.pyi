@@ -513,7 +513,7 @@ class LocalizeRequest(_message.Message):
 
     @_builtins.property
     def camera(self) -> Global___Camera:
-        """Left out: EXIF focal length, else one estimated with the pose or guessed, which the answer marks."""
+        """Left out: EXIF focal length, else one estimated with the pose, which the answer marks."""
 
     @_builtins.property
     def options(self) -> Global___LocalizeOptions: ...
@@ -653,7 +653,7 @@ class RigImage(_message.Message):
     @_builtins.property
     def camera(self) -> Global___Camera:
         """Left out: the rig's for this sensor; of a rig_id, the map's for this sensor; else EXIF, else
-        one estimated or guessed, which the answer marks.
+        one estimated with the pose of an image on its own; among several it is left out.
         """
 
     def __init__(
