@@ -227,7 +227,13 @@ def test_the_dependencies_are_those_that_the_tests_run_with() -> None:
 
     assert len(installs) == 5
     assert all("--constraint constraints.txt" in step for step in installs)
-    assert extras == {"vision", "service,s3,tracing", "mapping", "clients"}
+    assert extras == {
+        "vision,gem",
+        "service,s3,tracing",
+        "service,gem,s3,tracing",
+        "mapping",
+        "clients",
+    }
     declared = PROJECT["project"]["optional-dependencies"]
     assert {name for names in extras for name in names.split(",")} <= declared.keys()
 

@@ -484,7 +484,7 @@ def test_killed_in_any_stage_the_same_command_resumes_and_makes_the_same_map(
         "progress:densevlad words:5",
         "call:visloc.features.vlad:learn_words",
         "progress:densevlad:2",
-        "call:visloc.features.vlad:learn_whitening",
+        "call:visloc.features.whitening:learn_whitening",
         "progress:localvlad:1",
         "progress:depth:4",
         "call:mapping.rgbd:merge_landmarks",
