@@ -3,14 +3,18 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+PAGE := visloc_web/built/.done
+PAGE_SOURCES := $(shell find web -path web/node_modules -prune -o -type f -print)
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all fuzz fuzz-api bench bench-scale fmt lint types contracts proto proto-check check serve clean
+# Vite needs this much; without it the service has no page, and says so.
+NODE_IS_THERE = command -v npm >/dev/null && node -e 'const [a, b] = process.versions.node.split(".").map(Number); process.exit(a > 22 || (a === 22 && b >= 12) || (a === 20 && b >= 19) ? 0 : 1)'
+.PHONY: help install page check-page demo test test-all fuzz fuzz-api bench bench-scale fmt lint types contracts proto proto-check check serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-install: $(INSTALLED) ## make .venv with every extra
+install: $(INSTALLED) page ## make .venv with every extra, and the page where Node.js is
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "visloc needs Python 3.11 or newer")'
@@ -18,6 +22,18 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
 		--editable '.[mapping,service,gem,s3,tracing,clients,compare,dev]'
 	touch $(INSTALLED)
+
+page: ## build the page from web/
+	@if $(NODE_IS_THERE); then $(MAKE) --no-print-directory $(PAGE); \
+	else echo 'The page is not built: that takes npm and Node.js 20.19, 22.12 or newer.' >&2; fi
+
+web/node_modules/.done: web/package.json web/package-lock.json
+	npm ci --prefix web --ignore-scripts --no-audit --no-fund
+	touch $@
+
+$(PAGE): web/node_modules/.done $(PAGE_SOURCES)
+	npm run --prefix web --silent build
+	touch $@
 
 demo: install ## the main job on a synthetic sample: build, serve, localize, picture
 	$(BIN)/python examples/demo.py
@@ -63,10 +79,14 @@ proto-check: proto ## the committed stubs are those of the proto
 	git diff --exit-code -- visloc_api
 	@test -z "$$(git status --porcelain -- visloc_api)" || (git status --short -- visloc_api; exit 1)
 
-check: lint types contracts proto-check ## what must be green before review
+check-page: page ## types, format and unit tests of web/
+	@if $(NODE_IS_THERE); then npm run --prefix web --silent check; \
+	else echo 'The page is not checked: there is no Node.js.' >&2; fi
+
+check: lint types contracts proto-check check-page ## what must be green before review
 
 serve: install ## serve the maps in maps/ on 127.0.0.1:8000 (HTTP) and :50051 (gRPC)
 	$(BIN)/python -m service --maps-dir maps
 
 clean: ## remove what make made
-	rm -rf $(VENV) .demo .bench
+	rm -rf $(VENV) .demo .bench web/node_modules visloc_web/built

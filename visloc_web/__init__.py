@@ -1,0 +1,44 @@
+"""The built page and report viewer, from the sources in ``web/``; ``make install`` builds them.
+
+``service`` serves the page, ``mapping report`` writes the viewer into its file.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from visloc.errors import Unavailable
+
+_BUILT = Path(__file__).parent / "built"
+
+
+def page_folder() -> Path:
+    """Return the folder of the page: ``index.html``, and all else in ``assets/``.
+
+    Raises:
+        Unavailable: ``page.not_built``.
+    """
+    return _built("page", "index.html")
+
+
+def report_parts() -> tuple[str, str]:
+    """Return the script and the style sheet of the report.
+
+    Raises:
+        Unavailable: ``page.not_built``.
+    """
+    folder = _built("report", "report.js")
+    return (folder / "report.js").read_text("utf-8"), (folder / "report.css").read_text("utf-8")
+
+
+def _built(part: str, first: str) -> Path:
+    folder = _BUILT / part
+    if not (folder / first).is_file():
+        raise Unavailable(
+            "page.not_built",
+            "the page's files are not here: they are made from web/ by Node.js 20.19 or newer; "
+            "wheels and images carry them",
+            field=str(folder),
+            expected="what `make install` builds where npm is present",
+        )
+    return folder
