@@ -62,6 +62,7 @@ from mapping.options import (
 from mapping.packing import write_packed
 from mapping.pairing import PairSettings
 from mapping.progress import StageProgress
+from mapping.report.command import report
 from mapping.rgbd import DepthSettings
 from mapping.rig_calibration import calibrate_rig, refuse_known_rigs, write_calibration
 from mapping.sample import write_sample
@@ -565,6 +566,9 @@ def verify(
     Localizer(opened, extractor, make_descriptor)  # raises when they differ
     names = (name, *(record.fingerprint.name for record in opened.manifest.global_features))
     _out.print(f"{', '.join(names)}: the same features as here", soft_wrap=True)
+
+
+app.command()(report)
 
 
 @app.command("export-features")

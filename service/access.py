@@ -38,12 +38,19 @@ _SCOPES_OF_CALLS = {
     **{f"/{_MAPS}/{name}": Scope.MANAGE for name in ("PutVersion", "DeleteVersion", "SetCurrent")},
 }
 
+_ASSET = re.compile(r"/assets/[^/]+")
 _ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-f:]+\](:\d{1,5})?")
 
 
-def needed_over_http(method: str, path: str) -> Needed:
-    """Return what a request over HTTP needs, by its method and its path without %-escapes."""
-    if path in _PUBLIC_PATHS:
+def needed_over_http(method: str, path: str, *, page: bool = False) -> Needed:
+    """Return what a request over HTTP needs.
+
+    Args:
+        method: of the request.
+        path: without %-escapes.
+        page: whether the files of our own page are served, which need nothing.
+    """
+    if path in _PUBLIC_PATHS or (page and _is_of_page(method, path)):
         return NOTHING
     match path.split("/")[1:2]:
         case ["localize" | "geopose"]:
@@ -53,6 +60,12 @@ def needed_over_http(method: str, path: str) -> Needed:
         case ["metrics"]:
             return frozenset({Scope.READ})
     return ANY_KEY
+
+
+def _is_of_page(method: str, path: str) -> bool:
+    if method not in _READING_METHODS:
+        return False
+    return path == "/" or _ASSET.fullmatch(path) is not None
 
 
 def needed_over_grpc(method: str) -> Needed:

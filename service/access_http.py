@@ -20,12 +20,18 @@ from service.responses import problem_response
 from visloc.errors import VislocError
 
 
-def add_access(app: Starlette, access: Access, observer: Observer) -> None:
+def add_access(app: Starlette, access: Access, observer: Observer, *, page: bool = False) -> None:
     """Put access control before the routes, and CORS before it if some pages may call.
 
     Call this before the outermost middleware is added, which gives requests their ids.
+
+    Args:
+        app: what is protected.
+        access: the rules.
+        observer: is told of refusals.
+        page: whether the files of our own page are served, to everyone.
     """
-    app.add_middleware(AccessControl, access=access, observer=observer)
+    app.add_middleware(AccessControl, access=access, observer=observer, page=page)
     if access.origins:
         app.add_middleware(
             CORSMiddleware,
@@ -42,10 +48,11 @@ def add_access(app: Starlette, access: Access, observer: Observer) -> None:
 class AccessControl:
     """Lets a request through or refuses it, before any of its body is read."""
 
-    def __init__(self, app: ASGIApp, access: Access, observer: Observer) -> None:
+    def __init__(self, app: ASGIApp, access: Access, observer: Observer, *, page: bool) -> None:
         self._app = app
         self._access = access
         self._observer = observer
+        self._page = page
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
@@ -59,7 +66,8 @@ class AccessControl:
                 host, origins = headers.get("host", ""), headers.getlist("origin")
                 self._access.check_page(scope["scheme"], host, origins)
                 tokens = tokens_of(headers.getlist("authorization"), headers.getlist("x-api-key"))
-                key = self._access.key_of(tokens, needed_over_http(scope["method"], scope["path"]))
+                needed = needed_over_http(scope["method"], scope["path"], page=self._page)
+                key = self._access.key_of(tokens, needed)
                 if key is not None:
                     note_key(key.name)
                 stack.enter_context(self._access.place(key))

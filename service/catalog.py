@@ -154,6 +154,20 @@ class Catalog:
             for of in taken:
                 self._give_back(of.ref)
 
+    @asynccontextmanager
+    async def reading(self, ref: str) -> AsyncIterator[MapFolder]:
+        """Give ``id@version``, to be read in this process; it stays until the block ends.
+
+        Raises:
+            NotFound: ``map.version``.
+            VislocError: what the store raises.
+        """
+        of = await self._hold(ref)
+        try:
+            yield of
+        finally:
+            self._give_back(of.ref)
+
     async def activate(self, map_id: str, version: str, workers: Workers) -> None:
         """Put a version into use, once a worker process has it open and warm.
 
@@ -230,20 +244,25 @@ class Catalog:
         """Return a map, which stays until it is given back."""
         while True:
             found = ref if "@" in ref else (await self._resolve(ref, workers)).ref
-            if found in self._leaving:
-                raise NotFound(
-                    "map.version", "the version is being deleted", field="map", got=found
-                )
-            self._users[found] += 1
             try:
-                # Asked every time: copies of a remote store come and go by their use.
-                return MapFolder(found, await self._folder(found))
-            except BaseException as error:
-                self._give_back(found)
+                return await self._hold(found)
+            except NotFound:
                 served = self._serving.get(ref)
-                if isinstance(error, NotFound) and served is not None and served.ref != found:
-                    continue  # another version took over meanwhile
-                raise
+                if served is None or served.ref == found:
+                    raise
+                # Another version took over meanwhile.
+
+    async def _hold(self, ref: str) -> MapFolder:
+        """Return ``id@version``, which stays until it is given back."""
+        if ref in self._leaving:
+            raise NotFound("map.version", "the version is being deleted", field="map", got=ref)
+        self._users[ref] += 1
+        try:
+            # Asked every time: copies of a remote store come and go by their use.
+            return MapFolder(ref, await self._folder(ref))
+        except BaseException:
+            self._give_back(ref)
+            raise
 
     def _give_back(self, ref: str) -> None:
         self._users[ref] -= 1

@@ -23,6 +23,7 @@ from service.jobs import (
     SequenceStart,
 )
 from service.metrics import Metrics
+from service.scenes import Scenes
 from service.stores import Store
 from service.uploads import Uploads
 from service.wire import stopping_error
@@ -74,6 +75,7 @@ class Engine:
 
     Attributes:
         workers: the processes.
+        scenes: points and photos of the maps, to be drawn.
     """
 
     def __init__(
@@ -91,6 +93,7 @@ class Engine:
         self._store = store
         self._metrics = metrics
         self._catalog = Catalog(store)
+        self.scenes = Scenes(self._catalog)
         self.workers = Workers(
             workers,
             settings,
@@ -131,6 +134,7 @@ class Engine:
         self._draining = True
         if self._following is not None:
             self._following.cancel()
+        self.scenes.close()
         self._catalog.close()
         await self.workers.close()
 

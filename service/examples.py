@@ -147,6 +147,27 @@ NEW_MAP: dict[str, Any] = MAP | {
     ],
     "content_hash": "51c09f3e8d7b6a594837261504f3e2d1c0bfae9d8c7b6a5948372615f4e3d2c1",
 }
+MAP_IMAGES: dict[str, Any] = {
+    "map": {"id": "sample", "version": "20261121T111436.881Z-7f9cafe0"},
+    "total": 60,
+    "first": 0,
+    "cameras": {
+        "left": {
+            "model": "PINHOLE",
+            "width": 640,
+            "height": 480,
+            "params": [457.6, 457.6, 321.92, 238.08],
+        }
+    },
+    "images": [
+        {
+            "name": "mapping/left/0000.jpg",
+            "camera": "left",
+            "position": [1.3, 0.0, 1.52],
+            "orientation": [0.5, -0.5, 0.5, -0.5],
+        }
+    ],
+}
 READY: dict[str, Any] = {
     "ready": True,
     "maps": ["sample@20261121T111436.881Z-7f9cafe0"],

@@ -33,6 +33,7 @@ from service.metrics import ServiceState
 from service.metrics_http import metrics_response
 from service.observation import Observer, route_of
 from service.openapi import App, problems
+from service.page import add_page_routes
 from service.request_bodies import LOCALIZE_BODY, RIG_BODY, SEQUENCE_BODY
 from service.responses import (
     NDJSON,
@@ -41,6 +42,7 @@ from service.responses import (
     problem_response,
     while_connected,
 )
+from service.scene_http import add_scene_routes
 from service.schemas import (
     Health,
     InstantAnswer,
@@ -90,7 +92,7 @@ def create_app(
         redirect_slashes=False,  # to wherever the request says that this server is
     )
     app.state.observer, app.state.arrivals = observer, arrivals
-    add_access(app, access, observer)
+    add_access(app, access, observer, page=settings.page)
     app.add_middleware(RequestEnvelope, observer=observer, is_stopping=lambda: engine.draining)
     app.add_exception_handler(VislocError, _on_error)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
@@ -186,7 +188,10 @@ def create_app(
         return await metrics_response(render)
 
     add_map_routes(app, engine, settings)
+    add_scene_routes(app, engine, settings)
     add_geopose_routes(app, engine, settings)
+    if settings.page:
+        add_page_routes(app)
     return app
 
 

@@ -30,6 +30,7 @@ _ANSWERS: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {
     ("/localize/sequence", "post", "200"): {"sequence": batch_examples.SEQUENCE},
     ("/maps", "get", "200"): {"maps": {"maps": [examples.MAP]}},
     ("/maps/{ref}", "get", "200"): {"map": examples.MAP},
+    ("/maps/{ref}/images", "get", "200"): {"images": examples.MAP_IMAGES},
     ("/maps/{map_id}/current", "post", "200"): {"map": examples.MAP},
     ("/maps/{map_id}/versions/{version}", "get", "200"): {"map": examples.NEW_MAP},
     ("/maps/{map_id}/versions/{version}", "put", "201"): {"map": examples.NEW_MAP},

@@ -90,6 +90,8 @@ class ServiceSettings(BaseModel):
     """PEM file of the certificate's private key"""
     cors_origins: Names = ()
     """comma-separated origins of web pages that may call the HTTP API; none by default"""
+    page: bool = True
+    """whether / is a web page that shows maps and localizes photos; its files need no key"""
     metrics_port: Port | None = None
     """a port of its own for /metrics, without a key, for a scraper in a private network"""
     max_queue: Annotated[int, Field(ge=0)] = 64

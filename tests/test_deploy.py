@@ -1,4 +1,4 @@
-"""Images, compose file, alerts and docs/operations.md agree with the code and each other."""
+"""Wheel, images, compose file, alerts and docs/operations.md agree with the code and each other."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import tomllib
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
@@ -258,6 +259,22 @@ def test_the_code_is_all_of_the_wheel() -> None:
     assert copied == set(wheel)
 
 
+def test_the_page_is_made_in_a_stage_of_its_own_from_its_sources() -> None:
+    stages = dockerfile()
+    steps = [rest for _, rest in stages["page"].own]
+    packages = steps.index("web/package.json web/package-lock.json ./")
+    sources = steps.index("web .")
+    ignored = (ROOT / ".dockerignore").read_text().splitlines()
+
+    assert steps[packages + 1].startswith("npm ci ")
+    assert sources > packages + 1  # packages change less often than code
+    assert steps[sources + 1] == "npm run build"
+    assert "--from=page /src/visloc_web/built visloc_web/built" in stages["code"].of("COPY")
+    assert {"visloc_web/built", "web/node_modules"} <= set(ignored)
+    # Who runs an image has no Node.js in it.
+    assert [name for name, stage in stages.items() if stage.base in ("page", "${NODE}")] == ["page"]
+
+
 def test_only_what_is_copied_is_sent_to_the_builder() -> None:
     lines = (ROOT / ".dockerignore").read_text().splitlines()
     sent = {line[1:] for line in lines if line.startswith("!")}
@@ -272,6 +289,33 @@ def test_only_what_is_copied_is_sent_to_the_builder() -> None:
     assert "*" in lines
     assert all((ROOT / name).exists() for name in copied)
     assert {name if name in sent else name.split("/")[0] for name in copied} == sent
+
+
+# Wheel
+
+
+def test_a_wheel_carries_the_built_page_and_the_report_and_nothing_else_of_web(
+    tmp_path: Path,
+) -> None:
+    built = ROOT / "visloc_web" / "built"
+    if not (built / "page" / "index.html").is_file():
+        pytest.skip("the page is not built: `make page`, where Node.js is")
+    subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        timeout=100,
+    )
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        carried = set(archive.namelist())
+
+    files = {path.relative_to(ROOT).as_posix() for path in built.rglob("*") if path.is_file()}
+    assert {"index.html", "report.js"} <= {Path(name).name for name in files}
+    assert any(name.startswith("visloc_web/built/page/assets/") for name in files)
+    assert {name for name in carried if name.startswith("visloc_web/built/")} == files
+    assert not any("node_modules" in name or name.startswith("web/") for name in carried)
 
 
 # Healthcheck
@@ -377,13 +421,14 @@ def test_a_service_with_tls_is_asked_over_tls(tmp_path: Path) -> None:
 def test_every_setting_is_listed_with_its_default() -> None:
     table = OPERATIONS.read_text().partition("| setting |")[2].partition("\n\n")[0]
     rows = re.findall(r"^\| `(\w+)` \| (.*?) \| (.*) \|$", table, re.MULTILINE)
-    shown = {None: "none", (): "none"}
+    shown = {"None": "none", "()": "none", "True": "true"}
 
     assert [name for name, *_ in rows] == list(ServiceSettings.model_fields)
     for name, default, meaning in rows:
         field = ServiceSettings.model_fields[name]
         if field.default_factory is None:
-            assert default == shown.get(field.default, str(field.default)), name
+            value = str(field.default)
+            assert default == shown.get(value, value), name
         assert meaning
 
 

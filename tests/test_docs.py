@@ -33,6 +33,7 @@ from service.schemas import (
     LocalizeResponse,
     LocalizeRigRequest,
     LocalizeSequenceRequest,
+    MapImages,
     MapInfo,
     PoseEstimate,
     Problem,
@@ -127,7 +128,7 @@ class Desk:
             (r"127\.0\.0\.1:8000", self.http),
             (r"127\.0\.0\.1:50051", self.grpc),
             (r"\.venv/bin/", f"{COMMANDS}/"),
-            (r"\bkitchen\b|(?<=map[= ])sample\b|(?<=\")sample(?=\")", "room"),
+            (r"\bkitchen\b|(?<=map[= ])sample\b|(?<=maps/)sample(?=/)|(?<=\")sample(?=\")", "room"),
             (r"PINHOLE,[\d,.]+", self.camera_text),
             (r'Camera\("PINHOLE".*?\)\)', repr(self.camera)),
         ):
@@ -198,6 +199,7 @@ def desk(
         pytest.param(code, id=f"{page.name}-{number}")
         for page in PAGES
         for number, code in enumerate(blocks(page, "python"))
+        if "/points" not in code
     ],
 )
 def test_python_examples_say_where_the_photo_was_taken(code: str, desk: Desk) -> None:
@@ -205,6 +207,22 @@ def test_python_examples_say_where_the_photo_was_taken(code: str, desk: Desk) ->
 
     position = [float(number) for number in re.findall(r"-?\d+\.\d+(?:e-?\d+)?", printed)[:3]]
     np.testing.assert_allclose(position, desk.center, atol=0.05)
+
+
+def test_the_example_that_reads_points_sees_the_map(built_maps: Path, desk: Desk) -> None:
+    (code,) = (code for code in blocks(API, "python") if "/points" in code)
+    opened = MapStore(built_maps).open("room")
+
+    total, count, *middle = re.findall(
+        r"-?\d+\.?\d*(?:e-?\d+)?", desk.run(sys.executable, "-c", desk.paste(code))
+    )
+
+    assert int(total) == len(opened.landmarks)
+    assert int(count) == min(20_000, int(total))
+    extent = opened.manifest.world.extent
+    assert all(
+        low < float(x) < high for low, x, high in zip(extent.min, middle, extent.max, strict=True)
+    )
 
 
 @pytest.mark.parametrize(
@@ -251,7 +269,7 @@ JSON_EXAMPLES = [json.loads(text) for page in PAGES for text in blocks(page, "js
 
 
 def model_of(example: dict[str, Any]) -> type[BaseModel]:
-    models = (LocalizeResponse, InstantAnswer, MapInfo, Problem)
+    models = (LocalizeResponse, InstantAnswer, MapImages, MapInfo, Problem)
     (model,) = (model for model in models if model.model_fields.keys() == example.keys())
     return model
 
@@ -352,8 +370,8 @@ def test_every_relative_link_leads_somewhere(page: Path) -> None:
 # docs/api.md and the code
 
 CODE = re.compile(
-    r"(access|request|image|camera|options|maps?|near|packed|features|weights|server|pose|geopose"
-    r"|debug|rig|sequence|upload)"
+    r"(access|request|image|camera|options|maps?|near|packed|page|features|weights|server|pose"
+    r"|geopose|debug|rig|sequence|upload)"
     r"\.[a-z0-9_]+"
 )
 # Modules that take part in an answer, and the codes of theirs that no client meets.

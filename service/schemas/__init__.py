@@ -48,6 +48,7 @@ from service.schemas.rigs import (
     RigImage,
     RigSensor,
 )
+from service.schemas.scene import MapCamera, MapImage, MapImages
 from service.schemas.sequences import (
     Instant,
     LocalizeSequenceRequest,
@@ -90,6 +91,9 @@ __all__ = [
     "LocalizeRigRequest",
     "LocalizeSequenceRequest",
     "LocalizeSequenceResponse",
+    "MapCamera",
+    "MapImage",
+    "MapImages",
     "MapInfo",
     "MapNotLoaded",
     "MapRef",

@@ -107,6 +107,34 @@ def test_every_path_needs_what_it_is_for(
     assert needed_over_http(method, path) == needed
 
 
+@pytest.mark.parametrize(
+    ("method", "path", "needed"),
+    [
+        ("GET", "/", NOTHING),
+        ("HEAD", "/", NOTHING),
+        ("GET", "/assets/index-1a2b.js", NOTHING),
+        ("HEAD", "/assets/index-1a2b.js", NOTHING),
+        ("POST", "/", ANY_KEY),
+        ("POST", "/assets/index-1a2b.js", ANY_KEY),
+        ("OPTIONS", "/", ANY_KEY),
+        ("GET", "//", ANY_KEY),
+        ("GET", "/assets", ANY_KEY),
+        ("GET", "/assets/", ANY_KEY),
+        ("GET", "/assets/../maps", ANY_KEY),
+        ("GET", "/assets/a/b", ANY_KEY),
+        ("GET", "/assets/a\n/maps", ANY_KEY),
+        ("GET", "/maps/room/points", READ),
+        ("GET", "/maps/room/images", READ),
+        ("POST", "/localize", LOCALIZE),
+        ("GET", "/nowhere", ANY_KEY),
+    ],
+)
+def test_of_a_page_that_is_served_only_the_files_need_nothing(
+    method: str, path: str, needed: frozenset[Scope] | None
+) -> None:
+    assert needed_over_http(method, path, page=True) == needed
+
+
 def test_every_method_of_grpc_needs_a_scope_of_its_own() -> None:
     needed = {
         method.name: needed_over_grpc(f"/{service.full_name}/{method.name}")

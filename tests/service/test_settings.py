@@ -48,6 +48,7 @@ def test_every_setting_has_a_flag_a_variable_and_a_line_of_help(
         "inference": "fp32",
         "log_format": "json",
         "log_level": "error",
+        "page": "false",
     }
     value = words.get(name, "7")
     flag, variable = "--" + name.replace("_", "-"), "VISLOC_" + name.upper()

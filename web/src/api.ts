@@ -1,4 +1,7 @@
 // The part of the service's HTTP API that the page speaks (docs/api.md).
+//
+// What the service answers is taken for what it says it is; what is no answer of the service, such
+// as a proxy's page, is told apart here, so that callers meet one kind of error: ServiceError.
 
 export type Vector3 = [number, number, number];
 /** Unit quaternion: w, x, y, z. */
@@ -19,6 +22,10 @@ export interface MapInfo {
   size_bytes: number;
   /** Unit vector; empty when not known. */
   down: number[];
+  /** Whether this version is in use. */
+  current: boolean;
+  /** All published ones, oldest first. */
+  versions: { version: string; current: boolean }[];
 }
 
 export interface Camera {
@@ -83,4 +90,151 @@ export interface Problem {
   expected: string | null;
   got: string | null;
   request_id: string;
+}
+
+/** What the service refused, or why no usable answer came (codes server.*, status 0). */
+export class ServiceError extends Error {
+  constructor(
+    readonly problem: Problem,
+    /** What the service asks to wait before asking again; null when it does not say. */
+    readonly retryAfterSeconds: number | null = null,
+  ) {
+    super(problem.detail);
+    this.name = "ServiceError";
+  }
+}
+
+/** A photo to localize. `name` is the file's, for people; `map` is an id or `id@version`. */
+export interface LocalizeCall {
+  map: string;
+  image: Blob;
+  name: string;
+  camera: Camera | null;
+  options: Record<string, string | number>;
+  priors?: unknown;
+  debug?: boolean;
+}
+
+/** Every method throws ServiceError, or what `signal` was aborted with. */
+export interface Service {
+  maps(signal?: AbortSignal): Promise<MapInfo[]>;
+  /** Describe one map: an id or `id@version`. */
+  map(ref: string, signal?: AbortSignal): Promise<MapInfo>;
+  points(ref: string, first: number, count: number, signal?: AbortSignal): Promise<ArrayBuffer>;
+  images(ref: string, first: number, count: number, signal?: AbortSignal): Promise<MapImages>;
+  localize(request: LocalizeCall, signal?: AbortSignal): Promise<LocalizeResponse>;
+}
+
+/** `MODEL,width,height,params...`, as the service, the command line and curl take a camera. */
+export function cameraText(camera: Camera): string {
+  return [camera.model, camera.width, camera.height, ...camera.params].join(",");
+}
+
+/** As people name it: with the version only where that is not the one in use. */
+export function shortRef(map: { id: string; version: string; current: boolean }): string {
+  return map.current ? map.id : mapRef(map);
+}
+
+/** The version that is meant, so that what is shown and what is answered are of one map. */
+export function mapRef(map: { id: string; version: string }): string {
+  return `${map.id}@${map.version}`;
+}
+
+/** Speak with the service at `base`, which ends in a slash; `key` is asked before each request. */
+export function connect(base: URL, key: () => string | null): Service {
+  async function ask(path: string, init: RequestInit = {}): Promise<Response> {
+    const headers = new Headers();
+    const given = key();
+    if (given !== null) headers.set("Authorization", `Bearer ${given}`);
+    let response: Response;
+    try {
+      response = await fetch(new URL(path, base), { ...init, headers });
+    } catch (error) {
+      if (init.signal?.aborted) throw error;
+      throw noAnswer("server.unreachable", "the service cannot be reached", String(error));
+    }
+    if (!response.ok) throw await serviceError(response);
+    return response;
+  }
+
+  async function readJson<Answer>(path: string, init: RequestInit): Promise<Answer> {
+    const response = await ask(path, init);
+    return whole(init.signal, () => response.json() as Promise<Answer>);
+  }
+
+  const withSignal = (signal?: AbortSignal): RequestInit =>
+    signal === undefined ? {} : { signal };
+  const mapPath = (ref: string): string => `maps/${encodeURIComponent(ref)}`;
+
+  return {
+    async maps(signal) {
+      const answer = await readJson<{ maps?: MapInfo[] } | null>("maps", withSignal(signal));
+      if (!Array.isArray(answer?.maps)) {
+        throw noAnswer("server.answer", "this is not the list of maps", JSON.stringify(answer));
+      }
+      return answer.maps;
+    },
+    map: (ref, signal) => readJson(mapPath(ref), withSignal(signal)),
+    async points(ref, first, count, signal) {
+      const path = `${mapPath(ref)}/points?first=${first}&count=${count}`;
+      const response = await ask(path, withSignal(signal));
+      return whole(signal, () => response.arrayBuffer());
+    },
+    images: (ref, first, count, signal) =>
+      readJson(`${mapPath(ref)}/images?first=${first}&count=${count}`, withSignal(signal)),
+    localize: (call, signal) =>
+      readJson("localize", { ...withSignal(signal), method: "POST", body: localizeForm(call) }),
+  };
+}
+
+/** The form of POST /localize. What was not chosen is not sent: the service has defaults. */
+export function localizeForm(call: LocalizeCall): FormData {
+  const form = new FormData();
+  form.set("map", call.map);
+  form.set("image", call.image, call.name || "photo");
+  if (call.camera !== null) form.set("camera", cameraText(call.camera));
+  if (Object.keys(call.options).length > 0) form.set("options", JSON.stringify(call.options));
+  if (call.priors !== undefined) form.set("priors", JSON.stringify(call.priors));
+  if (call.debug === true) form.set("debug", "true");
+  return form;
+}
+
+/** Read a body; one that breaks off or is of another kind is no answer of the service. */
+async function whole<Body>(
+  signal: AbortSignal | null | undefined,
+  read: () => Promise<Body>,
+): Promise<Body> {
+  try {
+    return await read();
+  } catch (error) {
+    if (signal?.aborted) throw error;
+    throw noAnswer("server.answer", "the answer is not one of the service", String(error));
+  }
+}
+
+async function serviceError(response: Response): Promise<ServiceError> {
+  const retryAfter = Number.parseFloat(response.headers.get("Retry-After") ?? "");
+  const seconds = Number.isFinite(retryAfter) ? retryAfter : null;
+  const said: unknown = await response.json().catch(() => null);
+  return new ServiceError(problemOf(said, response), seconds);
+}
+
+function problemOf(said: unknown, response: Response): Problem {
+  const words = (typeof said === "object" && said !== null ? said : {}) as Record<string, unknown>;
+  const text = (name: string): string | null => (words[name] == null ? null : String(words[name]));
+  return {
+    title: text("title") ?? response.statusText,
+    status: response.status,
+    detail: text("detail") ?? "something other than the service answered, such as a proxy",
+    code: text("code") ?? "server.answer",
+    field: text("field"),
+    expected: text("expected"),
+    got: text("got"),
+    request_id: text("request_id") ?? response.headers.get("X-Request-Id") ?? "",
+  };
+}
+
+function noAnswer(code: string, detail: string, got: string): ServiceError {
+  const problem = { title: "No answer", status: 0, detail, code, field: null, expected: null };
+  return new ServiceError({ ...problem, got: got.slice(0, 200), request_id: "" });
 }

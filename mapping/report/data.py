@@ -1,0 +1,225 @@
+"""All that a report shows, in the shape of web/src/report/data.ts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import spearmanr
+
+from mapping.report.grid import Grid, Plan, forecast_grid, make_grid
+from mapping.report.held_out import HeldOut, hold_out
+from mapping.report.model import Forecast, Learned, Within, learn, tolerance_of
+from mapping.report.statistics import statistics_of
+from mapping.report.viewpoints import Viewpoints
+from mapping.report.weak_spots import WeakSpot, find_weak_spots
+from mapping.stages import WorkFolder
+from mapping.workers import Workers
+from visloc import __version__
+from visloc.archive import Map
+from visloc.geometry import Camera
+
+_MAX_CALIBRATION_BINS, _RUNS_PER_BIN = 10, 10
+# With fewer runs that failed, or succeeded, than this, what tells both apart is a guess.
+_FEW_OUTCOMES = 5
+
+
+def make_report_data(
+    opened: Map,
+    work: WorkFolder,
+    *,
+    command: str,
+    workers: Workers,
+    progress: Callable[[str, int, int], None],
+) -> dict[str, Any]:
+    """Measure and predict where a map localizes.
+
+    Args:
+        opened: the map; neither photos nor weights are needed.
+        work: keeps held-out runs, for a report that was interrupted or is made again.
+        command: that asked for the report.
+        workers: who localizes held-out photos.
+        progress: told the stage, how much is done, and of how much.
+
+    Returns:
+        JSON values as ``ReportData`` of web/src/report/data.ts, but for ``points``.
+    """
+    viewpoints = Viewpoints.of(opened)
+    within = tolerance_of(opened, viewpoints)
+    runs = hold_out(opened, work, workers, partial(progress, "held-out photos"))
+    learned = learn(opened, viewpoints, runs, within, partial(progress, "what is found again"))
+    plan = Plan.of(opened, viewpoints)
+    grid = make_grid(plan, viewpoints)
+    forecasts = forecast_grid(learned.model, plan, grid, partial(progress, "coverage"))
+    unit = " m" if opened.manifest.world.metric else ""
+    spots = find_weak_spots(grid, plan, forecasts, learned.model, within, unit)
+    origin = np.array(opened.manifest.world.origin)
+    notes = [*opened.manifest.notes, *_doubts(runs, within)]
+    return {
+        "map": {**_about(opened), "notes": notes},
+        "made_by": {"command": command, "version": __version__},
+        "up": {"direction": _numbers(plan.up, 9), "source": plan.up_source},
+        "cameras": {name: _camera(camera) for name, camera in opened.cameras.items()},
+        "images": _images(opened, viewpoints, origin),
+        "statistics": statistics_of(opened),
+        "held_out": _held_out(runs, learned),
+        "coverage": {
+            "within": {"position": within.position, "orientation_deg": within.orientation_deg},
+            "cell": grid.side,
+            "right": _numbers(plan.right, 9),
+            "ahead": _numbers(plan.ahead, 9),
+            "directions_deg": list(grid.directions_deg),
+            "pitch_deg": round(plan.pitch_deg, 3),
+            "camera": _camera(plan.camera),
+            "cells": [
+                _cell(position + origin, row)
+                for position, row in zip(grid.positions, forecasts, strict=True)
+            ],
+            "weak_spots": [_weak_spot(spot, grid, forecasts, origin) for spot in spots],
+            "calibration": calibration_of(runs, learned.probabilities, within),
+            "rank_correlation": rank_correlation_of(runs, learned.probabilities),
+        },
+    }
+
+
+def calibration_of(
+    runs: Sequence[HeldOut], probabilities: NDArray[np.float64], within: Within
+) -> list[dict[str, float]]:
+    """Compare predicted with measured shares of success, in bins of as many runs each."""
+    order = np.argsort(probabilities, kind="stable")
+    held = np.array([within.holds(run) for run in runs], dtype=np.float64)
+    num_bins = min(_MAX_CALIBRATION_BINS, len(runs) // _RUNS_PER_BIN)
+    return [
+        {
+            "predicted": round(float(probabilities[rows].mean()), 4),
+            "measured": round(float(held[rows].mean()), 4),
+            "runs": len(rows),
+        }
+        for rows in (np.array_split(order, num_bins) if num_bins else [])
+    ]
+
+
+def rank_correlation_of(
+    runs: Sequence[HeldOut], probabilities: NDArray[np.float64]
+) -> float | None:
+    """Spearman's, of predicted failure and measured error; those refused are the worst.
+
+    None where all predictions or all errors are the same.
+    """
+    errors = np.array([run.position_error for run in runs])
+    if len(runs) < 3 or np.ptp(probabilities) == 0 or (errors == errors[0]).all():
+        return None
+    return round(float(spearmanr(-probabilities, errors).statistic), 4)
+
+
+def _doubts(runs: Sequence[HeldOut], within: Within) -> list[str]:
+    """What the reader must know before trusting the predictions."""
+    if not runs:
+        return [
+            "Coverage: no photo could be held out, so that probabilities rest on what holds for "
+            "other maps."
+        ]
+    failed = sum(not within.holds(run) for run in runs)
+    few = min(failed, len(runs) - failed)
+    if few >= _FEW_OUTCOMES:
+        return []
+    kind = "failed" if failed == few else "succeeded"
+    return [
+        f"Coverage: only {few} of {len(runs)} held-out runs {kind}, so that where the line runs "
+        "rests in part on what holds for other maps."
+    ]
+
+
+def _about(opened: Map) -> dict[str, Any]:
+    manifest, extent = opened.manifest, opened.manifest.world.extent
+    return {
+        "id": manifest.id,
+        "version": manifest.version,
+        "created": manifest.created,
+        "method": manifest.method.name,
+        "local_features": manifest.local_features.fingerprint.name,
+        "global_features": [g.fingerprint.name for g in manifest.global_features],
+        "metric": manifest.world.metric,
+        "images": manifest.counts.images,
+        "landmarks": manifest.counts.landmarks,
+        "observations": manifest.counts.observations,
+        "size_bytes": opened.size_bytes,
+        "extent": {"min": list(extent.min), "max": list(extent.max)},
+    }
+
+
+def _images(
+    opened: Map, viewpoints: Viewpoints, origin: NDArray[np.float64]
+) -> list[dict[str, Any]]:
+    turned_back = opened.image_poses[:, :4] * (1.0, -1.0, -1.0, -1.0)
+    return [
+        {
+            "name": image.name,
+            "camera": image.camera,
+            "position": _numbers(center + origin),
+            "orientation": _numbers(orientation, 9),
+        }
+        for image, center, orientation in zip(
+            opened.images, viewpoints.centers, turned_back, strict=True
+        )
+    ]
+
+
+def _held_out(runs: Sequence[HeldOut], learned: Learned) -> list[dict[str, Any]]:
+    return [
+        {
+            "image": run.image,
+            "left_out": len(run.left_out),
+            "localized": run.localized,
+            "reason": run.reason or None,
+            "position_error": round(run.position_error, 6) if run.localized else None,
+            "orientation_error_deg": round(run.orientation_error_deg, 5) if run.localized else None,
+            "inliers": run.inliers,
+            "expected_inliers": round(float(expected), 1),
+            "probability": round(float(probability), 4),
+        }
+        for run, expected, probability in zip(
+            runs, learned.expected_inliers, learned.probabilities, strict=True
+        )
+    ]
+
+
+def _cell(position: NDArray[np.float64], forecasts: Sequence[Forecast]) -> dict[str, Any]:
+    stds = [forecast.outlook.position_std for forecast in forecasts]
+    return {
+        "position": _numbers(position),
+        "probability": [round(forecast.probability, 4) for forecast in forecasts],
+        "expected_inliers": [round(f.outlook.expected_inliers, 1) for f in forecasts],
+        "position_std": [float(f"{std:.4g}") if math.isfinite(std) else None for std in stds],
+    }
+
+
+def _weak_spot(
+    spot: WeakSpot,
+    grid: Grid,
+    forecasts: Sequence[Sequence[Forecast]],
+    origin: NDArray[np.float64],
+) -> dict[str, Any]:
+    return {
+        "position": _numbers(grid.positions[spot.cell] + origin),
+        "direction_deg": grid.directions_deg[spot.direction],
+        "probability": round(forecasts[spot.cell][spot.direction].probability, 4),
+        "why": spot.why,
+    }
+
+
+def _camera(camera: Camera) -> dict[str, Any]:
+    return {
+        "model": camera.model,
+        "width": camera.width,
+        "height": camera.height,
+        "params": list(camera.params),
+    }
+
+
+def _numbers(values: ArrayLike, digits: int = 6) -> list[float]:
+    return [round(float(value), digits) for value in np.asarray(values)]

@@ -1,0 +1,169 @@
+"""Places to stand and directions to look, over the area that was mapped."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mapping.report.model import CoverageModel, Forecast
+from mapping.report.viewpoints import Viewpoints
+from visloc.archive import Map
+from visloc.geometry import Camera, Pose
+
+NUM_DIRECTIONS = 12
+_NUM_CELLS = 320
+# How far around the mapping photos the grid reaches, of the distance from which they see.
+MARGIN_OF_REACH = 0.5
+# A mean of directions shorter than this tells none.
+_LEAST_MEAN = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """The frame of the grid, and the photo that is thought to be taken everywhere.
+
+    Attributes:
+        up: (3,) unit vector.
+        up_source: ``gravity`` where the map knows it, else ``cameras``: the mean of theirs.
+        right: (3,) unit vector, level.
+        ahead: (3,) unit vector, level; right, ahead and up make a right-handed frame.
+        pitch_deg: how far the photo looks below the level.
+        quarter_turns: of the camera about its axis, clockwise as seen from behind: 1 or 3 where
+            the mapping photos are stored lying on their side.
+        camera: of the photo.
+    """
+
+    up: NDArray[np.float64]
+    up_source: str
+    right: NDArray[np.float64]
+    ahead: NDArray[np.float64]
+    pitch_deg: float
+    quarter_turns: int
+    camera: Camera
+
+    @staticmethod
+    def of(opened: Map, viewpoints: Viewpoints) -> Plan:
+        """Stand and look as most mapping photos do."""
+        up, source = _up(opened, viewpoints)
+        # The world's x axis where it is level enough, so that the plan lies as the world does.
+        axis = np.eye(3)[0] if abs(up[0]) < 0.9 else np.eye(3)[1]
+        right = axis - (axis @ up) * up
+        right /= np.linalg.norm(right)
+        downwards = -(viewpoints.rotations[:, 2] @ up)
+        pitch_deg = math.degrees(math.asin(float(np.clip(np.median(downwards), -1.0, 1.0))))
+        # Where up is in the picture: against its y axis in most photos.
+        in_picture = viewpoints.rotations[:, :2] @ up
+        turns = np.rint(np.arctan2(in_picture[:, 0], -in_picture[:, 1]) / (math.pi / 2))
+        quarter_turns = Counter((turns.astype(int) % 4).tolist()).most_common(1)[0][0]
+        cameras = Counter(image.camera for image in opened.images)
+        camera = opened.cameras[cameras.most_common(1)[0][0]]
+        return Plan(up, source, right, np.cross(up, right), pitch_deg, quarter_turns, camera)
+
+    def level(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Coordinates (n, 2) of points (n, 3) along right and ahead."""
+        return np.asarray(points @ np.column_stack([self.right, self.ahead]))
+
+    def pose(self, position: NDArray[np.float64], direction_deg: float) -> Pose:
+        """``cam_from_local`` of a photo taken at a position, looking in a direction."""
+        direction, pitch = math.radians(direction_deg), math.radians(self.pitch_deg)
+        level = math.cos(direction) * self.right + math.sin(direction) * self.ahead
+        forward = math.cos(pitch) * level - math.sin(pitch) * self.up
+        x = np.cross(level, self.up)
+        y = np.cross(forward, x)
+        for _ in range(self.quarter_turns):
+            x, y = -y, x
+        rotation = np.stack([x, y, forward])
+        return Pose(rotation, -rotation @ position)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grid:
+    """Where to stand.
+
+    Attributes:
+        side: of a cell, units of the world.
+        positions: (c, 3) float64 relative to the map's origin, middles of cells.
+        away: (c,) float64, level distance to the nearest mapping photo.
+        directions_deg: in which to look at each, from right towards ahead.
+    """
+
+    side: float
+    positions: NDArray[np.float64]
+    away: NDArray[np.float64]
+    directions_deg: tuple[float, ...]
+
+
+def make_grid(plan: Plan, viewpoints: Viewpoints) -> Grid:
+    """Lay a grid over the surroundings of the mapping photos, as high as the nearest of them.
+
+    It knows no walls: cells within them are there too.
+    """
+    photos = plan.level(viewpoints.centers)
+    tree = cKDTree(photos)
+    margin = MARGIN_OF_REACH * viewpoints.reach
+    # By halving an interval: the number of cells falls as they grow, if not quite steadily.
+    low, high = 0.01 * margin, max(margin, float(np.ptp(photos, axis=0).max()))
+    for _ in range(20):
+        side = math.sqrt(low * high)
+        if _num_cells(photos, margin, side) > 50 * _NUM_CELLS:
+            low = side
+            continue
+        count = len(_cells(photos, tree, margin, side))
+        low, high = (side, high) if count > _NUM_CELLS else (low, side)
+    cells = _cells(photos, tree, margin, high)
+    away, nearest = tree.query(cells)
+    heights = viewpoints.centers[nearest] @ plan.up
+    positions = cells @ np.stack([plan.right, plan.ahead]) + heights[:, None] * plan.up
+    step = 360.0 / NUM_DIRECTIONS
+    return Grid(high, positions, np.asarray(away), tuple(step * i for i in range(NUM_DIRECTIONS)))
+
+
+def forecast_grid(
+    model: CoverageModel, plan: Plan, grid: Grid, progress: Callable[[int, int], None]
+) -> list[list[Forecast]]:
+    """Forecast a photo at every cell in every direction."""
+    forecasts = []
+    progress(0, len(grid.positions))
+    for done, position in enumerate(grid.positions, 1):
+        poses = [plan.pose(position, direction) for direction in grid.directions_deg]
+        forecasts.append([model.forecast(pose, plan.camera) for pose in poses])
+        progress(done, len(grid.positions))
+    return forecasts
+
+
+def probabilities_of(forecasts: Sequence[Sequence[Forecast]]) -> NDArray[np.float64]:
+    """Probabilities (c, d) by cell and direction."""
+    return np.array([[forecast.probability for forecast in row] for row in forecasts])
+
+
+def _up(opened: Map, viewpoints: Viewpoints) -> tuple[NDArray[np.float64], str]:
+    if opened.gravity is not None:
+        return -opened.gravity, "gravity"
+    mean = -viewpoints.rotations[:, 1].mean(axis=0)
+    length = float(np.linalg.norm(mean))
+    if length < _LEAST_MEAN:  # photos in all orientations: any plan is as good
+        return np.array([0.0, 0.0, 1.0]), "cameras"
+    return mean / length, "cameras"
+
+
+def _num_cells(photos: NDArray[np.float64], margin: float, side: float) -> float:
+    """Cells of the box about all photos."""
+    return float(np.prod((np.ptp(photos, axis=0) + 2 * margin) / side + 2))
+
+
+def _cells(
+    photos: NDArray[np.float64], tree: cKDTree, margin: float, side: float
+) -> NDArray[np.float64]:
+    """Middles (c, 2) of the cells within the margin of a photo; whole multiples of the side."""
+    first = np.floor((photos.min(axis=0) - margin) / side)
+    last = np.ceil((photos.max(axis=0) + margin) / side)
+    x, y = (np.arange(a, b + 1) * side for a, b in zip(first, last, strict=True))
+    cells = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    away, _ = tree.query(cells, distance_upper_bound=margin * (1 + 1e-9))
+    return np.asarray(cells[np.isfinite(away)])

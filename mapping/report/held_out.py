@@ -1,0 +1,269 @@
+"""Mapping photos, localized in a map that never had them.
+
+What the map keeps of a photo is a query: its descriptors, its keypoints and its rows of the global
+descriptors. The same functions as online answer it, from what would be in the map without the
+photo and without those taken near it. Its landmarks that are gone then stay in the query: they
+are what a photo of a place shows that the map does not have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.report.viewpoints import Viewpoints
+from mapping.stages import Item, WorkFolder, key_of
+from mapping.workers import Workers
+from visloc.archive import Map, open_map
+from visloc.constraints import MapGeometry
+from visloc.evaluation import pose_error
+from visloc.geometry import Pose
+from visloc.matching.correspondences import Correspondences, match_landmarks
+from visloc.matching.products import EightBitRows
+from visloc.pose.reprojection import reprojection_errors
+from visloc.pose.views import MatchedView
+from visloc.priors import NO_PRIORS
+from visloc.retrieval.index import retrieve
+from visloc.solving import Look, Matches, SeenImage, registration_for, solve_instant
+from visloc.types import CameraSource, Evidence, LocalizeOptions, ReadAs
+
+_REVISION = 1
+# Photos that are localized; of larger maps evenly many.
+MAX_PHOTOS = 200
+# How far from the photo others are left out, as ``Viewpoints.apart_from`` counts: nothing but the
+# photo itself, then as if the mapper had walked by further away or not looked there.
+LEAVE_OUT_WITHIN = (0.0, 0.2, 0.4, 0.6, 0.9)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOut:
+    """One run.
+
+    Attributes:
+        image: row of the map's photos.
+        left_out: (k,) int64 rows of the photos that were left out, ``image`` among them.
+        reason: of the refusal; "" when localized.
+        position_error: units of the world; infinity when refused.
+        orientation_error_deg: degrees; infinity when refused.
+        inliers: of the best pose, believed or not.
+        correct: (c,) int64 landmarks that were matched with where the photo does see them.
+        errors_px: (c,) float64, how far from it their projections with the photo's pose are.
+    """
+
+    image: int
+    left_out: NDArray[np.int64]
+    reason: str
+    position_error: float
+    orientation_error_deg: float
+    inliers: int
+    correct: NDArray[np.int64]
+    errors_px: NDArray[np.float64]
+
+    @property
+    def localized(self) -> bool:
+        """Whether the map gave a pose."""
+        return self.reason == ""
+
+
+def hold_out(
+    opened: Map,
+    work: WorkFolder,
+    workers: Workers,
+    progress: Callable[[int, int], None],
+) -> list[HeldOut]:
+    """Localize mapping photos without themselves, and without ever more of their neighbours.
+
+    Finished photos are found again in the work folder.
+
+    Args:
+        opened: the map.
+        work: keeps finished photos.
+        workers: where they are localized.
+        progress: told how many photos are done, and of how many.
+
+    Returns:
+        By photo, then by how many were left out. Nothing for a map of which nothing would remain.
+    """
+    images = chosen_photos(len(opened.images))
+    keys = {image: _key(opened, image) for image in images}
+    todo = [image for image in images if not work.has(keys[image])]
+    progress(len(images) - len(todo), len(images))
+    if todo:
+        task = partial(_keep_runs, opened.path, work)
+        done = len(images) - len(todo)
+        workers.run(task, todo, lambda now, _: progress(done + now, len(images)))
+    return [run for image in images for run in _unpacked(image, work.read(keys[image]))]
+
+
+def chosen_photos(num_photos: int) -> list[int]:
+    """Rows of at most ``MAX_PHOTOS`` photos, evenly spread."""
+    chosen = np.linspace(0, num_photos - 1, min(num_photos, MAX_PHOTOS)).astype(np.int64)
+    return [int(image) for image in np.unique(chosen)]
+
+
+def left_out_sets(opened: Map, viewpoints: Viewpoints, image: int) -> list[NDArray[np.int64]]:
+    """Which photos (k,) to leave out in each run of one, fewest first.
+
+    Those that the same rig took at the same instant always go with it: no query has them.
+    """
+    record = opened.images[image]
+    on_rig = {record.camera}.union(*(rig for rig in opened.rigs.values() if record.camera in rig))
+    together = np.array(
+        [i.timestamp == record.timestamp and i.camera in on_rig for i in opened.images]
+    )
+    together[image] = True
+    apart = viewpoints.apart_from(viewpoints.pose(image))
+    sets: list[NDArray[np.int64]] = []
+    for within in LEAVE_OUT_WITHIN:
+        without = np.flatnonzero(together | (apart < within))
+        is_new = not sets or len(without) > len(sets[-1])
+        if is_new and len(without) < len(opened.images):
+            sets.append(without)
+    return sets
+
+
+def localize_held_out(
+    opened: Map, viewpoints: Viewpoints, image: int, left_out: NDArray[np.int64]
+) -> HeldOut:
+    """Localize one photo in what the map would be without some, itself among them."""
+    options = LocalizeOptions()
+    camera = opened.cameras[opened.images[image].camera]
+    pose = viewpoints.pose(image)
+    matched = _match(opened, image, left_out, options)
+    pixels = opened.keypoints(image)[matched.keypoints].astype(np.float64)
+    points = opened.landmarks[matched.landmarks].astype(np.float64)
+    view = MatchedView(camera, Pose.identity(), pixels, points)
+    errors_px = reprojection_errors(view, pose) if len(view) else np.empty(0)
+    correct = errors_px <= registration_for(options, [camera]).max_error_px  # False for NaN
+
+    evidence = Evidence(
+        camera,
+        CameraSource.GIVEN,
+        1,
+        ReadAs.STORED,
+        num_keypoints=len(opened.observations(image)[0]),
+        num_correspondences=len(matched),
+    )
+    look = Look(evidence, Matches(pixels, points), matched.landmarks, Matches.none())
+    solved = solve_instant(
+        [SeenImage("camera", Pose.identity(), look)], MapGeometry(opened), options, NO_PRIORS
+    )
+    refusal, position_error, orientation_error = solved.answer.refusal, np.inf, np.inf
+    if refusal is None and solved.pose is not None:
+        position_error, orientation_error = pose_error(solved.pose.rig_from_world, pose)
+    return HeldOut(
+        image,
+        left_out,
+        "" if refusal is None else str(refusal.reason),
+        position_error,
+        orientation_error,
+        sum(int(mask.sum()) for mask in solved.inliers),
+        matched.landmarks[correct],
+        errors_px[correct],
+    )
+
+
+def vanishing(opened: Map, left_out: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Sorted landmarks that a map without some of its photos would not have.
+
+    Those made of matches need two photos that see them, those of a depth map one.
+    """
+    least = 1 if opened.manifest.method.name == "rgbd" else 2
+    seen = [opened.observations(int(image))[0] for image in left_out]
+    landmarks, counts = np.unique(np.concatenate(seen), return_counts=True)
+    remaining = opened.track_lengths[landmarks].astype(np.int64) - counts
+    return landmarks[remaining < least].astype(np.int64)
+
+
+def _match(
+    opened: Map, image: int, left_out: NDArray[np.int64], options: LocalizeOptions
+) -> Correspondences:
+    """What a photo's features show of a map without some photos, as ``visloc.localizer`` does."""
+    remaining = np.ones(len(opened.images))
+    remaining[left_out] = 0.0
+    rows = opened.global_descriptors
+    query = {name: rows[name][image] for name in opened.fusion.counted(rows)}
+    retrieved = retrieve(query, rows, options.top_k, remaining, opened.fusion)
+    scale = opened.manifest.local_features.descriptor_scale
+    gone = vanishing(opened, left_out)
+
+    def observed(photo: int) -> tuple[NDArray[np.integer], EightBitRows]:
+        landmarks, descriptors = opened.observations(photo)
+        there = ~np.isin(landmarks, gone)
+        return landmarks[there], EightBitRows(descriptors[there], scale)
+
+    return match_landmarks(
+        EightBitRows(opened.observations(image)[1], scale),
+        [observed(int(photo)) for photo in retrieved.images],
+    )
+
+
+def _key(opened: Map, image: int) -> str:
+    return key_of(
+        "held-out",
+        _REVISION,
+        map=opened.manifest.content_hash,
+        image=image,
+        within=LEAVE_OUT_WITHIN,
+    )
+
+
+@lru_cache(maxsize=1)
+def _opened(folder: Path) -> tuple[Map, Viewpoints]:
+    """A map, once per process: its arrays must not travel to workers with every photo."""
+    opened = open_map(folder)
+    return opened, Viewpoints.of(opened)
+
+
+def _keep_runs(folder: Path, work: WorkFolder, image: int) -> None:
+    opened, viewpoints = _opened(folder)
+    work.get(_key(opened, image), lambda: _runs_of(opened, viewpoints, image))
+
+
+def _runs_of(opened: Map, viewpoints: Viewpoints, image: int) -> Item:
+    sets = left_out_sets(opened, viewpoints, image)
+    return _packed([localize_held_out(opened, viewpoints, image, s) for s in sets])
+
+
+def _packed(runs: Sequence[HeldOut]) -> Item:
+    """The runs of one photo as arrays; lists of all runs lie one after another."""
+    return {
+        "reason": np.array([run.reason for run in runs], dtype=np.str_),
+        "error": np.array(
+            [(run.position_error, run.orientation_error_deg) for run in runs]
+        ).reshape(-1, 2),
+        "inliers": np.array([run.inliers for run in runs], dtype=np.int64),
+        "num_left_out": np.array([len(run.left_out) for run in runs], dtype=np.int64),
+        "num_correct": np.array([len(run.correct) for run in runs], dtype=np.int64),
+        "left_out": np.concatenate([np.empty(0, np.int64), *(run.left_out for run in runs)]),
+        "correct": np.concatenate([np.empty(0, np.int64), *(run.correct for run in runs)]),
+        "errors_px": np.concatenate([np.empty(0), *(run.errors_px for run in runs)]),
+    }
+
+
+def _unpacked(image: int, item: Mapping[str, NDArray[np.generic]]) -> list[HeldOut]:
+    left_out = _split(item["left_out"], item["num_left_out"])
+    correct = _split(item["correct"], item["num_correct"])
+    errors_px = _split(item["errors_px"], item["num_correct"])
+    return [
+        HeldOut(
+            image,
+            left_out[run].astype(np.int64),
+            str(reason),
+            float(item["error"][run, 0]),
+            float(item["error"][run, 1]),
+            int(item["inliers"][run]),
+            correct[run].astype(np.int64),
+            errors_px[run].astype(np.float64),
+        )
+        for run, reason in enumerate(item["reason"].tolist())
+    ]
+
+
+def _split(values: NDArray[np.generic], lengths: NDArray[np.generic]) -> list[NDArray[np.generic]]:
+    return np.split(values, np.cumsum(lengths.astype(np.int64))[:-1]) if len(lengths) else []

@@ -1,0 +1,200 @@
+"""Where would a photo be localized: learned from held-out runs, asked of any pose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.report.chance import Chance, Outlook, fit_chance, outlook_of
+from mapping.report.held_out import HeldOut, vanishing
+from mapping.report.places import Places, sample_places
+from mapping.report.rematch import Counted, Rematch, count, fit_rematch
+from mapping.report.sight import Absent, Sight, look_around
+from mapping.report.viewpoints import Viewpoints
+from visloc.archive import Map
+from visloc.geometry import Camera, Pose
+
+# What counts as localized. In metric maps the high precision of Sattler et al. 2018; in others as
+# much of the distance from which photos see as the angle is of a turn.
+_POSITION_M, _ORIENTATION_DEG = 0.25, 2.0
+_POSITION_OF_REACH = 0.05
+_NUM_FOLDS = 5
+_NOISE_PX = 1.0  # of a map without runs
+_MEDIAN_OF_RAYLEIGH = 1.1774  # by the standard deviation along each axis
+
+
+@dataclass(frozen=True, slots=True)
+class Within:
+    """What counts as localized: so near to where the photo was taken.
+
+    Attributes:
+        position: units of the world.
+        orientation_deg: degrees.
+    """
+
+    position: float
+    orientation_deg: float
+
+    def holds(self, run: HeldOut) -> bool:
+        """Whether a run was localized that well."""
+        return (
+            run.position_error <= self.position
+            and run.orientation_error_deg <= self.orientation_deg
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Forecast:
+    """What is expected of a photo at a pose.
+
+    Attributes:
+        sight: what is in view.
+        outlook: what of it is expected to be found again, and how well that determines the pose.
+        probability: that it is localized well.
+    """
+
+    sight: Sight
+    outlook: Outlook
+    probability: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoverageModel:
+    """A map's landmarks and what held-out runs taught about them."""
+
+    viewpoints: Viewpoints
+    places: Places
+    rematch: Rematch
+    chance: Chance
+    noise_px: float
+
+    def forecast(self, pose: Pose, camera: Camera) -> Forecast:
+        """Predict what happens to a photo.
+
+        Args:
+            pose: ``cam_from_local``, relative to the map's origin.
+            camera: of the photo.
+        """
+        sight = look_around(self.places, self.viewpoints, pose, camera)
+        outlook = _outlook(sight, self.rematch, self.places, camera, self.noise_px)
+        return Forecast(sight, outlook, float(self.chance.of([outlook])[0]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Learned:
+    """The model, and what others that did not know a run's photo expected of the run.
+
+    Attributes:
+        model: made from all runs.
+        expected_inliers: (r,) of each run.
+        probabilities: (r,) of each run.
+    """
+
+    model: CoverageModel
+    expected_inliers: NDArray[np.float64]
+    probabilities: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """A run, with what was in view."""
+
+    run: HeldOut
+    camera: Camera
+    sight: Sight
+    counted: Counted
+
+
+def tolerance_of(opened: Map, viewpoints: Viewpoints) -> Within:
+    """What counts as localized in a map."""
+    metric = opened.manifest.world.metric
+    position = _POSITION_M if metric else _POSITION_OF_REACH * viewpoints.reach
+    return Within(position, _ORIENTATION_DEG)
+
+
+def learn(
+    opened: Map,
+    viewpoints: Viewpoints,
+    runs: Sequence[HeldOut],
+    within: Within,
+    progress: Callable[[int, int], None],
+) -> Learned:
+    """Make the model of a map.
+
+    Photos are dealt into groups of neighbours. What is said of a run comes from a model that saw
+    no run of its group.
+
+    Args:
+        opened: the map.
+        viewpoints: of its photos.
+        runs: may be none: then the model knows what was thought before.
+        within: what counts as localized.
+        progress: told how many runs were looked at, and of how many.
+    """
+    places = sample_places(opened, viewpoints)
+    seen = []
+    progress(0, len(runs))
+    for done, run in enumerate(runs, 1):
+        seen.append(_seen(opened, viewpoints, places, run))
+        progress(done, len(runs))
+    model = _fit(viewpoints, places, seen, within)
+    expected, probabilities = np.zeros(len(runs)), np.zeros(len(runs))
+    groups = _neighbours(viewpoints, np.array([run.image for run in runs], dtype=np.int64))
+    for group in np.unique(groups):
+        others = _fit(
+            viewpoints, places, [s for s, g in zip(seen, groups, strict=True) if g != group], within
+        )
+        mine = np.flatnonzero(groups == group)
+        outlooks = [
+            _outlook(seen[i].sight, others.rematch, places, seen[i].camera, others.noise_px)
+            for i in mine
+        ]
+        expected[mine] = [outlook.expected_inliers for outlook in outlooks]
+        probabilities[mine] = others.chance.of(outlooks)
+    return Learned(model, expected, probabilities)
+
+
+def _seen(opened: Map, viewpoints: Viewpoints, places: Places, run: HeldOut) -> _Seen:
+    camera = opened.cameras[opened.images[run.image].camera]
+    absent = Absent(run.left_out, vanishing(opened, run.left_out))
+    sight = look_around(places, viewpoints, viewpoints.pose(run.image), camera, absent)
+    matched = places.of_landmark[run.correct]
+    matches = np.bincount(matched[matched >= 0], minlength=len(places.points))[sight.places]
+    return _Seen(run, camera, sight, count(sight, matches))
+
+
+def _fit(
+    viewpoints: Viewpoints, places: Places, seen: Sequence[_Seen], within: Within
+) -> CoverageModel:
+    rematch = fit_rematch([s.counted for s in seen])
+    errors_px = np.concatenate([np.empty(0), *(s.run.errors_px for s in seen)])
+    noise_px = float(np.median(errors_px)) / _MEDIAN_OF_RAYLEIGH if len(errors_px) else _NOISE_PX
+    noise_px = max(noise_px, 0.01)  # exact maps, as in tests, have none
+    outlooks = [_outlook(s.sight, rematch, places, s.camera, noise_px) for s in seen]
+    succeeded = np.array([within.holds(s.run) for s in seen], dtype=np.bool_)
+    chance = fit_chance(outlooks, succeeded, within.position)
+    return CoverageModel(viewpoints, places, rematch, chance, noise_px)
+
+
+def _outlook(
+    sight: Sight, rematch: Rematch, places: Places, camera: Camera, noise_px: float
+) -> Outlook:
+    return outlook_of(sight, rematch.expected(sight), places.share, camera, noise_px)
+
+
+def _neighbours(viewpoints: Viewpoints, images: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Deal photos (n,) into groups of neighbours: those nearest to some that lie far apart."""
+    groups = np.zeros(len(images), dtype=np.int64)
+    nearest = np.full(len(images), np.inf)
+    middle = 0
+    for group in range(_NUM_FOLDS if len(images) else 0):
+        apart = viewpoints.apart_from(viewpoints.pose(int(images[middle])))[images]
+        if nearest.max() == 0.0:  # all photos are the middle of a group
+            break
+        groups[apart < nearest] = group
+        nearest = np.minimum(nearest, apart)
+        middle = int(np.argmax(nearest))
+    return groups

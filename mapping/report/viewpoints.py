@@ -1,0 +1,58 @@
+"""Where the mapping photos stood, and how far apart two viewpoints are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from visloc.archive import Map
+from visloc.constraints import MapGeometry
+from visloc.geometry import Pose
+
+_LEAST_REACH = 1e-9  # of a map whose photos see nothing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Viewpoints:
+    """The mapping photos' poses, relative to the map's origin.
+
+    Attributes:
+        centers: (n, 3) float64.
+        rotations: (n, 3, 3) float64, camera from world.
+        reach: median distance from photos to what they see, units of the world; above 0.
+    """
+
+    centers: NDArray[np.float64]
+    rotations: NDArray[np.float64]
+    reach: float
+
+    @staticmethod
+    def of(opened: Map) -> Viewpoints:
+        """Read them from a map."""
+        geometry = MapGeometry(opened)
+        rotations = Rotation.from_quat(opened.image_poses[:, :4], scalar_first=True)
+        reach = max(geometry.reach, _LEAST_REACH)
+        return Viewpoints(geometry.centers, rotations.as_matrix(), reach)
+
+    def __len__(self) -> int:
+        return len(self.centers)
+
+    def pose(self, image: int) -> Pose:
+        """``cam_from_local`` of one photo."""
+        rotation = self.rotations[image]
+        return Pose(rotation, -rotation @ self.centers[image])
+
+    def apart_from(self, pose: Pose) -> NDArray[np.float64]:
+        """How far each photo (n,) is from a pose, in radians.
+
+        The sum of two angles by which what is seen moves: that of the turn, and that under which
+        the way between both is seen from where the map's photos look.
+        """
+        traces = np.einsum("nij,ij->n", self.rotations, pose.rotation)
+        cosines = (traces - 1.0) / 2.0
+        angles = np.arccos(np.clip(cosines, -1.0, 1.0))
+        moved = np.linalg.norm(self.centers - pose.center, axis=1)
+        return np.asarray(angles + moved / self.reach)

@@ -1,0 +1,100 @@
+"""Points and photos of maps over HTTP, for the page and for whoever draws maps."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated, Any
+
+from fastapi import FastAPI, Query, Request, Response
+from fastapi.responses import StreamingResponse
+
+from service.caching import ASK_ALWAYS, FOR_EVER_PRIVATE, is_current, not_modified
+from service.deadlines import TIMEOUT_HEADER, timeout_of, within
+from service.engine import Engine
+from service.openapi import problems
+from service.schemas import MapImages
+from service.settings import ServiceSettings
+from visloc.archive import MapOutline
+from visloc.archive.detail import HEADER_BYTES, ROW_BYTES
+
+MAX_POINTS, MAX_IMAGES = 262_144, 10_000
+
+_BINARY = "application/octet-stream"
+_CACHED: dict[int | str, dict[str, Any]] = {304: {"description": "as `If-None-Match` names it"}}
+_POINTS: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "a header of 48 bytes and 16 bytes per landmark (docs/api.md)",
+        "content": {_BINARY: {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+
+First = Annotated[int, Query(ge=0, lt=2**32, description="place in the order to begin at")]
+
+
+class _Binary(Response):
+    media_type = _BINARY
+
+
+def add_scene_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) -> None:
+    """Add what is below /maps to be drawn."""
+
+    def timeout(request: Request) -> float:
+        return timeout_of(request.headers.get(TIMEOUT_HEADER), settings.request_timeout_s)
+
+    @app.get(
+        "/maps/{ref}/points",
+        response_class=_Binary,
+        responses={**_POINTS, **_CACHED, **problems(404, 422, 500, 503, 504)},
+    )
+    async def get_points(
+        request: Request,
+        ref: str,
+        first: First = 0,
+        count: Annotated[int, Query(ge=1, le=MAX_POINTS, description="most landmarks")] = 65_536,
+    ) -> Response:
+        """Give landmarks of a map (`id`, or `id@version`), in an order of detail.
+
+        Every beginning of the order is an even sample of the map in space: as many as are read is
+        the level of detail. With `id@version` the answer may be kept for ever.
+        """
+        async with within(timeout(request)):
+            outline = (await engine.map(ref)).outline
+            headers = _caching(outline, ref, first, count)
+            if is_current(request.headers, headers["ETag"]):
+                return not_modified(headers)
+            num, pieces = await engine.scenes.points(outline, first, count)
+        headers["Content-Length"] = str(HEADER_BYTES + num * ROW_BYTES)
+        return StreamingResponse(pieces, headers=headers, media_type=_BINARY)
+
+    @app.get(
+        "/maps/{ref}/images",
+        response_model=MapImages,
+        responses={**_CACHED, **problems(404, 422, 500, 503, 504)},
+    )
+    async def get_images(
+        request: Request,
+        ref: str,
+        first: First = 0,
+        count: Annotated[int, Query(ge=1, le=MAX_IMAGES, description="most photos")] = 1000,
+    ) -> Response:
+        """Say where the mapping photos of a map (`id`, or `id@version`) were taken."""
+        async with within(timeout(request)):
+            outline = (await engine.map(ref)).outline
+            headers = _caching(outline, ref, first, count)
+            if is_current(request.headers, headers["ETag"]):
+                return not_modified(headers)
+            photos = await engine.scenes.photos(outline)
+            text = await asyncio.to_thread(
+                lambda: MapImages.of(outline, photos, first, count).model_dump_json()
+            )
+        return Response(text, headers=headers, media_type="application/json")
+
+
+def _caching(outline: MapOutline, ref: str, first: int, count: int) -> dict[str, str]:
+    """Return the headers that say how long a part of a map may be kept."""
+    manifest = outline.manifest
+    return {
+        # The version too: answers name it, and it is not part of the content.
+        "ETag": f'"{manifest.version}-{manifest.content_hash[:32]}-{first}-{count}"',
+        "Cache-Control": FOR_EVER_PRIVATE if "@" in ref else ASK_ALWAYS,
+    }

@@ -1,0 +1,209 @@
+from __future__ import annotations
+
+import base64
+import json
+import struct
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mapping import cli
+from mapping.report import command
+from mapping.report.command import MAX_POINTS, summary_of_report
+from mapping.stages import exclusive
+from visloc.archive import MapStore
+from visloc.errors import Unavailable
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run ``mapping report`` in this process; return exit status, stdout and stderr."""
+    monkeypatch.delenv("VISLOC_MAPS_DIR", raising=False)
+
+    def run_command(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["mapping", "report", *map(str, arguments)])
+        with pytest.raises(SystemExit) as left:
+            cli.main()
+        out, err = capsys.readouterr()
+        return int(left.value.code or 0), out, err
+
+    return run_command
+
+
+def _run(image: int, left_out: int, error: float | None) -> dict[str, Any]:
+    return {
+        "image": image,
+        "left_out": left_out,
+        "localized": error is not None,
+        "position_error": error,
+        "orientation_error_deg": None if error is None else 1.0,
+    }
+
+
+def _data(**changes: Any) -> dict[str, Any]:
+    return {
+        "map": {"id": "room", "version": "v1"},
+        "images": [{"name": "a.jpg"}, {"name": "[b].jpg"}, {"name": "c.jpg"}],
+        "held_out": [
+            *(_run(0, 1, 0.01), _run(0, 5, None)),
+            *(_run(1, 1, None), _run(1, 5, None)),
+            *(_run(2, 1, 0.2), _run(2, 5, 0.3)),
+        ],
+        "coverage": {
+            "within": {"position": 0.05, "orientation_deg": 5.0},
+            "cells": [{"probability": [1.0, 0.9, 0.5, 0.05]}],
+            "weak_spots": [
+                {
+                    "position": [1.0, 2.0, 0.5],
+                    "direction_deg": 180,
+                    "probability": 0.05,
+                    "why": "few landmarks [there]",
+                }
+            ],
+        },
+    } | changes
+
+
+@pytest.fixture
+def computed(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """A report that is computed at once; holds how it was asked for."""
+    asked: dict[str, Any] = {}
+
+    def make(opened: object, work: object, **options: Any) -> dict[str, Any]:
+        asked.update(options, opened=opened, work=work)
+        options["progress"]("held-out runs", 3, 3)
+        return _data()
+
+    monkeypatch.setattr(command, "make_report_data", make)
+    monkeypatch.setattr(command, "report_parts", lambda: ("script();", "body {}"))
+    return asked
+
+
+def test_the_file_carries_the_data_and_the_points(
+    run: Run, computed: dict[str, Any], built_maps: Path, tmp_path: Path
+) -> None:
+    target = tmp_path / "new" / "room.html"
+    status, _, err = run("room", "--maps-dir", built_maps, "--output", target, "--workers", 1)
+    assert status == 0
+    assert "held-out runs: 3/3" in err
+    text = target.read_text("utf-8")
+    data = json.loads(text.split('id="report">')[1].split("</script>")[0])
+    points = base64.b64decode(data.pop("points"))
+    assert data == _data()
+    opened = MapStore(built_maps).open("room")
+    magic, version, total, first, count = struct.unpack("<4s4I", points[:20])
+    assert (magic, version, total, first) == (b"VLPT", 1, len(opened.landmarks), 0)
+    assert count == min(total, MAX_POINTS)
+    assert computed["command"] == f"mapping report room --maps-dir {built_maps}"
+
+
+@pytest.mark.usefixtures("computed")
+def test_people_see_what_failed_where_it_is_weak_and_where_the_file_is(
+    run: Run, built_maps: Path, tmp_path: Path
+) -> None:
+    target = tmp_path / "room.html"
+    _, out, _ = run("room", "--maps-dir", built_maps, "--output", target, "--workers", 1)
+    assert "photos localized without themselves, within 0.05 m and 5 degrees: 1 of 3" in out
+    assert "not localized: [b].jpg\nnot localized: c.jpg\n" in out
+    assert "90 % or more: 50%; of less than 10 %: 25%" in out
+    assert "9 o'clock" in out
+    assert "few landmarks [there]" in out
+    assert out.endswith(f"report: {target}\n")
+
+
+@pytest.mark.usefixtures("computed")
+def test_programs_get_json(run: Run, built_maps: Path, tmp_path: Path) -> None:
+    target = tmp_path / "room.html"
+    _, out, _ = run("room", "--maps-dir", built_maps, "--output", target, "--json", "--workers", 1)
+    assert json.loads(out) == summary_of_report(_data()) | {"output": str(target)}
+
+
+@pytest.mark.usefixtures("computed")
+def test_the_file_is_named_after_the_map_and_replaces_an_older_one(
+    run: Run,
+    built_maps: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "room-report.html").write_text("old")
+    status, _, _ = run("room", "--maps-dir", built_maps, "--workers", 1)
+    assert status == 0
+    assert (tmp_path / "room-report.html").read_text("utf-8").startswith("<!doctype html>")
+    assert [path.name for path in tmp_path.iterdir()] == ["room-report.html"]
+
+
+def test_a_folder_is_not_overwritten(
+    run: Run, computed: dict[str, Any], built_maps: Path, tmp_path: Path
+) -> None:
+    status, out, err = run("room", "--maps-dir", built_maps, "--output", tmp_path)
+    assert (status, out) == (1, "")
+    assert err.startswith("error [report.output] --output: this is a folder")
+    assert computed == {}
+
+
+def test_an_unbuilt_viewer_is_told_before_the_long_work(
+    run: Run,
+    computed: dict[str, Any],
+    built_maps: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def absent() -> tuple[str, str]:
+        raise Unavailable("page.not_built", "the page's files are not here")
+
+    monkeypatch.setattr(command, "report_parts", absent)
+    status, _, err = run("room", "--maps-dir", built_maps, "--output", tmp_path / "room.html")
+    assert (status, computed) == (1, {})
+    assert err.startswith("error [page.not_built]")
+
+
+@pytest.mark.usefixtures("computed")
+def test_what_was_computed_stays_when_it_is_interrupted(
+    run: Run,
+    maps_dir: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupted(_: object, work: Any, **__: object) -> None:
+        work.root.mkdir(parents=True)
+        (work.root / "kept").touch()
+        raise Unavailable("build.worker_died", "a worker died")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(command, "make_report_data", interrupted)
+        status, _, _ = run("room", "--maps-dir", maps_dir, "--output", tmp_path / "room.html")
+    assert status == 1
+    assert not (tmp_path / "room.html").exists()
+    (kept,) = maps_dir.rglob("kept")
+    status, _, _ = run("room", "--maps-dir", maps_dir, "--output", tmp_path / "room.html")
+    assert status == 0
+    assert not kept.parent.exists()
+    assert MapStore(maps_dir).ids() == ["room"]
+
+
+@pytest.mark.usefixtures("computed")
+def test_two_reports_of_a_map_at_once_are_refused(run: Run, maps_dir: Path, tmp_path: Path) -> None:
+    with exclusive(maps_dir / ".report" / "room.lock"):
+        status, _, err = run("room", "--maps-dir", maps_dir, "--output", tmp_path / "room.html")
+    assert status == 1
+    assert err.startswith("error [report.running]")
+
+
+def test_photos_count_by_the_run_that_left_out_the_fewest() -> None:
+    summary = summary_of_report(_data())
+    assert summary["held_out"] == 3
+    assert summary["failed"] == ["[b].jpg", "c.jpg"]  # refused; too far off
+    assert (summary["likely"], summary["unlikely"]) == (0.5, 0.25)
+
+
+def test_a_map_of_one_photo_has_a_summary() -> None:
+    empty = {"within": {"position": 1.0, "orientation_deg": 5.0}, "cells": [], "weak_spots": []}
+    summary = summary_of_report(_data(held_out=[], coverage=empty))
+    assert summary["held_out"] == 0
+    assert summary["likely"] is None

@@ -1,0 +1,300 @@
+// The answer to a photo: a pose, or how far the photo came and what to try.
+import type { LocalizeResponse, PoseEstimate } from "../api";
+import { button, element, facts } from "../dom";
+import { ellipsoid95, lengthText, positionCovariance, REACH_95 } from "../geometry";
+import { textsToCopy } from "./copying";
+import type { Entry } from "./photo_queue";
+import { photoPicture } from "./photo_picture";
+import { advice, outcomes, STAGES } from "./refusals";
+import { answerJson, curlLine, pythonLines, type Question } from "./snippets";
+import { CAMERA_SOURCES, countText, digits, positionStd, secondsText } from "./words";
+
+const IN_FOLDER = "To be run in the folder of the photo.";
+
+export interface AnswerActions {
+  metric: boolean;
+  question: Question;
+  announce(text: string): void;
+  /** Let these mapping photos stand out; null is those of the answer. */
+  highlight(image: string | null): void;
+  takeCamera(): void;
+  again(): void;
+}
+
+export function answerView(
+  entry: Entry,
+  answer: LocalizeResponse,
+  actions: AnswerActions,
+): HTMLElement {
+  const { pose, refusal } = answer;
+  return element(
+    "div",
+    { class: "stack answer" },
+    pose === null ? refused(answer) : localized(answer, pose, actions.metric),
+    photoPicture(entry.photo, answer),
+    ...(pose === null ? [] : [poseTable(pose, actions.metric)]),
+    section(
+      refusal === null ? "What it rests on" : "What was found",
+      facts([
+        ["Keypoints", `${countText(answer.keypoints)} in the photo`],
+        ["Matches", `${countText(answer.correspondences)} with landmarks`],
+        ["Inliers", `${countText(answer.inliers)}, ${percent(answer)} of the matches`],
+        ["Camera", cameraWords(answer, actions)],
+        ["Map", answer.map.id],
+      ]),
+    ),
+    section("Time", timeBar(answer, entry.seconds)),
+    retrievedTable(answer, actions),
+    ...(entry.overlay === null ? [] : [overlayDisclosure(entry.overlay)]),
+    section(
+      "Take along",
+      textsToCopy(
+        [
+          { name: "JSON", text: answerJson(answer), note: "The answer to the lines of curl." },
+          { name: "curl", text: curlLine(actions.question), note: IN_FOLDER },
+          { name: "Python", text: pythonLines(actions.question), note: IN_FOLDER },
+        ],
+        actions.announce,
+      ),
+    ),
+    element("div", { class: "row" }, button("Ask again", actions.again)),
+  );
+}
+
+/** One line about an answer, for lists and for those who do not see it. */
+export function inShort(answer: LocalizeResponse): string {
+  return answer.pose !== null
+    ? `localized, ${countText(answer.inliers)} inliers`
+    : `not localized: ${answer.refusal?.message ?? ""}`;
+}
+
+function localized(answer: LocalizeResponse, pose: PoseEstimate, metric: boolean): HTMLElement {
+  const { rotation_wxyz: rotation, translation } = pose.cam_from_world;
+  const covariance = positionCovariance(
+    rotation as [number, number, number, number],
+    translation as [number, number, number],
+    pose.covariance,
+  );
+  const std = ellipsoid95(covariance).halfAxes[0] / REACH_95;
+  return element(
+    "div",
+    { class: "verdict good" },
+    element("h2", {}, "Localized"),
+    element(
+      "p",
+      {},
+      `${percent(answer)} of the matches agree on a place, ±${lengthText(std, metric)} (one standard deviation).`,
+    ),
+  );
+}
+
+function refused(answer: LocalizeResponse): HTMLElement {
+  const { meaning, tries } = advice(answer);
+  const states = outcomes(answer);
+  const said = { passed: "passed", stopped: "stopped here", not_reached: "not reached" };
+  const steps = STAGES.map(([, name, what], i) =>
+    element(
+      "li",
+      { class: states[i]!, title: what },
+      element("span", {}, name),
+      element("span", { class: "unseen" }, `: ${said[states[i]!]}`),
+    ),
+  );
+  return element(
+    "div",
+    { class: "verdict unsure stack near" },
+    element("h2", {}, "The map says: I do not know."),
+    element("ol", { class: "pipeline", "aria-label": "How far the photo came" }, ...steps),
+    element("p", {}, meaning),
+    element(
+      "p",
+      { class: "small" },
+      `In the words of the service: ${answer.refusal?.message ?? ""}`,
+    ),
+    element("h3", {}, "What to try"),
+    element("ul", { class: "tries" }, ...tries.map((text) => element("li", {}, text))),
+  );
+}
+
+function percent(answer: LocalizeResponse): string {
+  return `${digits(100 * answer.inlier_ratio, 2)} %`;
+}
+
+function poseTable(pose: PoseEstimate, metric: boolean): HTMLElement {
+  const row = (name: string, unit: string, values: string[]): HTMLElement =>
+    element(
+      "tr",
+      {},
+      element("th", { scope: "row" }, name),
+      ...values.map((value) => element("td", { class: "number" }, value)),
+      element("td", { class: "quiet" }, unit),
+    );
+  const heads = (...names: string[]): HTMLElement =>
+    element(
+      "tr",
+      {},
+      element("td"),
+      ...names.map((name) => element("th", { class: "number", scope: "col" }, name)),
+      element("td"),
+    );
+  const unit = metric ? "m" : "units";
+  return section(
+    "Pose",
+    element(
+      "table",
+      { class: "pose" },
+      element(
+        "tbody",
+        {},
+        heads("x", "y", "z"),
+        row(
+          "Position",
+          unit,
+          pose.position.map((value) => value.toFixed(3)),
+        ),
+        row(
+          "Its std",
+          metric ? "cm" : unit,
+          pose.position_std.map((std) => positionStd(std, metric)),
+        ),
+        row(
+          "Rotation’s std",
+          "°",
+          pose.orientation_std_deg.map((std) => digits(std, 2)),
+        ),
+      ),
+    ),
+    element(
+      "p",
+      { class: "small" },
+      element("span", { class: "quiet" }, "Orientation w, x, y, z: "),
+      element(
+        "span",
+        { class: "number" },
+        pose.orientation.map((value) => value.toFixed(4)).join(", "),
+      ),
+    ),
+  );
+}
+
+function cameraWords(answer: LocalizeResponse, actions: AnswerActions): HTMLElement {
+  const { model, width, height, params, source } = answer.camera;
+  const numbers = params.map((value) => digits(value, 6)).join(", ");
+  return element(
+    "div",
+    {},
+    `${model} ${width} × ${height}: ${numbers}`,
+    element("div", { class: "quiet" }, CAMERA_SOURCES[source] ?? source),
+    ...(source === "given"
+      ? []
+      : [button("Use as typed camera", actions.takeCamera, { class: "link" })]),
+  );
+}
+
+// In their order; others are kept as they are named.
+const STAGE_NAMES: Readonly<Record<string, string>> = {
+  queued: "waiting",
+  open_map: "opening the map",
+  decode: "decoding",
+  local_features: "local features",
+  global_features: "global features",
+  retrieval: "retrieval",
+  matching: "matching",
+  pose: "pose",
+};
+
+function timeBar(answer: LocalizeResponse, whole: number | null): HTMLElement {
+  const all = Object.entries(answer.seconds);
+  const total = all.reduce((sum, [, seconds]) => sum + seconds, 0);
+  // What takes less than a hundredth is in the sum only.
+  const parts = all.filter(([, seconds]) => seconds >= total / 100);
+  const bar = element("div", { class: "parts", "aria-hidden": "true" });
+  const legend = element("ul", { class: "parts-legend" });
+  for (const [i, [stage, seconds]] of parts.entries()) {
+    const part = element("span", { class: `part-${(i % 6) + 1}` });
+    part.style.flexGrow = String(seconds);
+    bar.append(part);
+    legend.append(
+      element(
+        "li",
+        { class: `part-${(i % 6) + 1}` },
+        `${STAGE_NAMES[stage] ?? stage} `,
+        element("span", { class: "number quiet" }, secondsText(seconds)),
+      ),
+    );
+  }
+  const way = whole === null ? "" : `, ${secondsText(whole)} with the way there and back`;
+  return element(
+    "div",
+    { class: "stack near" },
+    element("p", { class: "number" }, `${secondsText(total)} at the service${way}`),
+    bar,
+    legend,
+  );
+}
+
+function retrievedTable(answer: LocalizeResponse, actions: AnswerActions): HTMLElement {
+  if (answer.retrieved.length === 0) return element("p", { class: "quiet" }, "No mapping photos.");
+  const kinds = [...new Set(answer.retrieved.flatMap((r) => Object.keys(r.similarities)))];
+  // Names are long: each has a line of its own above its numbers.
+  const groups = answer.retrieved.map(({ image, score, similarities }) => {
+    const name = button(image, () => actions.highlight(image), { class: "link name" });
+    const numbers = [score, ...kinds.map((kind) => similarities[kind])];
+    const group = element(
+      "tbody",
+      {},
+      element("tr", {}, element("th", { scope: "rowgroup", colspan: numbers.length }, name)),
+      element(
+        "tr",
+        {},
+        ...numbers.map((n) => element("td", { class: "number" }, n?.toFixed(3) ?? "–")),
+      ),
+    );
+    group.addEventListener("pointerenter", () => actions.highlight(image));
+    group.addEventListener("pointerleave", () => actions.highlight(null));
+    name.addEventListener("focus", () => actions.highlight(image));
+    name.addEventListener("blur", () => actions.highlight(null));
+    return group;
+  });
+  const heads = ["score", ...kinds].map((text) =>
+    element("th", { scope: "col", class: "number" }, text),
+  );
+  return element(
+    "details",
+    { open: true },
+    element(
+      "summary",
+      {},
+      "Mapping photos that look alike",
+      element("span", { class: "quiet" }, countText(groups.length)),
+    ),
+    element(
+      "div",
+      { class: "scrolled", tabindex: 0, role: "region", "aria-label": "Mapping photos" },
+      element(
+        "table",
+        { class: "retrieved" },
+        element("thead", {}, element("tr", {}, ...heads)),
+        ...groups,
+      ),
+    ),
+  );
+}
+
+function overlayDisclosure(jpeg: Blob): HTMLElement {
+  const image = element("img", { alt: "The photo’s matches beside photos of the map" });
+  const details = element("details", {}, element("summary", {}, "Picture of the matches"), image);
+  let url = "";
+  details.addEventListener("toggle", () => {
+    URL.revokeObjectURL(url);
+    url = "";
+    if (details.open) image.src = url = URL.createObjectURL(jpeg);
+  });
+  // Decoded, it needs its address no more.
+  image.addEventListener("load", () => URL.revokeObjectURL(url));
+  return details;
+}
+
+function section(title: string, ...children: Node[]): HTMLElement {
+  return element("section", { class: "stack near" }, element("h3", {}, title), ...children);
+}

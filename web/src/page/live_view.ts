@@ -1,0 +1,63 @@
+// The pose of a walk in the 3D view, and the view that goes along.
+import type { LocalizeResponse, Quaternion, Vector3 } from "../api";
+import { add, positionCovariance, scale, viewingDirection } from "../geometry";
+import type { ShownPose, Viewer } from "../viewer/types";
+
+// A view that never rests cannot be looked at; and whoever turns it wants to look for themselves.
+const FLY_EVERY_MS = 1500;
+const HANDS_OFF_MS = 5000;
+// What stands on the screen is taken for the present: an older pose goes when a frame is refused.
+const POSE_SHOWN_MS = 3000;
+
+export class WalkView {
+  #shownAt = -Infinity;
+  #flownAt = -Infinity;
+  #handsOnAt = -Infinity;
+
+  /** @param back how far behind the walker the view is, beyond where a single photo is seen from. */
+  constructor(
+    readonly viewer: Viewer,
+    readonly back: () => number,
+  ) {
+    const touched = ({ target }: Event): void => {
+      if (target instanceof HTMLCanvasElement) this.#handsOnAt = performance.now();
+    };
+    for (const touch of ["pointerdown", "wheel", "keydown"]) {
+      document.addEventListener(touch, touched, { passive: true, capture: true });
+    }
+  }
+
+  /** @param follow whether the view goes along, unless somebody is turning it. */
+  show(answer: LocalizeResponse, follow: boolean): void {
+    const now = performance.now();
+    const pose = shownPose(answer);
+    if (pose === null) {
+      if (now - this.#shownAt > POSE_SHOWN_MS) this.viewer.showPose(null);
+      return;
+    }
+    this.viewer.showPose(pose);
+    this.#shownAt = now;
+    const leftAlone = now - this.#handsOnAt > HANDS_OFF_MS;
+    if (follow && leftAlone && now - this.#flownAt > FLY_EVERY_MS) {
+      this.#flownAt = now;
+      const behind = scale(viewingDirection(pose.orientation), -this.back());
+      this.viewer.flyTo({ ...pose, position: add(pose.position, behind) });
+    }
+  }
+}
+
+/** The pose as a frustum with its ellipsoid; null of a refusal. */
+function shownPose({ pose, camera }: LocalizeResponse): ShownPose | null {
+  if (pose === null) return null;
+  const { rotation_wxyz, translation } = pose.cam_from_world;
+  return {
+    position: pose.position as Vector3,
+    orientation: pose.orientation as Quaternion,
+    camera,
+    positionCovariance: positionCovariance(
+      rotation_wxyz as Quaternion,
+      translation as Vector3,
+      pose.covariance,
+    ),
+  };
+}

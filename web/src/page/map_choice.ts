@@ -1,0 +1,121 @@
+// Which map is shown: the list of them, the choice, and the address that links to it.
+import { shortRef, ServiceError, type MapInfo, type Service } from "../api";
+import { element } from "../dom";
+import { instantText } from "./words";
+
+/** What came of the wish to see a map. */
+export type Choice =
+  | { kind: "asking" }
+  | { kind: "no_maps" }
+  | { kind: "problem"; error: ServiceError }
+  | { kind: "map"; map: MapInfo };
+
+export interface MapChoice {
+  current(): MapInfo | null;
+  /** Ask for the list again, and keep the choice where it still exists. */
+  reload(): void;
+}
+
+// While the service starts; it says itself how long when it is busy.
+const ASK_AGAIN_MS = 3000;
+
+/** Let `select` and the address choose; `onChoice` is told what came of it. */
+export function createMapChoice(
+  select: HTMLSelectElement,
+  service: Service,
+  onChoice: (choice: Choice) => void,
+): MapChoice {
+  let maps: MapInfo[] = [];
+  let chosen: MapInfo | null = null;
+  let asking = new AbortController();
+  let askAgain = 0;
+
+  /** Do the newest thing only: what was being asked before is given up. */
+  async function attempt(ask: (signal: AbortSignal) => Promise<Choice>): Promise<void> {
+    asking.abort();
+    clearTimeout(askAgain);
+    const { signal } = (asking = new AbortController());
+    onChoice({ kind: "asking" });
+    let choice: Choice;
+    try {
+      choice = await ask(signal);
+    } catch (error) {
+      if (signal.aborted) return;
+      if (!(error instanceof ServiceError)) throw error;
+      choice = { kind: "problem", error };
+      const { status } = error.problem;
+      if (status === 503 || status === 429) {
+        const wait = (error.retryAfterSeconds ?? 0) * 1000;
+        askAgain = window.setTimeout(reload, Math.max(wait, ASK_AGAIN_MS));
+      }
+    }
+    if (signal.aborted) return;
+    chosen = choice.kind === "map" ? choice.map : null;
+    if (chosen !== null) history.replaceState(null, "", hashOf(shortRef(chosen)));
+    fill();
+    onChoice(choice);
+  }
+
+  // Described anew: another version may be in use since the list came.
+  const choose = (ref: string): Promise<void> =>
+    attempt(async (signal) => ({ kind: "map", map: await service.map(ref, signal) }));
+
+  const reload = (): void =>
+    void attempt(async (signal) => {
+      maps = await service.maps(signal);
+      fill();
+      const ref = refOfHash() ?? (chosen === null ? maps[0]?.id : shortRef(chosen));
+      if (ref === undefined) return { kind: "no_maps" };
+      return { kind: "map", map: await service.map(ref, signal) };
+    });
+
+  function fill(): void {
+    const options = maps.flatMap((map) => [
+      element("option", { value: map.id }, map.id),
+      ...map.versions
+        .filter((other) => !other.current)
+        .reverse() // the newest first
+        .map(({ version }) =>
+          element(
+            "option",
+            { value: `${map.id}@${version}` },
+            `${map.id} · ${versionText(version)}`,
+          ),
+        ),
+    ]);
+    const value = chosen === null ? "" : shortRef(chosen);
+    if (!options.some((option) => option.value === value)) {
+      // None is chosen, or one that was published since the list came.
+      options.unshift(element("option", { value }, chosen === null ? "Choose a map" : value));
+    }
+    select.replaceChildren(...options);
+    select.value = value;
+    select.disabled = maps.length === 0;
+  }
+
+  select.addEventListener("change", () => {
+    if (select.value !== "") void choose(select.value);
+  });
+  addEventListener("hashchange", () => {
+    const ref = refOfHash();
+    if (ref !== null && (chosen === null || ref !== shortRef(chosen))) void choose(ref);
+  });
+  return { current: () => chosen, reload };
+}
+
+/** `#map=id` or `#map=id@version`. */
+function hashOf(ref: string): string {
+  return `#map=${encodeURIComponent(ref).replaceAll("%40", "@")}`;
+}
+
+function refOfHash(): string | null {
+  return new URLSearchParams(location.hash.slice(1)).get("map") || null;
+}
+
+/** Versions begin with the instant at which they were built; others are as they are. */
+function versionText(version: string): string {
+  const parts = /^(\d{4})(\d\d)(\d\d)T(\d\d)(\d\d)(\d\d)\.\d+Z-/.exec(version);
+  if (parts === null) return version;
+  const [, year, month, day, hour, minute, second] = parts;
+  return instantText(`${year}-${month}-${day}T${hour}:${minute}:${second}Z`);
+}

@@ -1,0 +1,165 @@
+// The tab "Map": what the map is, and how it is shown.
+import type { MapImages, MapInfo } from "../api";
+import { element, facts } from "../dom";
+import { lengthText } from "../geometry";
+import { MAX_POINTS } from "../points";
+import { PALETTES, SEEN_BY_MOST } from "../viewer/themes";
+import type { PointBlock, PointColours, Theme, Viewer } from "../viewer/types";
+import { MAX_IMAGES } from "./map_loading";
+import { bytesText, counted, countText, instantText } from "./words";
+
+export interface MapPanel {
+  /** Something else than a map: why there is none. */
+  showInstead(content: Node): void;
+  showMap(map: MapInfo): void;
+  showBlock(block: PointBlock, loaded: number): void;
+  showImages(images: MapImages): void;
+  /** Below the facts: what could not be loaded. */
+  showProblem(problem: Node): void;
+  setTheme(theme: Theme): void;
+}
+
+export function createMapPanel(host: HTMLElement, viewer: Viewer, theme: Theme): MapPanel {
+  const about = element("div", { class: "stack" });
+  const problems = element("div", { class: "stack" });
+  const progress = element("p", { class: "quiet small number" });
+  const camerasNote = element("p", { class: "quiet small" });
+  const looks = element("div", { class: "stack" });
+
+  const photo = radio("colours", "photo", "Colours of the photos");
+  const seenBy = radio("colours", "seen_by", "Number of photos that see them");
+  const noColours = element("span", { class: "quiet", hidden: true }, "(this map keeps none)");
+  photo.label.append(noColours);
+  const legend = element("div", { class: "legend", hidden: true });
+  const legendScale = element("div", { class: "legend-scale", role: "img" });
+  legendScale.setAttribute("aria-label", `Colours from 2 to ${SEEN_BY_MOST} photos or more`);
+  // Where the four colours are: by the logarithm of the number.
+  const ticks = [0, 1, 2, 3].map((i) => Math.round(2 * (SEEN_BY_MOST / 2) ** (i / 3)));
+  legend.append(
+    legendScale,
+    element(
+      "div",
+      { class: "legend-ticks number" },
+      ...ticks.map((n, i) => element("span", {}, i < 3 ? `${n}` : `${n}+`)),
+    ),
+  );
+  paintLegend(legendScale, theme);
+  /** What the user said last; a map without colours does not change it. */
+  let preferred: PointColours = "photo";
+  const showColours = (by: PointColours): void => {
+    (by === "photo" ? photo : seenBy).input.checked = true;
+    legend.hidden = by === "photo";
+    viewer.setPointColours(by);
+  };
+  for (const { input } of [photo, seenBy]) {
+    input.addEventListener("change", () => {
+      preferred = input.value as PointColours;
+      showColours(preferred);
+    });
+  }
+
+  const size = element("input", { id: "point-size", type: "range", min: 1, max: 6, step: 0.5 });
+  size.value = "2";
+  size.addEventListener("input", () => viewer.setPointSize(Number(size.value)));
+  const cameras = element("input", { type: "checkbox", checked: true });
+  cameras.addEventListener("change", () => viewer.showMappingCameras(cameras.checked));
+  looks.append(
+    element(
+      "fieldset",
+      { class: "stack near" },
+      element("legend", {}, "Landmarks"),
+      photo.label,
+      seenBy.label,
+      legend,
+    ),
+    element(
+      "div",
+      { class: "field" },
+      element("label", { for: "point-size" }, "Size of the points"),
+      size,
+    ),
+    element("label", { class: "check" }, cameras, "Mapping cameras"),
+    camerasNote,
+  );
+
+  return {
+    showInstead(content) {
+      host.replaceChildren(content);
+    },
+    showMap(map) {
+      about.replaceChildren(element("h2", {}, map.id), mapFacts(map));
+      problems.replaceChildren();
+      say(camerasNote, "");
+      say(
+        progress,
+        map.landmarks === 0 ? "This map has no landmarks: no photo can be localized in it." : "",
+      );
+      host.replaceChildren(element("div", { class: "stack" }, about, progress, problems, looks));
+      // What was chosen is chosen for this map too.
+      showColours(preferred);
+      photo.input.disabled = false;
+      noColours.hidden = true;
+      viewer.setPointSize(Number(size.value));
+      viewer.showMappingCameras(cameras.checked);
+    },
+    showBlock(block, loaded) {
+      if (!block.coloured && noColours.hidden) {
+        noColours.hidden = false;
+        photo.input.disabled = true;
+        showColours("seen_by");
+      }
+      const all = Math.min(block.total, MAX_POINTS);
+      if (loaded < all)
+        say(progress, `${countText(loaded)} of ${counted(all, "landmark")} are here`);
+      else if (all === block.total) say(progress, "");
+      else say(progress, `An even sample of ${countText(all)} landmarks is shown`);
+    },
+    showImages(images) {
+      if (images.total > MAX_IMAGES) {
+        say(camerasNote, `The first ${countText(images.images.length)} are shown.`);
+      }
+    },
+    showProblem(problem) {
+      problems.replaceChildren(problem);
+    },
+    setTheme(now) {
+      paintLegend(legendScale, now);
+    },
+  };
+
+  function radio(name: string, value: string, text: string) {
+    const input = element("input", { type: "radio", name, value });
+    return { input, label: element("label", { class: "check" }, input, text) };
+  }
+}
+
+/** An empty line takes no room. */
+function say(line: HTMLElement, text: string): void {
+  line.textContent = text;
+  line.hidden = text === "";
+}
+
+function paintLegend(scale: HTMLElement, theme: Theme): void {
+  scale.style.backgroundImage = `linear-gradient(to right, ${PALETTES[theme].seenBy.join(", ")})`;
+}
+
+function mapFacts(map: MapInfo): HTMLElement {
+  const size = [0, 1, 2].map((axis) => (map.extent.max[axis] ?? 0) - (map.extent.min[axis] ?? 0));
+  const rows: [string, string][] = [
+    ["Photos", countText(map.images)],
+    ["Landmarks", countText(map.landmarks)],
+    ["Sightings", `${countText(map.observations)} of them in the photos`],
+  ];
+  if (map.landmarks > 0 && size.every(Number.isFinite)) {
+    const sides = size.map((side) => lengthText(side, map.metric));
+    rows.push(["Extent", `${sides.join(" × ")}${map.metric ? "" : " (not metric)"}`]);
+  }
+  rows.push(
+    ["Method", map.method],
+    ["Features", [map.local_features, ...map.global_features].join(", ")],
+    ["Created", instantText(map.created)],
+    ["Version", map.current ? map.version : `${map.version}, not in use`],
+    ["Size", bytesText(map.size_bytes)],
+  );
+  return facts(rows);
+}

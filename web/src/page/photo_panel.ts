@@ -1,0 +1,297 @@
+// The tab "Photo": photos come in, are asked about one after the other, and their answers shown.
+import {
+  mapRef,
+  ServiceError,
+  type Camera,
+  type LocalizeResponse,
+  type MapInfo,
+  type Problem,
+  type Quaternion,
+  type Service,
+  type Vector3,
+} from "../api";
+import { button, byId, element } from "../dom";
+import { positionCovariance } from "../geometry";
+import type { ShownPose, Viewer } from "../viewer/types";
+import { answerView, inShort } from "./answer_view";
+import { createCameraForm } from "./camera_form";
+import { createOptionsForm } from "./options_form";
+import { decodePhoto } from "./photo_picture";
+import { createPhotoQueue, questionOf, type Entry, type Wish } from "./photo_queue";
+import { problemView } from "./problem_view";
+import { countText } from "./words";
+
+export interface PhotoPanelParts {
+  service: Service;
+  server: URL;
+  viewer: Viewer;
+  map(): MapInfo | null;
+  hasKey(): boolean;
+  askForKey(): void;
+  announce(text: string): void;
+  /** Bring this tab to the front. */
+  open(): void;
+}
+
+export interface PhotoPanel {
+  camera(): Camera | null;
+  options(): Record<string, string | number>;
+  add(photos: { photo: Blob; name: string }[]): void;
+  /** Another map is shown: what was drawn of a photo is gone. */
+  mapChanged(): void;
+  /** Another key was given: ask again what failed for the lack of one. */
+  keyChanged(): void;
+  /** Of the photo that is shown, or was asked about last. */
+  readonly answer: LocalizeResponse | null;
+  readonly problem: Problem | null;
+}
+
+export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): PhotoPanel {
+  const { viewer, announce } = parts;
+  const camera = createCameraForm();
+  const options = createOptionsForm();
+  const list = element("ul", { class: "photos" });
+  const listHead = element("h2", { class: "small" });
+  const listing = element("section", { class: "stack near", hidden: true });
+  listing.append(
+    element(
+      "div",
+      { class: "row" },
+      listHead,
+      element("span", { class: "gap" }),
+      button("Clear", clear, { class: "link" }),
+    ),
+    list,
+  );
+  const shown = element("div", { class: "shown" });
+  const photoView = byId("photo-view", HTMLButtonElement);
+  let selected: Entry | null = null;
+  /** Show each answer as it comes, until another photo is clicked. */
+  let follow = true;
+  let drawn: ShownPose | null = null;
+
+  const queue = createPhotoQueue(parts.service, parts.hasKey, (entry) => {
+    if (entry.state === "running" && follow) selected = entry;
+    fillList();
+    if (entry !== selected) return;
+    if (entry.answer !== null) announce(`${entry.name}: ${inShort(entry.answer)}`);
+    else if (entry.error !== null) announce(`${entry.name}: ${entry.error.problem.detail}`);
+    show(entry, true);
+  });
+
+  const chooser = element("input", { id: "photo-files", type: "file", multiple: true });
+  chooser.accept = "image/*";
+  chooser.classList.add("unseen");
+  chooser.addEventListener("change", () => {
+    add([...(chooser.files ?? [])].map((file) => ({ photo: file, name: file.name })));
+    chooser.value = ""; // the same file may be chosen again
+  });
+  host.append(
+    element(
+      "div",
+      { class: "stack" },
+      element(
+        "div",
+        { class: "intake" },
+        chooser,
+        element("label", { for: "photo-files", class: "button primary" }, "Choose photos"),
+        element("p", { class: "quiet" }, "or drop or paste them"),
+      ),
+      element("div", { class: "settings" }, camera.element, options.element),
+      listing,
+      shown,
+    ),
+  );
+
+  function wish(): Wish {
+    const map = parts.map();
+    if (map === null) {
+      throw new ServiceError({
+        ...{ title: "No map is chosen", status: 0, detail: "choose a map first", code: "page.map" },
+        ...{ field: null, expected: null, got: null, request_id: "" },
+      });
+    }
+    return { map, camera: camera.camera(), options: options.options() };
+  }
+
+  function add(photos: { photo: Blob; name: string }[]): void {
+    if (photos.length === 0) return;
+    parts.open();
+    follow = true;
+    const entries = photos.map(({ photo, name }) => queue.add(photo, name, wish));
+    if (entries[0]!.state === "failed") select(entries[0]!);
+    camera.sent();
+    void suggestSize(photos[0]!.photo);
+    announce(photos.length === 1 ? `Asking about ${photos[0]!.name}` : `${photos.length} photos`);
+  }
+
+  async function suggestSize(photo: Blob): Promise<void> {
+    const decoded = await decodePhoto(photo);
+    if (decoded === null) return;
+    camera.suggestSize(decoded.width, decoded.height);
+    decoded.close();
+  }
+
+  function again(entry: Entry): void {
+    selected = entry;
+    queue.again(entry, wish);
+  }
+
+  function clear(): void {
+    queue.clear();
+    selected = null;
+    fillList();
+    shown.replaceChildren();
+    draw(null);
+  }
+
+  function select(entry: Entry): void {
+    selected = entry;
+    fillList();
+    show(entry, true);
+  }
+
+  function fillList(): void {
+    const { entries } = queue;
+    listing.hidden = entries.length === 0;
+    listHead.textContent = entries.length === 1 ? "Photo" : `${entries.length} photos`;
+    // The focus stays on the photo that had it.
+    const focused = document.activeElement?.closest<HTMLElement>("[data-entry]")?.dataset["entry"];
+    list.replaceChildren(
+      ...entries.map((entry) => {
+        const line = button("", () => {
+          follow = false;
+          select(entry);
+        });
+        line.dataset["entry"] = String(entry.id);
+        line.append(
+          element("span", { class: "name" }, entry.name),
+          element("span", { class: "quiet" }, stateWords(entry)),
+        );
+        line.dataset["state"] = outcome(entry);
+        if (entry === selected) line.setAttribute("aria-current", "true");
+        return element("li", {}, line);
+      }),
+    );
+    if (focused !== undefined) {
+      list.querySelector<HTMLElement>(`[data-entry="${focused}"]`)?.focus();
+    }
+  }
+
+  function show(entry: Entry, fly: boolean): void {
+    const { answer, error } = entry;
+    if (answer !== null && entry.wish !== null) {
+      const { map } = entry.wish;
+      shown.replaceChildren(
+        answerView(entry, answer, {
+          metric: map.metric,
+          question: questionOf(entry, entry.wish, parts.server),
+          announce,
+          highlight: (image) =>
+            viewer.highlight(image === null ? retrievedOf(answer) : new Set([image])),
+          takeCamera: () => {
+            const { model, width, height, params } = answer.camera;
+            camera.set({ model, width, height, params });
+            announce("The camera of this answer is used for what is asked from now on");
+          },
+          again: () => again(entry),
+        }),
+      );
+      draw(isShown(answer) ? answer : null, fly);
+      return;
+    }
+    draw(null);
+    if (error !== null) {
+      if (error.problem.code.startsWith("camera.")) camera.open();
+      if (error.problem.code.startsWith("options.")) options.open();
+      const actions = { giveKey: parts.askForKey, again: () => again(entry) };
+      shown.replaceChildren(problemView(error, actions));
+    } else {
+      shown.replaceChildren(waiting(entry));
+    }
+  }
+
+  /** Whether the answer is of the map that is shown. */
+  function isShown(answer: LocalizeResponse): boolean {
+    const map = parts.map();
+    return map !== null && mapRef(map) === mapRef(answer.map);
+  }
+
+  function draw(answer: LocalizeResponse | null, fly = false): void {
+    drawn = answer === null ? null : shownPose(answer);
+    viewer.showPose(drawn);
+    viewer.highlight(answer === null ? new Set() : retrievedOf(answer));
+    photoView.hidden = drawn === null;
+    if (!fly) return;
+    // Of a refused photo, where it was looked for.
+    if (drawn !== null) viewer.flyTo(drawn);
+    else if (answer !== null) viewer.overview();
+  }
+  photoView.addEventListener("click", () => {
+    if (drawn !== null) viewer.flyTo(drawn);
+  });
+
+  return {
+    camera: camera.camera,
+    options: options.options,
+    add,
+    mapChanged() {
+      if (selected !== null) show(selected, false);
+    },
+    keyChanged() {
+      if (!parts.hasKey()) return;
+      for (const entry of queue.entries) {
+        if (entry.error?.problem.status === 401) queue.again(entry, wish);
+      }
+    },
+    get answer() {
+      return selected?.answer ?? null;
+    },
+    get problem() {
+      return selected?.error?.problem ?? null;
+    },
+  };
+}
+
+function retrievedOf(answer: LocalizeResponse): Set<string> {
+  return new Set(answer.retrieved.map(({ image }) => image));
+}
+
+function shownPose({ pose, camera, debug }: LocalizeResponse): ShownPose | null {
+  if (pose === null) return null;
+  const { rotation_wxyz: rotation, translation } = pose.cam_from_world;
+  return {
+    position: pose.position as Vector3,
+    orientation: pose.orientation as Quaternion,
+    camera,
+    positionCovariance: positionCovariance(
+      rotation as Quaternion,
+      translation as Vector3,
+      pose.covariance,
+    ),
+    inliers:
+      debug?.inliers.flatMap((yes, i) => (yes ? debug.points.slice(3 * i, 3 * i + 3) : [])) ?? [],
+  };
+}
+
+type Outcome = "waiting" | "running" | "localized" | "refused" | "failed";
+
+function outcome(entry: Entry): Outcome {
+  if (entry.state !== "answered") return entry.state;
+  return entry.answer?.status === "localized" ? "localized" : "refused";
+}
+
+function stateWords(entry: Entry): string {
+  const words = {
+    waiting: "waits",
+    running: "is asked …",
+    failed: "error",
+    refused: "not localized",
+  };
+  const state = outcome(entry);
+  return state === "localized" ? `${countText(entry.answer!.inliers)} inliers` : words[state];
+}
+
+function waiting(entry: Entry): HTMLElement {
+  return element("p", { class: "quiet asking" }, `Asking the service about ${entry.name} …`);
+}

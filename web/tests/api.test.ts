@@ -1,0 +1,157 @@
+import { afterEach, describe, expect, test, vi } from "vitest";
+import { connect, localizeForm, mapRef, ServiceError, type LocalizeCall } from "../src/api";
+
+const BASE = new URL("https://maps.example.org/visloc/");
+const CALL: LocalizeCall = {
+  map: "kitchen",
+  image: new Blob(["photo"]),
+  name: 'a "b".jpg',
+  camera: null,
+  options: {},
+};
+
+/** Answer every request with this, and return the requests. */
+function answering(respond: () => Response | Promise<Response>): Request[] {
+  const asked: Request[] = [];
+  vi.stubGlobal("fetch", (url: URL, init: RequestInit) => {
+    asked.push(new Request(url, init));
+    return Promise.resolve().then(respond);
+  });
+  return asked;
+}
+
+const json = (body: unknown, init: ResponseInit = {}): Response =>
+  new Response(JSON.stringify(body), init);
+
+const failure = (call: Promise<unknown>): Promise<ServiceError> =>
+  call.then(
+    () => expect.fail("no error"),
+    (error: unknown) => {
+      expect(error).toBeInstanceOf(ServiceError);
+      return error as ServiceError;
+    },
+  );
+
+afterEach(() => vi.unstubAllGlobals());
+
+describe("asking", () => {
+  test("goes below the address of the page, with names that are escaped", async () => {
+    const asked = answering(() => json({ maps: [] }));
+    const service = connect(BASE, () => null);
+    await service.maps();
+    await service.map("kitchen@1");
+    await service.points("../../evil?x#y", 5, 10);
+    await service.images("kitchen", 0, 1000);
+    expect(asked.map(({ url }) => url)).toEqual([
+      "https://maps.example.org/visloc/maps",
+      "https://maps.example.org/visloc/maps/kitchen%401",
+      "https://maps.example.org/visloc/maps/..%2F..%2Fevil%3Fx%23y/points?first=5&count=10",
+      "https://maps.example.org/visloc/maps/kitchen/images?first=0&count=1000",
+    ]);
+  });
+
+  test("sends the API key only when one is given, and the newest", async () => {
+    const asked = answering(() => json({ maps: [] }));
+    let key: string | null = null;
+    const service = connect(BASE, () => key);
+    await service.maps();
+    key = "secret";
+    await service.maps();
+    expect(asked.map(({ headers }) => headers.get("Authorization"))).toEqual([
+      null,
+      "Bearer secret",
+    ]);
+  });
+
+  test("names the version that is shown", () => {
+    expect(mapRef({ id: "kitchen", version: "7" })).toBe("kitchen@7");
+  });
+});
+
+describe("the form of a photo", () => {
+  test("holds nothing that was not chosen", () => {
+    expect([...localizeForm(CALL).keys()]).toEqual(["map", "image"]);
+  });
+
+  test("holds what was, as the API has it", () => {
+    const form = localizeForm({
+      ...CALL,
+      camera: { model: "PINHOLE", width: 640, height: 480, params: [525, 525.5, 320, 240] },
+      options: { top_k: 5 },
+      priors: { position: { position: [0, 0, 0] } },
+      debug: true,
+    });
+    expect(form.get("camera")).toBe("PINHOLE,640,480,525,525.5,320,240");
+    expect(form.get("options")).toBe('{"top_k":5}');
+    expect(form.get("priors")).toBe('{"position":{"position":[0,0,0]}}');
+    expect(form.get("debug")).toBe("true");
+    expect((form.get("image") as File).name).toBe('a "b".jpg');
+  });
+
+  test("names a photo that came without a name", () => {
+    expect((localizeForm({ ...CALL, name: "" }).get("image") as File).name).toBe("photo");
+  });
+
+  test("is posted", async () => {
+    const asked = answering(() => json({ status: "not_localized" }));
+    await connect(BASE, () => null).localize(CALL);
+    expect(asked[0]!.method).toBe("POST");
+    expect(asked[0]!.headers.get("Content-Type")).toMatch(/^multipart\/form-data/);
+  });
+});
+
+describe("errors", () => {
+  test("are the service's problem details", async () => {
+    const problem = {
+      title: "Unprocessable Entity",
+      status: 422,
+      detail: "wrong number of parameters for PINHOLE",
+      code: "camera.param_count",
+      field: "camera.params",
+      expected: "4: fx, fy, cx, cy",
+      got: "3",
+      request_id: "f38b",
+    };
+    answering(() =>
+      json({ type: "about:blank", kind: "InvalidInput", ...problem }, { status: 422 }),
+    );
+    const error = await failure(connect(BASE, () => null).localize(CALL));
+    expect(error.problem).toEqual(problem);
+    expect(error.message).toBe(problem.detail);
+    expect(error.retryAfterSeconds).toBeNull();
+  });
+
+  test("say how long to wait, when the service does", async () => {
+    const headers = { "Retry-After": "7" };
+    answering(() => json({ code: "server.busy", detail: "busy" }, { status: 429, headers }));
+    expect((await failure(connect(BASE, () => null).maps())).retryAfterSeconds).toBe(7);
+  });
+
+  test("tell a proxy's page from an error of the service", async () => {
+    answering(() => new Response("<h1>Bad gateway</h1>", { status: 502 }));
+    const { problem } = await failure(connect(BASE, () => null).maps());
+    expect([problem.code, problem.status]).toEqual(["server.answer", 502]);
+  });
+
+  test.each([
+    ["no JSON", () => new Response("<h1>Sign in</h1>")],
+    ["another JSON", () => json({ hello: 1 })],
+    ["null", () => json(null)],
+  ])("an answer that is %s is none", async (_, respond) => {
+    answering(respond);
+    expect((await failure(connect(BASE, () => null).maps())).problem.code).toBe("server.answer");
+  });
+
+  test("a service that is not there is unreachable", async () => {
+    answering(() => Promise.reject(new TypeError("Failed to fetch")));
+    const { problem } = await failure(connect(BASE, () => null).maps());
+    expect([problem.code, problem.status]).toEqual(["server.unreachable", 0]);
+  });
+
+  test("what the page itself gave up is no error of the service", async () => {
+    const aborted = new DOMException("given up", "AbortError");
+    answering(() => Promise.reject(aborted));
+    const signal = AbortSignal.abort(aborted);
+    await expect(connect(BASE, () => null).maps(signal)).rejects.toBe(aborted);
+  });
+});
