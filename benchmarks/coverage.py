@@ -104,7 +104,7 @@ def measure(localizer: Localizer, model: CoverageModel, queries: Dataset) -> Ite
             *errors,
             answer.evidence.num_inliers,
             forecast.outlook.expected_inliers,
-            forecast.outlook.position_std,
+            forecast.position_std,
             forecast.probability,
             float(away.min()),
             float(turned.min()),

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import spearmanr
 
 from mapping.report.grid import Grid, Plan, forecast_grid, make_grid
 from mapping.report.held_out import HeldOut, hold_out
@@ -113,6 +112,8 @@ def rank_correlation_of(
     errors = np.array([run.position_error for run in runs])
     if len(runs) < 3 or np.ptp(probabilities) == 0 or (errors == errors[0]).all():
         return None
+    from scipy.stats import spearmanr  # takes long to load, and every command loads this module
+
     return round(float(spearmanr(-probabilities, errors).statistic), 4)
 
 
@@ -189,7 +190,7 @@ def _held_out(runs: Sequence[HeldOut], learned: Learned) -> list[dict[str, Any]]
 
 
 def _cell(position: NDArray[np.float64], forecasts: Sequence[Forecast]) -> dict[str, Any]:
-    stds = [forecast.outlook.position_std for forecast in forecasts]
+    stds = [forecast.position_std for forecast in forecasts]
     return {
         "position": _numbers(position),
         "probability": [round(forecast.probability, 4) for forecast in forecasts],

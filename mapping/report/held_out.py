@@ -112,9 +112,10 @@ def left_out_sets(opened: Map, viewpoints: Viewpoints, image: int) -> list[NDArr
     Those that the same rig took at the same instant always go with it: no query has them.
     """
     record = opened.images[image]
-    on_rig = {record.camera}.union(*(rig for rig in opened.rigs.values() if record.camera in rig))
+    on_rig = set[str]().union(*(rig for rig in opened.rigs.values() if record.camera in rig))
+    others = on_rig - {record.camera}
     together = np.array(
-        [i.timestamp == record.timestamp and i.camera in on_rig for i in opened.images]
+        [i.timestamp == record.timestamp and i.camera in others for i in opened.images]
     )
     together[image] = True
     apart = viewpoints.apart_from(viewpoints.pose(image))

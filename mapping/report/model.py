@@ -8,7 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.report.chance import Chance, Outlook, fit_chance, outlook_of
+from mapping.report.chance import (
+    Chance,
+    Outlook,
+    Precision,
+    fit_chance,
+    fit_precision,
+    outlook_of,
+)
 from mapping.report.held_out import HeldOut, vanishing
 from mapping.report.places import Places, sample_places
 from mapping.report.rematch import Counted, Rematch, count, fit_rematch
@@ -54,11 +61,14 @@ class Forecast:
         sight: what is in view.
         outlook: what of it is expected to be found again, and how well that determines the pose.
         probability: that it is localized well.
+        position_std: where it is localized, units of the world; infinity where so little is in
+            view that no position is determined.
     """
 
     sight: Sight
     outlook: Outlook
     probability: float
+    position_std: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,6 +79,7 @@ class CoverageModel:
     places: Places
     rematch: Rematch
     chance: Chance
+    precision: Precision
     noise_px: float
 
     def forecast(self, pose: Pose, camera: Camera) -> Forecast:
@@ -80,7 +91,8 @@ class CoverageModel:
         """
         sight = look_around(self.places, self.viewpoints, pose, camera)
         outlook = _outlook(sight, self.rematch, self.places, camera, self.noise_px)
-        return Forecast(sight, outlook, float(self.chance.of([outlook])[0]))
+        chance = float(self.chance.of([outlook])[0])
+        return Forecast(sight, outlook, chance, self.precision.std(outlook))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,7 +188,9 @@ def _fit(
     outlooks = [_outlook(s.sight, rematch, places, s.camera, noise_px) for s in seen]
     succeeded = np.array([within.holds(s.run) for s in seen], dtype=np.bool_)
     chance = fit_chance(outlooks, succeeded, within.position)
-    return CoverageModel(viewpoints, places, rematch, chance, noise_px)
+    errors = np.array([s.run.position_error for s in seen])
+    precision = fit_precision(outlooks, errors, within.position)
+    return CoverageModel(viewpoints, places, rematch, chance, precision, noise_px)
 
 
 def _outlook(

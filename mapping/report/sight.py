@@ -29,6 +29,7 @@ class Sight:
     """Places in view, and how the photo that knows each best differs from the pose.
 
     Attributes:
+        apart: radians to the nearest photo, as ``Viewpoints.apart_from``; infinity without any.
         places: (k,) int64 rows.
         pixels: (k, 2) float64.
         rays: (k, 3) float64 unit vectors in the camera's frame.
@@ -40,6 +41,7 @@ class Sight:
             same part of the picture; mostly 0 or more.
     """
 
+    apart: float
     places: NDArray[np.int64]
     pixels: NDArray[np.float64]
     rays: NDArray[np.float64]
@@ -110,6 +112,7 @@ def look_around(
     seen, first, counts = np.unique(which[order], return_index=True, return_counts=True)
     best = order[first]
     return Sight(
+        float(apart[near[0]]),
         found[seen],
         pixels[seen],
         in_cam[seen] / distance[best][:, None],

@@ -131,9 +131,10 @@ def _why(
     sides = np.array([plan.camera.width, plan.camera.height])
     if float((sight.pixels.std(axis=0) / sides).max()) < _SPREAD:
         reasons.append("all of it is in one part of the picture")
-    if np.isfinite(outlook.position_std) and outlook.position_std > _OPEN * within.position:
+    if np.isfinite(outlook.scatter) and outlook.scatter > _OPEN * within.position:
         distance = float(np.median(sight.distances))
         reasons.append(f"half of it is further than {distance:.3g}{unit} away")
     if not reasons:
         reasons.append("what is in view is seldom found again")
-    return f"{'; '.join(reasons[:_MOST_REASONS])}: about {outlook.expected_inliers:.0f} matches expected"
+    why = "; ".join(reasons[:_MOST_REASONS])
+    return f"{why}: about {outlook.expected_inliers:.0f} matches expected"

@@ -21,6 +21,8 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
+from mapping.report.command import write_report
+from visloc.archive import MapStore
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
 
@@ -209,7 +211,7 @@ def test_photos_appear_where_they_were_taken(photos: dict[str, Any], queries: li
         assert result["problem"] is None
         assert result["answer"]["camera"]["source"] == "given"
         assert_is_at(result["answer"], query.cam_from_world)
-    assert f"{photos['results'][-1]['answer']['inliers']} of" in photos["shown"]
+    assert str(photos["results"][-1]["answer"]["inliers"]) in photos["shown"]
     assert photos["marked"] > 200  # pixels in the colour of inliers
 
 
@@ -341,3 +343,26 @@ def test_axe_finds_nothing_serious_in_light_dark_and_on_a_phone(
     assert seen["faults"] == []
     for page_width, window_width in seen["widths"].values():
         assert page_width <= window_width
+
+
+# Report
+
+
+def test_the_report_of_a_map_needs_nothing_but_its_file(
+    browser: Browser, built_maps: Path, tmp_path: Path
+) -> None:
+    opened, file = MapStore(built_maps).open("room"), tmp_path / "room.html"
+    write_report(
+        *(opened, file, tmp_path), workers=1, command=["mapping"], progress=lambda *_: None
+    )
+
+    seen = browser.see("report", file=file.as_uri())
+
+    inside = ("data:", "blob:")
+    asked = [request["url"] for request in seen["requests"]]
+    assert [url for url in asked if not url.startswith(inside)] == [file.as_uri()]
+    assert seen["console"] == seen["violations"] == seen["dialogs"] == []
+    assert seen["cells"] > 10
+    assert "8 of 8" in seen["shown"] or "100\N{NO-BREAK SPACE}%" in seen["shown"]
+    assert f"{len(opened.landmarks):,} landmarks" in seen["described"]  # the view, in words
+    assert seen["faults"] == []

@@ -6,23 +6,13 @@
 //
 // VIDEO, frames as concatenated JPEG files, is what the browser's fake camera sees.
 import { createInterface } from "node:readline";
-import { chromium } from "playwright-core";
+import { launch } from "./browser.mjs";
+import { watched } from "./watched.mjs";
 
 const LONGEST_MS = 60_000;
 const [executablePath, video] = process.argv.slice(2);
 
-const browser = await chromium.launch({
-  executablePath,
-  args: [
-    "--no-sandbox", // tests run as root in containers; only our own page is opened
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
-    "--use-fake-device-for-media-stream",
-    "--use-fake-ui-for-media-stream",
-    `--use-file-for-fake-video-capture=${video}`,
-  ],
-});
+const browser = await launch(executablePath, video);
 
 async function run(scenario, given) {
   const { default: play } = await import(`./${scenario}.mjs`);
@@ -41,7 +31,9 @@ for await (const line of createInterface({ input: process.stdin })) {
   const { scenario, ...given } = JSON.parse(line);
   const answer = await run(scenario, given).then(
     (seen) => ({ seen }),
-    (error) => ({ failed: error.stack }),
+    (error) => ({
+      failed: [error.stack, "Console:", ...(watched.at(-1)?.console ?? [])].join("\n"),
+    }),
   );
   process.stdout.write(`${JSON.stringify(answer)}\n`);
 }

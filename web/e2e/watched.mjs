@@ -5,6 +5,9 @@ const LOOK = {
   reducedMotion: "reduce", // what flies is there at once
 };
 
+/** What was seen in all pages so far, to say more about a scenario that fails. */
+export const watched = [];
+
 /**
  * Open a page of its own and watch it from its first request on.
  *
@@ -17,6 +20,7 @@ export async function openWatched(browser, url, { prepare, ...options } = {}) {
   context.setDefaultTimeout(20_000);
   const page = await context.newPage();
   const seen = { console: [], violations: [], requests: [], dialogs: [] };
+  watched.push(seen);
   page.on("console", (message) => {
     if (message.type() === "error") seen.console.push(message.text());
   });

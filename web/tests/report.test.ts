@@ -72,7 +72,7 @@ describe("numbers in words", () => {
 
   test("directions are hours of a clock, twelve being up on the plan", () => {
     expect([90, 0, -90, 180, 60].map(clock)).toEqual(
-      [12, 3, 6, 9, 1].map((hour) => `${hour} o’clock`),
+      [12, 3, 6, 9, 1].map((hour) => `${hour}\u00a0o’clock`),
     );
   });
 });
@@ -141,7 +141,7 @@ describe("the verdict", () => {
     );
     expect(trials).toContain("50\u00a0% of trials: 1 of 2 mapping photos");
     expect(anywhere).toContain("50\u00a0% of places and directions");
-    expect(weakest).toContain("at the left of the plan, looking towards 9 o’clock");
+    expect(weakest).toContain("at the left of the plan, looking towards 9\u00a0o’clock");
   });
 
   test("says so when nothing could be held out", () => {

@@ -207,3 +207,21 @@ def test_a_map_of_one_photo_has_a_summary() -> None:
     summary = summary_of_report(_data(held_out=[], coverage=empty))
     assert summary["held_out"] == 0
     assert summary["likely"] is None
+
+
+def test_a_real_map_is_reported_on_with_numbers_that_hold_together(
+    run: Run, built_maps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command, "report_parts", lambda: ("script();", "body {}"))
+    target = tmp_path / "room.html"
+    status, out, err = run(
+        *("room", "--maps-dir", built_maps, "--output", target, "--json", "--workers", 1)
+    )
+    assert status == 0, err
+    summary = json.loads(out)
+    data = json.loads(target.read_text("utf-8").split('id="report">')[1].split("</script>")[0])
+    assert summary["held_out"] == len({run["image"] for run in data["held_out"]}) == 8
+    assert 0 <= summary["likely"] + summary["unlikely"] <= 1
+    directions = data["coverage"]["directions_deg"]
+    assert all(len(cell["probability"]) == len(directions) for cell in data["coverage"]["cells"])
+    assert {image["name"] for image in data["images"]} >= set(summary["failed"])

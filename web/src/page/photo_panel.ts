@@ -77,6 +77,7 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
     if (entry.answer !== null) announce(`${entry.name}: ${inShort(entry.answer)}`);
     else if (entry.error !== null) announce(`${entry.name}: ${entry.error.problem.detail}`);
     show(entry, true);
+    if (entry.state === "answered" || entry.state === "failed") reveal();
   });
 
   const chooser = element("input", { id: "photo-files", type: "file", multiple: true });
@@ -149,6 +150,12 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
     selected = entry;
     fillList();
     show(entry, true);
+  }
+
+  /** Where the panel is low, as on a phone, the answer may be below what is seen of it. */
+  function reveal(): void {
+    const { top, height } = host.getBoundingClientRect();
+    if (shown.getBoundingClientRect().top - top > height / 2) listing.scrollIntoView();
   }
 
   function fillList(): void {

@@ -19,6 +19,7 @@ interface Advice {
 const ANOTHER_PLACE = "Was the photo taken in the place of this map? If not, choose another map.";
 const MORE_PHOTOS = "Under Options, raise “mapping photos to match” (top_k).";
 const TURNED = "If the photo is stored turned, set “read photo as” to upright under Options.";
+const CHECK_CAMERA = "Check the camera: model, focal length, size.";
 const SHARPER = "Try a sharper, brighter or larger photo.";
 
 /** By reason; a test holds them against docs/api.md. */
@@ -32,33 +33,29 @@ export const ADVICE: Readonly<Record<string, Advice>> = {
     tries: ["Check what is known before (the priors), its frame and its unit.", "Leave it out."],
   },
   too_few_matches: {
-    meaning: "Too little of the photo was found among the map's landmarks to look for a pose.",
+    meaning: "Too little of the photo was found among the map’s landmarks to look for a pose.",
     tries: [ANOTHER_PLACE, "Take in more of the scene.", MORE_PHOTOS, TURNED],
   },
   no_pose: {
     meaning: "There are matches, but no camera sees them where they lie in the photo.",
-    tries: ["Check the camera: model, focal length, size.", MORE_PHOTOS, ANOTHER_PLACE],
+    tries: [CHECK_CAMERA, MORE_PHOTOS, ANOTHER_PLACE],
   },
   too_few_inliers: {
     meaning:
       "The best pose explains too few matches: as a rule of another place, or with wrong " +
       "camera parameters.",
-    tries: [ANOTHER_PLACE, "Check the camera: model, focal length, size."],
+    tries: [ANOTHER_PLACE, CHECK_CAMERA],
   },
   low_inlier_ratio: {
     meaning: "The best pose explains too small a share of the matches.",
-    tries: [
-      ANOTHER_PLACE,
-      "Check the camera: model, focal length, size.",
-      "If the preset is config1, use default.",
-    ],
+    tries: [ANOTHER_PLACE, CHECK_CAMERA, "If the preset is config1, use default."],
   },
   uncertain_pose: {
     meaning:
       "What was matched leaves the pose open: it lies in a line or a spot, halves of it " +
-      "contradict each other, or the camera's focal length cannot be told.",
+      "contradict each other, or the camera’s focal length cannot be told.",
     tries: [
-      "Type the camera's parameters.",
+      "Type the camera’s parameters.",
       "Step back, or choose a photo in which near and far things are seen.",
       SHARPER,
     ],
@@ -90,7 +87,8 @@ export function advice(answer: LocalizeResponse): Advice {
       text !== TURNED || (answer.orientation.exif !== 1 && answer.orientation.read_as === "stored"),
   );
   if (guessed && answer.refusal?.stage === "gate" && reason !== "uncertain_pose") {
-    tries.unshift("Type the camera's parameters: the photo does not tell its focal length.");
+    const typed = "Type the camera’s parameters: the photo does not tell its focal length.";
+    return { meaning: known.meaning, tries: [typed, ...tries.filter((t) => t !== CHECK_CAMERA)] };
   }
   return { meaning: known.meaning, tries };
 }

@@ -18,7 +18,7 @@ import { format, svg } from "./svg";
 import { clock, count, length, percent } from "./words";
 
 /** A cell is never drawn smaller than this, pixels: a wide plan scrolls instead. */
-const LEAST_CELL = 16;
+const LEAST_CELL = 12;
 const MOST_CELL = 76;
 /** Photos that look this far off a chosen direction count as looking that way. */
 const LOOKS_THAT_WAY_DEG = 45;

@@ -51,7 +51,7 @@ export function bytes(size: number): string {
 /** Twelve o'clock is up on the plan. */
 export function clock(heading: number): string {
   const hour = Math.round((((90 - heading) % 360) + 360) / 30) % 12;
-  return `${hour === 0 ? 12 : hour} o’clock`;
+  return `${hour === 0 ? 12 : hour}\u00a0o’clock`;
 }
 
 const PLACES = [

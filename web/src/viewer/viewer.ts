@@ -11,7 +11,14 @@ import { Overlay } from "./overlay";
 import { Pace } from "./pace";
 import { PoseMark } from "./pose";
 import { Steering } from "./steering";
-import { coverageArrows, groundGrid, sceneFromWorld, trailLine, type Extent } from "./surroundings";
+import {
+  coverageArrows,
+  groundGrid,
+  sceneFromWorld,
+  trailLine,
+  wholeView,
+  type Extent,
+} from "./surroundings";
 import { PALETTES } from "./themes";
 import type { CoverageArrow, CreateViewer, ShownPose, Theme, Viewer } from "./types";
 import "./viewer.css";
@@ -21,7 +28,9 @@ const EXTENT_SAMPLE = 5000;
 // The share of them at either end that does not: the rest is stretched as if they went on evenly,
 // so that a few landmarks far away do not make the map small.
 const OUTSIDE = 0.07;
-// In a picture while the view rests.
+// In a picture while the view rests: where the processor draws, it does so after a moment only, as
+// moves come less often than pictures would.
+const QUIET_MS = 150;
 const RESTING_POINTS = 131_072;
 const PICK_PX = 12;
 // From the side and above: enough to tell heights, not so much that walls hide rooms.
@@ -65,6 +74,7 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
   let viewMoved = true;
   let lost = false;
   let drawnBefore = false;
+  let lastMoved = -Infinity;
 
   const request = (): void => {
     if (!lost) requested ??= requestAnimationFrame(draw);
@@ -84,6 +94,11 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
     if (extent !== null) steering.enclose(extent.centre, extent.radius);
     const moved = viewMoved;
     viewMoved = false;
+    if (moved) lastMoved = now;
+    else if (software && now - lastMoved < QUIET_MS) {
+      request();
+      return;
+    }
     if (moved && cloud.loaded > 0) pace.moved(now, cloud.drawn);
     const { camera } = steering;
     world.updateMatrixWorld();
