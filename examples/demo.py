@@ -42,7 +42,10 @@ def main() -> int:
     shutil.rmtree(ROOT, ignore_errors=True)
     ROOT.mkdir()
     run("mapping", "sample", DATASET)
-    run("mapping", "build", DATASET / "mapping", "--map", "sample", "--maps-dir", MAPS)
+    run(
+        *("mapping", "build", DATASET / "mapping", "--map", "sample", "--maps-dir", MAPS),
+        "--keep-colours",
+    )
     http_port, grpc_port = free_port(), free_port()
     server = f"http://127.0.0.1:{http_port}"
     with served(http_port, grpc_port):

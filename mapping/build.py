@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.anchor import MAX_DIRECTION_ERROR_DEG, known_positions
+from mapping.colours import landmark_colours
 from mapping.features import (
     ExtractedFeatures,
     LocalFeaturesSource,
@@ -93,6 +94,8 @@ class BuildSettings:
         gravity: a vector of any length that points down in the map's world; None where that is
             not known. A map that is anchored on Earth knows it without.
         keep_photos: whether the map keeps a small picture of each photo, for a person's eyes.
+        keep_colours: whether it keeps the colours of the landmarks, for the same. Those that a
+            model brings along stay in any case.
         workers: processes that work on photos and pairs.
         force: publish a new version of a map that exists.
     """
@@ -115,6 +118,7 @@ class BuildSettings:
     sfm: SfmSettings = field(default_factory=SfmSettings)
     gravity: tuple[float, float, float] | None = None
     keep_photos: bool = False
+    keep_colours: bool = False
     workers: int = 1
     force: bool = False
 
@@ -316,7 +320,9 @@ def _build(
     photos, notes = collect_photos(
         dataset,
         posed=not settings.sfm.estimate_poses,
-        with_files=isinstance(features, ExtractedFeatures) or settings.keep_photos,
+        with_files=isinstance(features, ExtractedFeatures)
+        or settings.keep_photos
+        or settings.keep_colours,
         has_features=features.has if isinstance(features, ReadyMadeFeatures) else None,
         with_depth=settings.method == "rgbd",
         depth_sensor=settings.depth_sensor,
@@ -348,6 +354,10 @@ def _build(
     made = _make_landmarks(
         settings, dataset, work, photos, features, global_features, workers, progress
     )
+    if settings.keep_colours and made.landmarks.colors is None:
+        placed = [photos[row] for row in made.photos]
+        colours = landmark_colours(work, placed, made.landmarks, workers, progress)
+        made = replace(made, landmarks=replace(made.landmarks, colors=colours))
     content = _content(
         settings, dataset, photos, features, global_features, made, (*dataset.notes, *notes)
     )

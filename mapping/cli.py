@@ -133,6 +133,15 @@ def build(
             "localize --debug. Left out, nobody can see the photos in the map.",
         ),
     ] = False,
+    keep_colours: Annotated[
+        bool,
+        typer.Option(
+            "--keep-colours",
+            help="Keep the colours of the landmarks in the map, as the photos have them, for the "
+            "page and the report. A coloured cloud shows what the place looks like. Those that a "
+            "model brings along are kept anyway.",
+        ),
+    ] = False,
     workers: WorkersOption = DEFAULT_WORKERS,
     force: Annotated[
         bool, typer.Option("--force", help="Publish a new version of a map that exists.")
@@ -233,6 +242,7 @@ def build(
         ),
         gravity=None if gravity is None else _parse_vector("--gravity", gravity),
         keep_photos=keep_photos,
+        keep_colours=keep_colours,
         workers=workers,
         force=force,
     )

@@ -14,6 +14,7 @@ from mapping.georeference import Georeference
 from mapping.importers import ImportSummary
 from mapping.rig_calibration import OUTLIER_MULTIPLE, RigCalibration, Spread
 from visloc.archive import Map
+from visloc.archive.schema import photo_file
 from visloc.retrieval.fusion import EQUAL_GHARM
 
 # More lines than anyone reads.
@@ -33,6 +34,10 @@ def summary_of(opened: Map) -> dict[str, Any]:
         "rigs": {rig: sorted(members) for rig, members in opened.rigs.items()},
         # What a geodetic anchor tells of it is not in every manifest.
         "gravity": None if opened.gravity is None else opened.gravity.tolist(),
+        "keeps": [
+            *(["photos"] if photo_file(0) in opened.manifest.files else []),
+            *(["colours"] if opened.colors is not None else []),
+        ],
         "path": str(opened.path),
     }
 
@@ -66,6 +71,7 @@ def print_map(out: Console, opened: Map) -> None:
         else f"down is ({', '.join(f'{value:.6g}' for value in opened.gravity)})",
         "place": _place(opened),
         "method": summary["method"]["name"],
+        "keeps": ", ".join(summary["keeps"]) or "neither photos nor colours",
         "size": f"{summary['size_bytes'] / 2**20:.1f} MiB, "
         f"{summary['bytes_per_observation']:.0f} bytes per observation",
         "created": summary["created"],

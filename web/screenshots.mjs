@@ -14,7 +14,7 @@ import { launch } from "./e2e/browser.mjs";
 import { localize, openMap, openTab, typeCamera } from "./e2e/steps.mjs";
 import { openWatched, until } from "./e2e/watched.mjs";
 
-const FRAMES_PER_PHOTO = 6; // of 30 per second
+const FRAMES_PER_PHOTO = 25; // of 30 per second: a slow service still sees each
 const STEPS_OF_WALK = 12;
 const DESK = { viewport: { width: 1280, height: 800 } };
 const PHONE = {
@@ -91,6 +91,9 @@ async function takeReport(look, options) {
   const address = pathToFileURL(resolve(given.report)).href;
   const { context, page } = await openWatched(browser, address, options);
   await until(page, () => document.querySelector("canvas"));
+  await page.getByRole("heading", { name: "Coverage", exact: true }).evaluate((heading) => {
+    heading.scrollIntoView();
+  });
   await take(page, "report", look);
   await context.close();
 }
@@ -98,8 +101,12 @@ async function takeReport(look, options) {
 /** What is in the window, as WebP: a quarter of PNG's size for clouds of points. */
 async function take(page, view, look) {
   await page.waitForTimeout(1500); // the last picture of the view
+  const { width, height } = page.viewportSize();
+  const scale = await page.evaluate(() => devicePixelRatio);
+  const clip = { x: 0, y: 0, width, height, scale };
   const session = await page.context().newCDPSession(page);
-  const { data } = await session.send("Page.captureScreenshot", { format: "webp", quality: 85 });
+  const format = { format: "webp", quality: 75 };
+  const { data } = await session.send("Page.captureScreenshot", { ...format, clip });
   const path = join(given.output, `page-${view}-${look}.webp`);
   await writeFile(path, Buffer.from(data, "base64"));
   console.log(path);

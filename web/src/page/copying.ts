@@ -24,8 +24,12 @@ export function textsToCopy(
     const copy = async (): Promise<void> => {
       const done = await copyText(text, code);
       copied.textContent = done ? "Copied" : "Selected";
+      copied.removeAttribute("aria-label");
       announce(done ? `${name} copied` : `${name} selected: copy it with the keyboard`);
-      setTimeout(() => (copied.textContent = "Copy"), 2000);
+      setTimeout(() => {
+        copied.textContent = "Copy";
+        copied.setAttribute("aria-label", `Copy ${name}`);
+      }, 2000);
     };
     copied.setAttribute("aria-label", `Copy ${name}`);
     const below = element("div", { class: "row" });

@@ -47,15 +47,14 @@ export interface Live {
 
 const ANNOUNCE_EVERY_MS = 5000;
 
-// Of the map's diagonal: what nobody sees as a step, and from where one sees the way that one came.
+// Of the map's diagonal: what nobody sees as a step.
 const STEP_SHARE = 1 / 2000;
-const BACK_SHARE = 0.15;
 
 /** Fill the tab; nothing asks for the camera before it is started. */
 export function createLive(host: HTMLElement, context: PageContext): Live {
   const panel = livePanel();
   const reader = new FrameReader(panel.video, () => Number(panel.longest.value));
-  const view = new WalkView(context.viewer, () => BACK_SHARE * diagonal(context.map()));
+  const view = new WalkView(context.viewer);
   const screen = new ScreenLock();
   const figures = new LiveFigures();
   const prior = new WalkingPrior();

@@ -1,6 +1,6 @@
 // The pose of a walk in the 3D view, and the view that goes along.
 import type { LocalizeResponse, Quaternion, Vector3 } from "../api";
-import { add, positionCovariance, scale, viewingDirection } from "../geometry";
+import { positionCovariance } from "../geometry";
 import type { ShownPose, Viewer } from "../viewer/types";
 
 // A view that never rests cannot be looked at; and whoever turns it wants to look for themselves.
@@ -14,11 +14,7 @@ export class WalkView {
   #flownAt = -Infinity;
   #handsOnAt = -Infinity;
 
-  /** @param back how far behind the walker the view is, beyond where a single photo is seen from. */
-  constructor(
-    readonly viewer: Viewer,
-    readonly back: () => number,
-  ) {
+  constructor(readonly viewer: Viewer) {
     const touched = ({ target }: Event): void => {
       if (target instanceof HTMLCanvasElement) this.#handsOnAt = performance.now();
     };
@@ -40,8 +36,7 @@ export class WalkView {
     const leftAlone = now - this.#handsOnAt > HANDS_OFF_MS;
     if (follow && leftAlone && now - this.#flownAt > FLY_EVERY_MS) {
       this.#flownAt = now;
-      const behind = scale(viewingDirection(pose.orientation), -this.back());
-      this.viewer.flyTo({ ...pose, position: add(pose.position, behind) });
+      this.viewer.flyTo(pose);
     }
   }
 }

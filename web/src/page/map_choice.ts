@@ -98,7 +98,10 @@ export function createMapChoice(
   });
   addEventListener("hashchange", () => {
     const ref = refOfHash();
-    if (ref !== null && (chosen === null || ref !== shortRef(chosen))) void choose(ref);
+    if (ref === null || (chosen !== null && ref === shortRef(chosen))) return;
+    // While the list is still being asked for, that goes on to the choice.
+    if (maps.length === 0) reload();
+    else void choose(ref);
   });
   return { current: () => chosen, reload };
 }

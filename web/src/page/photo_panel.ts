@@ -16,9 +16,9 @@ import type { ShownPose, Viewer } from "../viewer/types";
 import { answerView, inShort } from "./answer_view";
 import { createCameraForm } from "./camera_form";
 import { createOptionsForm } from "./options_form";
-import { decodePhoto } from "./photo_picture";
 import { createPhotoQueue, questionOf, type Entry, type Wish } from "./photo_queue";
 import { problemView } from "./problem_view";
+import { storedSize } from "./stored_size";
 import { countText } from "./words";
 
 export interface PhotoPanelParts {
@@ -127,10 +127,8 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
   }
 
   async function suggestSize(photo: Blob): Promise<void> {
-    const decoded = await decodePhoto(photo);
-    if (decoded === null) return;
-    camera.suggestSize(decoded.width, decoded.height);
-    decoded.close();
+    const size = await storedSize(photo);
+    if (size !== null) camera.suggestSize(size.width, size.height);
   }
 
   function again(entry: Entry): void {

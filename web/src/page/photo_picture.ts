@@ -1,5 +1,5 @@
-// The photo with what was matched in it. Everything is in pixels as stored, as the service counts
-// them; only the picture as a whole is turned upright for the eye.
+// The photo with what was matched in it, upright. The service counts pixels as stored: what it found
+// is turned as the photo is.
 import type { LocalizeResponse } from "../api";
 import { button, element } from "../dom";
 import { countText } from "./words";
@@ -33,10 +33,13 @@ export function uprightFromStored(exif: number, width: number, height: number): 
   }
 }
 
-/** Decode a photo to its pixels as stored; null for a kind that this browser does not read. */
-export async function decodePhoto(photo: Blob): Promise<ImageBitmap | null> {
+/**
+ * Decode a photo; null for a kind that this browser does not read. Browsers turn it upright by its
+ * EXIF orientation, and can no longer be asked not to.
+ */
+async function decodePhoto(photo: Blob): Promise<ImageBitmap | null> {
   try {
-    return await createImageBitmap(photo, { imageOrientation: "none" });
+    return await createImageBitmap(photo);
   } catch (error) {
     if (!(error instanceof DOMException)) throw error;
     return null;
@@ -84,10 +87,16 @@ export function photoPicture(photo: Blob, answer: LocalizeResponse): HTMLElement
     const top = canvas.height / 2 - by * view.y;
     const [a, b, c, d, e, f] = matrix;
     if (bitmap !== null) {
-      context.setTransform(by * a, by * b, by * c, by * d, by * e + left, by * f + top);
       context.imageSmoothingEnabled = by < 4;
-      context.drawImage(bitmap, 0, 0, width, height);
-      context.resetTransform();
+      // Of kinds other than JPEG some browsers do not read the orientation.
+      const asStored = turned && bitmap.width === width && width !== height;
+      if (asStored) {
+        context.setTransform(by * a, by * b, by * c, by * d, by * e + left, by * f + top);
+        context.drawImage(bitmap, 0, 0, width, height);
+        context.resetTransform();
+      } else {
+        context.drawImage(bitmap, left, top, by * size.width, by * size.height);
+      }
     }
     const mark = density * Math.min(1.5 * Math.sqrt(view.zoom), 5);
     const place = (i: number): [number, number] => {

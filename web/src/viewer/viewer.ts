@@ -308,7 +308,8 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
     },
     flyTo(frustum) {
       const ahead = viewingDirection(frustum.orientation);
-      const back = 4 * depth();
+      // So far that what lies around can be made out, not only the few points just ahead.
+      const back = Math.max(4 * depth(), 0.2 * (extent?.radius ?? 0));
       const behind = add(add(frustum.position, scale(ahead, -1.6 * back)), scale(up, 0.55 * back));
       const target = add(frustum.position, scale(ahead, 1.5 * back));
       steering.go(toScene(behind), toScene(target));

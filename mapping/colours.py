@@ -1,0 +1,104 @@
+"""Colours of landmarks, for maps that are to show what a place looks like."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.features import Progress
+from mapping.photos import MappingPhoto
+from mapping.stages import Item, WorkFolder, key_of
+from mapping.workers import Workers
+from visloc.archive import Landmarks
+from visloc.errors import DatasetError
+from visloc.images import read_photo_file
+
+# Raised when the code of the stage changes what comes out.
+_REVISION = 1
+
+
+def landmark_colours(
+    work: WorkFolder,
+    photos: Sequence[MappingPhoto],
+    landmarks: Landmarks,
+    workers: Workers,
+    progress: Progress,
+) -> NDArray[np.uint8]:
+    """Return the mean colour (P, 3) RGB of the pixels where the photos see each landmark.
+
+    The mean, because sums of whole numbers need no more memory for more photos and are the same
+    in any order; of the two or three photos that see most landmarks a median tells little else.
+    A landmark that no photo sees is black.
+
+    Args:
+        work: where finished work is kept.
+        photos: n photos, those of the landmarks' observations, with their files.
+        landmarks: with observations by these photos.
+        workers: who reads the photos.
+        progress: told how far it is.
+
+    Raises:
+        DatasetError: ``dataset.photo_size``.
+        VislocError: what ``read_photo_file`` raises.
+    """
+    bounds = list(pairwise(landmarks.offsets.tolist()))
+    items = [
+        _Item(photo, landmarks.keypoints[first:end])
+        for photo, (first, end) in zip(photos, bounds, strict=True)
+    ]
+    workers.run(partial(_sample, work), items, partial(progress, "colours"))
+    num = len(landmarks.points)
+    seen = np.bincount(landmarks.observed, minlength=num)
+    # By channel: a photo may see a landmark twice, and NumPy adds to one column quickly.
+    sums = np.zeros((3, num), dtype=np.int64)
+    for item, (first, end) in zip(items, bounds, strict=True):
+        pixels = work.read(item.key)["rgb"]
+        for channel in range(3):
+            np.add.at(sums[channel], landmarks.observed[first:end], pixels[:, channel])
+    count = np.maximum(seen, 1)
+    return np.ascontiguousarray(((2 * sums + count) // (2 * count)).T, dtype=np.uint8)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Item:
+    """A photo and where it sees landmarks: (m, 2) float32 pixels."""
+
+    photo: MappingPhoto
+    keypoints: NDArray[np.float32]
+
+    @property
+    def key(self) -> str:
+        digest = hashlib.sha256(self.keypoints.tobytes()).hexdigest()
+        return key_of("colours", _REVISION, photo=self.photo.sha256, keypoints=digest)
+
+
+def _sample(work: WorkFolder, item: _Item) -> None:
+    work.get(item.key, partial(_pixels, item))
+
+
+def _pixels(item: _Item) -> Item:
+    """The pixels (m, 3) that the keypoints lie in."""
+    photo, camera = item.photo, item.photo.camera
+    rgb = read_photo_file(photo.path).rgb
+    height, width = rgb.shape[:2]
+    # Features found here have shown it before, ready-made ones have not.
+    if (width, height) != (camera.width, camera.height):
+        raise DatasetError(
+            "dataset.photo_size",
+            "the photo is not of the size of its camera",
+            field=str(photo.path),
+            expected=f"{camera.width} x {camera.height} as sensors.txt has it for "
+            f"{photo.record.sensor_id}",
+            got=f"{width} x {height}",
+        )
+    # Coordinates count from the corner of the first pixel. Those of other tools may lie on the far
+    # edge or a little beyond.
+    last = np.array([width - 1, height - 1])
+    x, y = np.clip(np.floor(item.keypoints), 0, last).astype(np.int64).T
+    return {"rgb": rgb[y, x]}
