@@ -34,7 +34,7 @@ def landmark_colours(
 
     The mean, because sums of whole numbers need no more memory for more photos and are the same
     in any order; of the two or three photos that see most landmarks a median tells little else.
-    A landmark that no photo sees is black.
+    A landmark that no photo sees is black. It takes about 100 bytes of memory per landmark.
 
     Args:
         work: where finished work is kept.
@@ -54,15 +54,16 @@ def landmark_colours(
     ]
     workers.run(partial(_sample, work), items, partial(progress, "colours"))
     num = len(landmarks.points)
-    seen = np.bincount(landmarks.observed, minlength=num)
-    # By channel: a photo may see a landmark twice, and NumPy adds to one column quickly.
-    sums = np.zeros((3, num), dtype=np.int64)
+    sums, counts = np.zeros((3, num), dtype=np.int64), np.zeros(num, dtype=np.int64)
     for item, (first, end) in zip(items, bounds, strict=True):
-        pixels = work.read(item.key)["rgb"]
-        for channel in range(3):
-            np.add.at(sums[channel], landmarks.observed[first:end], pixels[:, channel])
-    count = np.maximum(seen, 1)
-    return np.ascontiguousarray(((2 * sums + count) // (2 * count)).T, dtype=np.uint8)
+        observed = landmarks.observed[first:end]  # twice the same, where a photo sees it twice
+        np.add.at(counts, observed, 1)
+        # NumPy is quick with single columns of one type.
+        pixels = work.read(item.key)["rgb"].astype(np.int64)
+        for channel, values in zip(sums, pixels.T, strict=True):
+            np.add.at(channel, observed, values)
+    counts = np.maximum(counts, 1)
+    return np.ascontiguousarray(((2 * sums + counts) // (2 * counts)).T, dtype=np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -32,9 +32,8 @@ async function copied(page) {
   const texts = {};
   for (const name of ["JSON", "curl", "Python"]) {
     await page.getByRole("tab", { name, exact: true }).click();
-    const button = page.getByRole("button", { name: `Copy ${name}` });
-    await button.click();
-    await button.filter({ hasText: "Copied" }).waitFor();
+    await page.getByRole("button", { name: `Copy ${name}` }).click();
+    await page.getByRole("status").filter({ hasText: `${name} copied` }).waitFor();
     texts[name] = await page.evaluate(() => navigator.clipboard.readText());
   }
   return texts;
