@@ -22,6 +22,8 @@ _NUM_CELLS = 320
 MARGIN_OF_REACH = 0.5
 # A mean of directions shorter than this tells none.
 _LEAST_MEAN = 0.1
+# What the mean of the upper edges counts beside the rows: enough where all photos look one way.
+_MEAN_WEIGHT = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +32,7 @@ class Plan:
 
     Attributes:
         up: (3,) unit vector.
-        up_source: ``gravity`` where the map knows it, else ``cameras``: the mean of theirs.
+        up_source: ``gravity`` where the map knows it, else ``cameras``: from how they were held.
         right: (3,) unit vector, level.
         ahead: (3,) unit vector, level; right, ahead and up make a right-handed frame.
         pitch_deg: how far the photo looks below the level.
@@ -143,13 +145,22 @@ def probabilities_of(forecasts: Sequence[Sequence[Forecast]]) -> NDArray[np.floa
 
 
 def _up(opened: Map, viewpoints: Viewpoints) -> tuple[NDArray[np.float64], str]:
+    """Gravity's, else the direction to which the rows of the pictures are most nearly level.
+
+    Whoever takes a photo holds it level, but looks up or down as they like: the mean of where the
+    pictures have their upper edge leans. It decides which way round, and where all look one way.
+    """
     if opened.gravity is not None:
         return -opened.gravity, "gravity"
     mean = -viewpoints.rotations[:, 1].mean(axis=0)
     length = float(np.linalg.norm(mean))
     if length < _LEAST_MEAN:  # photos in all orientations: any plan is as good
         return np.array([0.0, 0.0, 1.0]), "cameras"
-    return mean / length, "cameras"
+    mean /= length
+    rows = viewpoints.rotations[:, 0]
+    tilts = rows.T @ rows / len(rows) + _MEAN_WEIGHT * (np.eye(3) - np.outer(mean, mean))
+    up = np.linalg.eigh(tilts)[1][:, 0]
+    return np.asarray(up * np.sign(up @ mean)), "cameras"
 
 
 def _num_cells(photos: NDArray[np.float64], margin: float, side: float) -> float:

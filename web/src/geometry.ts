@@ -207,17 +207,33 @@ export function viewingDirection(orientation: Quaternion): Vector3 {
   return apply(rotationMatrix(orientation), [0, 0, 1]);
 }
 
+// What the mean of the upper edges counts beside the rows: enough where all photos look one way.
+const MEAN_WEIGHT = 0.01;
+
 /**
- * Up in the world: against `down` where the map knows it, else where photos have their upper edge
- * on average. Photos that cancel each other out leave -y, up of a world made from the first photo.
+ * Up in the world: against `down` where the map knows it, else the direction to which the rows of
+ * the photos are most nearly level: people hold a camera level, but look up or down as they like.
+ * Photos that cancel each other out leave -y, up of a world made from the first photo.
  */
 export function worldUp(down: number[], images: Pick<MapImage, "orientation">[]): Vector3 {
   if (down.length === 3) return normalized(scale(down as Vector3, -1));
-  const sum = images.reduce<Vector3>(
+  const mean = images.reduce<Vector3>(
     (total, { orientation }) => add(total, apply(rotationMatrix(orientation), [0, -1, 0])),
     [0, 0, 0],
   );
-  return length(sum) > 0.1 * images.length ? normalized(sum) : [0, -1, 0];
+  if (length(mean) < 0.1 * images.length || images.length === 0) return [0, -1, 0];
+  const upper = normalized(mean);
+  const tilts: Matrix3 = [0, 1, 2].flatMap((i) =>
+    [0, 1, 2].map((j) => MEAN_WEIGHT * ((i === j ? 1 : 0) - upper[i]! * upper[j]!)),
+  ) as Matrix3;
+  for (const { orientation } of images) {
+    const row = apply(rotationMatrix(orientation), [1, 0, 0]);
+    for (let k = 0; k < 9; k++)
+      tilts[k]! += (row[Math.floor(k / 3)]! * row[k % 3]!) / images.length;
+  }
+  const { vectors } = symmetricEigen(tilts);
+  const up: Vector3 = [vectors[2]!, vectors[5]!, vectors[8]!];
+  return dot(up, upper) < 0 ? scale(up, -1) : up;
 }
 
 /** The largest of ..., 0.1, 0.2, 0.5, 1, 2, 5, ... that is not above `most`. */

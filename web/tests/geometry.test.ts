@@ -215,6 +215,15 @@ describe("up", () => {
     expectClose(worldUp([], images), [0, -1, 0]);
   });
 
+  test("is not led astray by photos that all look down", () => {
+    // Turned about the world's -y by 0 and 90 degrees, then each 30 degrees down about its own x.
+    const down: Quaternion = [Math.cos(Math.PI / 12), -Math.sin(Math.PI / 12), 0, 0];
+    const aside: Quaternion = [HALF * down[0], HALF * down[1], HALF * down[0], -HALF * down[1]];
+    const images = [down, aside].map((orientation) => ({ orientation }));
+    const up = worldUp([], images);
+    expect(up[1]).toBeLessThan(-0.999);
+  });
+
   test("is that of the first photo where photos cancel each other out", () => {
     const images = [IDENTITY, unit(0, 0, 0, 1)].map((orientation) => ({ orientation }));
     expectClose(worldUp([], images), [0, -1, 0]);
