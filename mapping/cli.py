@@ -58,6 +58,7 @@ from mapping.options import (
     TopKOption,
     WeightsDirOption,
     WorkersOption,
+    map_folder,
 )
 from mapping.packing import write_packed
 from mapping.pairing import PairSettings
@@ -69,7 +70,7 @@ from mapping.sample import write_sample
 from mapping.sfm import SfmSettings
 from mapping.triangulation import MAPPER_CONFIGS, REFINABLE
 from mapping.workers import DEFAULT_WORKERS
-from visloc.archive import MapStore, open_map, verify_map
+from visloc.archive import open_map, verify_map
 from visloc.errors import InvalidInput, VislocError
 from visloc.features import (
     DEFAULT_LOCAL_FEATURES,
@@ -235,7 +236,7 @@ def build(
             pairs_file=pairs_file,
             covisible_in=None
             if covisible_in is None
-            else open_map(_folder(covisible_in, maps_dir)),
+            else open_map(map_folder(covisible_in, maps_dir)),
             mapper=mapper,
             refine=_names(refine),
             estimate_poses=poses == "estimate",
@@ -274,7 +275,7 @@ def pairs(
     pairing = PairSettings(
         top_k=top_k, max_distance=max_distance, max_angle_deg=max_angle, near=near, far=far
     )
-    known = None if covisible_in is None else open_map(_folder(covisible_in, maps_dir))
+    known = None if covisible_in is None else open_map(map_folder(covisible_in, maps_dir))
     with StageProgress(_err, if_stopped="nothing was written") as progress:
         count = write_pairs_of(
             dataset,
@@ -485,7 +486,7 @@ def anchor(
             expected="--dataset; or --correspondences; or all of --latitude, --longitude, "
             "--altitude, --yaw, and where needed --accuracy, --scale and --gravity",
         )
-    opened = open_map(_folder(map_ref, maps_dir))
+    opened = open_map(map_folder(map_ref, maps_dir))
     if dataset is not None:
         found = georeference(opened, correspondences_from_fixes(opened, read_dataset(dataset)))
     elif correspondences is not None:
@@ -513,7 +514,7 @@ def export(
     maps_dir: MapsDirOption = Path("maps"),
 ) -> None:
     """Write a map for other tools: a COLMAP model, a kapture dataset, or a PLY point cloud."""
-    export_map(open_map(_folder(map_ref, maps_dir)), output, format_name)
+    export_map(open_map(map_folder(map_ref, maps_dir)), output, format_name)
     _out.print(f"{format_name}: {output}", soft_wrap=True)
 
 
@@ -524,7 +525,7 @@ def pack(
     maps_dir: MapsDirOption = Path("maps"),
 ) -> None:
     """Write a map into one file, for localize maps push; every byte is checked first."""
-    manifest = write_packed(_folder(map_ref, maps_dir), output)
+    manifest = write_packed(map_folder(map_ref, maps_dir), output)
     size = output.stat().st_size / 2**20
     _out.print(
         f"{manifest.id}@{manifest.version}: {output}, {size:.1f} MiB",
@@ -552,7 +553,7 @@ def inspect(
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
     """Show what a map holds."""
-    opened = open_map(_folder(map_ref, maps_dir))
+    opened = open_map(map_folder(map_ref, maps_dir))
     if as_json:
         sys.stdout.write(json.dumps(summary_of(opened), indent=2) + "\n")
     else:
@@ -566,7 +567,7 @@ def verify(
     weights_dir: WeightsDirOption = None,
 ) -> None:
     """Read every byte of a map: checksums and ranges; then compare its features with ours."""
-    opened = verify_map(_folder(map_ref, maps_dir))
+    opened = verify_map(map_folder(map_ref, maps_dir))
     num_files = len(opened.manifest.files)
     read_imported_points(opened)  # raises when they are damaged
     _out.print(f"{opened.ref}: {num_files} files, every byte as published", soft_wrap=True)
@@ -596,7 +597,7 @@ def export_features_command(
     maps_dir: MapsDirOption = Path("maps"),
 ) -> None:
     """Write our features of a dataset in kapture's layout, for other tools."""
-    opened = None if map_ref is None else open_map(_folder(map_ref, maps_dir))
+    opened = None if map_ref is None else open_map(map_folder(map_ref, maps_dir))
     with StageProgress(_err) as progress:
         absent = export_features(
             dataset,
@@ -692,11 +693,6 @@ def _parse_size(text: str) -> tuple[int, int]:
             "sample.size", "not a size", field="--size", expected="WxH such as 640x480", got=text
         )
     return int(width), int(height)
-
-
-def _folder(ref: str, maps_dir: Path) -> Path:
-    path = Path(ref)
-    return path if (path / "manifest.json").is_file() else MapStore(maps_dir).folder(ref)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mapping.pairing import PAIRINGS
+from visloc.archive import MapStore
 from visloc.features import DEFAULT_GLOBAL_FEATURES, global_feature_names, local_feature_names
 from visloc.geometry import PixelOrigin
 from visloc.types import Fusion, Inference
@@ -126,3 +127,13 @@ CovisibleInOption = Annotated[
         rich_help_panel=SFM_PANEL,
     ),
 ]
+
+
+def is_map_folder(ref: str) -> bool:
+    """Tell whether a ``MapArgument`` is a folder."""
+    return (Path(ref) / "manifest.json").is_file()
+
+
+def map_folder(ref: str, maps_dir: Path) -> Path:
+    """Return the folder that a ``MapArgument`` stands for."""
+    return Path(ref) if is_map_folder(ref) else MapStore(maps_dir).folder(ref)

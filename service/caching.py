@@ -10,7 +10,7 @@ from starlette.responses import Response
 # As long as caches keep anything.
 _FOR_EVER = "max-age=31536000, immutable"
 FOR_EVER, FOR_EVER_PRIVATE = f"public, {_FOR_EVER}", f"private, {_FOR_EVER}"
-ASK_ALWAYS = "no-cache"
+ASK_ALWAYS, ASK_ALWAYS_PRIVATE = "no-cache", "private, no-cache"
 
 _TAG = re.compile(r'(?:W/)?("[^"]*")')
 

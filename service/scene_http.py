@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Awaitable, Callable
 from typing import Annotated, Any
 
 from fastapi import FastAPI, Query, Request, Response
-from fastapi.responses import StreamingResponse
 
-from service.caching import ASK_ALWAYS, FOR_EVER_PRIVATE, is_current, not_modified
+from service.caching import ASK_ALWAYS_PRIVATE, FOR_EVER_PRIVATE, is_current, not_modified
 from service.deadlines import TIMEOUT_HEADER, timeout_of, within
 from service.engine import Engine
 from service.openapi import problems
 from service.schemas import MapImages
 from service.settings import ServiceSettings
 from visloc.archive import MapOutline
-from visloc.archive.detail import HEADER_BYTES, ROW_BYTES
+from visloc.errors import NotFound
 
 MAX_POINTS, MAX_IMAGES = 262_144, 10_000
 
@@ -57,14 +57,16 @@ def add_scene_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) ->
         Every beginning of the order is an even sample of the map in space: as many as are read is
         the level of detail. With `id@version` the answer may be kept for ever.
         """
-        async with within(timeout(request)):
-            outline = (await engine.map(ref)).outline
+
+        async def answer(outline: MapOutline) -> Response:
             headers = _caching(outline, ref, first, count)
             if is_current(request.headers, headers["ETag"]):
                 return not_modified(headers)
-            num, pieces = await engine.scenes.points(outline, first, count)
-        headers["Content-Length"] = str(HEADER_BYTES + num * ROW_BYTES)
-        return StreamingResponse(pieces, headers=headers, media_type=_BINARY)
+            body = await engine.scenes.points(outline, first, count)
+            return Response(body, headers=headers, media_type=_BINARY)
+
+        async with within(timeout(request)):
+            return await _of_version(engine, ref, answer)
 
     @app.get(
         "/maps/{ref}/images",
@@ -78,8 +80,8 @@ def add_scene_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) ->
         count: Annotated[int, Query(ge=1, le=MAX_IMAGES, description="most photos")] = 1000,
     ) -> Response:
         """Say where the mapping photos of a map (`id`, or `id@version`) were taken."""
-        async with within(timeout(request)):
-            outline = (await engine.map(ref)).outline
+
+        async def answer(outline: MapOutline) -> Response:
             headers = _caching(outline, ref, first, count)
             if is_current(request.headers, headers["ETag"]):
                 return not_modified(headers)
@@ -87,7 +89,24 @@ def add_scene_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) ->
             text = await asyncio.to_thread(
                 lambda: MapImages.of(outline, photos, first, count).model_dump_json()
             )
-        return Response(text, headers=headers, media_type="application/json")
+            return Response(text, headers=headers, media_type="application/json")
+
+        async with within(timeout(request)):
+            return await _of_version(engine, ref, answer)
+
+
+async def _of_version(
+    engine: Engine, ref: str, answer: Callable[[MapOutline], Awaitable[Response]]
+) -> Response:
+    """Answer of the version that ``ref`` stands for."""
+    outline = (await engine.map(ref)).outline
+    try:
+        return await answer(outline)
+    except NotFound:
+        now = (await engine.map(ref)).outline
+        if now.ref == outline.ref:
+            raise
+        return await answer(now)  # it took over, and the one before was deleted
 
 
 def _caching(outline: MapOutline, ref: str, first: int, count: int) -> dict[str, str]:
@@ -96,5 +115,7 @@ def _caching(outline: MapOutline, ref: str, first: int, count: int) -> dict[str,
     return {
         # The version too: answers name it, and it is not part of the content.
         "ETag": f'"{manifest.version}-{manifest.content_hash[:32]}-{first}-{count}"',
-        "Cache-Control": FOR_EVER_PRIVATE if "@" in ref else ASK_ALWAYS,
+        "Cache-Control": FOR_EVER_PRIVATE if "@" in ref else ASK_ALWAYS_PRIVATE,
+        # With another key, or without, what was kept is no answer.
+        "Vary": "Authorization, X-API-Key",
     }

@@ -1,10 +1,14 @@
-"""Points and photos of maps, to be drawn: opened, ordered and kept, in the main process."""
+"""Points and photos of maps, to be drawn: read, ordered and kept, in the main process.
+
+This process answers everybody, so nothing of a map is mapped into its memory: a file that is cut
+short meanwhile is an error of one request.
+"""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Awaitable, Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Awaitable, Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
 from copy import copy
 from functools import partial
 from typing import Generic, TypeVar
@@ -14,25 +18,15 @@ from numpy.typing import NDArray
 
 from service.catalog import Catalog
 from visloc.archive import MapOutline
-from visloc.archive.detail import (
-    MapPoints,
-    detail_order,
-    open_points,
-    point_header,
-    point_rows,
-)
+from visloc.archive.detail import detail_order, read_landmarks, read_points
 from visloc.archive.photos import MappingPhotos, read_photos
 from visloc.errors import VislocError
 
-# So many requests are at work at once: photos that are to be localized go first.
+# So many requests are read at once.
 _THREADS = 2
-# An order takes four bytes per landmark.
-_MAX_ORDERS_BYTES = 128 * 2**20
-# About what the name and the pose of a photo take in memory, and room for 100 000 of them.
-_PHOTO_BYTES = 320
-_MAX_PHOTOS_BYTES = 32 * 2**20
-# Rows that are packed at a time, 16 bytes each: what a client does not take, waits here.
-_BLOCK = 16_384
+# Of the last maps that were drawn, whatever their size: to make the order of a large map again
+# takes much longer than that of a small one. Four bytes per landmark, some hundred per photo.
+_MAX_ORDERS, _MAX_PHOTOS = 4, 4
 
 T = TypeVar("T")
 
@@ -49,38 +43,32 @@ class Scenes:
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="scene")
-        self._orders = _Kept[NDArray[np.uint32]](_MAX_ORDERS_BYTES, lambda order: order.nbytes)
-        self._photos = _Kept[MappingPhotos](
-            _MAX_PHOTOS_BYTES, lambda photos: len(photos.images) * _PHOTO_BYTES
-        )
+        # One order at a time, which bounds their memory, and in a thread of its own: those of
+        # large maps take long, and other maps are drawn meanwhile.
+        self._one_order = asyncio.Lock()
+        self._order_thread = ThreadPoolExecutor(1, thread_name_prefix="order")
+        self._orders = _Kept[NDArray[np.uint32]](_MAX_ORDERS)
+        self._photos = _Kept[MappingPhotos](_MAX_PHOTOS)
 
-    async def points(
-        self, outline: MapOutline, first: int, count: int
-    ) -> tuple[int, AsyncGenerator[bytes]]:
-        """Return landmarks in their order of detail, packed (docs/api.md), in pieces.
+    async def points(self, outline: MapOutline, first: int, count: int) -> bytes:
+        """Return landmarks in their order of detail, packed (docs/api.md).
 
         Args:
             outline: of the version.
             first: place in the order to begin at.
             count: most landmarks to return.
 
-        Returns:
-            How many landmarks follow, and the bytes.
-
         Raises:
             NotFound: ``map.version``.
-            MapCorrupt: ``map.array``.
+            MapCorrupt: ``map.array``, ``map.range``.
             VislocError: what the store raises.
         """
+        manifest = outline.manifest
+        order = await self._orders.get(manifest.content_hash, lambda: self._order(outline))
+        rows = order[first : first + count].copy()  # a view would keep the whole order
         async with self._catalog.reading(outline.ref) as of:
-            opened = await self._in_thread(partial(open_points, of.folder, outline.manifest))
-        # From here on the files may be deleted: what is mapped stays.
-        order = await self._orders.get(
-            outline.manifest.content_hash,
-            lambda: self._in_thread(partial(detail_order, opened.landmarks)),
-        )
-        rows = order[first : first + count]
-        return len(rows), self._packed(opened, rows, first)
+            work = partial(read_points, of.folder, manifest, rows, first)
+            return await _in(self._threads, work)
 
     async def photos(self, outline: MapOutline) -> MappingPhotos:
         """Return the mapping photos of a version.
@@ -93,36 +81,36 @@ class Scenes:
 
         async def read() -> MappingPhotos:
             async with self._catalog.reading(outline.ref) as of:
-                return await self._in_thread(partial(read_photos, of.folder, outline))
+                return await _in(self._threads, partial(read_photos, of.folder, outline))
 
         return await self._photos.get(outline.manifest.content_hash, read)
 
     def close(self) -> None:
         """Let go of the threads."""
-        self._threads.shutdown(wait=False, cancel_futures=True)
+        for threads in (self._threads, self._order_thread):
+            threads.shutdown(wait=False, cancel_futures=True)
 
-    async def _packed(
-        self, opened: MapPoints, rows: NDArray[np.uint32], first: int
-    ) -> AsyncGenerator[bytes]:
-        yield point_header(opened, first, len(rows))
-        for start in range(0, len(rows), _BLOCK):
-            yield await self._in_thread(partial(point_rows, opened, rows[start : start + _BLOCK]))
+    async def _order(self, outline: MapOutline) -> NDArray[np.uint32]:
+        async with self._one_order:
+            async with self._catalog.reading(outline.ref) as of:
+                work = partial(read_landmarks, of.folder, outline.manifest)
+                landmarks = await _in(self._threads, work)
+            return await _in(self._order_thread, partial(detail_order, landmarks))
 
-    async def _in_thread(self, work: Callable[[], T]) -> T:
-        return await asyncio.get_running_loop().run_in_executor(self._threads, work)
+
+async def _in(threads: Executor, work: Callable[[], T]) -> T:
+    return await asyncio.get_running_loop().run_in_executor(threads, work)
 
 
 class _Kept(Generic[T]):
     """Values by key, each made once for all who ask; the last used ones are kept.
 
     Args:
-        max_bytes: room for them; one that is larger is kept alone.
-        size_of: the bytes of one.
+        most: of them.
     """
 
-    def __init__(self, max_bytes: int, size_of: Callable[[T], int]) -> None:
-        self._max_bytes = max_bytes
-        self._size_of = size_of
+    def __init__(self, most: int) -> None:
+        self._most = most
         self._values: dict[str, T] = {}  # the last used one is the last
         self._making: dict[str, asyncio.Task[T]] = {}
 
@@ -147,9 +135,6 @@ class _Kept(Generic[T]):
         finally:
             del self._making[key]
         self._values[key] = value
-        used = sum(map(self._size_of, self._values.values()))
-        for oldest in tuple(self._values)[:-1]:
-            if used <= self._max_bytes:
-                break
-            used -= self._size_of(self._values.pop(oldest))
+        for oldest in tuple(self._values)[: -self._most]:
+            del self._values[oldest]
         return value

@@ -16,6 +16,7 @@ import { openWatched, until } from "./e2e/watched.mjs";
 
 const FRAMES_PER_PHOTO = 25; // of 30 per second: a slow service still sees each
 const STEPS_OF_WALK = 12;
+const MOST_HEIGHT = 1400; // of the report's picture, pixels
 const DESK = { viewport: { width: 1280, height: 800 } };
 const PHONE = {
   ...{ viewport: { width: 390, height: 844 }, deviceScaleFactor: 2 },
@@ -91,21 +92,18 @@ async function takeReport(look, options) {
   const address = pathToFileURL(resolve(given.report)).href;
   const { context, page } = await openWatched(browser, address, options);
   await until(page, () => document.querySelector("canvas"));
-  await page.getByRole("heading", { name: "Coverage", exact: true }).evaluate((heading) => {
-    heading.scrollIntoView();
-  });
-  await take(page, "report", look);
+  // The clip counts from the top of the page, not of the window.
+  const place = await page.locator("main section").first().boundingBox();
+  await take(page, "report", look, { ...place, height: Math.min(place.height, MOST_HEIGHT) });
   await context.close();
 }
 
 /** What is in the window, as WebP: a quarter of PNG's size for clouds of points. */
-async function take(page, view, look) {
+async function take(page, view, look, place = { x: 0, y: 0, ...page.viewportSize() }) {
   await page.waitForTimeout(1500); // the last picture of the view
-  const { width, height } = page.viewportSize();
-  const scale = await page.evaluate(() => devicePixelRatio);
-  const clip = { x: 0, y: 0, width, height, scale };
+  const clip = { ...place, scale: await page.evaluate(() => devicePixelRatio) };
   const session = await page.context().newCDPSession(page);
-  const format = { format: "webp", quality: 75 };
+  const format = { format: "webp", quality: 75, captureBeyondViewport: true };
   const { data } = await session.send("Page.captureScreenshot", { ...format, clip });
   const path = join(given.output, `page-${view}-${look}.webp`);
   await writeFile(path, Buffer.from(data, "base64"));

@@ -10,7 +10,7 @@ import shutil
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Annotated, Any
 
 import typer
@@ -18,13 +18,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from mapping.options import MapArgument, MapsDirOption
+from mapping.options import MapArgument, MapsDirOption, is_map_folder, map_folder
 from mapping.progress import StageProgress
 from mapping.report import make_report_data
+from mapping.report.data import UP_IS_A_GUESS, decimals_of
 from mapping.report.html import report_page
 from mapping.stages import WorkFolder, exclusive
 from mapping.workers import DEFAULT_WORKERS, Workers
-from visloc.archive import Map, MapStore, open_map
+from visloc.archive import Map, open_map
 from visloc.archive.detail import detail_order, packed_points
 from visloc.errors import Conflict
 from visloc_web import report_parts
@@ -61,41 +62,39 @@ def report(
     Writes one HTML file that needs neither network nor server, and says the main points here.
     Photos of the map are localized without themselves; no photo is needed for that.
     """
-    path = Path(map_ref)
-    given_as_folder = (path / "manifest.json").is_file()
-    opened = open_map(path if given_as_folder else MapStore(maps_dir).folder(map_ref))
+    opened = open_map(map_folder(map_ref, maps_dir))
     target = Path(f"{opened.manifest.id}-report.html") if output is None else output
-    command = ["mapping", "report", map_ref]
-    if maps_dir != Path("maps") and not given_as_folder:
-        command += ["--maps-dir", str(maps_dir)]
+    # Beside the report where the map is in no folder of maps.
+    work_dir = target.parent if is_map_folder(map_ref) else maps_dir
     with StageProgress(_err) as progress:
         data = write_report(
-            opened, target, maps_dir, workers=workers, command=command, progress=progress
+            opened, target, work_dir, workers=workers, command=_typed(), progress=progress
         )
     summary = summary_of_report(data) | {"output": str(target)}
     if as_json:
         sys.stdout.write(json.dumps(summary, indent=2) + "\n")
     else:
-        _print_summary(summary, metric=opened.manifest.world.metric)
+        decimals = decimals_of(data["coverage"]["cell"] / 10)
+        _print_summary(summary, metric=opened.manifest.world.metric, decimals=decimals)
 
 
 def write_report(
     opened: Map,
     target: Path,
-    maps_dir: Path,
+    work_dir: Path,
     *,
     workers: int,
-    command: list[str],
+    command: str,
     progress: Callable[[str, int, int], None],
 ) -> dict[str, Any]:
     """Write the report of a map, whole or not at all, and return what it shows.
 
-    Finished runs are kept in ``maps_dir`` until the report is written.
+    Finished runs are kept in ``work_dir`` until the report is written.
 
     Args:
         opened: the map.
         target: the HTML file; one that exists is replaced.
-        maps_dir: where work in progress is kept.
+        work_dir: where work in progress is kept, in ``.report``.
         workers: processes that localize.
         command: how to make it again, for the reader.
         progress: told the stage, how much is done, and how much there is.
@@ -104,38 +103,41 @@ def write_report(
         A ``ReportData`` as ``web/src/report/data.ts`` has it.
 
     Raises:
-        Conflict: ``report.output`` if a folder is there, ``report.running``.
+        Conflict: ``report.output`` or ``report.work`` if nothing can be written there;
+            ``report.running``.
         Unavailable: ``page.not_built``.
     """
-    if target.is_dir():
-        raise Conflict(
-            "report.output",
-            "this is a folder",
-            field="--output",
-            expected="a file, such as room.html",
-            got=target,
-        )
-    script, style = report_parts()  # raises before the long work
-    root = maps_dir / ".report" / opened.manifest.id
+    # What can go wrong at the end is tried before the long work.
+    script, style = report_parts()
+    unfinished = _begun(target)
     with ExitStack() as held:
+        held.callback(unfinished.unlink, missing_ok=True)
+        root = work_dir / ".report" / opened.manifest.id
         try:
             held.enter_context(exclusive(root.with_name(f"{root.name}.lock")))
+            root.mkdir(exist_ok=True)
         except Conflict as error:
             raise Conflict(
                 "report.running", "another report of this map is being made", field=str(root)
             ) from error
+        except OSError as error:
+            raise Conflict(
+                "report.work",
+                "finished work cannot be kept in this folder; give one that can be written",
+                field=str(root.parent),
+                expected="a folder that can be written, of --maps-dir, or of --output for a map "
+                "that is given as a folder",
+                got=error.strerror,
+            ) from error
         with Workers(workers) as pool:
             data = make_report_data(
-                opened,
-                WorkFolder(root),
-                command=shlex.join(command),
-                workers=pool,
-                progress=progress,
+                opened, WorkFolder(root), command=command, workers=pool, progress=progress
             )
         order = detail_order(opened.landmarks)
         points = packed_points(opened, order, 0, MAX_POINTS)
         data["points"] = base64.b64encode(points).decode("ascii")
-        _replace(target, report_page(data, script, style))
+        unfinished.write_text(report_page(data, script, style), "utf-8")
+        unfinished.replace(target)
         shutil.rmtree(root, ignore_errors=True)
     return data
 
@@ -145,6 +147,7 @@ def summary_of_report(data: Mapping[str, Any]) -> dict[str, Any]:
 
     Each photo counts by the run that left out the fewest others. ``likely`` and ``unlikely`` are
     the shares of places and directions with a chance of 90 % and more, and of less than 10 %.
+    ``up`` is ``gravity``, or ``cameras`` where it was guessed from how these were held.
     """
     within = data["coverage"]["within"]
     kindest: dict[int, Mapping[str, Any]] = {}
@@ -162,6 +165,7 @@ def summary_of_report(data: Mapping[str, Any]) -> dict[str, Any]:
     chances = [chance for cell in data["coverage"]["cells"] for chance in cell["probability"]]
     return {
         "map": f"{data['map']['id']}@{data['map']['version']}",
+        "up": data["up"]["source"],
         "within": within,
         "held_out": len(kindest),
         "failed": failed,
@@ -171,18 +175,47 @@ def summary_of_report(data: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _replace(target: Path, page: str) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
+def _begun(target: Path) -> Path:
+    """Make the file, still empty, that is to take the place of the target.
+
+    Raises:
+        Conflict: ``report.output``.
+    """
+    if target.is_dir():
+        raise _no_output(target, "this is a folder", "there is a folder of this name")
     unfinished = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:
-        unfinished.write_text(page, "utf-8")
-        unfinished.replace(target)
-    except BaseException:
-        unfinished.unlink(missing_ok=True)
-        raise
+        target.parent.mkdir(parents=True, exist_ok=True)
+        unfinished.touch()
+    except OSError as error:
+        raise _no_output(
+            target, "the report cannot be written there", str(error.strerror)
+        ) from error
+    return unfinished
 
 
-def _print_summary(summary: Mapping[str, Any], *, metric: bool) -> None:
+def _no_output(target: Path, message: str, why: str) -> Conflict:
+    return Conflict(
+        "report.output",
+        message,
+        field="--output",
+        expected="a file in a folder that can be written, such as room.html",
+        got=f"{target}: {why}",
+    )
+
+
+def _typed() -> str:
+    """The command as it was typed, for whoever gets the file: of paths their last parts only."""
+    options = ("--output=", "--maps-dir=")
+    words = []
+    for word in sys.argv[1:]:
+        option = next((option for option in options if word.startswith(option)), "")
+        value = word.removeprefix(option)
+        words.append(option + (PurePath(value).name or value))
+    return shlex.join(["mapping", *words])
+
+
+def _print_summary(summary: Mapping[str, Any], *, metric: bool, decimals: int) -> None:
     def say(text: str) -> None:
         _out.print(text, markup=False, highlight=False, soft_wrap=True)
 
@@ -207,13 +240,15 @@ def _print_summary(summary: Mapping[str, Any], *, metric: bool) -> None:
             table.add_column(name)
         for spot in summary["weak_spots"]:
             table.add_row(
-                ", ".join(f"{value:.2f}" for value in spot["position"]),
+                ", ".join(f"{value:.{decimals}f}" for value in spot["position"]),
                 _clock(spot["direction_deg"]),
                 f"{spot['probability']:.0%}",
                 escape(spot["why"]),
             )
         _out.print(table, highlight=False)
         say("looking: as a clock on the plan of the report, where 12 is up")
+    if summary["up"] != "gravity":
+        say(f"note: {UP_IS_A_GUESS}")
     say(f"report: {summary['output']}")
 
 

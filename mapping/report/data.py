@@ -25,6 +25,10 @@ from visloc.geometry import Camera
 _MAX_CALIBRATION_BINS, _RUNS_PER_BIN = 10, 10
 # With fewer runs that failed, or succeeded, than this, what tells both apart is a guess.
 _FEW_OUTCOMES = 5
+UP_IS_A_GUESS = (
+    "Up was guessed from how the cameras were held, which is wrong for cameras that look straight "
+    "down and for photos stored on their side. Then state it: build the map with --gravity."
+)
 
 
 def make_report_data(
@@ -58,14 +62,18 @@ def make_report_data(
     spots = find_weak_spots(grid, plan, forecasts, learned.model, within, unit)
     origin = np.array(opened.manifest.world.origin)
     notes = [*opened.manifest.notes, *_doubts(runs, within)]
+    if plan.up_source != "gravity":
+        notes.append(UP_IS_A_GUESS)
+    # Micrometres, and of small worlds as much finer.
+    digits = max(6, decimals_of(viewpoints.reach / 1e5))
     return {
         "map": {**_about(opened), "notes": notes},
         "made_by": {"command": command, "version": __version__},
         "up": {"direction": _numbers(plan.up, 9), "source": plan.up_source},
         "cameras": {name: _camera(camera) for name, camera in opened.cameras.items()},
-        "images": _images(opened, viewpoints, origin),
+        "images": _images(opened, viewpoints, origin, digits),
         "statistics": statistics_of(opened),
-        "held_out": _held_out(runs, learned),
+        "held_out": _held_out(runs, learned, digits),
         "coverage": {
             "within": {"position": within.position, "orientation_deg": within.orientation_deg},
             "cell": grid.side,
@@ -75,10 +83,15 @@ def make_report_data(
             "pitch_deg": round(plan.pitch_deg, 3),
             "camera": _camera(plan.camera),
             "cells": [
-                _cell(position + origin, row)
+                _cell(_numbers(position + origin, digits), row)
                 for position, row in zip(grid.positions, forecasts, strict=True)
             ],
-            "weak_spots": [_weak_spot(spot, grid, forecasts, origin) for spot in spots],
+            "weak_spots": [
+                _weak_spot(
+                    _numbers(grid.positions[spot.cell] + origin, digits), spot, grid, forecasts
+                )
+                for spot in spots
+            ],
             "calibration": calibration_of(runs, learned.probabilities, within),
             "rank_correlation": rank_correlation_of(runs, learned.probabilities),
         },
@@ -115,6 +128,11 @@ def rank_correlation_of(
     from scipy.stats import spearmanr  # takes long to load, and every command loads this module
 
     return round(float(spearmanr(-probabilities, errors).statistic), 4)
+
+
+def decimals_of(step: float) -> int:
+    """Digits after the point that tell numbers apart that differ by a step."""
+    return max(0, -math.floor(math.log10(step)))
 
 
 def _doubts(runs: Sequence[HeldOut], within: Within) -> list[str]:
@@ -154,14 +172,14 @@ def _about(opened: Map) -> dict[str, Any]:
 
 
 def _images(
-    opened: Map, viewpoints: Viewpoints, origin: NDArray[np.float64]
+    opened: Map, viewpoints: Viewpoints, origin: NDArray[np.float64], digits: int
 ) -> list[dict[str, Any]]:
     turned_back = opened.image_poses[:, :4] * (1.0, -1.0, -1.0, -1.0)
     return [
         {
             "name": image.name,
             "camera": image.camera,
-            "position": _numbers(center + origin),
+            "position": _numbers(center + origin, digits),
             "orientation": _numbers(orientation, 9),
         }
         for image, center, orientation in zip(
@@ -170,14 +188,14 @@ def _images(
     ]
 
 
-def _held_out(runs: Sequence[HeldOut], learned: Learned) -> list[dict[str, Any]]:
+def _held_out(runs: Sequence[HeldOut], learned: Learned, digits: int) -> list[dict[str, Any]]:
     return [
         {
             "image": run.image,
             "left_out": len(run.left_out),
             "localized": run.localized,
             "reason": run.reason or None,
-            "position_error": round(run.position_error, 6) if run.localized else None,
+            "position_error": round(run.position_error, digits) if run.localized else None,
             "orientation_error_deg": round(run.orientation_error_deg, 5) if run.localized else None,
             "inliers": run.inliers,
             "expected_inliers": round(float(expected), 1),
@@ -189,10 +207,10 @@ def _held_out(runs: Sequence[HeldOut], learned: Learned) -> list[dict[str, Any]]
     ]
 
 
-def _cell(position: NDArray[np.float64], forecasts: Sequence[Forecast]) -> dict[str, Any]:
+def _cell(position: list[float], forecasts: Sequence[Forecast]) -> dict[str, Any]:
     stds = [forecast.position_std for forecast in forecasts]
     return {
-        "position": _numbers(position),
+        "position": position,
         "probability": [round(forecast.probability, 4) for forecast in forecasts],
         "expected_inliers": [round(f.outlook.expected_inliers, 1) for f in forecasts],
         "position_std": [float(f"{std:.4g}") if math.isfinite(std) else None for std in stds],
@@ -200,13 +218,13 @@ def _cell(position: NDArray[np.float64], forecasts: Sequence[Forecast]) -> dict[
 
 
 def _weak_spot(
+    position: list[float],
     spot: WeakSpot,
     grid: Grid,
     forecasts: Sequence[Sequence[Forecast]],
-    origin: NDArray[np.float64],
 ) -> dict[str, Any]:
     return {
-        "position": _numbers(grid.positions[spot.cell] + origin),
+        "position": position,
         "direction_deg": grid.directions_deg[spot.direction],
         "probability": round(forecasts[spot.cell][spot.direction].probability, 4),
         "why": spot.why,
@@ -222,5 +240,5 @@ def _camera(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _numbers(values: ArrayLike, digits: int = 6) -> list[float]:
+def _numbers(values: ArrayLike, digits: int) -> list[float]:
     return [round(float(value), digits) for value in np.asarray(values)]

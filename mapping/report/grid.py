@@ -149,6 +149,7 @@ def _up(opened: Map, viewpoints: Viewpoints) -> tuple[NDArray[np.float64], str]:
 
     Whoever takes a photo holds it level, but looks up or down as they like: the mean of where the
     pictures have their upper edge leans. It decides which way round, and where all look one way.
+    Of cameras that look straight down, and photos stored on their side, it is wrong.
     """
     if opened.gravity is not None:
         return -opened.gravity, "gravity"
@@ -160,7 +161,7 @@ def _up(opened: Map, viewpoints: Viewpoints) -> tuple[NDArray[np.float64], str]:
     rows = viewpoints.rotations[:, 0]
     tilts = rows.T @ rows / len(rows) + _MEAN_WEIGHT * (np.eye(3) - np.outer(mean, mean))
     up = np.linalg.eigh(tilts)[1][:, 0]
-    return np.asarray(up * np.sign(up @ mean)), "cameras"
+    return np.asarray(up if up @ mean >= 0 else -up), "cameras"
 
 
 def _num_cells(photos: NDArray[np.float64], margin: float, side: float) -> float:

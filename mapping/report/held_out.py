@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from mapping.report.viewpoints import Viewpoints
 from mapping.stages import Item, WorkFolder, key_of
 from mapping.workers import Workers
+from visloc import __version__
 from visloc.archive import Map, open_map
 from visloc.constraints import MapGeometry
 from visloc.evaluation import pose_error
@@ -38,6 +39,7 @@ MAX_PHOTOS = 200
 # How far from the photo others are left out, as ``Viewpoints.apart_from`` counts: nothing but the
 # photo itself, then as if the mapper had walked by further away or not looked there.
 LEAVE_OUT_WITHIN = (0.0, 0.2, 0.4, 0.6, 0.9)
+_COUNTED_PART = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,9 +176,20 @@ def vanishing(opened: Map, left_out: NDArray[np.int64]) -> NDArray[np.int64]:
 
     Those made of matches need two photos that see them, those of a depth map one.
     """
-    least = 1 if opened.manifest.method.name == "rgbd" else 2
     seen = [opened.observations(int(image))[0] for image in left_out]
-    landmarks, counts = np.unique(np.concatenate(seen), return_counts=True)
+    return too_seldom_seen(opened, np.concatenate(seen))
+
+
+def too_seldom_seen(opened: Map, seen: NDArray[np.integer]) -> NDArray[np.int64]:
+    """``vanishing`` of the landmarks (k,) that the photos left out see, each as often."""
+    least = 1 if opened.manifest.method.name == "rgbd" else 2
+    num = len(opened.landmarks)
+    if len(seen) > num // _COUNTED_PART:  # to sort so many takes longer than to count all
+        counts = np.bincount(seen, minlength=num)
+        landmarks = np.flatnonzero(counts)
+        counts = counts[landmarks]
+    else:
+        landmarks, counts = np.unique(seen, return_counts=True)
     remaining = opened.track_lengths[landmarks].astype(np.int64) - counts
     return landmarks[remaining < least].astype(np.int64)
 
@@ -208,6 +221,8 @@ def _key(opened: Map, image: int) -> str:
     return key_of(
         "held-out",
         _REVISION,
+        program=__version__,
+        options=repr(LocalizeOptions()),
         map=opened.manifest.content_hash,
         image=image,
         within=LEAVE_OUT_WITHIN,

@@ -16,7 +16,7 @@ from mapping.report.chance import (
     fit_precision,
     outlook_of,
 )
-from mapping.report.held_out import HeldOut, vanishing
+from mapping.report.held_out import HeldOut, too_seldom_seen
 from mapping.report.places import Places, sample_places
 from mapping.report.rematch import Counted, Rematch, count, fit_rematch
 from mapping.report.sight import Absent, Sight, look_around
@@ -171,7 +171,9 @@ def learn(
 
 def _seen(opened: Map, viewpoints: Viewpoints, places: Places, run: HeldOut) -> _Seen:
     camera = opened.cameras[opened.images[run.image].camera]
-    absent = Absent(run.left_out, vanishing(opened, run.left_out))
+    # Of landmarks that are not drawn, nothing is asked.
+    rows, _ = places.rows(run.left_out)
+    absent = Absent(run.left_out, too_seldom_seen(opened, places.landmarks[rows]))
     sight = look_around(places, viewpoints, viewpoints.pose(run.image), camera, absent)
     matched = places.of_landmark[run.correct]
     matches = np.bincount(matched[matched >= 0], minlength=len(places.points))[sight.places]

@@ -61,7 +61,7 @@ class Absent:
 
     Attributes:
         photos: (k,) int64 rows.
-        landmarks: int64, those that are gone with them.
+        landmarks: int64, those that are gone with them, of the places' landmarks at least.
     """
 
     photos: NDArray[np.int64]

@@ -113,7 +113,8 @@ def _why(
         return "nothing that the map knows is in view"
     reasons = []
     if in_view < _FEW_OF_USUAL * usual:
-        reasons.append(f"only {in_view} places of the map in view, where photos have {usual:.0f}")
+        share = in_view / usual
+        reasons.append(f"in view is only {share:.0%} of what a mapping photo usually has in view")
     # What would be found again if it were seen as the mapping photos saw it?
     expected = model.rematch.expected(sight).sum()
     level, octaves = np.zeros(len(sight)), float(np.median(sight.octaves))

@@ -46,6 +46,11 @@ def chromium() -> str | None:
     return os.environ.get("VISLOC_CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
 
 
+def grouped(count: int) -> str:
+    """As the page and the report write a count."""
+    return f"{count:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
 def missing() -> str:
     """What these tests need and is not here; empty when all is."""
     if chromium() is None:
@@ -177,7 +182,7 @@ def test_the_landmarks_of_a_chosen_map_come(browser: Browser) -> None:
     assert seen["map"]["id"] == "room"
     assert seen["statistics"]["pointsLoaded"] == seen["map"]["landmarks"] > 1000
     assert seen["statistics"]["pointsDrawn"] > 0
-    for fact in (f"{seen['map']['landmarks']:,}", seen["map"]["version"], "sift"):
+    for fact in (grouped(seen["map"]["landmarks"]), seen["map"]["version"], "sift"):
         assert fact in seen["panel"]
 
 
@@ -364,5 +369,5 @@ def test_the_report_of_a_map_needs_nothing_but_its_file(
     assert seen["console"] == seen["violations"] == seen["dialogs"] == []
     assert seen["cells"] > 10
     assert "8 of 8" in seen["shown"] or "100\N{NO-BREAK SPACE}%" in seen["shown"]
-    assert f"{len(opened.landmarks):,} landmarks" in seen["described"]  # the view, in words
+    assert f"{grouped(len(opened.landmarks))} landmarks" in seen["described"]  # the view, in words
     assert seen["faults"] == []

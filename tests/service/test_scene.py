@@ -16,16 +16,19 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from starlette.responses import Response
 
 import service.scenes
+from service.catalog import ServedMap
 from service.key_file import Scope, edited_keys, new_key
+from service.scene_http import _of_version
 from service.scenes import Scenes, _Kept
 from service.schemas import MapImages
 from service.worker import MapFolder
 from tests.service.conftest import Doors
-from visloc.archive import Map, MapStore
+from visloc.archive import Map, MapOutline, MapStore
 from visloc.archive.detail import detail_order, packed_points
-from visloc.errors import MapCorrupt
+from visloc.errors import MapCorrupt, NotFound
 from visloc.geometry import Pose
 
 
@@ -63,16 +66,6 @@ def test_pages_make_up_the_whole_map(doors: Doors, opened: Map) -> None:
 
     whole = packed_points(opened, detail_order(opened.landmarks), 0, 2**31)
     assert b"".join(pages) == whole[48:]
-
-
-def test_an_answer_that_is_packed_in_pieces_is_the_same(
-    doors: Doors, opened: Map, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(service.scenes, "_BLOCK", 64)
-
-    answer = doors.http.get("/maps/room/points", params={"first": 3, "count": 1000})
-
-    assert answer.content == packed_points(opened, detail_order(opened.landmarks), 3, 1000)
 
 
 def test_beyond_the_end_there_are_no_points_and_no_error(doors: Doors, opened: Map) -> None:
@@ -167,7 +160,7 @@ def test_a_version_may_be_kept_for_ever_and_a_map_is_asked_for_again(
     of_map = get(f"/maps/room/{path}")
     of_version = get(f"/maps/room@{opened.manifest.version}/{path}")
 
-    assert of_map.headers["cache-control"] == "no-cache"
+    assert of_map.headers["cache-control"] == "private, no-cache"
     assert of_version.headers["cache-control"] == "private, max-age=31536000, immutable"
     assert of_map.headers["etag"] == of_version.headers["etag"]
     assert of_map.headers["etag"] != get(f"/maps/room/{path}?first=1").headers["etag"]
@@ -177,8 +170,16 @@ def test_a_version_may_be_kept_for_ever_and_a_map_is_asked_for_again(
         again = get(f"/maps/room/{path}", headers={"If-None-Match": given})
         assert (again.status_code, again.content) == (304, b"")
         assert again.headers["etag"] == etag
+        assert again.headers["vary"] == of_map.headers["vary"]
     changed = get(f"/maps/room/{path}", headers={"If-None-Match": '"other"'})
     assert changed.content == of_map.content
+
+
+@pytest.mark.parametrize("path", ["points", "images"])
+def test_what_was_kept_is_no_answer_to_another_key(path: str, doors: Doors, opened: Map) -> None:
+    for ref in ("room", f"room@{opened.manifest.version}"):
+        named = doors.http.get(f"/maps/{ref}/{path}").headers["vary"].lower()
+        assert {"authorization", "x-api-key"} <= set(named.replace(" ", "").split(","))
 
 
 # Who may
@@ -290,37 +291,111 @@ def test_an_order_that_takes_too_long_is_there_the_next_time(
         assert doors.http.get("/maps/room/points").status_code == 200
 
 
-def test_a_version_is_held_while_it_is_opened_and_no_longer(opened: Map) -> None:
-    held: list[bool] = []
+def outline_named(opened: Map, name: str) -> MapOutline:
+    manifest = opened.manifest.model_copy(update={"content_hash": name})
+    return MapOutline(manifest, opened.cameras, opened.rigs)
 
-    class OneMap:
-        reading_now = 0
 
-        @asynccontextmanager
-        async def reading(self, ref: str) -> AsyncIterator[MapFolder]:
-            self.reading_now += 1
-            held.append(True)
-            yield MapFolder(ref, opened.path)
-            self.reading_now -= 1
+class OneMap:
+    """A catalog that gives one folder for everything and counts who has it."""
 
-    async def ask() -> bytes:
-        catalog: Any = OneMap()
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.reading_now = 0
+        self.held = 0
+
+    @asynccontextmanager
+    async def reading(self, ref: str) -> AsyncIterator[MapFolder]:
+        self.reading_now += 1
+        self.held += 1
+        yield MapFolder(ref, self.folder)
+        self.reading_now -= 1
+
+
+def test_a_version_is_held_while_it_is_read_and_no_longer(
+    opened: Map, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    catalog: Any = OneMap(opened.path)
+    scenes = Scenes(catalog)
+
+    def order(landmarks: Any) -> Any:
+        assert catalog.reading_now == 0  # it may take long
+        return detail_order(landmarks)
+
+    monkeypatch.setattr(service.scenes, "detail_order", order)
+    body = asyncio.run(scenes.points(opened, 0, 10))
+    scenes.close()
+
+    assert body == packed_points(opened, detail_order(opened.landmarks), 0, 10)
+    assert (catalog.held, catalog.reading_now) == (2, 0)
+
+
+def test_points_and_photos_never_wait_for_the_order_of_another_map(
+    opened: Map, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    enough = threading.Event()
+    at_once: list[int] = []
+    under_way: list[int] = []
+
+    def slow(landmarks: Any) -> Any:
+        under_way.append(1)
+        at_once.append(len(under_way))
+        enough.wait(20)
+        under_way.pop()
+        return detail_order(landmarks)
+
+    async def use() -> None:
+        catalog: Any = OneMap(opened.path)
         scenes = Scenes(catalog)
-        _, pieces = await scenes.points(opened, 0, 10)
-        assert catalog.reading_now == 0
-        body = b"".join([piece async for piece in pieces])
+        known = await scenes.points(opened, 0, 10)
+        monkeypatch.setattr(service.scenes, "detail_order", slow)
+        large = [
+            asyncio.create_task(scenes.points(outline_named(opened, name), 0, 10))
+            for name in ("large", "larger", "largest")
+        ]
+        async with asyncio.timeout(10):
+            while not at_once:
+                await asyncio.sleep(0.001)
+            assert await scenes.points(opened, 0, 10) == known
+            assert (await scenes.photos(outline_named(opened, "small"))).images == opened.images
+        enough.set()
+        assert await asyncio.gather(*large) == [known] * 3
         scenes.close()
-        return body
 
-    assert asyncio.run(ask()) == packed_points(opened, detail_order(opened.landmarks), 0, 10)
-    assert held == [True]
+    asyncio.run(use())
+    assert at_once == [1, 1, 1]  # and one at a time, which bounds their memory
 
 
-def test_the_last_used_values_are_kept_and_a_large_one_alone() -> None:
+@pytest.mark.parametrize("takes_over", [True, False])
+def test_a_version_that_goes_meanwhile_is_looked_up_once_more(
+    takes_over: bool, opened: Map
+) -> None:
+    versions = ["first", "second" if takes_over else "first"]
+
+    class Replaced:
+        async def map(self, _: str) -> ServedMap:
+            manifest = opened.manifest.model_copy(update={"version": versions.pop(0)})
+            return ServedMap(MapOutline(manifest, {}, {}), True, ())
+
+    async def answer(outline: MapOutline) -> Response:
+        if outline.manifest.version == "first":
+            raise NotFound("map.version", "deleted", field="map")
+        return Response(outline.manifest.version)
+
+    engine: Any = Replaced()
+    if takes_over:
+        assert asyncio.run(_of_version(engine, "room", answer)).body == b"second"
+    else:
+        with pytest.raises(NotFound):
+            asyncio.run(_of_version(engine, "room", answer))
+    assert versions == []
+
+
+def test_the_last_used_values_are_kept_whatever_their_size() -> None:
     made: list[str] = []
 
     async def use() -> None:
-        kept = _Kept[str](10, len)
+        kept = _Kept[str](2)
 
         async def get(key: str, value: str) -> None:
             async def make() -> str:
@@ -329,23 +404,21 @@ def test_the_last_used_values_are_kept_and_a_large_one_alone() -> None:
 
             assert await kept.get(key, make) == value
 
-        for key in "abab":
-            await get(key, "12345")
+        for key in "abab":  # a large one and a small one in turn
+            await get(key, "x" * (1 if key == "a" else 10**6))
         assert made == ["a", "b"]
         await get("c", "12345")  # a was used longest ago
-        await get("b", "12345")
+        await get("b", "x" * 10**6)
         assert made == ["a", "b", "c"]
-        await get("d", "x" * 1000)
-        await get("d", "x" * 1000)
-        await get("b", "12345")
-        assert made == ["a", "b", "c", "d", "b"]
+        await get("a", "x")
+        assert made == ["a", "b", "c", "a"]
 
     asyncio.run(use())
 
 
 def test_a_failure_reaches_all_who_wait_and_is_not_kept() -> None:
     async def use() -> None:
-        kept = _Kept[str](10, len)
+        kept = _Kept[str](10)
         go = asyncio.Event()
 
         async def fail() -> str:

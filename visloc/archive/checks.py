@@ -24,6 +24,9 @@ RecordType = TypeVar("RecordType", bound=BaseModel)
 _MAX_JSON_BYTES = 2**27  # about a million photos; read, it takes some 20 times the memory
 _MAX_MANIFEST_BYTES = 16 * 2**20
 
+# Rows of an array that are read at a time: some hundred kilobytes.
+_BLOCK_ROWS = 16_384
+
 # What follows the name of a model's int8 matrix in the name of the scales of its columns.
 SCALES = ".scales"
 
@@ -177,28 +180,60 @@ def map_array(
         MapCorrupt: ``map.array`` when it is not exactly such an array.
     """
     path = folder / name
+    found, offset, order = _array_header(path, dtype, shape, before)
+    if load:
+        try:
+            values = np.fromfile(path, found, math.prod(shape), offset=offset)
+        except OSError as error:
+            raise _cut_short(path) from error
+        if len(values) < math.prod(shape):
+            raise _cut_short(path)
+        return values.reshape(shape, order=order)
+    return np.memmap(path, found, "r", offset, shape, order)
+
+
+def array_rows(
+    folder: Path, name: str, dtype: str, shape: tuple[int, ...], rows: NDArray[np.integer]
+) -> NDArray[Any]:
+    """Read some rows of one ``.npy`` of a map, without mapping it into memory.
+
+    A file that is cut short while it is mapped ends the process that looks at it (SIGBUS); one
+    that is read is refused. Blocks of the file are read in turn, but for those that hold no row.
+
+    Args:
+        folder: the map.
+        name: the file.
+        dtype: what it holds.
+        shape: its shape.
+        rows: (k,) in any order.
+
+    Raises:
+        MapCorrupt: ``map.array`` when it is not exactly such an array, or ends early.
+    """
+    path = folder / name
+    found, offset, order = _array_header(path, dtype, shape, None)
+    if order == "F" and len(shape) > 1:  # a row is not in one place
+        whole: NDArray[Any] = map_array(folder, name, dtype, shape, load=True)[rows]
+        return whole
+    width = math.prod(shape[1:])
+    by_place = np.argsort(rows)
+    ordered = rows[by_place].astype(np.int64)
+    chosen = np.empty((len(rows), *shape[1:]), found)
     try:
         with path.open("rb") as file:
-            found_shape, fortran, found = read_npy_header(file)
-            offset = file.tell()
-            size = file.seek(0, os.SEEK_END)
-    except (ValueError, OSError) as error:
-        raise MapCorrupt("map.array", "not a NumPy array file", field=str(path)) from error
-    expected = np.dtype(dtype if before is None or found != np.dtype(before) else before)
-    whole = size == offset + math.prod(shape) * expected.itemsize
-    # Before any memory is taken: a header can say anything.
-    if found != expected or found_shape != shape or not whole:
-        raise MapCorrupt(
-            "map.array",
-            "an array of the map is not what the manifest says",
-            field=str(path),
-            expected=f"{expected} of shape {shape}, in a file as long as that",
-            got=f"{found} of shape {found_shape}, in {size} bytes",
-        )
-    order: Literal["C", "F"] = "F" if fortran else "C"
-    if load:
-        return np.fromfile(path, expected, offset=offset).reshape(shape, order=order)
-    return np.memmap(path, expected, "r", offset, shape, order)
+            for block in np.unique(ordered // _BLOCK_ROWS):
+                start = int(block) * _BLOCK_ROWS
+                stop = min(start + _BLOCK_ROWS, shape[0])
+                file.seek(offset + start * width * found.itemsize)
+                data = file.read((stop - start) * width * found.itemsize)
+                if len(data) < (stop - start) * width * found.itemsize:
+                    raise _cut_short(path)
+                first, last = np.searchsorted(ordered, (start, stop))
+                values = np.frombuffer(data, found).reshape(-1, *shape[1:])
+                chosen[by_place[first:last]] = values[ordered[first:last] - start]
+    except OSError as error:
+        raise _cut_short(path) from error
+    return chosen
 
 
 def read_model(folder: Path, name: str) -> dict[str, NDArray[np.float32]]:
@@ -239,6 +274,39 @@ def _widened(values: NDArray[Any], scales: NDArray[Any]) -> NDArray[Any]:
         return values
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused next
         return np.asarray(values * scales)
+
+
+def _array_header(
+    path: Path, dtype: str, shape: tuple[int, ...], before: str | None
+) -> tuple[np.dtype[Any], int, Literal["C", "F"]]:
+    """Check an ``.npy``; return its type, where its numbers begin, and their order."""
+    try:
+        with path.open("rb") as file:
+            found_shape, fortran, found = read_npy_header(file)
+            offset = file.tell()
+            size = file.seek(0, os.SEEK_END)
+    except (ValueError, OSError) as error:
+        raise MapCorrupt("map.array", "not a NumPy array file", field=str(path)) from error
+    expected = np.dtype(dtype if before is None or found != np.dtype(before) else before)
+    whole = size == offset + math.prod(shape) * expected.itemsize
+    # Before any memory is taken: a header can say anything.
+    if found != expected or found_shape != shape or not whole:
+        raise MapCorrupt(
+            "map.array",
+            "an array of the map is not what the manifest says",
+            field=str(path),
+            expected=f"{expected} of shape {shape}, in a file as long as that",
+            got=f"{found} of shape {found_shape}, in {size} bytes",
+        )
+    return expected, offset, "F" if fortran else "C"
+
+
+def _cut_short(path: Path) -> MapCorrupt:
+    return MapCorrupt(
+        "map.array",
+        "an array of the map could not be read to its end; restore or rebuild the map",
+        field=str(path),
+    )
 
 
 def _read_text(path: Path, limit: int, code: str) -> str:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.archive.checks import map_array
+from visloc.archive.checks import array_rows, is_finite, map_array
 from visloc.archive.schema import Manifest
+from visloc.errors import MapCorrupt
 
 MAGIC = b"VLPT"
 FORMAT = 1
@@ -20,17 +20,18 @@ HAS_COLORS = 1
 _HEADER = struct.Struct("<4s5I3d")
 _ROW = np.dtype([("position", "<f4", 3), ("rgb", "u1", 3), ("photos", "u1")])
 HEADER_BYTES, ROW_BYTES = _HEADER.size, _ROW.itemsize
+_LANDMARKS, _COLORS = "landmarks.npy", "landmark_rgb.npy"
 
 # How often cells are halved; the numbers of the finest along three axes fit into 64 bits.
 _LEVELS = 21
 # Of each axis, landmarks that say how large the scene is. What lies outside may be an outlier.
 _INNER_PERCENT = (1, 99)
 _MAX_MEASURED = 1_000_000
-_BLOCK = 1_000_000
+_BLOCK = 250_000
 
 
 class DrawnMap(Protocol):
-    """What is drawn of a map: a ``Map``, or ``MapPoints``."""
+    """What is drawn of a map: of a ``Map``, the landmarks without what localizes."""
 
     @property
     def manifest(self) -> Manifest:
@@ -49,30 +50,41 @@ class DrawnMap(Protocol):
         """(P, 3) RGB; None when the map has none."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MapPoints:
-    """The landmarks of a map without what localizes, memory-mapped; fields as of ``Map``."""
+def read_landmarks(folder: Path, manifest: Manifest) -> NDArray[np.float32]:
+    """Read where the landmarks (P, 3) of a map are, whose manifest was read before.
 
-    manifest: Manifest
-    landmarks: NDArray[np.float32]
-    track_lengths: NDArray[np.uint16]
-    colors: NDArray[np.uint8] | None
+    Raises:
+        MapCorrupt: ``map.array``; ``map.range`` where they are not finite, which no map is that
+            was verified.
+    """
+    landmarks = map_array(folder, _LANDMARKS, "<f4", (manifest.counts.landmarks, 3), load=True)
+    if not is_finite(landmarks):
+        raise MapCorrupt(
+            "map.range", "numbers are out of their range", field=str(folder / _LANDMARKS)
+        )
+    return landmarks
 
 
-def open_points(folder: Path, manifest: Manifest) -> MapPoints:
-    """Open the landmarks of a map, whose manifest was read before.
+def read_points(folder: Path, manifest: Manifest, rows: NDArray[np.uint32], first: int) -> bytes:
+    """Read landmarks of a map as ``GET /maps/{id}/points`` sends them (docs/api.md).
+
+    Nothing of the map is mapped into memory, or kept open.
+
+    Args:
+        folder: the map.
+        manifest: of it, read before.
+        rows: (k,) of the landmarks, in the order in which they are sent.
+        first: place of the first of them in the map's ``detail_order``.
 
     Raises:
         MapCorrupt: ``map.array``.
     """
     num = manifest.counts.landmarks
-    return MapPoints(
-        manifest,
-        map_array(folder, "landmarks.npy", "<f4", (num, 3)),
-        map_array(folder, "landmark_track_length.npy", "<u2", (num,)),
-        map_array(folder, "landmark_rgb.npy", "|u1", (num, 3))
-        if "landmark_rgb.npy" in manifest.files
-        else None,
+    colored = _COLORS in manifest.files
+    return _header(manifest, first, len(rows), colored=colored) + _packed(
+        array_rows(folder, _LANDMARKS, "<f4", (num, 3), rows),
+        array_rows(folder, "landmark_track_length.npy", "<u2", (num,), rows),
+        array_rows(folder, _COLORS, "|u1", (num, 3), rows) if colored else None,
     )
 
 
@@ -93,18 +105,25 @@ def detail_order(landmarks: NDArray[np.float32]) -> NDArray[np.uint32]:
     num = len(landmarks)
     if num == 0:
         return np.zeros(0, np.uint32)
-    shuffled = np.random.default_rng(0).permutation(num).astype(np.uint32)
+    # Maps may be large: what is no longer needed goes at once, and what can be changed in place is.
+    shuffled = np.arange(num, dtype=np.uint32)
+    np.random.default_rng(0).shuffle(shuffled)
     cells = _cells(landmarks)[shuffled]
     # The landmark of a cell is the one that came first in the shuffle. So it is also that of all
     # smaller cells that it is in, and no level takes anything back.
-    by_cell = np.argsort(cells, kind="stable").astype(np.uint32)
-    cells, chosen = cells[by_cell], by_cell
+    chosen = np.argsort(cells, kind="stable").astype(np.uint32)
+    cells = cells[chosen]
     levels = np.full(num, _LEVELS + 1, np.uint8)  # landmarks that share a finest cell come last
     for level in range(_LEVELS, -1, -1):
-        starts = np.flatnonzero(np.r_[True, cells[1:] != cells[:-1]])
+        begins = np.ones(len(cells), np.bool_)
+        np.not_equal(cells[1:], cells[:-1], out=begins[1:])
+        starts = np.flatnonzero(begins)
         chosen = np.minimum.reduceat(chosen, starts)
         levels[chosen] = level
-        cells = cells[starts] >> np.uint64(3)
+        cells = cells[begins]
+        cells >>= np.uint64(3)
+        del begins, starts
+    del cells, chosen
     return shuffled[np.argsort(levels, kind="stable")]
 
 
@@ -118,24 +137,32 @@ def packed_points(opened: DrawnMap, order: NDArray[np.uint32], first: int, count
         count: most landmarks to return.
     """
     rows = order[first : first + count]
-    return point_header(opened, first, len(rows)) + point_rows(opened, rows)
+    colors = opened.colors
+    return _header(opened.manifest, first, len(rows), colored=colors is not None) + _packed(
+        opened.landmarks[rows],
+        opened.track_lengths[rows],
+        None if colors is None else colors[rows],
+    )
 
 
-def point_header(opened: DrawnMap, first: int, count: int) -> bytes:
-    """Return the 48 bytes before ``count`` rows."""
-    flags = 0 if opened.colors is None else HAS_COLORS
-    manifest = opened.manifest
+def _header(manifest: Manifest, first: int, count: int, *, colored: bool) -> bytes:
+    """The 48 bytes before ``count`` rows."""
+    flags = HAS_COLORS if colored else 0
     total = manifest.counts.landmarks
     return _HEADER.pack(MAGIC, FORMAT, total, first, count, flags, *manifest.world.origin)
 
 
-def point_rows(opened: DrawnMap, rows: NDArray[np.uint32]) -> bytes:
-    """Return 16 bytes of each of these landmarks: x, y, z, colour, number of photos."""
-    packed = np.zeros(len(rows), _ROW)
-    packed["position"] = opened.landmarks[rows]
-    if opened.colors is not None:
-        packed["rgb"] = opened.colors[rows]
-    packed["photos"] = np.minimum(opened.track_lengths[rows], 255)
+def _packed(
+    positions: NDArray[np.float32],
+    track_lengths: NDArray[np.uint16],
+    colors: NDArray[np.uint8] | None,
+) -> bytes:
+    """16 bytes of each landmark: x, y, z, colour, number of photos."""
+    packed = np.zeros(len(positions), _ROW)
+    packed["position"] = positions
+    if colors is not None:
+        packed["rgb"] = colors
+    packed["photos"] = np.minimum(track_lengths, 255)
     return packed.tobytes()
 
 

@@ -33,7 +33,10 @@ async function copied(page) {
   for (const name of ["JSON", "curl", "Python"]) {
     await page.getByRole("tab", { name, exact: true }).click();
     await page.getByRole("button", { name: `Copy ${name}` }).click();
-    await page.getByRole("status").filter({ hasText: `${name} copied` }).waitFor();
+    await page
+      .getByRole("status")
+      .filter({ hasText: `${name} copied` })
+      .waitFor();
     texts[name] = await page.evaluate(() => navigator.clipboard.readText());
   }
   return texts;

@@ -104,6 +104,17 @@ export class ServiceError extends Error {
   }
 }
 
+/** An error that the page itself found, or why no answer of the service came: status 0. */
+export function ownError(
+  code: string,
+  title: string,
+  detail: string,
+  more: Partial<Pick<Problem, "field" | "expected" | "got">> = {},
+): ServiceError {
+  const nothing = { field: null, expected: null, got: null, request_id: "" };
+  return new ServiceError({ ...nothing, title, status: 0, detail, code, ...more });
+}
+
 /** A photo to localize. `name` is the file's, for people; `map` is an id or `id@version`. */
 export interface LocalizeCall {
   map: string;
@@ -157,9 +168,20 @@ export function connect(base: URL, key: () => string | null): Service {
     return response;
   }
 
-  async function readJson<Answer>(path: string, init: RequestInit): Promise<Answer> {
+  /** Ask for JSON that has `members`, those that everything else is read after. */
+  async function readJson<Answer>(
+    path: string,
+    what: string,
+    members: (keyof Answer)[],
+    init: RequestInit,
+  ): Promise<Answer> {
     const response = await ask(path, init);
-    return whole(init.signal, () => response.json() as Promise<Answer>);
+    const answer = await whole(init.signal, () => response.json() as Promise<Answer | null>);
+    const known = typeof answer === "object" && answer !== null;
+    if (!known || members.some((member) => answer[member] == null)) {
+      throw noAnswer("server.answer", `this is not ${what}`, JSON.stringify(answer));
+    }
+    return answer;
   }
 
   const withSignal = (signal?: AbortSignal): RequestInit =>
@@ -167,23 +189,41 @@ export function connect(base: URL, key: () => string | null): Service {
   const mapPath = (ref: string): string => `maps/${encodeURIComponent(ref)}`;
 
   return {
-    async maps(signal) {
-      const answer = await readJson<{ maps?: MapInfo[] } | null>("maps", withSignal(signal));
-      if (!Array.isArray(answer?.maps)) {
-        throw noAnswer("server.answer", "this is not the list of maps", JSON.stringify(answer));
-      }
-      return answer.maps;
-    },
-    map: (ref, signal) => readJson(mapPath(ref), withSignal(signal)),
+    maps: async (signal) =>
+      (
+        await readJson<{ maps: MapInfo[] }>(
+          "maps",
+          "the list of maps",
+          ["maps"],
+          withSignal(signal),
+        )
+      ).maps,
+    map: (ref, signal) =>
+      readJson(
+        mapPath(ref),
+        "a map",
+        ["id", "version", "extent", "down", "versions", "global_features"],
+        withSignal(signal),
+      ),
     async points(ref, first, count, signal) {
       const path = `${mapPath(ref)}/points?first=${first}&count=${count}`;
       const response = await ask(path, withSignal(signal));
       return whole(signal, () => response.arrayBuffer());
     },
     images: (ref, first, count, signal) =>
-      readJson(`${mapPath(ref)}/images?first=${first}&count=${count}`, withSignal(signal)),
+      readJson(
+        `${mapPath(ref)}/images?first=${first}&count=${count}`,
+        "the list of a map's photos",
+        ["images", "cameras", "total"],
+        withSignal(signal),
+      ),
     localize: (call, signal) =>
-      readJson("localize", { ...withSignal(signal), method: "POST", body: localizeForm(call) }),
+      readJson(
+        "localize",
+        "the answer to a photo",
+        ["status", "camera", "orientation", "retrieved", "map", "seconds"],
+        { ...withSignal(signal), method: "POST", body: localizeForm(call) },
+      ),
   };
 }
 
@@ -214,7 +254,8 @@ async function whole<Body>(
 
 async function serviceError(response: Response): Promise<ServiceError> {
   const retryAfter = Number.parseFloat(response.headers.get("Retry-After") ?? "");
-  const seconds = Number.isFinite(retryAfter) ? retryAfter : null;
+  // A service that says "at once" is not to be flooded, and timers hold no more than some weeks.
+  const seconds = Number.isFinite(retryAfter) ? Math.min(Math.max(retryAfter, 0.5), 3600) : null;
   const said: unknown = await response.json().catch(() => null);
   return new ServiceError(problemOf(said, response), seconds);
 }
@@ -235,6 +276,5 @@ function problemOf(said: unknown, response: Response): Problem {
 }
 
 function noAnswer(code: string, detail: string, got: string): ServiceError {
-  const problem = { title: "No answer", status: 0, detail, code, field: null, expected: null };
-  return new ServiceError({ ...problem, got: got.slice(0, 200), request_id: "" });
+  return ownError(code, "No answer", detail, { got: got.slice(0, 200) });
 }

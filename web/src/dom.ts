@@ -27,6 +27,11 @@ export function button(
   return made;
 }
 
+/** A control, which has an id, below its name. */
+export function field(name: string, control: HTMLElement): HTMLDivElement {
+  return element("div", { class: "field" }, element("label", { for: control.id }, name), control);
+}
+
 /** Names and their values. */
 export function facts(rows: [name: string, value: Child][]): HTMLDListElement {
   const list = element("dl", { class: "facts" });

@@ -245,8 +245,8 @@ export function niceLength(most: number): number {
 }
 
 /** A length in words: metres in their usual units, or units of a world without scale. */
-export function lengthText(value: number, metric: boolean): string {
-  const text = (v: number): string => String(Number(v.toPrecision(3)));
+export function lengthText(value: number, metric: boolean, significant = 3): string {
+  const text = (v: number): string => String(Number(v.toPrecision(significant)));
   if (!metric) return value === 1 ? "1 unit" : `${text(value)} units`;
   if (value >= 1000) return `${text(value / 1000)} km`;
   if (value >= 1) return `${text(value)} m`;

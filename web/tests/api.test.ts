@@ -39,9 +39,9 @@ describe("asking", () => {
     const asked = answering(() => json({ maps: [] }));
     const service = connect(BASE, () => null);
     await service.maps();
-    await service.map("kitchen@1");
+    await failure(service.map("kitchen@1"));
     await service.points("../../evil?x#y", 5, 10);
-    await service.images("kitchen", 0, 1000);
+    await failure(service.images("kitchen", 0, 1000));
     expect(asked.map(({ url }) => url)).toEqual([
       "https://maps.example.org/visloc/maps",
       "https://maps.example.org/visloc/maps/kitchen%401",
@@ -93,8 +93,12 @@ describe("the form of a photo", () => {
   });
 
   test("is posted", async () => {
-    const asked = answering(() => json({ status: "not_localized" }));
-    await connect(BASE, () => null).localize(CALL);
+    const answer = {
+      ...{ status: "not_localized", camera: {}, orientation: {}, retrieved: [], map: {} },
+      ...{ seconds: {} },
+    };
+    const asked = answering(() => json(answer));
+    expect(await connect(BASE, () => null).localize(CALL)).toEqual(answer);
     expect(asked[0]!.method).toBe("POST");
     expect(asked[0]!.headers.get("Content-Type")).toMatch(/^multipart\/form-data/);
   });
@@ -134,12 +138,31 @@ describe("errors", () => {
   });
 
   test.each([
+    ["0", 0.5],
+    ["-3", 0.5],
+    ["99999999", 3600],
+    ["Wed, 21 Oct 2026 07:28:00 GMT", null],
+  ])("that ask to wait %s are waited after for %s s", async (asked, seconds) => {
+    answering(() => json({}, { status: 429, headers: { "Retry-After": asked } }));
+    expect((await failure(connect(BASE, () => null).maps())).retryAfterSeconds).toBe(seconds);
+  });
+
+  describe.each([
     ["no JSON", () => new Response("<h1>Sign in</h1>")],
-    ["another JSON", () => json({ hello: 1 })],
+    ["another JSON", () => json({ hello: 1, status: "ok" })],
+    ["a number", () => json(7)],
     ["null", () => json(null)],
-  ])("an answer that is %s is none", async (_, respond) => {
-    answering(respond);
-    expect((await failure(connect(BASE, () => null).maps())).problem.code).toBe("server.answer");
+  ])("an answer that is %s is none", (_, respond) => {
+    const service = connect(BASE, () => null);
+    test.each([
+      ["maps", () => service.maps()],
+      ["map", () => service.map("kitchen")],
+      ["images", () => service.images("kitchen", 0, 10)],
+      ["localize", () => service.localize(CALL)],
+    ])("to %s", async (_, call) => {
+      answering(respond);
+      expect((await failure(call())).problem.code).toBe("server.answer");
+    });
   });
 
   test("a service that is not there is unreachable", async () => {

@@ -1,6 +1,6 @@
 // The logic of live mode, without a camera and without a page.
 import { describe, expect, it, vi } from "vitest";
-import { ServiceError, type LocalizeResponse, type Problem } from "../src/api";
+import { ownError, ServiceError, type LocalizeResponse, type Problem } from "../src/api";
 import {
   FocalEstimates,
   cameraOfFieldOfView,
@@ -25,8 +25,9 @@ import { Trail } from "../src/page/live_trail";
 const WIDE = { width: 1280, height: 720 };
 
 function serviceError(status: number, wait: number | null = null): ServiceError {
+  const code = status === 0 ? "server.unreachable" : "some.code";
   const problem: Problem = {
-    ...{ title: "", status, detail: "the detail", code: "some.code", request_id: "" },
+    ...{ title: "", status, detail: "the detail", code, request_id: "" },
     ...{ field: "camera", expected: "three numbers", got: "two" },
   };
   return new ServiceError(problem, wait);
@@ -80,16 +81,30 @@ describe("the camera of a frame", () => {
 
   it("is the typed one where that has the shape of the frame, else unknown, and says so", () => {
     const typed = cameraOfFieldOfView(60, { width: 4032, height: 3024 });
-    expect(chooseCamera({ width: 640, height: 480 }, typed, null).camera).toBe(typed);
-    const other = chooseCamera({ width: 640, height: 360 }, typed, null);
+    expect(chooseCamera({ width: 640, height: 480 }, () => typed, null).camera).toBe(typed);
+    const other = chooseCamera({ width: 640, height: 360 }, () => typed, null);
     expect(other.camera).toBeNull();
     expect(other.message).toContain("4032 × 3024, frames have 640 × 360");
-    expect(chooseCamera(WIDE, null, null).camera).toBeNull();
+    expect(chooseCamera(WIDE, () => null, null).camera).toBeNull();
+  });
+
+  it("says of a typed one that is not complete what is wrong, where it would count", () => {
+    const incomplete = () => {
+      throw ownError("camera.text", "", "the camera's width is missing");
+    };
+    const { camera, message } = chooseCamera(WIDE, incomplete, null);
+    expect(camera).toBeNull();
+    expect(message).toContain("the camera's width is missing");
+    expect(chooseCamera(WIDE, incomplete, 60).message).toContain("60.0°");
+    const mistake = () => {
+      throw new TypeError("a mistake");
+    };
+    expect(() => chooseCamera(WIDE, mistake, null)).toThrow("a mistake");
   });
 
   it("is that of the field of view when both are given", () => {
     const typed = cameraOfFieldOfView(60, WIDE);
-    expect(chooseCamera(WIDE, typed, 90).camera?.params[0]).toBeCloseTo(640, 9);
+    expect(chooseCamera(WIDE, () => typed, 90).camera?.params[0]).toBeCloseTo(640, 9);
   });
 
   it("is proposed from the median of what the service estimated, in any frame size", () => {

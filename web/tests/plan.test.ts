@@ -1,11 +1,10 @@
 import { describe, expect, test } from "vitest";
 import type { Vector3 } from "../src/api";
-import { apply, rotationMatrix } from "../src/geometry";
+import { apply, rotationMatrix, viewingDirection } from "../src/geometry";
 import {
   directionOf,
   headingOf,
   headingsApart,
-  looksAlong,
   nearestDirection,
   onPlan,
   orientationOf,
@@ -76,7 +75,7 @@ describe("a camera of the coverage", () => {
         const down = -direction.reduce((sum, value, axis) => sum + value * up[axis]!, 0);
         expect(down).toBeCloseTo(Math.sin((10 * Math.PI) / 180), 12);
         expect(headingsApart(headingOf(axes, direction)!, heading)).toBeCloseTo(0, 9);
-        expectClose(looksAlong(orientationOf(coverage, heading)), direction);
+        expectClose(viewingDirection(orientationOf(coverage, heading)), direction);
       }
     });
 

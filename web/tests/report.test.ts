@@ -7,7 +7,6 @@ import {
   byLeftOut,
   classOfChance,
   clock,
-  count,
   kindestRuns,
   length,
   percent,
@@ -63,11 +62,6 @@ describe("numbers in words", () => {
     expect(length(0.01234, true)).toBe("1.2 cm");
     expect(length(12.34, true)).toBe("12 m");
     expect(length(0.5, false)).toBe("0.5 units");
-  });
-
-  test("numbers are grouped by threes", () => {
-    expect(count(999)).toBe("999");
-    expect(count(1234567)).toBe("1\u202f234\u202f567");
   });
 
   test("directions are hours of a clock, twelve being up on the plan", () => {

@@ -207,7 +207,10 @@ test("the JSON is the answer without its matches, lists of numbers on a line", (
   const answer = {
     status: "localized",
     pose: { position: [0.25, -1, 3e-7] },
-    retrieved: [{ image: "[ 1,\n 2 ].jpg", score: 1 }],
+    retrieved: [
+      { image: "[ 1,\n 2 ].jpg", score: 1 },
+      { image: 'a[ 1,  2 ]"[ 3,  4 ]\\.jpg', score: 1 },
+    ],
     debug: { keypoints: [1, 2], points: [], inliers: [true], overlay: "AAAA" },
   } as unknown as LocalizeResponse;
   const text = answerJson(answer);

@@ -1,7 +1,11 @@
 from __future__ import annotations
 
+import os
+import shutil
 import struct
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,17 +15,16 @@ from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from visloc.archive import Map, MapOutline, MapStore, open_map, read_outline
+from visloc.archive import Map, MapOutline, MapStore, checks, open_map, read_outline
 from visloc.archive.detail import (
     _LEVELS,
     HEADER_BYTES,
     ROW_BYTES,
-    DrawnMap,
-    MapPoints,
     _cells,
     detail_order,
-    open_points,
     packed_points,
+    read_landmarks,
+    read_points,
 )
 from visloc.archive.photos import read_photos
 from visloc.errors import MapCorrupt
@@ -175,14 +178,14 @@ def test_a_map_may_have_colours_and_landmarks_that_many_photos_see(opened: Map) 
     lengths = np.full(num, 300, np.uint16)
     lengths[0] = 254
     for colors in (rgb, None):
-        drawn: DrawnMap = MapPoints(opened.manifest, opened.landmarks, lengths, colors)
+        drawn = replace(opened, track_lengths=lengths, colors=colors)
         head, rows = parsed(packed_points(drawn, np.arange(num, dtype=np.uint32), 0, 3))
         assert head[5] == (colors is not None)
         assert rows["photos"].tolist() == [254, 255, 255]
         np.testing.assert_array_equal(rows["rgb"], rgb[:3] if colors is not None else 0)
 
 
-# Opening without what localizes
+# Reading without what localizes
 
 
 @pytest.fixture
@@ -195,12 +198,41 @@ def outline(folder: Path) -> MapOutline:
     return read_outline(folder)
 
 
-def test_the_points_are_those_of_the_open_map(folder: Path, outline: MapOutline) -> None:
-    points, opened = open_points(folder, outline.manifest), open_map(folder)
+@pytest.mark.parametrize("block", [1, 7, 1000, 10**6])
+def test_rows_that_are_read_are_those_of_the_open_map(
+    block: int, folder: Path, outline: MapOutline, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checks, "_BLOCK_ROWS", block)
+    opened = open_map(folder)
+    order = detail_order(read_landmarks(folder, outline.manifest))
 
-    np.testing.assert_array_equal(points.landmarks, opened.landmarks)
-    np.testing.assert_array_equal(points.track_lengths, opened.track_lengths)
-    assert (points.colors is None) == (opened.colors is None)
+    for first, count in ((0, 20), (3, 400), (len(order) - 1, 5), (len(order), 5)):
+        read = read_points(folder, outline.manifest, order[first : first + count], first)
+        assert read == packed_points(opened, order, first, count)
+
+
+def test_colours_are_read_with_the_rest(tmp_path: Path, opened: Map) -> None:
+    num = opened.manifest.counts.landmarks
+    colors = np.arange(num * 3).reshape(num, 3).astype(np.uint8)
+    for name in ("landmarks.npy", "landmark_track_length.npy"):
+        shutil.copy(opened.path / name, tmp_path)
+    np.save(tmp_path / "landmark_rgb.npy", colors)
+    files = opened.manifest.files | {"landmark_rgb.npy": opened.manifest.files["landmarks.npy"]}
+    manifest = opened.manifest.model_copy(update={"files": files})
+    order = detail_order(opened.landmarks)
+
+    read = read_points(tmp_path, manifest, order[5:25], 5)
+
+    assert read == packed_points(replace(opened, colors=colors), order, 5, 20)
+
+
+def test_arrays_in_column_order_are_read_as_well(folder: Path, outline: MapOutline) -> None:
+    opened = open_map(folder)
+    order = detail_order(opened.landmarks)
+    expected = packed_points(opened, order, 0, 50)
+    np.save(folder / "landmarks.npy", np.asfortranarray(opened.landmarks))
+
+    assert read_points(folder, outline.manifest, order[:50], 0) == expected
 
 
 def test_photos_are_where_they_were_taken(folder: Path, outline: MapOutline) -> None:
@@ -223,8 +255,44 @@ def test_points_that_are_cut_short_are_refused(
     (folder / name).write_bytes((folder / name).read_bytes()[:-4])
 
     with pytest.raises(MapCorrupt) as caught:
-        open_points(folder, outline.manifest)
+        read_points(folder, outline.manifest, np.arange(3, dtype=np.uint32), 0)
     assert caught.value.code == "map.array"
+
+
+def test_a_file_that_is_cut_short_while_it_is_read_is_refused(
+    folder: Path, outline: MapOutline, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As by a copy in place. Mapped into memory, it would end the process.
+    header = checks._array_header
+
+    def cut_after_the_check(path: Path, *about: Any) -> Any:
+        found = header(path, *about)
+        os.truncate(path, 4096)
+        return found
+
+    rows = np.arange(outline.manifest.counts.landmarks, dtype=np.uint32)
+    monkeypatch.setattr(checks, "_array_header", cut_after_the_check)
+    for read in (
+        lambda: read_points(folder, outline.manifest, rows, 0),
+        lambda: read_landmarks(folder, outline.manifest),
+    ):
+        with pytest.raises(MapCorrupt) as caught:
+            read()
+        assert caught.value.code == "map.array"
+        assert str(caught.value.field).endswith("landmarks.npy")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_landmarks_that_are_nowhere_are_refused(
+    value: float, folder: Path, outline: MapOutline
+) -> None:
+    landmarks = np.load(folder / "landmarks.npy")
+    landmarks[3, 1] = value
+    np.save(folder / "landmarks.npy", landmarks)
+
+    with pytest.raises(MapCorrupt) as caught:
+        read_landmarks(folder, outline.manifest)
+    assert caught.value.code == "map.range"
 
 
 @pytest.mark.parametrize(

@@ -1,19 +1,23 @@
 // The answer to a photo: a pose, or how far the photo came and what to try.
 import type { LocalizeResponse, PoseEstimate } from "../api";
 import { button, element, facts } from "../dom";
-import { ellipsoid95, lengthText, positionCovariance, REACH_95 } from "../geometry";
-import { textsToCopy } from "./copying";
+import { ellipsoid95, lengthText, REACH_95 } from "../geometry";
+import { copyText, textsToCopy } from "./copying";
 import type { Entry } from "./photo_queue";
 import { photoPicture } from "./photo_picture";
 import { advice, outcomes, STAGES } from "./refusals";
+import { covarianceOfPosition } from "./shown_pose";
 import { answerJson, curlLine, pythonLines, type Question } from "./snippets";
-import { CAMERA_SOURCES, countText, digits, positionStd, secondsText } from "./words";
+import { CAMERA_SOURCES, countText, digits, positionStd, secondsText } from "../words";
 
 const IN_FOLDER = "To be run in the folder of the photo.";
 
 export interface AnswerActions {
   metric: boolean;
+  options: Record<string, string | number>;
   question: Question;
+  /** Choose the map that the answer is of; null when it is the one that is shown. */
+  chooseMap: (() => void) | null;
   announce(text: string): void;
   /** Let these mapping photos stand out; null is those of the answer. */
   highlight(image: string | null): void;
@@ -30,7 +34,8 @@ export function answerView(
   return element(
     "div",
     { class: "stack answer" },
-    pose === null ? refused(answer) : localized(answer, pose, actions.metric),
+    ...(actions.chooseMap === null ? [] : [ofAnotherMap(answer, actions.chooseMap)]),
+    pose === null ? refused(answer, actions.options) : localized(answer, pose, actions.metric),
     photoPicture(entry.photo, answer),
     ...(pose === null ? [] : [poseTable(pose, actions.metric)]),
     section(
@@ -40,7 +45,10 @@ export function answerView(
         ["Matches", `${countText(answer.correspondences)} with landmarks`],
         ["Inliers", `${countText(answer.inliers)}, ${percent(answer)} of the matches`],
         ["Camera", cameraWords(answer, actions)],
+        ...orientationWords(answer),
         ["Map", answer.map.id],
+        ["Version", answer.map.version],
+        ["Request", requestWords(answer.request_id, actions.announce)],
       ]),
     ),
     section("Time", timeBar(answer, entry.seconds)),
@@ -50,7 +58,7 @@ export function answerView(
       "Take along",
       textsToCopy(
         [
-          { name: "JSON", text: answerJson(answer), note: "The answer to the lines of curl." },
+          { name: "JSON", text: answerJson(answer), note: "What the line of curl answers." },
           { name: "curl", text: curlLine(actions.question), note: IN_FOLDER },
           { name: "Python", text: pythonLines(actions.question), note: IN_FOLDER },
         ],
@@ -58,6 +66,19 @@ export function answerView(
       ),
     ),
     element("div", { class: "row" }, button("Ask again", actions.again)),
+  );
+}
+
+function ofAnotherMap({ map }: LocalizeResponse, choose: () => void): HTMLElement {
+  return element(
+    "div",
+    { class: "note stack near" },
+    element(
+      "p",
+      {},
+      `This is an answer of ${map.id}, version ${map.version}: not of what is shown.`,
+    ),
+    element("div", { class: "row" }, button("Show that map", choose)),
   );
 }
 
@@ -69,13 +90,7 @@ export function inShort(answer: LocalizeResponse): string {
 }
 
 function localized(answer: LocalizeResponse, pose: PoseEstimate, metric: boolean): HTMLElement {
-  const { rotation_wxyz: rotation, translation } = pose.cam_from_world;
-  const covariance = positionCovariance(
-    rotation as [number, number, number, number],
-    translation as [number, number, number],
-    pose.covariance,
-  );
-  const std = ellipsoid95(covariance).halfAxes[0] / REACH_95;
+  const std = ellipsoid95(covarianceOfPosition(pose)).halfAxes[0] / REACH_95;
   return element(
     "div",
     { class: "verdict good" },
@@ -83,13 +98,14 @@ function localized(answer: LocalizeResponse, pose: PoseEstimate, metric: boolean
     element(
       "p",
       {},
-      `${percent(answer)} of the matches agree on a place, ±${lengthText(std, metric)} (one standard deviation).`,
+      `${percent(answer)} of the matches agree on a place. Their scatter leaves ±${lengthText(std, metric, 2)} ` +
+        "open (one standard deviation); errors of the map itself come on top.",
     ),
   );
 }
 
-function refused(answer: LocalizeResponse): HTMLElement {
-  const { meaning, tries } = advice(answer);
+function refused(answer: LocalizeResponse, options: Record<string, string | number>): HTMLElement {
+  const { meaning, tries } = advice(answer, options);
   const states = outcomes(answer);
   const said = { passed: "passed", stopped: "stopped here", not_reached: "not reached" };
   const steps = STAGES.map(([, name, what], i) =>
@@ -153,7 +169,7 @@ function poseTable(pose: PoseEstimate, metric: boolean): HTMLElement {
           pose.position.map((value) => value.toFixed(3)),
         ),
         row(
-          "Its std",
+          "Position’s std",
           metric ? "cm" : unit,
           pose.position_std.map((std) => positionStd(std, metric)),
         ),
@@ -191,6 +207,29 @@ function cameraWords(answer: LocalizeResponse, actions: AnswerActions): HTMLElem
   );
 }
 
+/** Of a photo that is stored turned: how it was read. */
+function orientationWords({ orientation }: LocalizeResponse): [string, string][] {
+  const { exif, read_as } = orientation;
+  if (exif === 1) return [];
+  return [
+    [
+      "Orientation",
+      `stored turned (EXIF ${exif}), read ${read_as === "upright" ? read_as : "as stored"}`,
+    ],
+  ];
+}
+
+/** The number that the service's log knows the request by. */
+function requestWords(id: string, announce: (text: string) => void): HTMLElement {
+  const shown = element("span", { class: "name" }, id);
+  const copy = button("Copy", () => void copied(), { class: "link", "aria-label": "Copy request" });
+  const copied = async (): Promise<void> => {
+    const done = await copyText(id, shown);
+    announce(done ? "Request copied" : "Request selected: copy it with the keyboard");
+  };
+  return element("div", { class: "request" }, shown, " ", copy);
+}
+
 // In their order; others are kept as they are named.
 const STAGE_NAMES: Readonly<Record<string, string>> = {
   queued: "waiting",
@@ -208,11 +247,12 @@ function timeBar(answer: LocalizeResponse, whole: number | null): HTMLElement {
   const total = all.reduce((sum, [, seconds]) => sum + seconds, 0);
   // What takes less than a hundredth is in the sum only.
   const parts = all.filter(([, seconds]) => seconds >= total / 100);
+  const drawn = parts.reduce((sum, [, seconds]) => sum + seconds, 0);
   const bar = element("div", { class: "parts", "aria-hidden": "true" });
   const legend = element("ul", { class: "parts-legend" });
   for (const [i, [stage, seconds]] of parts.entries()) {
     const part = element("span", { class: `part-${(i % 6) + 1}` });
-    part.style.flexGrow = String(seconds);
+    part.style.flexGrow = String(seconds / drawn); // less than 1 in all would leave room empty
     bar.append(part);
     legend.append(
       element(

@@ -1,10 +1,11 @@
 // The camera of a photo: told by its EXIF, or typed.
 import { cameraText, type Camera } from "../api";
-import { element } from "../dom";
+import { element, field } from "../dom";
 import {
   CAMERA_MODELS,
   cameraFaults,
   cameraOf,
+  textFaultOf,
   typedCamera,
   type TypedCamera,
 } from "./camera_models";
@@ -35,6 +36,8 @@ export function createCameraForm(): CameraForm {
     ...{ id: "camera-text", type: "text", spellcheck: "false", autocomplete: "off" },
     placeholder: "PINHOLE,640,480,525,525,320,240",
   });
+  const textFault = element("p", { id: "camera-text-fault", class: "small", role: "alert" });
+  text.setAttribute("aria-describedby", textFault.id);
   const keep = element("input", { type: "checkbox", checked: true });
   const summary = element("span", { class: "quiet" });
   let fields: { field: HTMLElement; input: HTMLInputElement }[] = [];
@@ -42,13 +45,9 @@ export function createCameraForm(): CameraForm {
   const form = element(
     "div",
     { class: "stack", hidden: true },
-    element(
-      "div",
-      { class: "field" },
-      element("label", { for: "camera-text" }, "As text, if you have it so"),
-      text,
-    ),
-    element("div", { class: "field" }, element("label", { for: "camera-model" }, "Model"), model),
+    field("As text, if you have it so", text),
+    textFault,
+    field("Model", model),
     element("div", { class: "fields" }, width.field, height.field),
     params,
     element("label", { class: "check" }, keep, "Keep for the next photos"),
@@ -113,12 +112,19 @@ export function createCameraForm(): CameraForm {
     else summary.textContent = cameraText(cameraOf(typed()));
     if (faults.length === 0 && document.activeElement !== text) {
       text.value = cameraText(cameraOf(typed()));
+      sayTextFault("");
     }
+  }
+
+  function sayTextFault(fault: string): void {
+    text.setAttribute("aria-invalid", String(fault !== ""));
+    textFault.textContent = fault;
+    textFault.hidden = fault === "";
   }
 
   text.addEventListener("input", () => {
     const read = typedCamera(text.value);
-    text.setAttribute("aria-invalid", String(text.value.trim() !== "" && read === null));
+    sayTextFault(read === null ? textFaultOf(text.value) : "");
     if (read !== null) show(read);
     changed();
   });
@@ -160,6 +166,5 @@ export function createCameraForm(): CameraForm {
 function numberField(name: string, inputmode: "numeric" | "decimal") {
   const id = `camera-${name}`;
   const input = element("input", { id, name, type: "text", inputmode, autocomplete: "off" });
-  const field = element("div", { class: "field" }, element("label", { for: id }, name), input);
-  return { field, input };
+  return { field: field(name, input), input };
 }

@@ -1,5 +1,5 @@
 // COLMAP's camera models, and a camera as text (docs/conventions.md, "Cameras").
-import { ServiceError, type Camera } from "../api";
+import { ownError, type Camera } from "../api";
 
 /** Names of the parameters, in COLMAP's order. */
 export const CAMERA_MODELS: Readonly<Record<string, readonly string[]>> = {
@@ -45,15 +45,10 @@ export function cameraFaults(typed: TypedCamera): { field: string; fault: string
 export function cameraOf(typed: TypedCamera): Camera {
   const [first] = cameraFaults(typed);
   if (first !== undefined) {
-    throw new ServiceError({
-      title: "The camera is not complete",
-      status: 0,
-      detail: `the camera's ${first.field} is missing or wrong`,
-      code: "camera.param_value",
+    const detail = `the camera's ${first.field} is missing or wrong`;
+    throw ownError("camera.param_value", "The camera is not complete", detail, {
       field: `camera.${first.field}`,
       expected: first.fault,
-      got: null,
-      request_id: "",
     });
   }
   const params = (CAMERA_MODELS[typed.model] ?? []).map((_, i) => numberOf(typed.params[i] ?? ""));
@@ -67,16 +62,29 @@ export function cameraOf(typed: TypedCamera): Camera {
 
 /** Read `MODEL,width,height,params...`, also with spaces; null when it is not that. */
 export function typedCamera(text: string): TypedCamera | null {
+  return text.trim() !== "" && textFaultOf(text) === "" ? splitCamera(text) : null;
+}
+
+/** Why this text is no camera; empty where it is one, or nothing was typed. */
+export function textFaultOf(text: string): string {
+  if (text.trim() === "") return "";
+  const typed = splitCamera(text);
+  const names = Object.hasOwn(CAMERA_MODELS, typed.model) ? CAMERA_MODELS[typed.model] : undefined;
+  if (names === undefined) return `No camera model: ${typed.model}.`;
+  const numbers = ["width", "height", ...names];
+  const got = [typed.width, typed.height, ...typed.params].filter((word) => word !== "").length;
+  if (got !== numbers.length) {
+    return `${typed.model} takes ${numbers.length} numbers, ${numbers.join(", ")}: here are ${got}.`;
+  }
+  const [first] = cameraFaults(typed);
+  return first === undefined ? "" : `${first.field}: expected ${first.fault}.`;
+}
+
+function splitCamera(text: string): TypedCamera {
   const [model = "", width = "", height = "", ...params] = text
-    .trim()
     .split(/[\s,]+/)
     .filter((word) => word !== "");
-  const names = Object.hasOwn(CAMERA_MODELS, model.toUpperCase())
-    ? CAMERA_MODELS[model.toUpperCase()]
-    : undefined;
-  if (names === undefined || params.length !== names.length) return null;
-  const typed = { model: model.toUpperCase(), width, height, params };
-  return cameraFaults(typed).length === 0 ? typed : null;
+  return { model: model.toUpperCase(), width, height, params };
 }
 
 /** Words that are no numbers, the empty one too, are NaN. A comma may mark the decimals. */

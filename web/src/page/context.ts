@@ -13,8 +13,13 @@ export interface PageContext {
    * Throws ServiceError when what was typed is no camera: nothing else is sent in its place.
    */
   camera(): Camera | null;
-  /** What was changed from the service's defaults: of POST /localize. */
+  /** What was changed from the service's defaults: of POST /localize. Throws as `camera` does. */
   options(): Record<string, string | number>;
+  /**
+   * A walk begins: what is drawn of a photo is taken away, and no photo is drawn until somebody
+   * asks about one or looks at one again. That stops Live.
+   */
+  walkBegins(): void;
   /** Say it to those who do not see the page. */
   announce(text: string): void;
   /** Be told of every map that is chosen from now on. */

@@ -30,8 +30,19 @@ export function takePhotos(
   });
   addEventListener("paste", (event) => {
     const photos = filesOf(event.clipboardData);
-    if (photos.length === 0) return; // text, for a field
+    if (photos.length === 0 || isForField(event)) return;
     event.preventDefault();
     onPhotos(photos);
   });
+}
+
+/**
+ * Whether text is pasted, or into a field. Spreadsheets and word processors give a picture of a text
+ * along with it, in both of its forms; a file's name comes as plain text only, a web page's picture
+ * with its markup only.
+ */
+function isForField({ target, clipboardData }: ClipboardEvent): boolean {
+  const types = clipboardData?.types ?? [];
+  const isText = types.includes("text/plain") && types.includes("text/html");
+  return isText || (target instanceof Element && target.closest("input, textarea") !== null);
 }

@@ -2,23 +2,18 @@
 import { mapRef, type LocalizeResponse, type MapInfo } from "../api";
 import { element } from "../dom";
 import { lengthText } from "../geometry";
+import { countText, counted } from "../words";
 import type { PageContext } from "./context";
 import { FIELD_OF_VIEW_DEG, FocalEstimates, chooseCamera, frameSize } from "./live_camera";
 import { LiveFigures } from "./live_figures";
-import { localizeFrames, pause, type Frame } from "./live_loop";
-import {
-  FrameReader,
-  ScreenLock,
-  cameraProblem,
-  namedCameras,
-  openCamera,
-  whyNoCamera,
-} from "./live_media";
+import type { Frame } from "./live_loop";
+import { FrameReader, ScreenLock, namedCameras, openCamera, whyNoCamera } from "./live_media";
 import { livePanel } from "./live_panel";
 import { WalkingPrior } from "./live_prior";
+import { LiveSession } from "./live_session";
 import { Trail } from "./live_trail";
 import { WalkView } from "./live_view";
-import { countText } from "./words";
+import { sentence } from "./problem_view";
 import "../style/live.css";
 
 export interface LiveState {
@@ -42,7 +37,8 @@ export interface LiveState {
 
 export interface Live {
   readonly state: LiveState;
-  stop(): void;
+  /** `why` is told to the user. */
+  stop(why?: string): void;
 }
 
 const ANNOUNCE_EVERY_MS = 5000;
@@ -60,132 +56,59 @@ export function createLive(host: HTMLElement, context: PageContext): Live {
   const prior = new WalkingPrior();
   const estimates = new FocalEstimates();
   const trail = new Trail(() => STEP_SHARE * diagonal(context.map()));
-  const requests = { inFlight: 0, maxInFlight: 0 };
   let last: LocalizeResponse | null = null;
-  let message = "";
-  // Started by the user; its signal ends with it. Null when off.
-  let session: AbortController | null = null;
-  let stream: MediaStream | null = null;
-  // Within a session: one run of the loop; paused between runs.
-  let run: AbortController | null = null;
-  let ended = Promise.resolve();
-  let opening = 0; // counts, so that a camera that comes after another was chosen is closed again
   let failing = false;
   let announced = { outcome: "", at: -Infinity };
+  const session = new LiveSession({
+    map: () => context.map(),
+    hidden: () => document.hidden,
+    openCamera: () => openCamera(panel.camera.value),
+    play,
+    grab: (signal) => reader.grab(signal),
+    localize,
+    answered,
+    failed(why) {
+      figures.errors += 1;
+      failing = true;
+      session.say(why);
+    },
+    resumed: () => figures.resume(performance.now()),
+    ended(why) {
+      prior.forget();
+      view.clear();
+      context.announce(why);
+    },
+    changed: drawState,
+  });
 
-  // Starting and stopping
-
-  async function start(): Promise<void> {
+  function start(): void {
     const impossible = whyNoCamera(window);
-    if (impossible !== null) return say(impossible);
-    if (context.map() === null) return say("Choose a map first.");
-    const started = (session = new AbortController());
+    if (impossible !== null) return session.say(impossible);
+    if (context.map() === null) return session.say("Choose a map first.");
     figures.clear();
-    requests.maxInFlight = 0;
     last = null;
     failing = false;
-    say("Waiting for the camera…");
-    drawState();
-    if (await openStream(started.signal)) {
-      void screen.hold();
-      resume();
-    }
+    context.walkBegins();
+    void session.start();
   }
 
-  /** Open the chosen camera; false when that failed, or it is no longer wanted. */
-  async function openStream(signal: AbortSignal): Promise<boolean> {
-    closeStream();
-    const mine = (opening += 1);
-    const unwanted = (): boolean => signal.aborted || mine !== opening;
-    let opened: MediaStream;
-    try {
-      opened = await openCamera(panel.camera.value);
-    } catch (error) {
-      // Only getUserMedia was asked; not all browsers derive its OverconstrainedError from Error.
-      if (!unwanted()) stop(cameraProblem(error as Error));
-      return false;
-    }
-    if (unwanted()) {
-      close(opened);
-      return false;
-    }
-    stream = opened;
-    for (const track of stream.getTracks()) {
-      track.addEventListener("ended", () => stop("The camera was taken away."));
-    }
+  function stop(why = `Stopped after ${counted(figures.answers, "answer")}.`): void {
+    session.stop(why);
+  }
+
+  async function play(stream: MediaStream | null): Promise<void> {
     panel.video.srcObject = stream;
+    if (stream === null) return screen.release();
+    void screen.hold();
     drawState(); // shows the video: some browsers do not play a hidden one
     await panel.video.play().catch(() => undefined); // another stream came before it played
     await nameCameras();
-    return !unwanted();
-  }
-
-  function closeStream(): void {
-    if (stream !== null) close(stream);
-    stream = null;
-    panel.video.srcObject = null;
-  }
-
-  function stop(why = `Stopped after ${figures.answers} answers.`): void {
-    if (session === null) return;
-    session.abort();
-    session = null;
-    interrupt();
-    closeStream();
-    screen.release();
-    prior.forget();
-    say(why);
-    drawState();
-    context.announce(why);
-  }
-
-  /** End the run, and with it the request that is under way. */
-  function interrupt(): void {
-    run?.abort();
-    run = null;
-  }
-
-  /** Begin a run, unless something is missing; the one before has ended by then. */
-  function resume(): void {
-    interrupt();
-    if (session === null || stream === null) return;
-    if (document.hidden) return;
-    const map = context.map();
-    if (map === null) return say("Choose a map to go on.");
-    const begun = (run = new AbortController());
-    figures.resume(performance.now());
-    say(`Looking for this place in ${map.id}…`);
-    drawState();
-    ended = ended.then(() => walk(map, begun.signal));
-  }
-
-  async function walk(map: MapInfo, signal: AbortSignal): Promise<void> {
-    const ask = (frame: Frame, limited: AbortSignal): Promise<LocalizeResponse> =>
-      counted(() => localize(map, frame, limited));
-    const grab = (limited: AbortSignal): Promise<Frame> => reader.grab(limited);
-    try {
-      const why = await localizeFrames({ grab, ask, answered, failed, wait: pause }, signal);
-      if (why !== null) stop(why);
-    } catch (error) {
-      stop(`Stopped by a mistake of this page: ${String(error)}`);
-      reportError(error);
-    }
   }
 
   // Frames and answers
 
-  async function counted<Answer>(ask: () => Promise<Answer>): Promise<Answer> {
-    requests.inFlight += 1;
-    requests.maxInFlight = Math.max(requests.maxInFlight, requests.inFlight);
-    try {
-      return await ask();
-    } finally {
-      requests.inFlight -= 1;
-    }
-  }
-
   function localize(map: MapInfo, frame: Frame, signal: AbortSignal): Promise<LocalizeResponse> {
-    const { camera } = chooseCamera(frame, context.camera(), fieldOfViewGiven());
+    const { camera } = chooseCamera(frame, context.camera, fieldOfViewGiven());
     const priors = panel.prior.checked && map.metric ? prior.at(frame.atMs) : undefined;
     const call = {
       map: mapRef(map), // the one whose landmarks are shown
@@ -210,8 +133,7 @@ export function createLive(host: HTMLElement, context: PageContext): Live {
     if (answer.pose === null) prior.refused();
     else prior.localized(answer.pose.position, frame.atMs);
     view.show(answer, panel.follow.checked);
-    say(answerInWords(answer, context.map()?.metric ?? true));
-    drawState();
+    session.say(answerInWords(answer, context.map()?.metric ?? true));
     const outcome = panel.status.textContent;
     if (outcome !== announced.outcome && now - announced.at > ANNOUNCE_EVERY_MS) {
       announced = { outcome, at: now };
@@ -219,23 +141,12 @@ export function createLive(host: HTMLElement, context: PageContext): Live {
     }
   }
 
-  function failed(why: string): void {
-    figures.errors += 1;
-    failing = true;
-    say(why);
-    drawState();
-  }
-
   // What is shown
 
-  function say(text: string): void {
-    message = text;
-    panel.message.textContent = text;
-  }
-
   function drawState(): void {
-    panel.preview.hidden = stream === null;
-    panel.toggle.textContent = session === null ? "Start the camera" : "Stop";
+    panel.message.textContent = session.message;
+    panel.preview.hidden = !session.filming;
+    panel.toggle.textContent = session.on ? "Stop" : "Start the camera";
     const [outcome, words] = outcomeWords();
     panel.status.dataset.outcome = outcome;
     panel.status.textContent = words;
@@ -251,8 +162,8 @@ export function createLive(host: HTMLElement, context: PageContext): Live {
   }
 
   function outcomeWords(): [outcome: string, words: string] {
-    if (session === null) return ["off", "Off"];
-    if (run === null) return ["off", "Paused"];
+    if (!session.on) return ["off", "Off"];
+    if (!session.running) return ["off", "Paused"];
     if (failing) return ["failed", "No answer"];
     if (last === null) return ["off", "Starting"];
     return last.pose === null ? ["refused", "I do not know"] : ["localized", "Localized"];
@@ -260,7 +171,7 @@ export function createLive(host: HTMLElement, context: PageContext): Live {
 
   function drawFigures(): void {
     const words = figures.inWords(performance.now());
-    if (run === null) words.rate = null;
+    if (!session.running) words.rate = null;
     for (const name of ["rate", "latency", "server", "share"] as const) {
       panel.figures[name].textContent = words[name] ?? "–";
     }
@@ -300,7 +211,7 @@ export function createLive(host: HTMLElement, context: PageContext): Live {
       panel.viewNote.textContent = `A field of view is between ${min} and ${max} degrees.`;
     } else if (width > 0) {
       const frame = frameSize({ width, height }, Number(panel.longest.value));
-      panel.viewNote.textContent = chooseCamera(frame, context.camera(), given).message;
+      panel.viewNote.textContent = chooseCamera(frame, context.camera, given).message;
     } else {
       panel.viewNote.textContent =
         "Along the longer side of a frame: 60 to 75 of most phones. Left empty, the service " +
@@ -308,16 +219,13 @@ export function createLive(host: HTMLElement, context: PageContext): Live {
     }
   }
 
-  panel.toggle.addEventListener("click", () => (session === null ? void start() : stop()));
+  panel.toggle.addEventListener("click", () => (session.on ? stop() : start()));
   panel.camera.addEventListener("change", () => {
     // Another camera has another field of view.
     estimates.clear();
     panel.view.value = "";
     drawState();
-    if (session === null) return;
-    const { signal } = session;
-    interrupt();
-    void openStream(signal).then((opened) => opened && resume());
+    void session.reopen();
   });
   panel.view.addEventListener("input", drawState);
   panel.useEstimate.addEventListener("click", () => {
@@ -349,45 +257,43 @@ export function createLive(host: HTMLElement, context: PageContext): Live {
     figures.clear();
     last = null;
     drawPriorNote();
-    resume();
     drawState();
+    session.resume();
   });
   document.addEventListener("visibilitychange", () => {
-    if (session === null) return;
-    if (!document.hidden) {
-      void screen.hold(); // the system took it away
-      return resume();
-    }
-    interrupt();
-    say("Paused while the page is hidden.");
-    drawState();
+    if (document.hidden) return session.pause("Paused while the page is hidden.");
+    if (session.filming) void screen.hold(); // the system took it away
+    session.resume();
   });
-  setInterval(() => run !== null && drawFigures(), 500); // the rate falls while nothing comes
+  // Nobody is filmed who does not see it; and the 3D view is free for what the other tabs show.
+  const tabLeft = (): void => void (host.hidden && stop("Stopped, because the tab was left."));
+  new MutationObserver(tabLeft).observe(host, { attributeFilter: ["hidden"] });
+  setInterval(() => session.running && drawFigures(), 500); // the rate falls while nothing comes
 
-  say(
+  session.say(
     whyNoCamera(window) ??
       "Frames of this device's camera are localized one after the other. Nothing is kept of them.",
   );
-  drawState();
   drawPriorNote();
   host.append(panel.root);
   return {
     get state(): LiveState {
       return Object.freeze({
-        running: run !== null,
+        running: session.running,
         answers: figures.answers,
         localized: figures.localized,
         refused: figures.answers - figures.localized,
         errors: figures.errors,
-        ...requests,
+        inFlight: session.inFlight,
+        maxInFlight: session.maxInFlight,
         rate: figures.rate(performance.now()),
         latencyMs: figures.latencyMs,
         last,
         trailLength: trail.drawn.length,
-        message,
+        message: session.message,
       });
     },
-    stop: () => stop(),
+    stop,
   };
 }
 
@@ -395,17 +301,10 @@ export function createLive(host: HTMLElement, context: PageContext): Live {
 function answerInWords(
   { pose, refusal, inliers, correspondences }: LocalizeResponse,
   metric: boolean,
-) {
-  if (pose === null) {
-    const why = refusal?.message ?? "No reason was given";
-    return why.charAt(0).toUpperCase() + why.slice(1) + (why.endsWith("?") ? "" : ".");
-  }
-  const std = lengthText(Number(Math.hypot(...pose.position_std).toPrecision(2)), metric);
+): string {
+  if (pose === null) return sentence(refusal?.message ?? "no reason was given");
+  const std = lengthText(Math.hypot(...pose.position_std), metric, 2);
   return `± ${std}; ${countText(inliers)} of ${countText(correspondences)} matches agree.`;
-}
-
-function close(stream: MediaStream): void {
-  for (const track of stream.getTracks()) track.stop();
 }
 
 /** Of the box around the map's landmarks. */

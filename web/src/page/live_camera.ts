@@ -1,6 +1,6 @@
 // The intrinsics of live frames: given for photos of the same shape, from a field of view, or left
 // to the service.
-import type { Camera, LocalizeResponse } from "../api";
+import { ServiceError, type Camera, type LocalizeResponse } from "../api";
 import { median } from "./live_pace";
 
 export interface Size {
@@ -51,12 +51,13 @@ export interface ChosenCamera {
 /**
  * Choose the camera of a frame.
  *
- * @param typed intrinsics of photos; count when a frame has their aspect.
+ * @param typedCamera intrinsics of photos; count when a frame has their aspect. Throws ServiceError
+ *   when they are not complete: that is said, and no reason to end a walk.
  * @param degrees field of view, which counts more because it was given here; null when not given.
  */
 export function chooseCamera(
   frame: Size,
-  typed: Camera | null,
+  typedCamera: () => Camera | null,
   degrees: number | null,
 ): ChosenCamera {
   if (degrees !== null) {
@@ -64,13 +65,21 @@ export function chooseCamera(
     const focal = camera.params[0]!.toFixed(0);
     return { camera, message: `Camera: focal length ${focal} px, of ${degrees.toFixed(1)}°.` };
   }
-  if (typed !== null && sameAspect(frame, typed)) {
-    return { camera: typed, message: `Camera: as typed for photos, ${typed.model}.` };
-  }
   const unknown =
     "Camera unknown: the service looks for the focal length with each pose, which takes longer " +
     "and is refused more often.";
+  let typed: Camera | null;
+  try {
+    typed = typedCamera();
+  } catch (error) {
+    if (!(error instanceof ServiceError)) throw error;
+    const why = `The camera typed for photos cannot be used: ${error.problem.detail}.`;
+    return { camera: null, message: `${unknown} ${why}` };
+  }
   if (typed === null) return { camera: null, message: unknown };
+  if (sameAspect(frame, typed)) {
+    return { camera: typed, message: `Camera: as typed for photos, ${typed.model}.` };
+  }
   const sizes = `${typed.width} × ${typed.height}, frames have ${frame.width} × ${frame.height}`;
   return {
     camera: null,

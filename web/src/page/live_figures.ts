@@ -1,7 +1,7 @@
 // The figures of a walk: how many answers a second, how long they take, how many are poses.
 import type { LocalizeResponse } from "../api";
+import { secondsText } from "../words";
 import { RateWindow, Recent, median } from "./live_pace";
-import { secondsText } from "./words";
 
 const RATE_SPAN_MS = 5000;
 const LATENCIES = 50;

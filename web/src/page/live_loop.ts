@@ -1,5 +1,5 @@
 // Frame after frame, one at a time: the next is taken when the answer to the last is there.
-import { ServiceError, type LocalizeResponse } from "../api";
+import { ownError, ServiceError, type LocalizeResponse } from "../api";
 import { afterFailure } from "./live_pace";
 
 /** A frame of the camera. */
@@ -79,14 +79,7 @@ async function withinTime<Answer>(
 
 function tooLate(): ServiceError {
   const detail = `nothing came within ${LONGEST_REQUEST_MS / 1000} s`;
-  const nothing = { field: null, expected: null, got: null, request_id: "" };
-  return new ServiceError({
-    title: "No answer",
-    status: 0,
-    detail,
-    code: "server.late",
-    ...nothing,
-  });
+  return ownError("server.late", "No answer", detail);
 }
 
 /** Wait; ends early, without complaint, when the signal is aborted. */

@@ -66,6 +66,7 @@ const LONGEST_WAIT_MS = 5000;
 /**
  * Decide what a failure means for the next frame.
  *
+ * What the page itself found wrong, such as an option, stays wrong until somebody changes it.
  * A service that is busy says how long to wait; one that cannot be reached, or that made a mistake,
  * is asked again after 0.5 s, 1 s, 2 s and then every 5 s; whatever else it refuses it would refuse
  * of the next frame too.
@@ -79,16 +80,18 @@ export function afterFailure(error: ServiceError, inARow: number): AfterFailure 
     const message = `The service is busy (${problem.detail}); waiting ${seconds} s as it asks.`;
     return { do: "wait", milliseconds: seconds * 1000, message };
   }
-  if (problem.status === 0 || problem.status >= 500) {
+  const unanswered = problem.status === 0 && problem.code.startsWith("server.");
+  if (unanswered || problem.status >= 500) {
     const milliseconds = Math.min(500 * 2 ** (inARow - 1), LONGEST_WAIT_MS);
-    const what = problem.status === 0 ? "No answer" : "The service failed";
+    const what = unanswered ? "No answer" : "The service failed";
     const message = `${what} (${problem.detail}); trying again in ${milliseconds / 1000} s.`;
     return { do: "wait", milliseconds, message };
   }
   if (problem.status === 401) {
     return { do: "stop", message: `The service wants an API key: ${problem.detail}.` };
   }
-  return { do: "stop", message: `The service refuses these frames: ${inWords(error)}.` };
+  const who = problem.status === 0 ? "Nothing is sent" : "The service refuses these frames";
+  return { do: "stop", message: `${who}: ${inWords(error)}.` };
 }
 
 function inWords({ problem }: ServiceError): string {

@@ -1,5 +1,5 @@
 // What the tab "Live" is made of; what it does is in live.ts.
-import { element } from "../dom";
+import { element, field } from "../dom";
 import { FIELD_OF_VIEW_DEG } from "./live_camera";
 
 /** Build the elements; nothing in them comes from outside yet. */
@@ -58,7 +58,7 @@ export function livePanel() {
       { class: "facts" },
       ...named("Rate", figures.rate),
       ...named("Latency (median)", figures.latency),
-      ...named("of it, the service", figures.server),
+      ...named("Service (median)", figures.server),
       ...named("Localized, last 20", figures.share),
     ),
     element(
@@ -96,18 +96,13 @@ function named(name: string, value: HTMLElement): HTMLElement[] {
   return [element("dt", {}, name), value];
 }
 
-function field(name: string, control: HTMLElement): HTMLElement {
-  return element("div", { class: "field" }, element("label", { for: control.id }, name), control);
-}
-
 function select(id: string, choices: [value: string, label: string][]): HTMLSelectElement {
   const options = choices.map(([value, label]) => element("option", { value }, label));
   return element("select", { id }, ...options);
 }
 
 function checkbox(id: string, note?: string): HTMLInputElement {
-  const described = note === undefined ? false : note;
-  return element("input", { type: "checkbox", id, "aria-describedby": described });
+  return element("input", { type: "checkbox", id, "aria-describedby": note ?? false });
 }
 
 function button(id: string, name: string): HTMLButtonElement {

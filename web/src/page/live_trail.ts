@@ -1,5 +1,6 @@
 // What was answered on a walk: a line to draw, and files for those who go on working with it.
 import type { LocalizeResponse, Vector3 } from "../api";
+import { length, subtract } from "../geometry";
 
 /** One answered frame. */
 export interface TrailEntry {
@@ -76,7 +77,7 @@ export class Trail {
 
   #draw(position: Vector3): boolean {
     const last = this.#drawn.at(-1);
-    if (last !== undefined && distance(last, position) < this.step()) return false;
+    if (last !== undefined && length(subtract(position, last)) < this.step()) return false;
     this.#drawn.push(position);
     if (this.#drawn.length > MOST_DRAWN) this.#drawn.shift();
     return true;
@@ -84,7 +85,3 @@ export class Trail {
 }
 
 const NO_POSE: string[] = Array<string>(7).fill("");
-
-function distance(a: Vector3, b: Vector3): number {
-  return Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
-}

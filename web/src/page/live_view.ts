@@ -1,7 +1,7 @@
 // The pose of a walk in the 3D view, and the view that goes along.
-import type { LocalizeResponse, Quaternion, Vector3 } from "../api";
-import { positionCovariance } from "../geometry";
-import type { ShownPose, Viewer } from "../viewer/types";
+import type { LocalizeResponse } from "../api";
+import type { Viewer } from "../viewer/types";
+import { shownPose } from "./shown_pose";
 
 // A view that never rests cannot be looked at; and whoever turns it wants to look for themselves.
 const FLY_EVERY_MS = 1500;
@@ -39,20 +39,9 @@ export class WalkView {
       this.viewer.flyTo(pose);
     }
   }
-}
 
-/** The pose as a frustum with its ellipsoid; null of a refusal. */
-function shownPose({ pose, camera }: LocalizeResponse): ShownPose | null {
-  if (pose === null) return null;
-  const { rotation_wxyz, translation } = pose.cam_from_world;
-  return {
-    position: pose.position as Vector3,
-    orientation: pose.orientation as Quaternion,
-    camera,
-    positionCovariance: positionCovariance(
-      rotation_wxyz as Quaternion,
-      translation as Vector3,
-      pose.covariance,
-    ),
-  };
+  /** The walk is over: its last pose is past. */
+  clear(): void {
+    this.viewer.showPose(null);
+  }
 }

@@ -1,7 +1,9 @@
 // The page that the service serves at `/`: puts its parts together.
-import { connect, mapRef, ServiceError, type MapInfo, type Problem } from "../api";
+import { connect, mapRef, ownError, ServiceError, type MapInfo, type Problem } from "../api";
 import { button, byId, element } from "../dom";
 import { PointsError } from "../points";
+import { NoGraphics } from "../viewer/graphics";
+import type { Viewer } from "../viewer/types";
 import { createViewer } from "../viewer/viewer";
 import type { PageContext } from "./context";
 import { takePhotos } from "./intake";
@@ -10,11 +12,13 @@ import { createLive } from "./live";
 import { createMapChoice, type Choice } from "./map_choice";
 import { loadMap } from "./map_loading";
 import { createMapPanel } from "./map_panel";
+import { patiently } from "./patience";
 import { createPhotoPanel } from "./photo_panel";
-import { problemView } from "./problem_view";
+import { problemView, sentence } from "./problem_view";
 import { createTabs } from "./tabs";
 import { createTheme } from "./theme";
-import { counted } from "./words";
+import { withoutView } from "./without_view";
+import { counted } from "../words";
 import "../style/tokens.css";
 import "../style/base.css";
 import "../style/page.css";
@@ -28,13 +32,19 @@ const announce = (text: string): void => void (announcer.textContent = text);
 const key = createKeyEntry(byId("key", HTMLButtonElement));
 const service = connect(server, key.current);
 const theme = createTheme(byId("theme", HTMLSelectElement));
-const viewer = createViewer(byId("viewer", HTMLElement), theme.current());
+const viewer = openViewer(byId("viewer", HTMLElement));
 const tabs = createTabs(document.querySelector<HTMLElement>("#panel > .tabs")!);
 
 const mapPanel = createMapPanel(byId("panel-map", HTMLElement), viewer, theme.current());
 theme.onChange((now) => {
   viewer.setTheme(now);
   mapPanel.setTheme(now);
+});
+
+// As a link it would replace the map in the address.
+document.querySelector(".skip")!.addEventListener("click", (event) => {
+  event.preventDefault();
+  byId("panel", HTMLElement).focus();
 });
 
 const wholeMap = byId("whole-map", HTMLButtonElement);
@@ -51,7 +61,10 @@ const photos = createPhotoPanel(byId("panel-photo", HTMLElement), {
   map: () => shownMap,
   hasKey: () => key.current() !== null,
   askForKey,
+  chooseMap: (ref) => choice.choose(ref),
+  reloadMaps,
   open: () => tabs.choose("tab-photo"),
+  beforeDrawing: () => live.stop("Stopped: a photo is being looked at."),
 });
 takePhotos(byId("drop", HTMLElement), photos.add);
 
@@ -60,6 +73,7 @@ const context: PageContext = {
   map: () => shownMap,
   camera: photos.camera,
   options: photos.options,
+  walkBegins: photos.undraw,
   onMapChange: (listener) => void mapListeners.push(listener),
 };
 const live = createLive(byId("panel-live", HTMLElement), context);
@@ -71,8 +85,30 @@ key.onChange(() => {
 });
 choice.reload();
 
-function askForKey(): void {
-  key.ask("The service answers only those who send an API key.");
+/** Where the browser cannot draw, the page does without a view. */
+function openViewer(host: HTMLElement): Viewer {
+  try {
+    return createViewer(host, theme.current());
+  } catch (error) {
+    if (!(error instanceof NoGraphics)) throw error;
+    return withoutView(host, `${error.message} Photos and Live work without.`);
+  }
+}
+
+function askForKey(problem: Problem): void {
+  key.ask(sentence(problem.detail));
+}
+
+function reloadMaps(): void {
+  choice.reload();
+}
+
+/** A map that cannot be shown is told of in its tab, whichever is open. */
+function tellOfMap(error: ServiceError, again: () => void): HTMLElement {
+  mapProblem = error.problem;
+  tabs.choose("tab-map");
+  announce(error.problem.detail);
+  return problemView(error, { giveKey: () => askForKey(error.problem), reloadMaps, again });
 }
 
 function choose(chosen: Choice): void {
@@ -90,12 +126,8 @@ function choose(chosen: Choice): void {
     announce("There are no maps yet");
     return;
   }
-  mapProblem = chosen.error.problem;
-  mapPanel.showInstead(
-    problemView(chosen.error, { giveKey: askForKey, again: () => choice.reload() }),
-  );
-  announce(chosen.error.problem.detail);
-  if (chosen.error.problem.status === 401) askForKey();
+  mapPanel.showInstead(tellOfMap(chosen.error, reloadMaps));
+  if (chosen.error.problem.status === 401) askForKey(chosen.error.problem);
 }
 
 async function show(map: MapInfo): Promise<void> {
@@ -108,7 +140,7 @@ async function show(map: MapInfo): Promise<void> {
   progress.hidden = false;
   progress.value = 0;
   try {
-    await loadMap(map, service, viewer, {
+    await loadMap(map, patiently(service), viewer, {
       signal,
       // What was drawn of a photo is gone with the map before.
       onReset: photos.mapChanged,
@@ -121,14 +153,11 @@ async function show(map: MapInfo): Promise<void> {
     });
   } catch (error) {
     if (signal.aborted) return;
-    const shown = errorOfLoading(error);
-    mapProblem = shown.problem;
     const again = (): void => {
       setMap(null);
       void show(map);
     };
-    mapPanel.showProblem(problemView(shown, { giveKey: askForKey, again }));
-    announce(shown.problem.detail);
+    mapPanel.showProblem(tellOfMap(errorOfLoading(error), again));
   }
   progress.hidden = true;
 }
@@ -137,17 +166,17 @@ function setMap(map: MapInfo | null): void {
   shownMap = map;
   wholeMap.disabled = map === null;
   document.title = map === null ? "visloc" : `${map.id} · visloc`;
-  if (map === null) viewer.reset({ origin: [0, 0, 0], up: [0, 0, 1], metric: true });
+  if (map === null) {
+    viewer.reset({ origin: [0, 0, 0], up: [0, 0, 1], metric: true });
+    photos.mapChanged();
+  }
   for (const listener of mapListeners) listener(map);
 }
 
 function errorOfLoading(error: unknown): ServiceError {
   if (error instanceof ServiceError) return error;
   if (!(error instanceof PointsError)) throw error;
-  return new ServiceError({
-    ...{ title: "No landmarks", status: 0, detail: error.message, code: "server.answer" },
-    ...{ field: null, expected: null, got: null, request_id: "" },
-  });
+  return ownError("server.answer", "No landmarks", error.message);
 }
 
 function noMaps(): HTMLElement {
@@ -162,12 +191,8 @@ function noMaps(): HTMLElement {
       { class: "quiet" },
       "A service that watches the folder shows it as soon as it is made.",
     ),
-    element("div", { class: "row" }, reloadButton()),
+    element("div", { class: "row" }, button("Look again", reloadMaps)),
   );
-}
-
-function reloadButton(): HTMLButtonElement {
-  return button("Look again", () => choice.reload());
 }
 
 /** What tests, and those who look for a fault, may read; nothing can be changed here. */

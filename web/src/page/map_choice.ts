@@ -1,7 +1,7 @@
 // Which map is shown: the list of them, the choice, and the address that links to it.
 import { shortRef, ServiceError, type MapInfo, type Service } from "../api";
 import { element } from "../dom";
-import { instantText } from "./words";
+import { instantText } from "../words";
 
 /** What came of the wish to see a map. */
 export type Choice =
@@ -11,7 +11,8 @@ export type Choice =
   | { kind: "map"; map: MapInfo };
 
 export interface MapChoice {
-  current(): MapInfo | null;
+  /** Choose a map: an id or `id@version`. */
+  choose(ref: string): void;
   /** Ask for the list again, and keep the choice where it still exists. */
   reload(): void;
 }
@@ -30,12 +31,19 @@ export function createMapChoice(
   let asking = new AbortController();
   let askAgain = 0;
 
-  /** Do the newest thing only: what was being asked before is given up. */
-  async function attempt(ask: (signal: AbortSignal) => Promise<Choice>): Promise<void> {
+  /**
+   * Do the newest thing only: what was being asked before is given up.
+   *
+   * @param quietly it was asked before, and the service was busy: that need not be said again.
+   */
+  async function attempt(
+    ask: (signal: AbortSignal) => Promise<Choice>,
+    quietly = false,
+  ): Promise<void> {
     asking.abort();
     clearTimeout(askAgain);
     const { signal } = (asking = new AbortController());
-    onChoice({ kind: "asking" });
+    if (!quietly) onChoice({ kind: "asking" });
     let choice: Choice;
     try {
       choice = await ask(signal);
@@ -46,7 +54,9 @@ export function createMapChoice(
       const { status } = error.problem;
       if (status === 503 || status === 429) {
         const wait = (error.retryAfterSeconds ?? 0) * 1000;
-        askAgain = window.setTimeout(reload, Math.max(wait, ASK_AGAIN_MS));
+        const again = (): void => void attempt(ask, true);
+        askAgain = window.setTimeout(again, Math.max(wait, ASK_AGAIN_MS));
+        if (quietly && !signal.aborted) return;
       }
     }
     if (signal.aborted) return;
@@ -103,7 +113,7 @@ export function createMapChoice(
     if (maps.length === 0) reload();
     else void choose(ref);
   });
-  return { current: () => chosen, reload };
+  return { choose: (ref) => void choose(ref), reload };
 }
 
 /** `#map=id` or `#map=id@version`. */

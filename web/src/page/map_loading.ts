@@ -1,5 +1,12 @@
 // A map into the viewer: its cameras, and its landmarks from coarse to fine.
-import { mapRef, type MapImages, type MapInfo, type Service, type Vector3 } from "../api";
+import {
+  mapRef,
+  type MapImage,
+  type MapImages,
+  type MapInfo,
+  type Service,
+  type Vector3,
+} from "../api";
 import { worldUp } from "../geometry";
 import { MAX_POINTS, streamPoints } from "../points";
 import type { PointBlock, Viewer } from "../viewer/types";
@@ -25,12 +32,19 @@ export async function loadMap(
 ): Promise<void> {
   const { signal } = loading;
   const ref = mapRef(map);
+  const reset = (known: MapImage[]): void => {
+    viewer.reset({ origin: middle(map), up: worldUp(map.down, known), metric: map.metric });
+    loading.onReset();
+  };
+  // At once: what is shown and what is answered are of one map, also when this one never comes.
+  reset([]);
   const images = allImages(service, ref, signal);
-  // Which way is up must be known before the first picture; most maps know it themselves.
-  const known = map.down.length === 3 ? [] : (await images).images;
-  signal.throwIfAborted();
-  viewer.reset({ origin: middle(map), up: worldUp(map.down, known), metric: map.metric });
-  loading.onReset();
+  // Which way is up must be known before the first picture; many maps do not say.
+  if (map.down.length !== 3) {
+    const known = await images;
+    signal.throwIfAborted();
+    reset(known.images);
+  }
 
   const cameras = images.then((all) => {
     signal.throwIfAborted();

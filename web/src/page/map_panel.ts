@@ -1,12 +1,12 @@
 // The tab "Map": what the map is, and how it is shown.
-import type { MapImages, MapInfo } from "../api";
-import { element, facts } from "../dom";
+import { shortRef, type MapImages, type MapInfo } from "../api";
+import { element, facts, field } from "../dom";
 import { lengthText } from "../geometry";
 import { MAX_POINTS } from "../points";
 import { PALETTES, SEEN_BY_MOST } from "../viewer/themes";
 import type { PointBlock, PointColours, Theme, Viewer } from "../viewer/types";
 import { MAX_IMAGES } from "./map_loading";
-import { bytesText, counted, countText, instantText } from "./words";
+import { bytesText, counted, countText, instantText } from "../words";
 
 export interface MapPanel {
   /** Something else than a map: why there is none. */
@@ -32,9 +32,9 @@ export function createMapPanel(host: HTMLElement, viewer: Viewer, theme: Theme):
   photo.label.append(noColours);
   const legend = element("div", { class: "legend", hidden: true });
   const legendScale = element("div", { class: "legend-scale", role: "img" });
-  legendScale.setAttribute("aria-label", `Colours from 2 to ${SEEN_BY_MOST} photos or more`);
+  legendScale.setAttribute("aria-label", `Colours from 1 to ${SEEN_BY_MOST} photos or more`);
   // Where the four colours are: by the logarithm of the number.
-  const ticks = [0, 1, 2, 3].map((i) => Math.round(2 * (SEEN_BY_MOST / 2) ** (i / 3)));
+  const ticks = [0, 1, 2, 3].map((i) => Math.round(SEEN_BY_MOST ** (i / 3)));
   legend.append(
     legendScale,
     element(
@@ -72,29 +72,39 @@ export function createMapPanel(host: HTMLElement, viewer: Viewer, theme: Theme):
       seenBy.label,
       legend,
     ),
-    element(
-      "div",
-      { class: "field" },
-      element("label", { for: "point-size" }, "Size of the points"),
-      size,
-    ),
+    field("Size of the points", size),
     element("label", { class: "check" }, cameras, "Mapping cameras"),
     camerasNote,
   );
 
+  /** The button that had the focus, such as "Ask again", may be gone then: it stays in the tab. */
+  function fill(content: Node): void {
+    const focused = host.contains(document.activeElement);
+    problems.replaceChildren();
+    host.replaceChildren(content);
+    if (focused) host.focus();
+  }
+
   return {
-    showInstead(content) {
-      host.replaceChildren(content);
-    },
+    showInstead: fill,
     showMap(map) {
-      about.replaceChildren(element("h2", {}, map.id), mapFacts(map));
-      problems.replaceChildren();
+      about.replaceChildren(
+        element("h2", {}, map.id),
+        element("p", {}, "Drop or paste a photo anywhere to see where it was taken."),
+        mapFacts(map),
+        element(
+          "p",
+          { class: "quiet small" },
+          "Where would a photo be localized, and where not? Where the service runs: ",
+          element("code", {}, `mapping report ${shortRef(map)}`),
+        ),
+      );
       say(camerasNote, "");
       say(
         progress,
         map.landmarks === 0 ? "This map has no landmarks: no photo can be localized in it." : "",
       );
-      host.replaceChildren(element("div", { class: "stack" }, about, progress, problems, looks));
+      fill(element("div", { class: "stack" }, about, progress, problems, looks));
       // What was chosen is chosen for this map too.
       showColours(preferred);
       photo.input.disabled = false;
@@ -148,7 +158,7 @@ function mapFacts(map: MapInfo): HTMLElement {
   const rows: [string, string][] = [
     ["Photos", countText(map.images)],
     ["Landmarks", countText(map.landmarks)],
-    ["Sightings", `${countText(map.observations)} of them in the photos`],
+    ["Observations", countText(map.observations)],
   ];
   if (map.landmarks > 0 && size.every(Number.isFinite)) {
     const sides = size.map((side) => lengthText(side, map.metric));

@@ -1,5 +1,6 @@
 // What may be chosen per photo. What is left alone is not sent: the service has its defaults.
-import { button, element } from "../dom";
+import { ownError } from "../api";
+import { button, element, field } from "../dom";
 
 // Words and defaults as in the tables of docs/api.md.
 const CHOICES: { name: string; label: string; unset: string; words: string[] }[] = [
@@ -15,7 +16,12 @@ const CHOICES: { name: string; label: string; unset: string; words: string[] }[]
     unset: "default",
     words: ["fast", "default", "accurate"],
   },
-  { name: "read_as", label: "Read photo as", unset: "stored", words: ["stored", "upright"] },
+  {
+    name: "read_as",
+    label: "Read photo as",
+    unset: "as its EXIF says",
+    words: ["stored", "upright"],
+  },
   {
     name: "fusion",
     label: "Fusion of similarities",
@@ -41,7 +47,7 @@ const CHOICES: { name: string; label: string; unset: string; words: string[] }[]
 
 export interface OptionsForm {
   readonly element: HTMLElement;
-  /** What was changed from the defaults. */
+  /** What was changed from the defaults. Throws ServiceError for what is no number. */
   options(): Record<string, string | number>;
   open(): void;
 }
@@ -51,8 +57,7 @@ export function createOptionsForm(): OptionsForm {
     const id = `option-${name}`;
     const select = element("select", { id, name }, element("option", { value: "" }, `(${unset})`));
     select.append(...words.map((word) => element("option", { value: word }, word)));
-    const field = element("div", { class: "field" }, element("label", { for: id }, label), select);
-    return { name, select, field };
+    return { name, select, field: field(label, select) };
   });
   const topK = element("input", {
     ...{ id: "option-top_k", name: "top_k", type: "number", min: 1, max: 1000, step: 1 },
@@ -74,21 +79,28 @@ export function createOptionsForm(): OptionsForm {
       element(
         "div",
         { class: "fields wide" },
-        element(
-          "div",
-          { class: "field" },
-          element("label", { for: "option-top_k" }, "Mapping photos to match (top_k)"),
-          topK,
-        ),
-        ...selects.map(({ field }) => field),
+        field("Mapping photos to match (top_k)", topK),
+        ...selects.map((one) => one.field),
       ),
       element("div", { class: "row" }, reset),
     ),
   );
 
   function options(): Record<string, string | number> {
+    // A field that holds no number says that it holds nothing.
+    if (topK.validity.badInput) {
+      const detail = "the number of mapping photos to match (top_k) is no number";
+      throw ownError("options.top_k", "An option is wrong", detail, {
+        field: "options.top_k",
+        expected: "a whole number, 1 to 1000",
+      });
+    }
+    return chosen();
+  }
+
+  function chosen(): Record<string, string | number> {
     const given: Record<string, string | number> = {};
-    // What is no number goes as it is: the service says what it expects.
+    // Of other numbers the service says what it expects.
     if (topK.value !== "") given["top_k"] = Number(topK.value);
     for (const { name, select } of selects) {
       if (select.value !== "") given[name] = select.value;
@@ -97,7 +109,10 @@ export function createOptionsForm(): OptionsForm {
   }
 
   function changed(): void {
-    const words = Object.entries(options()).map(([name, value]) => `${name} ${value}`);
+    const wrong = topK.validity.badInput;
+    topK.setAttribute("aria-invalid", String(wrong));
+    const words = Object.entries(chosen()).map(([name, value]) => `${name} ${value}`);
+    if (wrong) words.unshift("top_k is no number");
     summary.textContent = words.length === 0 ? "the service’s defaults" : words.join(", ");
     reset.disabled = words.length === 0;
   }

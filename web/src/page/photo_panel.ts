@@ -1,25 +1,23 @@
 // The tab "Photo": photos come in, are asked about one after the other, and their answers shown.
 import {
   mapRef,
-  ServiceError,
+  ownError,
   type Camera,
   type LocalizeResponse,
   type MapInfo,
   type Problem,
-  type Quaternion,
   type Service,
-  type Vector3,
 } from "../api";
 import { button, byId, element } from "../dom";
-import { positionCovariance } from "../geometry";
 import type { ShownPose, Viewer } from "../viewer/types";
 import { answerView, inShort } from "./answer_view";
 import { createCameraForm } from "./camera_form";
+import { jpegHeader } from "./jpeg_header";
 import { createOptionsForm } from "./options_form";
 import { createPhotoQueue, questionOf, type Entry, type Wish } from "./photo_queue";
 import { problemView } from "./problem_view";
-import { storedSize } from "./stored_size";
-import { countText } from "./words";
+import { shownPose } from "./shown_pose";
+import { countText } from "../words";
 
 export interface PhotoPanelParts {
   service: Service;
@@ -27,10 +25,17 @@ export interface PhotoPanelParts {
   viewer: Viewer;
   map(): MapInfo | null;
   hasKey(): boolean;
-  askForKey(): void;
+  /** Ask for another API key than the one that was refused so. */
+  askForKey(problem: Problem): void;
+  /** Choose the map of an answer: an id or `id@version`. */
+  chooseMap(ref: string): void;
+  /** Look which maps there are. */
+  reloadMaps(): void;
   announce(text: string): void;
   /** Bring this tab to the front. */
   open(): void;
+  /** A photo is about to be drawn: a walk is not any more. */
+  beforeDrawing(): void;
 }
 
 export interface PhotoPanel {
@@ -39,6 +44,8 @@ export interface PhotoPanel {
   add(photos: { photo: Blob; name: string }[]): void;
   /** Another map is shown: what was drawn of a photo is gone. */
   mapChanged(): void;
+  /** Draw no photo, until somebody asks about one or chooses one. */
+  undraw(): void;
   /** Another key was given: ask again what failed for the lack of one. */
   keyChanged(): void;
   /** Of the photo that is shown, or was asked about last. */
@@ -68,6 +75,7 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
   let selected: Entry | null = null;
   /** Show each answer as it comes, until another photo is clicked. */
   let follow = true;
+  let drawing = true;
   let drawn: ShownPose | null = null;
 
   const queue = createPhotoQueue(parts.service, parts.hasKey, (entry) => {
@@ -107,10 +115,7 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
   function wish(): Wish {
     const map = parts.map();
     if (map === null) {
-      throw new ServiceError({
-        ...{ title: "No map is chosen", status: 0, detail: "choose a map first", code: "page.map" },
-        ...{ field: null, expected: null, got: null, request_id: "" },
-      });
+      throw ownError("page.map", "No map is chosen", "choose a map first");
     }
     return { map, camera: camera.camera(), options: options.options() };
   }
@@ -118,6 +123,7 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
   function add(photos: { photo: Blob; name: string }[]): void {
     if (photos.length === 0) return;
     parts.open();
+    startDrawing();
     follow = true;
     const entries = photos.map(({ photo, name }) => queue.add(photo, name, wish));
     if (entries[0]!.state === "failed") select(entries[0]!);
@@ -127,11 +133,22 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
   }
 
   async function suggestSize(photo: Blob): Promise<void> {
-    const size = await storedSize(photo);
-    if (size !== null) camera.suggestSize(size.width, size.height);
+    try {
+      const size = await jpegHeader(photo);
+      if (size !== null) camera.suggestSize(size.width, size.height);
+    } catch (error) {
+      if (!(error instanceof DOMException)) throw error; // who asks about it says so
+    }
+  }
+
+  /** Photos are what the 3D view is for now. */
+  function startDrawing(): void {
+    parts.beforeDrawing();
+    drawing = true;
   }
 
   function again(entry: Entry): void {
+    startDrawing();
     selected = entry;
     queue.again(entry, wish);
   }
@@ -142,6 +159,7 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
     fillList();
     shown.replaceChildren();
     draw(null);
+    chooser.focus(); // the button is hidden now
   }
 
   function select(entry: Entry): void {
@@ -166,6 +184,7 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
       ...entries.map((entry) => {
         const line = button("", () => {
           follow = false;
+          startDrawing();
           select(entry);
         });
         line.dataset["entry"] = String(entry.id);
@@ -184,12 +203,24 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
   }
 
   function show(entry: Entry, fly: boolean): void {
+    const focused = shown.contains(document.activeElement);
+    fill(entry, fly);
+    // What had the focus, such as "Ask again", is gone.
+    if (!focused) return;
+    const head = shown.querySelector<HTMLElement>("h2, .asking");
+    head?.setAttribute("tabindex", "-1");
+    head?.focus({ preventScroll: true });
+  }
+
+  function fill(entry: Entry, fly: boolean): void {
     const { answer, error } = entry;
     if (answer !== null && entry.wish !== null) {
       const { map } = entry.wish;
       shown.replaceChildren(
         answerView(entry, answer, {
           metric: map.metric,
+          options: entry.wish.options,
+          chooseMap: isShown(answer) ? null : () => parts.chooseMap(mapRef(answer.map)),
           question: questionOf(entry, entry.wish, parts.server),
           announce,
           highlight: (image) =>
@@ -209,7 +240,8 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
     if (error !== null) {
       if (error.problem.code.startsWith("camera.")) camera.open();
       if (error.problem.code.startsWith("options.")) options.open();
-      const actions = { giveKey: parts.askForKey, again: () => again(entry) };
+      const giveKey = (): void => parts.askForKey(error.problem);
+      const actions = { giveKey, reloadMaps: parts.reloadMaps, again: () => again(entry) };
       shown.replaceChildren(problemView(error, actions));
     } else {
       shown.replaceChildren(waiting(entry));
@@ -223,6 +255,7 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
   }
 
   function draw(answer: LocalizeResponse | null, fly = false): void {
+    if (!drawing) return;
     drawn = answer === null ? null : shownPose(answer);
     viewer.showPose(drawn);
     viewer.highlight(answer === null ? new Set() : retrievedOf(answer));
@@ -243,10 +276,15 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
     mapChanged() {
       if (selected !== null) show(selected, false);
     },
+    undraw() {
+      draw(null);
+      drawing = false;
+    },
     keyChanged() {
       if (!parts.hasKey()) return;
       for (const entry of queue.entries) {
-        if (entry.error?.problem.status === 401) queue.again(entry, wish);
+        const status = entry.error?.problem.status;
+        if (status === 401 || status === 403) queue.again(entry, wish);
       }
     },
     get answer() {
@@ -262,23 +300,6 @@ function retrievedOf(answer: LocalizeResponse): Set<string> {
   return new Set(answer.retrieved.map(({ image }) => image));
 }
 
-function shownPose({ pose, camera, debug }: LocalizeResponse): ShownPose | null {
-  if (pose === null) return null;
-  const { rotation_wxyz: rotation, translation } = pose.cam_from_world;
-  return {
-    position: pose.position as Vector3,
-    orientation: pose.orientation as Quaternion,
-    camera,
-    positionCovariance: positionCovariance(
-      rotation as Quaternion,
-      translation as Vector3,
-      pose.covariance,
-    ),
-    inliers:
-      debug?.inliers.flatMap((yes, i) => (yes ? debug.points.slice(3 * i, 3 * i + 3) : [])) ?? [],
-  };
-}
-
 type Outcome = "waiting" | "running" | "localized" | "refused" | "failed";
 
 function outcome(entry: Entry): Outcome {
@@ -288,7 +309,7 @@ function outcome(entry: Entry): Outcome {
 
 function stateWords(entry: Entry): string {
   const words = {
-    waiting: "waits",
+    waiting: entry.waitSeconds === null ? "waits" : `waits ${waitText(entry)}: service is busy`,
     running: "is asked …",
     failed: "error",
     refused: "not localized",
@@ -298,5 +319,14 @@ function stateWords(entry: Entry): string {
 }
 
 function waiting(entry: Entry): HTMLElement {
-  return element("p", { class: "quiet asking" }, `Asking the service about ${entry.name} …`);
+  const text =
+    entry.waitSeconds === null
+      ? `Asking the service about ${entry.name} …`
+      : `The service is busy: ${entry.name} is asked about again in ${waitText(entry)}.`;
+  return element("p", { class: "quiet asking" }, text);
+}
+
+/** As long as the service asked for, when it last did. */
+function waitText({ waitSeconds }: Entry): string {
+  return `${Math.ceil(waitSeconds ?? 0)} s`;
 }

@@ -2,7 +2,7 @@
 // is turned as the photo is.
 import type { LocalizeResponse } from "../api";
 import { button, element } from "../dom";
-import { countText } from "./words";
+import { countText } from "../words";
 
 /** a, b, c, d, e, f: (x, y) goes to (a x + c y + e, b x + d y + f). */
 type Affine = [number, number, number, number, number, number];

@@ -1,6 +1,7 @@
 // The photos that were asked about: one on its way at a time, the others wait.
 import {
   mapRef,
+  ownError,
   ServiceError,
   shortRef,
   type Camera,
@@ -8,6 +9,9 @@ import {
   type MapInfo,
   type Service,
 } from "../api";
+import { jpegHeader } from "./jpeg_header";
+import { pause } from "./live_loop";
+import { busySeconds } from "./patience";
 import type { Question } from "./snippets";
 
 /** What is asked about a photo, as it was chosen when the photo came. */
@@ -19,11 +23,14 @@ export interface Wish {
 
 export interface Entry {
   readonly id: number;
-  readonly photo: Blob;
+  /** The file; once it was read, what was in it, as files change. */
+  photo: Blob;
   readonly name: string;
   /** Null when it could not even be asked: then `error` says why. */
   wish: Wish | null;
   state: "waiting" | "running" | "answered" | "failed";
+  /** How long the service, which is busy, asked to wait; null when it did not. */
+  waitSeconds: number | null;
   /** Without its picture, which is `overlay`. */
   answer: LocalizeResponse | null;
   /** JPEG; null when the photo came to nothing that could be drawn. */
@@ -62,39 +69,51 @@ export function createPhotoQueue(
     for (;;) {
       const entry = entries.find(({ state }) => state === "waiting");
       if (entry === undefined) break;
-      await ask(entry, (running = new AbortController()).signal);
+      const { signal } = (running = new AbortController());
+      await ask(entry, signal);
+      if (entry.waitSeconds !== null) await pause(1000 * entry.waitSeconds, signal);
     }
     busy = false;
   }
 
+  /** Ask about a photo; afterwards it waits only where the service asked to. Throws nothing. */
   async function ask(entry: Entry, signal: AbortSignal): Promise<void> {
-    const { photo, name, wish } = entry;
-    if (wish === null) return;
     entry.state = "running";
+    entry.waitSeconds = null;
     entry.withKey = hasKey();
-    onChange(entry);
-    const began = performance.now();
-    const { camera, options } = wish;
-    const call = { map: mapRef(wish.map), image: photo, name, camera, options, debug: true };
+    tell(entry);
     try {
-      keep(entry, await service.localize(call, signal));
+      const call = await read(entry);
+      signal.throwIfAborted();
+      const began = performance.now();
+      const answer = await service.localize(call, signal);
+      entry.seconds = (performance.now() - began) / 1000;
+      keep(entry, answer);
     } catch (error) {
       if (signal.aborted) return;
       fail(entry, error);
     }
-    entry.seconds = (performance.now() - began) / 1000;
-    onChange(entry);
+    tell(entry);
+  }
+
+  /** What shows the photos may have a mistake: the next one is asked about all the same. */
+  function tell(entry: Entry): void {
+    try {
+      onChange(entry);
+    } catch (error) {
+      reportError(error);
+    }
   }
 
   function start(entry: Entry, wish: () => Wish): void {
-    entry.answer = entry.overlay = entry.error = entry.seconds = null;
+    entry.answer = entry.overlay = entry.error = entry.seconds = entry.waitSeconds = null;
     try {
       entry.wish = wish();
       entry.state = "waiting";
     } catch (error) {
       fail(entry, error);
     }
-    onChange(entry);
+    tell(entry);
     void work();
   }
 
@@ -104,8 +123,8 @@ export function createPhotoQueue(
     },
     add(photo, name, wish) {
       const entry: Entry = {
-        ...{ id: next++, photo, name, wish: null, state: "waiting", answer: null, overlay: null },
-        ...{ error: null, withKey: false, seconds: null },
+        ...{ id: next++, photo, name, wish: null, state: "waiting", waitSeconds: null },
+        ...{ answer: null, overlay: null, error: null, withKey: false, seconds: null },
       };
       entries.push(entry);
       start(entry, wish);
@@ -121,18 +140,48 @@ export function createPhotoQueue(
   };
 }
 
+/** Read the file, and with it what is to be asked. */
+async function read(entry: Entry) {
+  const { name, wish } = entry;
+  if (wish === null) throw new Error("a photo waits that was never asked about");
+  let bytes: ArrayBuffer;
+  try {
+    bytes = await entry.photo.arrayBuffer();
+  } catch (error) {
+    if (!(error instanceof DOMException)) throw error;
+    throw ownError("page.file", "This file cannot be read", "it is gone, or a folder", {
+      expected: "a photo",
+      got: error.message,
+    });
+  }
+  entry.photo = new Blob([bytes], { type: entry.photo.type });
+  const header = await jpegHeader(entry.photo);
+  // Learned features do not know what lies on its side; who wants it so chooses it.
+  if (header !== null && header.orientation !== 1) {
+    entry.wish = { ...wish, options: { read_as: "upright", ...wish.options } };
+  }
+  const { map, camera, options } = entry.wish!;
+  return { map: mapRef(map), image: entry.photo, name, camera, options, debug: true };
+}
+
 function keep(entry: Entry, answer: LocalizeResponse): void {
-  entry.state = "answered";
   const overlay = answer.debug?.overlay ?? "";
+  if (overlay !== "") entry.overlay = jpegOf(overlay);
   entry.answer =
     answer.debug === null ? answer : { ...answer, debug: { ...answer.debug, overlay: "" } };
-  if (overlay !== "") entry.overlay = jpegOf(overlay);
+  entry.state = "answered";
 }
 
 function fail(entry: Entry, error: unknown): void {
-  if (!(error instanceof ServiceError)) throw error;
+  if (error instanceof ServiceError) {
+    entry.waitSeconds = busySeconds(error);
+    entry.state = entry.waitSeconds === null ? "failed" : "waiting";
+    entry.error = entry.waitSeconds === null ? error : null;
+    return;
+  }
   entry.state = "failed";
-  entry.error = error;
+  entry.error = ownError("page.mistake", "This page made a mistake", String(error));
+  reportError(error);
 }
 
 function jpegOf(base64: string): Blob {

@@ -5,6 +5,8 @@ import { button, element, facts } from "../dom";
 export interface ProblemActions {
   /** Ask for an API key. */
   giveKey(): void;
+  /** Look which maps there are: what is not there may have been removed. */
+  reloadMaps(): void;
   /** Do again what failed; none where that happens by itself. */
   again?: () => void;
 }
@@ -16,7 +18,11 @@ export function problemView(error: ServiceError, actions: ProblemActions): HTMLE
   if (problem.status === 401 || problem.status === 403) {
     buttons.append(button("Give an API key", actions.giveKey, { class: "primary" }));
   }
-  if (actions.again !== undefined) buttons.append(button("Ask again", actions.again));
+  if (problem.status === 404) {
+    buttons.append(button("Look which maps there are", actions.reloadMaps, { class: "primary" }));
+  } else if (actions.again !== undefined) {
+    buttons.append(button("Ask again", actions.again));
+  }
 
   const rows: [string, string][] = [];
   for (const [name, value] of [
@@ -44,7 +50,10 @@ function wordsFor({ problem, retryAfterSeconds }: ServiceError): [title: string,
     retryAfterSeconds === null
       ? "Wait a moment, then ask again."
       : `Wait ${Math.ceil(retryAfterSeconds)} s, then ask again.`;
-  const report = "Tell whoever runs the service, with the number of the request.";
+  const report =
+    problem.request_id === ""
+      ? "Tell whoever runs the service."
+      : "Tell whoever runs the service, with the number of the request.";
   switch (problem.status) {
     case 0:
       if (problem.code === "server.unreachable") {
@@ -52,14 +61,19 @@ function wordsFor({ problem, retryAfterSeconds }: ServiceError): [title: string,
       }
       return [problem.title, ""];
     case 401:
-      return ["An API key is needed", "Whoever runs the service makes keys."];
+      return [
+        problem.code === "access.key_unknown"
+          ? "This API key is not known"
+          : "An API key is needed",
+        "Whoever runs the service makes keys.",
+      ];
     case 403:
       return [
         "Not allowed",
         "Looking at maps takes a key with “read”, photos one with “localize”.",
       ];
     case 404:
-      return ["Not there", "It may have been removed since this page came: choose another map."];
+      return ["Not there", "It may have been removed since this page came: choose another one."];
     case 413:
       return ["Too large", "Make the photo smaller."];
     case 429:
@@ -68,14 +82,16 @@ function wordsFor({ problem, retryAfterSeconds }: ServiceError): [title: string,
       return ["The service is not ready", wait];
     case 504:
       return ["It took too long", "Ask again later, or for less: fewer photos to match (top_k)."];
+    case 400:
     case 422:
       return ["The service cannot use this", ""];
     default:
-      return ["The service failed", report];
+      return [problem.status < 500 ? "The service refuses this" : "The service failed", report];
   }
 }
 
-function sentence(text: string): string {
+/** As a sentence: the service's texts begin small and have no full stop. */
+export function sentence(text: string): string {
   const begun = text.charAt(0).toUpperCase() + text.slice(1);
   return /[.?!]$/.test(begun) ? begun : `${begun}.`;
 }

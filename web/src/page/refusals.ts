@@ -18,7 +18,9 @@ interface Advice {
 
 const ANOTHER_PLACE = "Was the photo taken in the place of this map? If not, choose another map.";
 const MORE_PHOTOS = "Under Options, raise “mapping photos to match” (top_k).";
-const TURNED = "If the photo is stored turned, set “read photo as” to upright under Options.";
+const TURNED = "The photo is stored turned: under Options, set “Read photo as” to upright.";
+const TURNING_HELPS = ["too_few_matches", "no_pose", "too_few_inliers", "low_inlier_ratio"];
+const DEFAULT_PRESET = "Under Options, choose the preset default instead of config1.";
 const CHECK_CAMERA = "Check the camera: model, focal length, size.";
 const SHARPER = "Try a sharper, brighter or larger photo.";
 
@@ -34,7 +36,7 @@ export const ADVICE: Readonly<Record<string, Advice>> = {
   },
   too_few_matches: {
     meaning: "Too little of the photo was found among the map’s landmarks to look for a pose.",
-    tries: [ANOTHER_PLACE, "Take in more of the scene.", MORE_PHOTOS, TURNED],
+    tries: [ANOTHER_PLACE, "Take in more of the scene.", MORE_PHOTOS],
   },
   no_pose: {
     meaning: "There are matches, but no camera sees them where they lie in the photo.",
@@ -48,7 +50,7 @@ export const ADVICE: Readonly<Record<string, Advice>> = {
   },
   low_inlier_ratio: {
     meaning: "The best pose explains too small a share of the matches.",
-    tries: [ANOTHER_PLACE, CHECK_CAMERA, "If the preset is config1, use default."],
+    tries: [ANOTHER_PLACE, CHECK_CAMERA, DEFAULT_PRESET],
   },
   uncertain_pose: {
     meaning:
@@ -74,21 +76,25 @@ export const ADVICE: Readonly<Record<string, Advice>> = {
   },
 };
 
-/** What to try for this answer: what may not apply to it is left out. */
-export function advice(answer: LocalizeResponse): Advice {
+/** What to try for this answer to what was asked: what may not apply to it is left out. */
+export function advice(answer: LocalizeResponse, options: Record<string, string | number>): Advice {
   const reason = answer.refusal?.reason ?? "";
   const known = (Object.hasOwn(ADVICE, reason) && ADVICE[reason]) || {
     meaning: "This page does not know the reason; the message is the service's.",
     tries: ["Reload the page: the service may be newer."],
   };
   const guessed = answer.camera.source === "guess" || answer.camera.source === "estimated";
-  const tries = known.tries.filter(
-    (text) =>
-      text !== TURNED || (answer.orientation.exif !== 1 && answer.orientation.read_as === "stored"),
-  );
+  const { exif, read_as } = answer.orientation;
+  const turned = exif !== 1 && read_as === "stored" && TURNING_HELPS.includes(reason);
+  const tries = [
+    ...(turned ? [TURNED] : []),
+    ...known.tries.filter((text) => text !== DEFAULT_PRESET || options["preset"] === "config1"),
+  ];
   if (guessed && answer.refusal?.stage === "gate" && reason !== "uncertain_pose") {
     const typed = "Type the camera’s parameters: the photo does not tell its focal length.";
-    return { meaning: known.meaning, tries: [typed, ...tries.filter((t) => t !== CHECK_CAMERA)] };
+    const others = tries.filter((text) => text !== CHECK_CAMERA);
+    others.splice(turned ? 1 : 0, 0, typed);
+    return { meaning: known.meaning, tries: others };
   }
   return { meaning: known.meaning, tries };
 }

@@ -18,9 +18,11 @@ export interface Question {
 /** The answer as the lines below get it: they do not ask for the matches and their picture. */
 export function answerJson(answer: LocalizeResponse): string {
   const text = JSON.stringify({ ...answer, debug: null }, null, 2);
-  // Lists of numbers on one line.
-  return text.replace(/\[[-+.\deE,\s]+\]/g, (list) =>
-    list.replace(/\s+/g, " ").replace("[ ", "[").replace(" ]", "]"),
+  // Lists of numbers on one line; texts are passed over, as what they hold may look like one.
+  return text.replace(/"(?:\\.|[^"\\])*"|\[[-+.\deE,\s]+\]/g, (found) =>
+    found.startsWith("[")
+      ? found.replace(/\s+/g, " ").replace("[ ", "[").replace(" ]", "]")
+      : found,
   );
 }
 

@@ -5,8 +5,8 @@ export interface Tabs {
   choose(id: string): void;
 }
 
-/** Give life to a tablist whose tabs name their panels. `onChoose` is told the id of a tab. */
-export function createTabs(list: HTMLElement, onChoose: (id: string) => void = () => {}): Tabs {
+/** Give life to a tablist whose tabs name their panels. */
+export function createTabs(list: HTMLElement): Tabs {
   const tabs = [...list.querySelectorAll<HTMLElement>("[role=tab]")];
 
   function choose(id: string): void {
@@ -17,7 +17,6 @@ export function createTabs(list: HTMLElement, onChoose: (id: string) => void = (
       const panel = panelOf(list, tab);
       if (panel !== null) panel.hidden = !chosen;
     }
-    onChoose(id);
   }
 
   for (const [i, tab] of tabs.entries()) {

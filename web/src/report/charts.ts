@@ -1,8 +1,9 @@
 // Small charts in SVG: bars of a histogram, and what was predicted against what was measured.
 import { element } from "../dom";
+import { countText, counted } from "../words";
 import type { Histogram, ReportData } from "./data";
 import { svg } from "./svg";
-import { count, percent, plural } from "./words";
+import { percent } from "./words";
 
 const [WIDTH, HEIGHT] = [320, 190];
 const EDGE = { left: 56, right: 10, top: 10, bottom: 38 };
@@ -75,7 +76,7 @@ export function histogramChart(
 }
 
 /** Where the values of a histogram lie, in words. */
-export function summaryOf(histogram: Histogram): string {
+function summaryOf(histogram: Histogram): string {
   const total = histogram.counts.reduce((sum, number) => sum + number, 0);
   if (total === 0) return "nothing was counted";
   const at = (share: number) => short(quantileOf(histogram, share));
@@ -99,7 +100,7 @@ export function calibrationChart(calibration: ReportData["coverage"]["calibratio
   const y = scaleOf(0, 1, HEIGHT - EDGE.bottom, EDGE.top);
   const words = calibration.map(
     ({ predicted, measured, runs }) =>
-      `predicted ${percent(predicted)}, measured ${percent(measured)} of ${plural(runs, "run")}`,
+      `predicted ${percent(predicted)}, measured ${percent(measured)} of ${counted(runs, "run")}`,
   );
   const picture = chart(`Predicted against measured: ${words.join("; ")}`);
   for (const tick of [0, 0.5, 1]) {
@@ -204,7 +205,7 @@ function scaleOf(low: number, high: number, from: number, to: number): (value: n
 
 /** Few digits: what fits beside an axis. */
 function short(value: number): string {
-  if (Math.abs(value) >= 10000) return `${count(value / 1000)}k`;
-  if (Math.abs(value) >= 100) return count(value);
+  if (Math.abs(value) >= 10000) return `${countText(value / 1000)}k`;
+  if (Math.abs(value) >= 100) return countText(value);
   return String(Number(value.toPrecision(3)));
 }

@@ -4,6 +4,7 @@ import "../style/report.css";
 import { element } from "../dom";
 import { parsePoints } from "../points";
 import type { PointBlock } from "../viewer/types";
+import { bytesText, countText } from "../words";
 import { histogramChart } from "./charts";
 import type { ReportData } from "./data";
 import { coverageSection } from "./coverage";
@@ -11,7 +12,7 @@ import { aboutSection } from "./about";
 import { onPlan } from "./plan";
 import { createScene } from "./scene";
 import { trials } from "./trials";
-import { bytes, count, kindestRuns, percent, sharesOfChance, succeeded, verdict } from "./words";
+import { kindestRuns, percent, sharesOfChance, succeeded, verdict } from "./words";
 
 function main(): void {
   const data = JSON.parse(document.getElementById("report")?.textContent ?? "") as ReportData;
@@ -53,8 +54,8 @@ function heading(data: ReportData): HTMLElement[] {
   const good = kindest.filter((run) => succeeded(run, coverage.within)).length;
   const shares = sharesOfChance(coverage);
   const figures: [string, string][] = [
-    [count(map.images), "mapping photos"],
-    [count(map.landmarks), "landmarks"],
+    [countText(map.images), "mapping photos"],
+    [countText(map.landmarks), "landmarks"],
     [
       kindest.length > 0 ? percent(good / kindest.length) : "–",
       "of photos localized without themselves",
@@ -78,7 +79,7 @@ function heading(data: ReportData): HTMLElement[] {
       { class: "note" },
       `${map.id}@${map.version}, made ${map.created.slice(0, 10)} by ${map.method} of ` +
         `${map.local_features} and ${map.global_features.join(", ")}; ` +
-        `${count(map.observations)} observations, ${bytes(map.size_bytes)}` +
+        `${countText(map.observations)} observations, ${bytesText(map.size_bytes)}` +
         (map.metric ? "." : "; not metric: lengths are in units of its own."),
     ),
     ...map.notes.map((text) => element("p", { class: "note" }, `Note: ${text}`)),

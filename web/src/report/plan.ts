@@ -1,6 +1,6 @@
 // Where things lie on the plan: the map seen from above, `right` to the right and `ahead` up.
 import type { Quaternion, Vector3 } from "../api";
-import { add, apply, cross, dot, percentile, rotationMatrix, scale } from "../geometry";
+import { add, cross, dot, percentile, scale } from "../geometry";
 import type { ReportData } from "./data";
 
 /** On the plan, units of the world; y grows downwards, as pixels do. */
@@ -20,11 +20,6 @@ type Axes = Pick<Coverage, "right" | "ahead">;
 /** Straight down onto the plan. */
 export function onPlan(axes: Axes, point: Vector3): PlanPoint {
   return { x: dot(point, axes.right), y: -dot(point, axes.ahead) };
-}
-
-/** The camera's z axis in the world: where a photo looks. */
-export function looksAlong(orientation: Quaternion): Vector3 {
-  return apply(rotationMatrix(orientation), [0, 0, 1]);
 }
 
 /** Angle from `right` towards `ahead`, degrees in [0, 360); null for what looks straight up or down. */
@@ -59,7 +54,7 @@ export function orientationOf(coverage: Axes & { pitch_deg: number }, heading: n
 }
 
 /** Of the rotation with these columns (Shepperd's method: divide by the largest component). */
-export function quaternionOf(x: Vector3, y: Vector3, z: Vector3): Quaternion {
+function quaternionOf(x: Vector3, y: Vector3, z: Vector3): Quaternion {
   const squares = [
     1 + x[0] + y[1] + z[2],
     1 + x[0] - y[1] - z[2],

@@ -1,11 +1,11 @@
 // The coverage seen from above, drawn as SVG: rosettes of directions, photos, weak spots.
 import { element } from "../dom";
-import { niceLength } from "../geometry";
+import { niceLength, viewingDirection } from "../geometry";
+import { countText } from "../words";
 import type { CoverageCell, ReportData } from "./data";
 import {
   headingOf,
   headingsApart,
-  looksAlong,
   nearestDirection,
   onPlan,
   petal,
@@ -15,7 +15,7 @@ import {
 } from "./plan";
 import type { Scale } from "./scale";
 import { format, svg } from "./svg";
-import { clock, count, length, percent } from "./words";
+import { clock, length, percent } from "./words";
 
 /** A cell is never drawn smaller than this, pixels: a wide plan scrolls instead. */
 const LEAST_CELL = 12;
@@ -49,7 +49,7 @@ export function createPlan(
   const photos = data.images.map((image) => ({
     name: image.name,
     at: onPlan(coverage, image.position),
-    heading: headingOf(coverage, looksAlong(image.orientation)),
+    heading: headingOf(coverage, viewingDirection(image.orientation)),
   }));
   const shown = [...cells, ...photos].map(({ at }) => at);
   const box = planBox(shown.length > 0 ? shown : landmarks, landmarks, coverage.cell);
@@ -270,7 +270,7 @@ export function describe(data: ReportData, cell: CoverageCell, direction: number
   return (
     `Looking towards ${clock(data.coverage.directions_deg[direction] ?? 0)}: localized in ` +
     `${percent(cell.probability[direction] ?? 0)} of cases, ` +
-    `${count(cell.expected_inliers[direction] ?? 0)} inliers expected, position ` +
+    `${countText(cell.expected_inliers[direction] ?? 0)} inliers expected, position ` +
     (std === null ? "not expected." : `± ${length(std, data.map.metric)} (standard deviation).`)
   );
 }

@@ -1,7 +1,8 @@
 // The map in 3D, by the viewer of the service's page.
 import { element } from "../dom";
+import { NoGraphics } from "../viewer/graphics";
 import { createViewer } from "../viewer/viewer";
-import type { CoverageArrow, PointBlock, Theme } from "../viewer/types";
+import type { CoverageArrow, PointBlock, Theme, Viewer } from "../viewer/types";
 import type { ReportData } from "./data";
 import { directionOf, orientationOf } from "./plan";
 
@@ -14,22 +15,19 @@ export interface Scene {
 
 /** Fill `host`; null where the browser has no WebGL, which `host` then says. */
 export function createScene(host: HTMLElement, data: ReportData, block: PointBlock): Scene | null {
-  if (!hasWebGl()) {
-    host.replaceChildren(
-      element(
-        "p",
-        { class: "note" },
-        "This browser shows no 3D (WebGL is not there or switched off). The plan and the tables " +
-          "have all of the numbers.",
-      ),
-    );
-    return null;
-  }
   const { coverage } = data;
   const stage = element("div", { class: "stage" });
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const theme = (): Theme => (dark.matches ? "dark" : "light");
-  const viewer = createViewer(stage, theme());
+  let viewer: Viewer;
+  try {
+    viewer = createViewer(stage, theme());
+  } catch (error) {
+    if (!(error instanceof NoGraphics)) throw error;
+    const text = `${error.message} The plan and the tables have all of the numbers.`;
+    host.replaceChildren(element("p", { class: "note" }, text));
+    return null;
+  }
   let direction: number | null = null;
   let arrowsShown = true;
 
@@ -97,11 +95,4 @@ export function createScene(host: HTMLElement, data: ReportData, block: PointBlo
       drawArrows();
     },
   };
-}
-
-function hasWebGl(): boolean {
-  const context = element("canvas").getContext("webgl2");
-  // Browsers allow few of them: this one goes back at once.
-  context?.getExtension("WEBGL_lose_context")?.loseContext();
-  return context !== null;
 }

@@ -1,18 +1,10 @@
 // The held-out trials: how they went by how much was left out, and the photos that did worst.
 import { element } from "../dom";
 import { percentile } from "../geometry";
+import { countText, counted } from "../words";
 import { calibrationChart } from "./charts";
 import type { HeldOutRun, ReportData } from "./data";
-import {
-  byLeftOut,
-  count,
-  degrees,
-  kindestRuns,
-  length,
-  percent,
-  plural,
-  succeeded,
-} from "./words";
+import { byLeftOut, degrees, kindestRuns, length, percent, succeeded } from "./words";
 
 /** More failures than this nobody reads; of photos that did well a few show what "well" is. */
 const [MOST_FAILURES, LEAST_PHOTOS] = [30, 10];
@@ -94,7 +86,7 @@ function outcomes({ held_out: runs, coverage: { within }, map }: ReportData): HT
     const turned = middle(answered.map((run) => run.orientation_error_deg));
     return [
       name,
-      count(group.length),
+      countText(group.length),
       percent(group.filter((run) => succeeded(run, within)).length / group.length),
       percent(answered.length / group.length),
       answered.length === 0 ? "–" : `${length(off, map.metric)}, ${degrees(turned)}`,
@@ -131,13 +123,13 @@ function worstPhotos(data: ReportData): HTMLElement {
     element("span", { class: "name" }, data.images[run.image]?.name ?? `photo ${run.image}`),
     element("span", { class: bad ? "failed" : "passed" }, outcomeOf(run, data, bad)),
     run.orientation_error_deg === null ? "–" : degrees(run.orientation_error_deg),
-    count(run.inliers),
+    countText(run.inliers),
     percent(run.probability),
   ]);
   const title =
     failed === 0
-      ? `All ${count(worst.length)} photos were localized without themselves; the furthest off`
-      : `${plural(failed, "photo")} of ${count(worst.length)} failed when only as little as possible was ` +
+      ? `All ${countText(worst.length)} photos were localized without themselves; the furthest off`
+      : `${counted(failed, "photo")} of ${countText(worst.length)} failed when only as little as possible was ` +
         `left out; the worst first`;
   const made = table(title, ["Photo", "Outcome", "Turned by", "Inliers", "Predicted"], rows);
   if (worst.length > shown.length) {

@@ -1,5 +1,6 @@
-// Numbers, places and verdicts in words.
+// Shares, places and verdicts in words.
 import { lengthText } from "../geometry";
+import { countText, counted } from "../words";
 import type { HeldOutRun, ReportData } from "./data";
 import { boxOf, onPlan, type PlanPoint } from "./plan";
 
@@ -25,27 +26,11 @@ export function percent(share: number): string {
 
 /** A length of the world: two digits, as much as there is to know. */
 export function length(value: number, metric: boolean): string {
-  return lengthText(Number(value.toPrecision(2)), metric);
+  return lengthText(value, metric, 2);
 }
 
 export function degrees(value: number): string {
   return `${Number(value.toFixed(value < 10 ? 1 : 0))}°`;
-}
-
-/** Digits in groups of three, with spaces that do not break. */
-export function count(value: number): string {
-  return Math.round(value)
-    .toString()
-    .replace(/\B(?=(\d{3})+$)/g, "\u202f");
-}
-
-export function plural(number: number, one: string, many = `${one}s`): string {
-  return `${count(number)} ${number === 1 ? one : many}`;
-}
-
-export function bytes(size: number): string {
-  const [value, unit] = size < 2 ** 20 ? [size / 2 ** 10, "KiB"] : [size / 2 ** 20, "MiB"];
-  return `${value.toFixed(value < 10 ? 1 : 0)} ${unit}`;
 }
 
 /** Twelve o'clock is up on the plan. */
@@ -124,8 +109,8 @@ export function verdict(data: ReportData): string[] {
     const good = kindest.filter((run) => succeeded(run, coverage.within)).length;
     sentences.push(
       `A photo taken where the mapping photos were taken is localized in ` +
-        `${percent(good / kindest.length)} of trials: ${count(good)} of ` +
-        `${plural(kindest.length, "mapping photo")}, each localized in the map without itself.`,
+        `${percent(good / kindest.length)} of trials: ${countText(good)} of ` +
+        `${counted(kindest.length, "mapping photo")}, each localized in the map without itself.`,
     );
   } else {
     sentences.push("No mapping photo could be held out, so that all below is a guess.");

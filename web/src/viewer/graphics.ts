@@ -13,15 +13,21 @@ export interface Graphics {
   software: boolean;
 }
 
-/** Throws an Error in words for people where there is no WebGL 2. */
-export function openGraphics(canvas: HTMLCanvasElement): Graphics {
-  const software = drawsInSoftware();
-  if (software === null) {
-    throw new Error(
+/** This browser cannot draw in 3D; the message says it to people. */
+export class NoGraphics extends Error {
+  constructor() {
+    super(
       "This browser cannot draw in 3D: WebGL 2 is missing or switched off. " +
         "Try a current browser, or switch hardware acceleration on in its settings.",
     );
+    this.name = "NoGraphics";
   }
+}
+
+/** Throws NoGraphics where there is no WebGL 2. */
+export function openGraphics(canvas: HTMLCanvasElement): Graphics {
+  const software = drawsInSoftware();
+  if (software === null) throw new NoGraphics();
   const renderer = new WebGLRenderer({
     canvas,
     antialias: !software,

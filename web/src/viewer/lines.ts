@@ -3,6 +3,7 @@ import {
   BufferAttribute,
   BufferGeometry,
   GLSL3,
+  InstancedMesh,
   LineBasicMaterial,
   LineSegments,
   Object3D,
@@ -84,6 +85,7 @@ export function discard(object: Object3D | null): void {
     const { geometry, material } = part as Partial<LineSegments>;
     geometry?.dispose();
     for (const one of material === undefined ? [] : [material].flat()) one.dispose();
+    if (part instanceof InstancedMesh) part.dispose(); // its places and colours
   });
   object?.removeFromParent();
 }

@@ -1,6 +1,6 @@
 // The mapping cameras: all in one set of lines, those that stand out drawn again in another colour.
 import { BufferAttribute, Group, Mesh, MeshBasicMaterial, DoubleSide, BufferGeometry } from "three";
-import type { Camera, MapImage, Vector3 } from "../api";
+import type { Camera, MapImage, Quaternion, Vector3 } from "../api";
 import { cornerRays, frustumCorners, subtract } from "../geometry";
 import { boldLines, discard, pyramidEdges, thinLines } from "./lines";
 import type { Palette } from "./themes";
@@ -9,13 +9,16 @@ interface Standing {
   name: string;
   /** In the scene. */
   position: Vector3;
-  corners: Vector3[];
+  orientation: Quaternion;
+  rays: Vector3[];
 }
 
 const HIGHLIGHT_SIZE = 1.25;
 
 export class MappingCameras {
   readonly object = new Group();
+  /** How deep frusta are painted, in units of the world. */
+  depth = 1;
   /** The place of each in the scene, by row of `names`. */
   positions: Vector3[] = [];
   names: string[] = [];
@@ -24,25 +27,17 @@ export class MappingCameras {
   private all: Group | null = null;
   private outstanding: Group | null = null;
 
-  /** How deep a frustum is, in units of the world, is the viewer's to say: `depth`. */
-  set(
-    images: MapImage[],
-    cameras: Record<string, Camera>,
-    origin: Vector3,
-    depth: number,
-    palette: Palette,
-  ): void {
-    const rays = new Map(Object.entries(cameras).map(([key, one]) => [key, cornerRays(one)]));
-    this.standing = images.flatMap((image) => {
-      const seen = rays.get(image.camera);
-      if (seen === undefined) return [];
-      const position = subtract(image.position, origin);
-      const corners = frustumCorners(position, image.orientation, seen, depth);
-      return [{ name: image.name, position, corners }];
+  /** Say where they stand; to be painted then, as their places say how deep they can be. */
+  set(images: MapImage[], cameras: Record<string, Camera>, origin: Vector3): void {
+    const raysOf = new Map(Object.entries(cameras).map(([key, one]) => [key, cornerRays(one)]));
+    this.standing = images.flatMap(({ name, camera, position, orientation }) => {
+      const rays = raysOf.get(camera);
+      return rays === undefined
+        ? []
+        : [{ name, position: subtract(position, origin), orientation, rays }];
     });
     this.positions = this.standing.map((one) => one.position);
     this.names = this.standing.map((one) => one.name);
-    this.paint(palette);
   }
 
   highlight(names: ReadonlySet<string>, palette: Palette): void {
@@ -54,7 +49,7 @@ export class MappingCameras {
     discard(this.all);
     this.all = new Group();
     if (this.standing.length > 0) {
-      const ends = this.standing.flatMap((one) => pyramidEdges(one.position, one.corners));
+      const ends = this.standing.flatMap((one) => pyramidEdges(one.position, this.corners(one)));
       // Many lines on top of each other need less of each.
       const opacity = this.standing.length > 300 ? 0.45 : 0.8;
       const lines = thinLines(new Float32Array(ends), palette.camera, opacity);
@@ -68,7 +63,9 @@ export class MappingCameras {
   private paintChosen(palette: Palette): void {
     discard(this.outstanding);
     this.outstanding = new Group();
-    const chosen = this.standing.filter((one) => this.chosen.has(one.name)).map(enlarged);
+    const chosen = this.standing
+      .filter((one) => this.chosen.has(one.name))
+      .map((one) => ({ position: one.position, corners: this.corners(one, HIGHLIGHT_SIZE) }));
     if (chosen.length > 0) {
       const ends = chosen.flatMap((one) => pyramidEdges(one.position, one.corners));
       const faces = chosen.flatMap(({ corners: [a, b, c, d] }) =>
@@ -82,6 +79,10 @@ export class MappingCameras {
     this.object.add(this.outstanding);
   }
 
+  private corners({ position, orientation, rays }: Standing, size = 1): Vector3[] {
+    return frustumCorners(position, orientation, rays, size * this.depth);
+  }
+
   clear(): void {
     discard(this.all);
     discard(this.outstanding);
@@ -91,14 +92,6 @@ export class MappingCameras {
     this.names = [];
     this.chosen = new Set();
   }
-}
-
-function enlarged(one: Standing): Standing {
-  const corners = one.corners.map((corner) => {
-    const reach = subtract(corner, one.position);
-    return reach.map((v, i) => one.position[i]! + HIGHLIGHT_SIZE * v) as Vector3;
-  });
-  return { ...one, corners };
 }
 
 /** Translucent triangles. */

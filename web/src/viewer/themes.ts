@@ -40,11 +40,11 @@ export const PALETTES: Record<Theme, Palette> = {
   },
 };
 
-/** So many photos see a landmark of the last colour of `seenBy`, or more; of the first, two. */
+/** So many photos see a landmark of the last colour of `seenBy`, or more; of the first, one. */
 export const SEEN_BY_MOST = 16;
 
 /** Of the chance that a photo is localized: 0, a half, 1. */
-export const PROBABILITY_COLOURS = ["#c23b0e", "#f0c04a", "#2078b8"] as const;
+const PROBABILITY_COLOURS = ["#c23b0e", "#f0c04a", "#2078b8"] as const;
 
 /** Red, green and blue, 0 to 1, of `#rrggbb`. */
 export function rgb(hex: string): [number, number, number] {

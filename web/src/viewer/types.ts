@@ -79,5 +79,8 @@ export interface Viewer {
   dispose(): void;
 }
 
-/** Make a viewer that fills `host`, which says what it shows in words for those who cannot see. */
+/**
+ * Make a viewer that fills `host`, which says what it shows in words for those who cannot see.
+ * Throws NoGraphics, and leaves `host` as it is, where the browser has no WebGL 2.
+ */
 export type CreateViewer = (host: HTMLElement, theme: Theme) => Viewer;

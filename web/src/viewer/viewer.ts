@@ -3,6 +3,7 @@ import { Group, Scene, Vector3 as Vector } from "three";
 import type { Camera, MapImage, Vector3 } from "../api";
 import { element } from "../dom";
 import { add, medianSpacing, percentile, scale, subtract, viewingDirection } from "../geometry";
+import { counted } from "../words";
 import { Cloud } from "./cloud";
 import { openGraphics } from "./graphics";
 import { discard } from "./lines";
@@ -58,7 +59,6 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
   let metric = false;
   let images: MapImage[] = [];
   let cameras: Record<string, Camera> = {};
-  let chosen: ReadonlySet<string> = new Set();
   let pose: ShownPose | null = null;
   let trail: Vector3[] = [];
   let coverage: CoverageArrow[] = [];
@@ -138,7 +138,7 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
       const rest = ((high - low) * OUTSIDE) / (1 - 2 * OUTSIDE);
       [min[axis], max[axis]] = [low - rest, high + rest];
     }
-    const radius = Math.max(min.distanceTo(max) / 2, 1e-6);
+    const radius = min.distanceTo(max) / 2 || 1; // of a single place, one unit around it
     const first = extent === null;
     extent = { min, max, radius, centre: min.clone().add(max).multiplyScalar(0.5) };
     steering.bound(radius);
@@ -156,10 +156,10 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
   }
 
   function showCameras(): void {
-    mapping.set(images, cameras, origin, 1, palette); // places first: they say how deep
+    mapping.set(images, cameras, origin);
     if (extent === null) measure();
-    mapping.set(images, cameras, origin, depth(), palette);
-    mapping.highlight(chosen, palette);
+    mapping.depth = depth();
+    mapping.paint(palette);
     describe();
     request();
   }
@@ -182,9 +182,9 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
   /** Say in words what the picture shows. */
   function describe(): void {
     const parts = [
-      `${cloud.loaded.toLocaleString("en")} landmarks`,
-      ...(images.length > 0 ? [`${images.length.toLocaleString("en")} mapping photos`] : []),
-      ...(pose !== null ? ["where the photo was taken"] : []),
+      counted(cloud.loaded, "landmark"),
+      ...(images.length > 0 ? [counted(images.length, "mapping photo")] : []),
+      ...(pose !== null ? ["the camera of the last answer"] : []),
       ...(coverage.length > 0 ? ["where a photo would be localized"] : []),
     ];
     canvas.setAttribute(
@@ -248,7 +248,7 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
       mark.set(null, origin, 1, palette, pixelRatio);
       discard(grid);
       [images, cameras, pose, trail, coverage] = [[], {}, null, [], []];
-      [chosen, extent, grid] = [new Set(), null, null];
+      [extent, grid] = [null, null];
       world.quaternion.copy(sceneFromWorld(up));
       world.updateMatrixWorld();
       cloud.object.quaternion.copy(world.quaternion);
@@ -284,8 +284,7 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
       request();
     },
     highlight(names) {
-      chosen = names;
-      mapping.highlight(chosen, palette);
+      mapping.highlight(names, palette);
       request();
     },
     showPose(given) {
@@ -360,6 +359,7 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
   });
   canvas.addEventListener("webglcontextrestored", () => {
     lost = false;
+    renderer.setClearColor(palette.ground); // forgotten with the memory
     overlay.tell(null);
     move();
   });

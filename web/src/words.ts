@@ -1,11 +1,11 @@
 // Numbers as people read them.
-import type { LocalizeResponse } from "../api";
+import type { LocalizeResponse } from "./api";
 
 const WHOLE = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
 
-/** 199,676 */
+/** 199 676: in groups of three, with thin spaces that do not break. */
 export function countText(count: number): string {
-  return WHOLE.format(count);
+  return WHOLE.format(count).replaceAll(",", "\u202f");
 }
 
 /** "1 photo", "20 photos" */
@@ -13,12 +13,12 @@ export function counted(count: number, one: string, many = `${one}s`): string {
   return `${countText(count)} ${count === 1 ? one : many}`;
 }
 
-/** Bytes as 33 MB. */
+/** Bytes as 33 MiB, the unit of `mapping`. */
 export function bytesText(bytes: number): string {
-  const units = ["B", "kB", "MB", "GB", "TB"];
+  const units = ["B", "KiB", "MiB", "GiB", "TiB"];
   let unit = 0;
-  for (; bytes >= 1000 && unit < units.length - 1; unit++) bytes /= 1000;
-  return `${bytes >= 100 || unit === 0 ? Math.round(bytes) : bytes.toPrecision(2)} ${units[unit]}`;
+  for (; bytes >= 1024 && unit < units.length - 1; unit++) bytes /= 1024;
+  return `${bytes >= 99.5 || unit === 0 ? Math.round(bytes) : bytes.toPrecision(2)} ${units[unit]}`;
 }
 
 /** Seconds as 58 ms or 1.24 s. */

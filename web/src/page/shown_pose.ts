@@ -1,0 +1,23 @@
+// An answer as the 3D view draws it.
+import type { LocalizeResponse, PoseEstimate, Quaternion, Vector3 } from "../api";
+import { positionCovariance, type Matrix3 } from "../geometry";
+import type { ShownPose } from "../viewer/types";
+
+/** The pose with its ellipsoid, and the inliers where they were asked for; null of a refusal. */
+export function shownPose({ pose, camera, debug }: LocalizeResponse): ShownPose | null {
+  if (pose === null) return null;
+  return {
+    position: pose.position as Vector3,
+    orientation: pose.orientation as Quaternion,
+    camera,
+    positionCovariance: covarianceOfPosition(pose),
+    inliers:
+      debug?.inliers.flatMap((yes, i) => (yes ? debug.points.slice(3 * i, 3 * i + 3) : [])) ?? [],
+  };
+}
+
+/** 3 x 3, row by row, of the camera's centre in the world. */
+export function covarianceOfPosition({ cam_from_world, covariance }: PoseEstimate): Matrix3 {
+  const { rotation_wxyz: rotation, translation } = cam_from_world;
+  return positionCovariance(rotation as Quaternion, translation as Vector3, covariance);
+}

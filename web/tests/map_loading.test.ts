@@ -1,0 +1,131 @@
+import { afterEach, beforeEach, describe, expect, test, vi } from "vitest";
+import { ownError, ServiceError, type MapImages, type MapInfo, type Service } from "../src/api";
+import { loadMap } from "../src/page/map_loading";
+import { patiently } from "../src/page/patience";
+import type { Viewer } from "../src/viewer/types";
+
+const MAP = {
+  ...{ id: "kitchen", version: "7", metric: true, down: [] as number[] },
+  extent: { min: [0, 0, 0], max: [2, 4, 6] },
+} as MapInfo;
+const UPRIGHT = [0.5, -0.5, 0.5, -0.5] as const; // world_from_cam: y down becomes z down
+const IMAGES = {
+  ...{ total: 1, first: 0, cameras: {} },
+  images: [{ name: "a", camera: "0", position: [0, 0, 0], orientation: [...UPRIGHT] }],
+} as unknown as MapImages;
+
+/** A body of GET /maps/{ref}/points with all of `total` landmarks. */
+function points(total: number): ArrayBuffer {
+  const body = new ArrayBuffer(48 + 16 * total);
+  const view = new DataView(body);
+  new Uint8Array(body).set([0x56, 0x4c, 0x50, 0x54]);
+  [1, total, 0, total, 0].forEach((value, i) => view.setUint32(4 + 4 * i, value, true));
+  return body;
+}
+
+function busy(status: number, wait: number | null): ServiceError {
+  const { problem } = ownError("server.busy", "Busy", "busy");
+  return new ServiceError({ ...problem, status }, wait);
+}
+
+/** What the viewer and the page were told, in order. */
+function load(service: Partial<Service>, map = MAP) {
+  const told: string[] = [];
+  const viewer = {
+    reset: ({ up }: { up: number[] }) => told.push(`reset ${up.map(Math.round).join()}`),
+    addPoints: ({ count }: { count: number }) => told.push(`points ${count}`),
+    setMappingCameras: (images: unknown[]) => told.push(`cameras ${images.length}`),
+  } as unknown as Viewer;
+  const given = new AbortController();
+  const whole: Partial<Service> = {
+    images: async () => structuredClone(IMAGES),
+    points: async () => points(3),
+    ...service,
+  };
+  const done = loadMap(map, patiently(whole as Service), viewer, {
+    signal: given.signal,
+    onReset: () => told.push("forgotten"),
+    onBlock: () => undefined,
+    onImages: () => undefined,
+  });
+  return { done, told, give_up: () => given.abort() };
+}
+
+beforeEach(() => void vi.useFakeTimers());
+afterEach(() => void vi.useRealTimers());
+
+describe("a map", () => {
+  test("that says which way is down is there at once", async () => {
+    const { done, told } = load({}, { ...MAP, down: [0, 0, -1] });
+    await done;
+    expect(told.slice(0, 2)).toEqual(["reset 0,0,1", "forgotten"]);
+    expect(told.slice(2).sort()).toEqual(["cameras 1", "points 3"]);
+  });
+
+  test("that does not is turned as its photos were held before its landmarks come", async () => {
+    const { done, told } = load({});
+    await done;
+    expect(told.filter((text) => text.startsWith("reset"))).toHaveLength(2);
+    expect(told.indexOf("points 3")).toBeGreaterThan(told.lastIndexOf("forgotten"));
+  });
+
+  test.each(["images", "points"])(
+    "whose %s fail leaves nothing of the one before",
+    async (what) => {
+      const { done, told } = load({ [what]: () => Promise.reject(busy(500, null)) });
+      await expect(done).rejects.toThrow("busy");
+      expect(told[0]).toMatch(/^reset/);
+    },
+  );
+
+  test("that is not wanted any more draws nothing, whatever still comes", async () => {
+    let send: (images: MapImages) => void = () => undefined;
+    const images = (): Promise<MapImages> => new Promise((done) => (send = done));
+    const { done, told, give_up } = load({ images });
+    const ended = expect(done).rejects.toThrow();
+    give_up();
+    const before = told.length;
+    send(IMAGES);
+    await ended;
+    expect(told).toHaveLength(before);
+  });
+
+  test("waits for a busy service as long as that asks", async () => {
+    const failures = [busy(429, 2), busy(503, 3)];
+    const asked = vi.fn(async () => {
+      const failure = failures.shift();
+      if (failure !== undefined) throw failure;
+      return points(3);
+    });
+    const { done, told } = load({ points: asked });
+    await vi.advanceTimersByTimeAsync(1_900);
+    expect(asked).toHaveBeenCalledTimes(1);
+    await vi.advanceTimersByTimeAsync(3_200);
+    await done;
+    expect(asked).toHaveBeenCalledTimes(3);
+    expect(told).toContain("points 3");
+  });
+
+  test.each([
+    ["always busy", busy(429, 1)],
+    ["busy for long", busy(503, 600)],
+  ])("is given up, in the words of the service, when that is %s", async (_, failure) => {
+    const asked = vi.fn(() => Promise.reject(failure));
+    const { done } = load({ points: asked });
+    const ended = expect(done).rejects.toBe(failure);
+    await vi.advanceTimersByTimeAsync(60_000);
+    await ended;
+    expect(asked.mock.calls.length).toBeLessThan(10);
+  });
+
+  test("that waits is not asked for when another one was chosen", async () => {
+    const asked = vi.fn(() => Promise.reject(busy(429, 2)));
+    const { done, give_up } = load({ points: asked });
+    const ended = expect(done).rejects.toThrow();
+    await vi.advanceTimersByTimeAsync(100);
+    give_up();
+    await vi.advanceTimersByTimeAsync(10_000);
+    await ended;
+    expect(asked).toHaveBeenCalledTimes(1);
+  });
+});
