@@ -181,10 +181,10 @@ def _begun(target: Path) -> Path:
     Raises:
         Conflict: ``report.output``.
     """
-    if target.is_dir():
-        raise _no_output(target, "this is a folder", "there is a folder of this name")
     unfinished = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:
+        if target.is_dir():
+            raise _no_output(target, "this is a folder", "there is a folder of this name")
         target.parent.mkdir(parents=True, exist_ok=True)
         unfinished.touch()
     except OSError as error:

@@ -86,12 +86,7 @@ def make_report_data(
                 _cell(_numbers(position + origin, digits), row)
                 for position, row in zip(grid.positions, forecasts, strict=True)
             ],
-            "weak_spots": [
-                _weak_spot(
-                    _numbers(grid.positions[spot.cell] + origin, digits), spot, grid, forecasts
-                )
-                for spot in spots
-            ],
+            "weak_spots": [_weak_spot(spot, grid, forecasts, origin, digits) for spot in spots],
             "calibration": calibration_of(runs, learned.probabilities, within),
             "rank_correlation": rank_correlation_of(runs, learned.probabilities),
         },
@@ -218,13 +213,14 @@ def _cell(position: list[float], forecasts: Sequence[Forecast]) -> dict[str, Any
 
 
 def _weak_spot(
-    position: list[float],
     spot: WeakSpot,
     grid: Grid,
     forecasts: Sequence[Sequence[Forecast]],
+    origin: NDArray[np.float64],
+    digits: int,
 ) -> dict[str, Any]:
     return {
-        "position": position,
+        "position": _numbers(grid.positions[spot.cell] + origin, digits),
         "direction_deg": grid.directions_deg[spot.direction],
         "probability": round(forecasts[spot.cell][spot.direction].probability, 4),
         "why": spot.why,

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import pytest
@@ -45,6 +45,21 @@ def _build_walk(dataset: Path, maps_dir: Path, **changes: object) -> Map:
     } | changes
     build_map(BuildSettings(dataset, "walk", maps_dir, **values), _quiet)  # type: ignore[arg-type]
     return MapStore(maps_dir).open("walk")
+
+
+@pytest.fixture(scope="session")
+def build_sample(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Map]:
+    """Build the map ``room`` of the sample by depth, with settings of its own."""
+
+    def build(**settings: Any) -> Map:
+        maps = tmp_path_factory.mktemp("maps of the sample")
+        build_map(
+            BuildSettings(sample / "mapping", "room", maps, local_features="sift", **settings),
+            _quiet,
+        )
+        return MapStore(maps).open("room")
+
+    return build
 
 
 def _localization_errors(opened: Map, dataset: Path) -> NDArray[np.float64]:

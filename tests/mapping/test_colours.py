@@ -33,14 +33,9 @@ def quiet(*_: object) -> None:
 
 
 @pytest.fixture(scope="module")
-def coloured(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Map:
+def coloured(build_sample: Build) -> Map:
     """The map ``room`` with colours; only to be read."""
-    maps = tmp_path_factory.mktemp("maps with colours")
-    settings = BuildSettings(
-        sample / "mapping", "room", maps, local_features="sift", keep_colours=True
-    )
-    build_map(settings, quiet)
-    return MapStore(maps).open("room")
+    return build_sample(keep_colours=True)
 
 
 @pytest.fixture(scope="module")

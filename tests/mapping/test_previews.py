@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -21,13 +22,8 @@ def quiet(*_: object) -> None:
 
 
 @pytest.fixture(scope="module")
-def built(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Map:
-    maps = tmp_path_factory.mktemp("maps with photos")
-    settings = BuildSettings(
-        sample / "mapping", "room", maps, local_features="sift", keep_photos=True
-    )
-    build_map(settings, quiet)
-    return MapStore(maps).open("room")
+def built(build_sample: Callable[..., Map]) -> Map:
+    return build_sample(keep_photos=True)
 
 
 def test_a_map_keeps_small_pictures_of_its_photos_when_asked(built: Map, sample: Path) -> None:

@@ -76,6 +76,7 @@ def make_map(tmp_path_factory: pytest.TempPathFactory) -> MakeMap:
         rigs: dict[str, dict[str, Pose]] | None = None,
         ready_made: bool = False,
         seed: int = 0,
+        nearest: float = 0.1,
     ) -> Map:
         random = np.random.default_rng(seed)
         points = points.astype(np.float32)
@@ -86,7 +87,7 @@ def make_map(tmp_path_factory: pytest.TempPathFactory) -> MakeMap:
             in_cam = pose.apply(points.astype(np.float64))
             pixels = project(CAMERA, in_cam)
             with np.errstate(invalid="ignore"):
-                inside = (in_cam[:, 2] > 0.1) & (pixels > 0).all(axis=1)
+                inside = (in_cam[:, 2] > nearest) & (pixels > 0).all(axis=1)
                 inside &= (pixels < (CAMERA.width, CAMERA.height)).all(axis=1)
             seen = np.flatnonzero(inside)
             rays = points[seen] - pose.center

@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
+from mapping.report import held_out
 from mapping.report.held_out import (
     chosen_photos,
     hold_out,
@@ -15,6 +16,7 @@ from mapping.report.held_out import (
 from mapping.report.viewpoints import Viewpoints
 from mapping.stages import WorkFolder
 from mapping.workers import Workers
+from visloc.types import LocalizeOptions
 
 
 def quiet(*_):
@@ -68,6 +70,25 @@ def test_landmarks_that_too_few_remaining_photos_see_vanish(make_map, looking):
     assert len(vanishing(by_depth, np.array([0, 1]))) == 0
     assert len(vanishing(by_matches, np.array([0]))) == 0
     assert vanishing(by_matches, np.array([0, 1])).tolist() == list(range(50))
+
+
+def test_what_vanishes_is_the_same_counted_and_sorted(half_mapped_room, monkeypatch):
+    left_out = np.arange(0, 18, 2)
+    monkeypatch.setattr("mapping.report.held_out._COUNTED_PART", 10**9)
+    counted = vanishing(half_mapped_room, left_out)
+    monkeypatch.setattr("mapping.report.held_out._COUNTED_PART", 1e-9)
+    assert len(counted) > 0
+    assert counted.tolist() == vanishing(half_mapped_room, left_out).tolist()
+
+
+def test_runs_of_another_program_are_not_found_again(half_mapped_room, monkeypatch):
+    before = held_out._key(half_mapped_room, 0)
+    assert held_out._key(half_mapped_room, 0) == before
+    with monkeypatch.context() as patch:
+        patch.setattr(held_out, "__version__", "0.0.0")
+        assert held_out._key(half_mapped_room, 0) != before
+    monkeypatch.setattr(held_out, "LocalizeOptions", lambda: LocalizeOptions(top_k=3))
+    assert held_out._key(half_mapped_room, 0) != before
 
 
 def test_nothing_is_matched_that_only_photos_left_out_saw(make_map, looking):

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import base64
 import json
+import shutil
 import struct
 import sys
 from collections.abc import Callable
@@ -48,6 +49,7 @@ def _run(image: int, left_out: int, error: float | None) -> dict[str, Any]:
 def _data(**changes: Any) -> dict[str, Any]:
     return {
         "map": {"id": "room", "version": "v1"},
+        "up": {"direction": [0.0, 0.0, 1.0], "source": "gravity"},
         "images": [{"name": "a.jpg"}, {"name": "[b].jpg"}, {"name": "c.jpg"}],
         "held_out": [
             *(_run(0, 1, 0.01), _run(0, 5, None)),
@@ -56,6 +58,7 @@ def _data(**changes: Any) -> dict[str, Any]:
         ],
         "coverage": {
             "within": {"position": 0.05, "orientation_deg": 5.0},
+            "cell": 0.3,
             "cells": [{"probability": [1.0, 0.9, 0.5, 0.05]}],
             "weak_spots": [
                 {
@@ -99,7 +102,10 @@ def test_the_file_carries_the_data_and_the_points(
     magic, version, total, first, count = struct.unpack("<4s4I", points[:20])
     assert (magic, version, total, first) == (b"VLPT", 1, len(opened.landmarks), 0)
     assert count == min(total, MAX_POINTS)
-    assert computed["command"] == f"mapping report room --maps-dir {built_maps}"
+    # Who gets the file need not know where its maker keeps things.
+    assert computed["command"] == (
+        f"mapping report room --maps-dir {built_maps.name} --output room.html --workers 1"
+    )
 
 
 @pytest.mark.usefixtures("computed")
@@ -147,6 +153,81 @@ def test_a_folder_is_not_overwritten(
     assert computed == {}
 
 
+@pytest.mark.parametrize("below", ["file/room.html", "file/new/room.html", f"{'x' * 300}.html"])
+def test_an_output_that_cannot_be_written_is_told_before_the_long_work(
+    below: str, run: Run, computed: dict[str, Any], built_maps: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    status, out, err = run("room", "--maps-dir", built_maps, "--output", tmp_path / below)
+    assert (status, out, computed) == (1, "", {})
+    assert err.startswith("error [report.output] --output: the report cannot be written there")
+    assert "a file in a folder that can be written" in err
+
+
+def test_a_folder_of_maps_that_cannot_be_written_is_told_before_the_long_work(
+    run: Run, computed: dict[str, Any], maps_dir: Path, tmp_path: Path
+) -> None:
+    shutil.rmtree(maps_dir / ".report", ignore_errors=True)  # of other tests
+    (maps_dir / ".report").touch()
+    status, out, err = run("room", "--maps-dir", maps_dir, "--output", tmp_path / "room.html")
+    assert (status, out, computed) == (1, "", {})
+    assert err.startswith("error [report.work]")
+    assert "a folder that can be written, of --maps-dir" in err
+    assert [path.name for path in tmp_path.iterdir() if path != maps_dir] == []
+
+
+def test_of_a_map_given_as_a_folder_the_work_is_beside_the_report(
+    run: Run,
+    computed: dict[str, Any],
+    built_maps: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = MapStore(built_maps).folder("room")
+    status, _, _ = run(folder, "--output", tmp_path / "out" / "room.html", "--workers=1")
+    assert status == 0
+    assert computed["work"].root == tmp_path / "out" / ".report" / "room"
+    assert computed["command"] == f"mapping report {folder.name} --output room.html --workers=1"
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.usefixtures("computed")
+def test_people_are_told_when_up_is_a_guess(
+    run: Run,
+    built_maps: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked = ("room", "--maps-dir", built_maps, "--output", tmp_path / "room.html")
+    assert "--gravity" not in run(*asked)[1]
+    guessed = _data(up={"direction": [0.0, 1.0, 0.0], "source": "cameras"})
+    monkeypatch.setattr(command, "make_report_data", lambda *_, **__: guessed)
+    out = run(*asked)[1]
+    assert "straight down" in out
+    assert "--gravity" in out
+
+
+@pytest.mark.parametrize(
+    ("cell", "shown"),
+    [(0.3, "1.23, 0.04, 100.00"), (1e-4, "1.23400, 0.03600"), (50.0, "1, 0, 100")],
+)
+def test_places_are_shown_as_finely_as_the_map_is(
+    cell: float,
+    shown: str,
+    run: Run,
+    built_maps: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    data = _data()
+    data["coverage"]["cell"] = cell
+    data["coverage"]["weak_spots"][0]["position"] = [1.234, 0.036, 100.0]
+    monkeypatch.setattr(command, "make_report_data", lambda *_, **__: data)
+    _, out, _ = run("room", "--maps-dir", built_maps, "--output", tmp_path / "room.html")
+    assert shown in out
+
+
 def test_an_unbuilt_viewer_is_told_before_the_long_work(
     run: Run,
     computed: dict[str, Any],
@@ -171,7 +252,6 @@ def test_what_was_computed_stays_when_it_is_interrupted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def interrupted(_: object, work: Any, **__: object) -> None:
-        work.root.mkdir(parents=True)
         (work.root / "kept").touch()
         raise Unavailable("build.worker_died", "a worker died")
 
@@ -203,7 +283,8 @@ def test_photos_count_by_the_run_that_left_out_the_fewest() -> None:
 
 
 def test_a_map_of_one_photo_has_a_summary() -> None:
-    empty = {"within": {"position": 1.0, "orientation_deg": 5.0}, "cells": [], "weak_spots": []}
+    within = {"position": 1.0, "orientation_deg": 5.0}
+    empty = {"within": within, "cell": 0.3, "cells": [], "weak_spots": []}
     summary = summary_of_report(_data(held_out=[], coverage=empty))
     assert summary["held_out"] == 0
     assert summary["likely"] is None

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mapping.report import make_report_data
-from mapping.report.data import calibration_of, rank_correlation_of
+from mapping.report.data import calibration_of, decimals_of, rank_correlation_of
 from mapping.report.grid import Plan, make_grid
 from mapping.report.held_out import HeldOut
 from mapping.report.model import Within
@@ -15,6 +15,7 @@ from mapping.report.viewpoints import Viewpoints
 from mapping.stages import WorkFolder
 from mapping.workers import Workers
 from visloc.archive import MapStore
+from visloc.geometry import Pose
 
 
 def report_of(opened, folder):
@@ -149,6 +150,63 @@ def test_a_built_map_has_a_report(built_maps, tmp_path):
     # The rig's other camera took a photo at the same instant: it never stays.
     assert min(run["left_out"] for run in data["held_out"]) == 2
     assert data["statistics"]["landmarks_per_image"]["counts"]
+
+
+def _turned(pose, axes):
+    """A pose whose camera is turned: new axes in rows, in the old camera's frame."""
+    turn = np.array(axes, dtype=np.float64)
+    return Pose(turn @ pose.rotation, turn @ pose.translation)
+
+
+@pytest.mark.parametrize(
+    "axes",
+    [
+        [[1, 0, 0], [0, 0, -1], [0, 1, 0]],  # straight down
+        [[0, -1, 0], [1, 0, 0], [0, 0, 1]],  # on its side
+        [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    ],
+)
+@pytest.mark.parametrize("gravity", [None, (0.0, 0.0, -1.0)])
+def test_a_guess_of_what_is_up_is_told_as_such(make_map, looking, tmp_path, axes, gravity):
+    points = np.random.default_rng(0).uniform(-3, 3, (800, 3))
+    poses = [_turned(looking((0.2 * i, 0, 0), 0.0), axes) for i in range(2)]
+    data, _ = report_of(make_map(points, poses, gravity=gravity), tmp_path)
+    told = [note for note in data["map"]["notes"] if "--gravity" in note]
+    if gravity is None:
+        assert data["up"]["source"] == "cameras"
+        assert len(told) == 1
+        assert "straight down" in told[0]
+        assert "on their side" in told[0]
+    else:
+        assert (data["up"]["source"], told) == ("gravity", [])
+        assert data["up"]["direction"] == [0.0, 0.0, 1.0]
+
+
+def test_up_is_a_direction_even_where_no_row_tells_which_way_round(make_map):
+    # Rows level and upper edges at right angles to what is most nearly level.
+    axes = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
+    poses = [Pose(turn @ axes, np.zeros(3)) for turn in (np.eye(3), np.diag([-1.0, 1, -1]))]
+    points = np.random.default_rng(0).uniform(-3, 3, (400, 3))
+    opened = make_map(points, poses, gravity=None)
+    plan = Plan.of(opened, Viewpoints.of(opened))
+    for axis in (plan.up, plan.right, plan.ahead):
+        assert np.linalg.norm(axis) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("step", "digits"), [(3.0, 0), (0.3, 1), (0.01, 2), (2e-7, 7), (50.0, 0)])
+def test_digits_tell_a_step_apart(step, digits):
+    assert decimals_of(step) == digits
+
+
+def test_places_of_a_small_world_keep_their_digits(make_map, looking, room, tmp_path):
+    size = 1e-5
+    points = size * room(np.random.default_rng(0), 400)
+    poses = [looking((0.5 * size * i, 0, 0), 0.0) for i in range(2)]
+    for pose in poses:
+        assert np.abs(pose.center).max() < 1e-5
+    data, _ = report_of(make_map(points, poses, metric=False, nearest=0.1 * size), tmp_path)
+    assert data["images"][1]["position"][0] == pytest.approx(0.5 * size, rel=1e-3)
+    assert len({tuple(cell["position"]) for cell in data["coverage"]["cells"]}) > 10
 
 
 def test_without_gravity_up_is_that_of_the_cameras(make_map, looking, room):

@@ -59,7 +59,7 @@ void main() {
   if (photo) {
     colour = vec3(bytes & 255u, (bytes >> 8) & 255u, (bytes >> 16) & 255u) / 255.0;
   } else {
-    float at = (log2(float(max(bytes >> 24, 1u))) - 1.0) / (log2(${SEEN_BY_MOST}.0) - 1.0);
+    float at = log2(float(max(bytes >> 24, 1u))) / log2(${SEEN_BY_MOST}.0);
     at = clamp(at, 0.0, 1.0) * 3.0;
     colour = mix(mix(ramp[0], ramp[1], min(at, 1.0)), ramp[2], clamp(at - 1.0, 0.0, 1.0));
     colour = mix(colour, ramp[3], clamp(at - 2.0, 0.0, 1.0));
