@@ -232,7 +232,7 @@ def _print_summary(summary: Mapping[str, Any], *, metric: bool, decimals: int) -
     if summary["likely"] is not None:
         say(
             "places and directions where a photo has a chance of 90 % or more: "
-            f"{summary['likely']:.0%}; of less than 10 %: {summary['unlikely']:.0%}"
+            f"{100 * summary['likely']:.0f} %; of less than 10 %: {100 * summary['unlikely']:.0f} %"
         )
     if summary["weak_spots"]:
         table = Table(box=None, title="where to take more photos", title_justify="left")
@@ -242,7 +242,7 @@ def _print_summary(summary: Mapping[str, Any], *, metric: bool, decimals: int) -
             table.add_row(
                 ", ".join(f"{value:.{decimals}f}" for value in spot["position"]),
                 _clock(spot["direction_deg"]),
-                f"{spot['probability']:.0%}",
+                f"{100 * spot['probability']:.0f} %",
                 escape(spot["why"]),
             )
         _out.print(table, highlight=False)

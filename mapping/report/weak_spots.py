@@ -114,7 +114,9 @@ def _why(
     reasons = []
     if in_view < _FEW_OF_USUAL * usual:
         share = in_view / usual
-        reasons.append(f"in view is only {share:.0%} of what a mapping photo usually has in view")
+        reasons.append(
+            f"in view is only {100 * share:.0f} % of what a mapping photo usually has in view"
+        )
     # What would be found again if it were seen as the mapping photos saw it?
     expected = model.rematch.expected(sight).sum()
     level, octaves = np.zeros(len(sight)), float(np.median(sight.octaves))

@@ -116,7 +116,7 @@ def test_people_see_what_failed_where_it_is_weak_and_where_the_file_is(
     _, out, _ = run("room", "--maps-dir", built_maps, "--output", target, "--workers", 1)
     assert "photos localized without themselves, within 0.05 m and 5 degrees: 1 of 3" in out
     assert "not localized: [b].jpg\nnot localized: c.jpg\n" in out
-    assert "90 % or more: 50%; of less than 10 %: 25%" in out
+    assert "90 % or more: 50 %; of less than 10 %: 25 %" in out
     assert "9 o'clock" in out
     assert "few landmarks [there]" in out
     assert out.endswith(f"report: {target}\n")
