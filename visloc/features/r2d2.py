@@ -58,7 +58,7 @@ MEAN = (0.485 * 255, 0.456 * 255, 0.406 * 255)
 STD = (0.229 * 255, 0.224 * 255, 0.225 * 255)
 
 
-class _Layer(NamedTuple):
+class Layer(NamedTuple):
     """One convolution; padding keeps the size."""
 
     kernel: int
@@ -73,10 +73,10 @@ class _Layer(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class _Architecture:
+class Architecture:
     name: str
     published: PublishedWeights
-    layers: tuple[_Layer, ...]
+    layers: tuple[Layer, ...]
     pool_after: int  # this many layers; 0 for no pooling
 
     @property
@@ -85,19 +85,19 @@ class _Architecture:
         return 2 if self.pool_after else 1
 
 
-def _layers(dilations: tuple[int, ...]) -> tuple[_Layer, ...]:
+def _layers(dilations: tuple[int, ...]) -> tuple[Layer, ...]:
     kernels = (3, 3, 3, 3, 3, 3, 2, 2, 2)
     widths = (1, 1, 2, 2, 4, 4, 4, 4, 0)
     return tuple(
-        _Layer(kernel, dilation, width, normalized=number < 9, relu=number < 7)
+        Layer(kernel, dilation, width, normalized=number < 9, relu=number < 7)
         for number, (kernel, dilation, width) in enumerate(
             zip(kernels, dilations, widths, strict=True), start=1
         )
     )
 
 
-R2D2 = _Architecture("r2d2", R2D2_WASF_N16, _layers((1, 1, 1, 2, 2, 4, 4, 8, 16)), pool_after=0)
-FAST_R2D2 = _Architecture(
+R2D2 = Architecture("r2d2", R2D2_WASF_N16, _layers((1, 1, 1, 2, 2, 4, 4, 8, 16)), pool_after=0)
+FAST_R2D2 = Architecture(
     "faster2d2", FASTER2D2_WASF_N16, _layers((1, 1, 1, 1, 1, 2, 2, 4, 8)), pool_after=3
 )
 
@@ -131,7 +131,7 @@ def load_faster2d2(
 
 
 def _load(
-    architecture: _Architecture, weights_dir: Path | None, inference: Inference, threads: int | None
+    architecture: Architecture, weights_dir: Path | None, inference: Inference, threads: int | None
 ) -> R2D2Extractor:
     checkpoint = read_weights(weights_dir, architecture.published)
     held = next(
@@ -175,7 +175,7 @@ class _Index(NamedTuple):
     batch_norm: int
 
 
-def _indices(architecture: _Architecture) -> Iterator[tuple[_Layer, _Index]]:
+def _indices(architecture: Architecture) -> Iterator[tuple[Layer, _Index]]:
     """Count as the published networks do: each batch norm, ReLU and pooling takes a number."""
     position = 0
     for number, layer in enumerate(architecture.layers, start=1):
@@ -189,7 +189,7 @@ def _prefix(checkpoint: Checkpoint) -> str:
 
 
 def _expected_shapes(
-    architecture: _Architecture, checkpoint: Checkpoint
+    architecture: Architecture, checkpoint: Checkpoint
 ) -> dict[str, tuple[int, ...]]:
     """Shapes of all tensors, for the width that the first layer of the checkpoint has."""
     prefix = _prefix(checkpoint)
@@ -256,7 +256,7 @@ class FoldedNetwork:
     stride: int
 
 
-def fold(architecture: _Architecture, checkpoint: Checkpoint) -> FoldedNetwork:
+def fold(architecture: Architecture, checkpoint: Checkpoint) -> FoldedNetwork:
     """Fold the batch norms of a checkpoint of this architecture into the convolutions."""
     prefix = _prefix(checkpoint)
     tensors = {name.removeprefix(prefix): array for name, array in checkpoint.tensors.items()}
@@ -279,7 +279,7 @@ def fold(architecture: _Architecture, checkpoint: Checkpoint) -> FoldedNetwork:
 
 
 def _folded(
-    layer: _Layer, index: _Index, tensors: Mapping[str, NDArray[Any]], *, pool: bool
+    layer: Layer, index: _Index, tensors: Mapping[str, NDArray[Any]], *, pool: bool
 ) -> Convolution:
     name = f"ops.{index.convolution}"
     weight, bias = tensors[f"{name}.weight"], tensors[f"{name}.bias"]
@@ -326,7 +326,7 @@ class R2D2Extractor:
     """Multi-scale extraction with R2D2 or Fast-R2D2."""
 
     def __init__(
-        self, architecture: _Architecture, checkpoint: Checkpoint, network: Network
+        self, architecture: Architecture, checkpoint: Checkpoint, network: Network
     ) -> None:
         self.network = network
         self.fingerprint = Fingerprint(

@@ -1,0 +1,138 @@
+"""The command ``python -m training``."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from training.checkpoint import FILE_NAME, load_state
+from training.pairs import Sources
+from training.photos import pack_photos, read_pack
+from training.run import Trainer, resume, train
+from training.settings import PRESETS, Settings
+from visloc.errors import Conflict, InvalidInput, VislocError
+
+DATA = Path(".training")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit status."""
+    options = _parser().parse_args(arguments)
+    try:
+        return int(options.run(options))
+    except VislocError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m training", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    pack = commands.add_parser("pack", help="pack photos into one file")
+    pack.add_argument("source", type=Path, help="folder of folders of photos, with SOURCES.tsv")
+    pack.add_argument("--output", type=Path, default=DATA / "photos.safetensors")
+    pack.add_argument("--research", action="store_true", help="also what forbids commercial use")
+    pack.add_argument("--validation", action="store_true", help="those held back, and no others")
+    pack.set_defaults(run=_pack)
+
+    run = commands.add_parser("run", help="train")
+    run.add_argument("folder", type=Path, help="where checkpoint and log go")
+    run.add_argument("--photos", type=Path, default=DATA / "photos.safetensors", help="a pack")
+    run.add_argument("--preset", choices=PRESETS, default="published")
+    run.add_argument("--start-from", type=Path, help="checkpoint whose weights to begin with")
+    for each in dataclasses.fields(Settings):
+        name = "--" + each.name.replace("_", "-")
+        meaning = f"{each.metadata['meaning']} (published: {each.default})"
+        if isinstance(each.default, bool):
+            run.add_argument(name, action=argparse.BooleanOptionalAction, help=meaning)
+        else:
+            run.add_argument(name, type=type(each.default), help=meaning, metavar="N")
+    _add_running(run)
+    run.set_defaults(run=_run)
+
+    again = commands.add_parser("resume", help="go on training where a run stopped")
+    again.add_argument("folder", type=Path, help="of the run")
+    again.add_argument("--photos", type=Path, default=DATA / "photos.safetensors", help="a pack")
+    _add_running(again)
+    again.set_defaults(run=_resume)
+    return parser
+
+
+def _add_running(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    parser.add_argument("--threads", type=int, help="of the processor")
+    parser.add_argument("--for-seconds", type=float, help="then stop; resume goes on")
+    parser.add_argument("--checkpoint-every-s", type=float, default=60.0)
+
+
+def _pack(options: argparse.Namespace) -> int:
+    number = pack_photos(
+        options.source, options.output, research=options.research, validation=options.validation
+    )
+    sys.stdout.write(f"{number} photos in {options.output}\n")
+    return 0
+
+
+def _run(options: argparse.Namespace) -> int:
+    if (options.folder / FILE_NAME).exists():
+        raise Conflict(
+            "training.exists", "there is a run in it; use resume", field=str(options.folder)
+        )
+    changed = {
+        each.name: getattr(options, each.name)
+        for each in dataclasses.fields(Settings)
+        if getattr(options, each.name) is not None
+    }
+    trainer = _trainer(dataclasses.replace(PRESETS[options.preset], **changed), options)
+    if options.start_from is not None:
+        trainer.start_from(load_state(options.start_from, trainer.sources.device))
+    return _train(trainer, options)
+
+
+def _resume(options: argparse.Namespace) -> int:
+    settings = load_state(options.folder / FILE_NAME, torch.device("cpu")).settings
+    trainer = _trainer(settings, options)
+    resume(trainer, options.folder)
+    return _train(trainer, options)
+
+
+def _trainer(settings: Settings, options: argparse.Namespace) -> Trainer:
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    device = torch.device(options.device)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise InvalidInput("training.device", "there is no CUDA GPU", field="device", got="cuda")
+    pack = read_pack(options.photos, device)
+    described = {
+        "photos_sha256": pack.sha256,
+        "photos": str(len(pack.photos)),
+        "licences": "; ".join(f"{n} {each}" for each, n in sorted(pack.licences.items())),
+    }
+    return Trainer(settings, Sources(pack.photos, (), device), described)
+
+
+def _train(trainer: Trainer, options: argparse.Namespace) -> int:
+    asked_to_stop = []
+    signal.signal(signal.SIGTERM, lambda *_: asked_to_stop.append(True))
+    signal.signal(signal.SIGINT, lambda *_: asked_to_stop.append(True))
+    finished = train(
+        trainer,
+        options.folder,
+        seconds=options.for_seconds,
+        checkpoint_every_s=options.checkpoint_every_s,
+        should_stop=lambda: bool(asked_to_stop),
+    )
+    how = "finished" if finished else "stopped; resume goes on"
+    sys.stdout.write(f"step {trainer.step} of {trainer.settings.steps}: {how}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,106 @@
+"""Reads and writes safetensors files: named arrays and a few words about them, nothing to run.
+
+Layout: the header's length as an unsigned 64-bit little-endian number, the header in JSON, then
+the numbers. The header names each tensor with its type, shape and span of bytes; ``__metadata__``
+holds words by name.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_DTYPES: Mapping[str, np.dtype[Any]] = {
+    "F32": np.dtype("<f4"),
+    "F16": np.dtype("<f2"),
+    "I64": np.dtype("<i8"),
+    "I16": np.dtype("<i2"),
+    "U8": np.dtype("u1"),
+}
+_NAMES = {dtype: name for name, dtype in _DTYPES.items()}
+_MAX_HEADER_BYTES = 10_000_000
+_MAX_DIMENSIONS = 8
+_LENGTH_BYTES = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tensors:
+    """What a file holds.
+
+    Attributes:
+        arrays: by name; views of the file's bytes, read-only.
+        metadata: words by name.
+    """
+
+    arrays: Mapping[str, NDArray[Any]]
+    metadata: Mapping[str, str]
+
+
+def decode_tensors(data: bytes) -> Tensors:
+    """Read the bytes of a safetensors file.
+
+    Raises:
+        ValueError: with what is wrong, if it is damaged or none.
+    """
+    length = int.from_bytes(data[:_LENGTH_BYTES], "little")
+    start = _LENGTH_BYTES + length
+    if len(data) < _LENGTH_BYTES or length > _MAX_HEADER_BYTES or start > len(data):
+        raise ValueError("no header of safetensors")
+    try:
+        header = json.loads(data[_LENGTH_BYTES:start])
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise ValueError("its header is no JSON") from error
+    if not isinstance(header, dict):
+        raise ValueError("its header is no JSON object")
+    metadata = header.pop("__metadata__", {})
+    if not (isinstance(metadata, dict) and all(isinstance(v, str) for v in metadata.values())):
+        raise ValueError("its metadata are not words by name")
+    values = memoryview(data)[start:]
+    return Tensors({name: _array(name, said, values) for name, said in header.items()}, metadata)
+
+
+def _array(name: str, said: object, values: memoryview) -> NDArray[Any]:
+    if not isinstance(said, dict) or said.get("dtype") not in _DTYPES:
+        raise ValueError(f"tensor {name:.60}: not one of the types {', '.join(_DTYPES)}")
+    dtype = _DTYPES[said["dtype"]]
+    shape, span = said.get("shape"), said.get("data_offsets")
+    if not (_are_counts(shape) and _are_counts(span) and len(shape) <= _MAX_DIMENSIONS):
+        raise ValueError(f"tensor {name:.60}: no shape or no span")
+    if len(span) != 2 or not span[0] <= span[1] <= len(values):
+        raise ValueError(f"tensor {name:.60}: its span is not inside the file")
+    if span[1] - span[0] != math.prod(shape) * dtype.itemsize:
+        raise ValueError(f"tensor {name:.60}: its span does not fit its shape")
+    return np.frombuffer(values[span[0] : span[1]], dtype).reshape(shape)
+
+
+def _are_counts(numbers: Any) -> bool:
+    return isinstance(numbers, list) and all(type(n) is int and 0 <= n < 2**40 for n in numbers)
+
+
+def encode_tensors(
+    arrays: Mapping[str, NDArray[Any]], metadata: Mapping[str, str] | None = None
+) -> bytes:
+    """Return the bytes of a safetensors file; equal content gives equal bytes."""
+    header: dict[str, Any] = {"__metadata__": dict(sorted((metadata or {}).items()))}
+    parts, position = [], 0
+    # Wide types first, so that every tensor begins at a multiple of its item size.
+    for name in sorted(arrays, key=lambda each: (-arrays[each].dtype.itemsize, each)):
+        array = np.ascontiguousarray(arrays[name])
+        part = array.tobytes()
+        span = [position, position + len(part)]
+        header[name] = {
+            "dtype": _NAMES[array.dtype],
+            "shape": list(array.shape),
+            "data_offsets": span,
+        }
+        parts.append(part)
+        position = span[1]
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    return b"".join([len(text).to_bytes(_LENGTH_BYTES, "little"), text, *parts])
