@@ -8,6 +8,9 @@ enlarged dot product, and a weighted sum of its squares is one of products of ne
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -23,20 +26,72 @@ def weighted_squares(features: Tensor, weight: Tensor, stride: int) -> Tensor:
         weight: (K, C).
         stride: 1 or 2; H = stride * h.
     """
-    columns = weight.T
-    own = (features * features) @ columns
     if stride == 1:
-        return own.permute(0, 3, 1, 2)
-    right = (features[:, :, :-1] * features[:, :, 1:]) @ columns
-    below = (features[:, :-1] * features[:, 1:]) @ columns
-    falling = features[:, :-1, :-1] * features[:, 1:, 1:]
-    rising = features[:, :-1, 1:] * features[:, 1:, :-1]
-    diagonals = (falling + rising) @ columns  # their weights are always equal
+        return (features.square() @ weight.T).permute(0, 3, 1, 2)
+    own, right, below, diagonals = _NeighbourProducts.apply(features, weight)
     # From rows to rows of twice the resolution, then the same from columns to columns.
     own_tall = _doubled(own, 2 * below, axis=1)
     right_tall = _doubled(right, diagonals, axis=1)
     # A step to the right and back is two products with the right neighbour.
     return _doubled(own_tall, 2 * right_tall, axis=2).permute(0, 3, 1, 2)
+
+
+class _NeighbourProducts(torch.autograd.Function):
+    """Weighted sums of products of each feature with itself and with three neighbours.
+
+    With features (B, h, w, C) and weight (K, C): of itself (B, h, w, K), with the right one
+    (B, h, w - 1, K), with the one below (B, h - 1, w, K), and of both diagonals of each square of
+    four (B, h - 1, w - 1, K), whose weights are always equal.
+
+    Autograd would keep each product of C channels and fill as many gradients with zeros; here one
+    image at a time goes through the processor's cache, in a quarter of the time.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, weight: Tensor) -> tuple[Tensor, ...]:
+        ctx.save_for_backward(features, weight)
+        made = [
+            [_product(pairs) @ weight.T for pairs in _neighbour_pairs(part)]
+            for part in _parts(features)
+        ]
+        return tuple(torch.cat(each) for each in zip(*made, strict=True))
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:
+        features, weight = ctx.saved_tensors
+        of_features, of_weight = torch.zeros_like(features), torch.zeros_like(weight)
+        split = [_parts(each) for each in (features, of_features, *gradients)]
+        for part, of_part, *of_sums in zip(*split, strict=True):
+            views = zip(_neighbour_pairs(part), _neighbour_pairs(of_part), of_sums, strict=True)
+            for pairs, of_pairs, of_sum in views:
+                of_product = of_sum @ weight
+                for (here, there), (of_here, of_there) in zip(pairs, of_pairs, strict=True):
+                    of_here.addcmul_(of_product, there)
+                    of_there.addcmul_(of_product, here)
+                product = _product(pairs)
+                of_weight += of_sum.flatten(0, 2).T @ product.flatten(0, 2)
+        return of_features, of_weight
+
+
+def _parts(batch: Tensor) -> Sequence[Tensor]:
+    """Return what is multiplied at a time: a GPU takes all images at once."""
+    return (batch,) if batch.is_cuda else batch.split(1)
+
+
+def _neighbour_pairs(x: Tensor) -> list[list[tuple[Tensor, Tensor]]]:
+    """Return the factors (B, h, w, C) of the four products; those of the last are two terms."""
+    above, below, left, right = x[:, :-1], x[:, 1:], x[:, :, :-1], x[:, :, 1:]
+    falling = (above[:, :, :-1], below[:, :, 1:])
+    rising = (above[:, :, 1:], below[:, :, :-1])
+    return [[(x, x)], [(left, right)], [(above, below)], [falling, rising]]
+
+
+def _product(pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
+    (here, there), *more = pairs
+    product = here * there
+    for each in more:
+        product.addcmul_(*each)
+    return product
 
 
 def _doubled(own: Tensor, between: Tensor, axis: int) -> Tensor:
