@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import hashlib
 import signal
 import sys
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ import torch
 
 from training.checkpoint import FILE_NAME, load_state
 from training.pairs import Sources
+from training.parallax import pack_rooms, read_rooms
 from training.photos import pack_photos, read_pack
 from training.run import Trainer, resume, train
 from training.settings import PRESETS, Settings
@@ -42,9 +44,15 @@ def _parser() -> argparse.ArgumentParser:
     pack.add_argument("--validation", action="store_true", help="those held back, and no others")
     pack.set_defaults(run=_pack)
 
+    rooms = commands.add_parser("rooms", help="photograph synthetic rooms, for true parallax")
+    rooms.add_argument("--output", type=Path, default=DATA / "rooms.safetensors")
+    rooms.add_argument("--rooms", type=int, default=6)
+    rooms.add_argument("--places", type=int, default=24, help="per room, three photos at each")
+    rooms.add_argument("--seed", type=int, default=1000)
+    rooms.set_defaults(run=_rooms)
+
     run = commands.add_parser("run", help="train")
     run.add_argument("folder", type=Path, help="where checkpoint and log go")
-    run.add_argument("--photos", type=Path, default=DATA / "photos.safetensors", help="a pack")
     run.add_argument("--preset", choices=PRESETS, default="published")
     run.add_argument("--start-from", type=Path, help="checkpoint whose weights to begin with")
     for each in dataclasses.fields(Settings):
@@ -59,13 +67,14 @@ def _parser() -> argparse.ArgumentParser:
 
     again = commands.add_parser("resume", help="go on training where a run stopped")
     again.add_argument("folder", type=Path, help="of the run")
-    again.add_argument("--photos", type=Path, default=DATA / "photos.safetensors", help="a pack")
     _add_running(again)
     again.set_defaults(run=_resume)
     return parser
 
 
 def _add_running(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--photos", type=Path, default=DATA / "photos.safetensors", help="a pack")
+    parser.add_argument("--rooms", type=Path, default=DATA / "rooms.safetensors", help="for --parallax-share")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--threads", type=int, help="of the processor")
     parser.add_argument("--for-seconds", type=float, help="then stop; resume goes on")
@@ -77,6 +86,14 @@ def _pack(options: argparse.Namespace) -> int:
         options.source, options.output, research=options.research, validation=options.validation
     )
     sys.stdout.write(f"{number} photos in {options.output}\n")
+    return 0
+
+
+def _rooms(options: argparse.Namespace) -> int:
+    number = pack_rooms(
+        options.output, rooms=options.rooms, places=options.places, seed=options.seed
+    )
+    sys.stdout.write(f"{number} photos of rooms in {options.output}\n")
     return 0
 
 
@@ -115,7 +132,10 @@ def _trainer(settings: Settings, options: argparse.Namespace) -> Trainer:
         "photos": str(len(pack.photos)),
         "licences": "; ".join(f"{n} {each}" for each, n in sorted(pack.licences.items())),
     }
-    return Trainer(settings, Sources(pack.photos, (), device), described)
+    places = read_rooms(options.rooms, device) if settings.parallax_share else ()
+    if places:
+        described["rooms_sha256"] = hashlib.sha256(options.rooms.read_bytes()).hexdigest()
+    return Trainer(settings, Sources(pack.photos, places, device), described)
 
 
 def _train(trainer: Trainer, options: argparse.Namespace) -> int:

@@ -88,7 +88,7 @@ def _look(
     # Foreshortening takes cos(tilt) off one direction: closer by its root keeps the area.
     distance = focal * scale * np.sqrt(np.cos(tilt))
     axis = np.array([np.cos(about), np.sin(about), 0.0])
-    rotation = _rotation(np.array([0.0, 0.0, 1.0]), turn) @ _rotation(axis, tilt)
+    rotation = rotation_about(np.array([0.0, 0.0, 1.0]), turn) @ rotation_about(axis, tilt)
     cam_from_plane = np.column_stack([rotation[:, 0], rotation[:, 1], [0.0, 0.0, distance]])
     middle = crop_px / 2
     crop_from_cam = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
@@ -97,7 +97,7 @@ def _look(
     return np.asarray(photo_from_crop / photo_from_crop[2, 2])
 
 
-def _rotation(axis: NDArray[np.float64], angle: float) -> Matrix:
+def rotation_about(axis: NDArray[np.float64], angle: float) -> Matrix:
     """Return the rotation by an angle about a unit axis (Rodrigues)."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

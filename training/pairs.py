@@ -11,7 +11,7 @@ from torch import Tensor
 
 from training.augmentation import augment
 from training.homographies import flow_between, look, random_looks, strength_at
-from training.parallax import View, random_parallax
+from training.parallax import Place, random_parallax
 from training.photos import Photo
 from training.sampler import random_pixels
 from training.settings import Settings
@@ -39,12 +39,12 @@ class Sources:
 
     Attributes:
         photos: for homographies.
-        rooms: views of synthetic rooms, one tuple per room, for true parallax; may be empty.
+        places: of synthetic rooms, for true parallax; may be empty.
         device: where the photos are and the pairs are made.
     """
 
     photos: tuple[Photo, ...]
-    rooms: tuple[tuple[View, ...], ...]
+    places: tuple[Place, ...]
     device: torch.device
 
 
@@ -56,8 +56,8 @@ def make_pairs(sources: Sources, settings: Settings, step: int) -> Pairs:
     firsts, seconds, flows = [], [], []
     for _ in range(settings.batch):
         if rng.random() < settings.parallax_share:
-            room = sources.rooms[rng.integers(len(sources.rooms))]
-            first, second, flow = random_parallax(rng, room, crop)
+            place = sources.places[rng.integers(len(sources.places))]
+            first, second, flow = random_parallax(rng, place, crop)
         else:
             photo = sources.photos[rng.integers(len(sources.photos))]
             size = photo.levels[0].shape

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 _DTYPES: Mapping[str, np.dtype[Any]] = {
+    "F64": np.dtype("<f8"),
     "F32": np.dtype("<f4"),
     "F16": np.dtype("<f2"),
     "I64": np.dtype("<i8"),
-    "I16": np.dtype("<i2"),
     "U8": np.dtype("u1"),
 }
 _NAMES = {dtype: name for name, dtype in _DTYPES.items()}
@@ -40,6 +40,11 @@ class Tensors:
 
     arrays: Mapping[str, NDArray[Any]]
     metadata: Mapping[str, str]
+
+
+def is_safetensors(data: bytes) -> bool:
+    """Tell whether bytes begin as such a file does: a length, then a JSON object."""
+    return data[_LENGTH_BYTES : _LENGTH_BYTES + 1] == b"{"
 
 
 def decode_tensors(data: bytes) -> Tensors:
