@@ -5,22 +5,28 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import hashlib
+import json
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 
-from training.checkpoint import FILE_NAME, load_state
+from training.checkpoint import FILE_NAME, State, load_state
+from training.export import export
 from training.pairs import Sources
 from training.parallax import pack_rooms, read_rooms
 from training.photos import pack_photos, read_pack
+from training.plots import draw
 from training.run import Trainer, resume, train
 from training.settings import PRESETS, Settings
+from training.validation import Score, features_of, validate, validation_pairs
 from visloc.errors import Conflict, InvalidInput, VislocError
+from visloc.features import make_local_features
 
 DATA = Path(".training")
+_CPU = torch.device("cpu")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -69,6 +75,25 @@ def _parser() -> argparse.ArgumentParser:
     again.add_argument("folder", type=Path, help="of the run")
     _add_running(again)
     again.set_defaults(run=_resume)
+
+    check = commands.add_parser("validate", help="how well features match held-back photos")
+    check.add_argument("features", nargs="*", help="names of local features")
+    check.add_argument("--checkpoints", type=Path, nargs="*", default=[], help="of training")
+    check.add_argument("--weights-dir", type=Path)
+    check.add_argument("--validation", type=Path, default=DATA / "validation.safetensors")
+    check.add_argument("--per-photo", type=int, default=1, help="pairs of each photo")
+    check.add_argument("--output", type=Path, help="append a line of JSON for each")
+    check.set_defaults(run=_validate)
+
+    ship = commands.add_parser("export", help="write a checkpoint as weights for visloc")
+    ship.add_argument("checkpoint", type=Path)
+    ship.add_argument("output", type=Path, help="faster2d2.safetensors in a weights folder")
+    ship.set_defaults(run=_export)
+
+    plots = commands.add_parser("plots", help="draw losses and validation of a run")
+    plots.add_argument("folder", type=Path, help="of the run")
+    plots.add_argument("--beside", type=Path, help="what validate --output wrote of others")
+    plots.set_defaults(run=_plots)
     return parser
 
 
@@ -79,6 +104,8 @@ def _add_running(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, help="of the processor")
     parser.add_argument("--for-seconds", type=float, help="then stop; resume goes on")
     parser.add_argument("--checkpoint-every-s", type=float, default=60.0)
+    parser.add_argument("--validate-every", type=int, help="steps; needs --validation")
+    parser.add_argument("--validation", type=Path, default=DATA / "validation.safetensors")
 
 
 def _pack(options: argparse.Namespace) -> int:
@@ -148,9 +175,55 @@ def _train(trainer: Trainer, options: argparse.Namespace) -> int:
         seconds=options.for_seconds,
         checkpoint_every_s=options.checkpoint_every_s,
         should_stop=lambda: bool(asked_to_stop),
+        validate_every=options.validate_every,
+        validated=_validation(options),
     )
     how = "finished" if finished else "stopped; resume goes on"
     sys.stdout.write(f"step {trainer.step} of {trainer.settings.steps}: {how}\n")
+    return 0
+
+
+def _validation(options: argparse.Namespace) -> Callable[[State], Score] | None:
+    if options.validate_every is None:
+        return None
+    pairs = validation_pairs(read_pack(options.validation, torch.device("cpu")).photos)
+    return lambda state: validate(features_of(state), pairs)
+
+
+def _validate(options: argparse.Namespace) -> int:
+    photos = read_pack(options.validation, torch.device("cpu")).photos
+    pairs = validation_pairs(photos, options.per_photo)
+    sys.stdout.write(
+        f"{len(pairs)} pairs\n\n| features | right within 1 px | 3 px | 5 px | right matches"
+        " | keypoints | repeatable |\n|---|---|---|---|---|---|---|\n"
+    )
+    named = [(n, lambda n=n: make_local_features(n, options.weights_dir)) for n in options.features]
+    for path in options.checkpoints:
+        named.append((str(path), lambda path=path: features_of(load_state(path, _CPU))))
+    for name, make in named:
+        score = validate(make(), pairs)
+        accuracy = " | ".join(f"{100 * each:.1f} %" for each in score.matching_accuracy)
+        sys.stdout.write(
+            f"| {name} | {accuracy} | {score.right_matches:.0f} | {score.keypoints:.0f}"
+            f" | {100 * score.repeatability:.1f} % |\n"
+        )
+        sys.stdout.flush()
+        if options.output is not None:
+            with options.output.open("a", encoding="utf-8") as file:
+                file.write(json.dumps({"features": name, **dataclasses.asdict(score)}) + "\n")
+    return 0
+
+
+def _export(options: argparse.Namespace) -> int:
+    size = export(load_state(options.checkpoint, _CPU), options.output)
+    sha256 = hashlib.sha256(options.output.read_bytes()).hexdigest()
+    sys.stdout.write(f"{options.output}: {size} bytes, sha256 {sha256}\n")
+    return 0
+
+
+def _plots(options: argparse.Namespace) -> int:
+    for path in draw(options.folder, options.beside):
+        sys.stdout.write(f"{path}\n")
     return 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import time
@@ -12,7 +13,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from training.checkpoint import FILE_NAME, State, load_state, save_state
 from training.losses import peakiness_loss, reliability_loss, similarity_loss
@@ -20,9 +21,11 @@ from training.network import ARCHITECTURES, Maps, TrainableR2D2
 from training.pairs import Pairs, Sources, make_pairs
 from training.sampler import sample
 from training.settings import Settings
+from training.validation import Score
 from visloc.errors import InvalidInput, VislocError
 
 LOG_NAME = "log.jsonl"
+VALIDATION_NAME = "validation.jsonl"
 BEFORE_DECAY_NAME = "before-decay.pt"
 _LOG_EVERY_STEPS = 25  # reading a loss makes a GPU wait
 
@@ -157,11 +160,23 @@ def train(
     seconds: float | None,
     checkpoint_every_s: float,
     should_stop: Callable[[], bool] = lambda: False,
+    validate_every: int | None = None,
+    validated: Callable[[State], Score] | None = None,
 ) -> bool:
     """Do steps until the last one, or the time is over, or it should stop; True when finished.
 
-    The folder gets ``checkpoint.pt``, ``log.jsonl`` with a line per step, and ``before-decay.pt``,
-    the state in which the learning rate begins to fall: a longer run can start from there.
+    The folder gets ``checkpoint.pt``, ``log.jsonl`` with a line per step, ``validation.jsonl`` with
+    a line per validation, and ``before-decay.pt``, the state in which the learning rate begins to
+    fall: a longer run can start from there.
+
+    Args:
+        trainer: what is trained.
+        folder: of the run.
+        seconds: after which to stop; None for never.
+        checkpoint_every_s: seconds.
+        should_stop: asked after every step.
+        validate_every: steps; needs ``validated``. The last step is validated as well.
+        validated: the score of a state.
 
     Raises:
         LossIsNaN: ``training.diverged``.
@@ -169,6 +184,7 @@ def train(
     settings = trainer.settings
     folder.mkdir(parents=True, exist_ok=True)
     log = _Log(folder / LOG_NAME, trainer.step)
+    scores = _Scores(folder / VALIDATION_NAME, trainer.step)
     started = saved = time.monotonic()
     decay_step = round(settings.decay_from * settings.steps)
     stopped = False
@@ -177,6 +193,9 @@ def train(
             save_state(folder / BEFORE_DECAY_NAME, trainer.state())
         rate = learning_rate(settings, trainer.step)
         log.note(trainer.step, rate, trainer.advance(), trainer.seconds)
+        if validated is not None and validate_every is not None:
+            if trainer.step % validate_every == 0 or trainer.step == settings.steps:
+                scores.add(trainer.step, validated(trainer.state()))
         now = time.monotonic()
         stopped = should_stop() or (seconds is not None and now - started >= seconds)
         if now - saved >= checkpoint_every_s:
@@ -225,6 +244,15 @@ class _Log:
         self._waiting.clear()
 
 
-def parameters_of(network: nn.Module) -> int:
-    """Return how many numbers are learned."""
-    return sum(each.numel() for each in network.parameters())
+class _Scores:
+    """Lines of JSON, one per validation; those after the checkpoint are cut."""
+
+    def __init__(self, path: Path, step: int) -> None:
+        self._path = path
+        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+        kept = [line for line in lines if json.loads(line)["step"] <= step]
+        path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+
+    def add(self, step: int, score: Score) -> None:
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"step": step, **dataclasses.asdict(score)}) + "\n")
