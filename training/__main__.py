@@ -99,7 +99,9 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_running(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--photos", type=Path, default=DATA / "photos.safetensors", help="a pack")
-    parser.add_argument("--rooms", type=Path, default=DATA / "rooms.safetensors", help="for --parallax-share")
+    parser.add_argument(
+        "--rooms", type=Path, default=DATA / "rooms.safetensors", help="for --parallax-share"
+    )
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--threads", type=int, help="of the processor")
     parser.add_argument("--for-seconds", type=float, help="then stop; resume goes on")
@@ -197,11 +199,12 @@ def _validate(options: argparse.Namespace) -> int:
         f"{len(pairs)} pairs\n\n| features | right within 1 px | 3 px | 5 px | right matches"
         " | keypoints | repeatable |\n|---|---|---|---|---|---|---|\n"
     )
-    named = [(n, lambda n=n: make_local_features(n, options.weights_dir)) for n in options.features]
-    for path in options.checkpoints:
-        named.append((str(path), lambda path=path: features_of(load_state(path, _CPU))))
-    for name, make in named:
-        score = validate(make(), pairs)
+    for name in [*options.features, *options.checkpoints]:
+        if isinstance(name, Path):
+            extractor = features_of(load_state(name, _CPU))
+        else:
+            extractor = make_local_features(name, options.weights_dir)
+        score = validate(extractor, pairs)
         accuracy = " | ".join(f"{100 * each:.1f} %" for each in score.matching_accuracy)
         sys.stdout.write(
             f"| {name} | {accuracy} | {score.right_matches:.0f} | {score.keypoints:.0f}"
@@ -210,7 +213,7 @@ def _validate(options: argparse.Namespace) -> int:
         sys.stdout.flush()
         if options.output is not None:
             with options.output.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"features": name, **dataclasses.asdict(score)}) + "\n")
+                file.write(json.dumps({"features": str(name), **dataclasses.asdict(score)}) + "\n")
     return 0
 
 

@@ -69,8 +69,7 @@ def load_state(path: Path, device: torch.device) -> State:
         raise NotFound("training.checkpoint", "no such checkpoint", field=str(path))
     try:
         content = torch.load(path, map_location=device, weights_only=True)
-        if content["version"] != _VERSION:
-            raise ValueError(f"version {content['version']}")
+        _check_version(content["version"])
         return State(
             Settings(**content["settings"]),
             content["step"],
@@ -79,7 +78,14 @@ def load_state(path: Path, device: torch.device) -> State:
             content["network"],
             content["optimizer"],
         )
-    except (RuntimeError, pickle.UnpicklingError, EOFError, LookupError, TypeError, ValueError) as e:
+    except (
+        RuntimeError,
+        pickle.UnpicklingError,
+        EOFError,
+        LookupError,
+        TypeError,
+        ValueError,
+    ) as e:
         raise InvalidInput(
             "training.checkpoint",
             "not a checkpoint of this training code",
@@ -87,3 +93,8 @@ def load_state(path: Path, device: torch.device) -> State:
             expected=f"version {_VERSION}",
             got=f"{type(e).__name__}: {e}",
         ) from e
+
+
+def _check_version(version: object) -> None:
+    if version != _VERSION:
+        raise ValueError(f"version {version}")

@@ -106,7 +106,7 @@ def rotation_about(axis: NDArray[np.float64], angle: float) -> Matrix:
 
 def flow_between(photo_from_first: Matrix, photo_from_second: Matrix, crop_px: int) -> Tensor:
     """Return the flow (H, W, 2) float32 from the first crop to the second, NaN outside of it."""
-    flow = _applied(np.linalg.solve(photo_from_second, photo_from_first), crop_px)
+    flow = _applied(np.linalg.inv(photo_from_second) @ photo_from_first, crop_px)
     inside = ((flow >= 0) & (flow < crop_px)).all(dim=-1, keepdim=True)
     return torch.where(inside, flow, torch.nan).float()
 

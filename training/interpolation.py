@@ -8,7 +8,7 @@ enlarged dot product, and a weighted sum of its squares is one of products of ne
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -28,7 +28,7 @@ def weighted_squares(features: Tensor, weight: Tensor, stride: int) -> Tensor:
     """
     if stride == 1:
         return (features.square() @ weight.T).permute(0, 3, 1, 2)
-    own, right, below, diagonals = _NeighbourProducts.apply(features, weight)
+    own, right, below, diagonals = _neighbour_products(features, weight)
     # From rows to rows of twice the resolution, then the same from columns to columns.
     own_tall = _doubled(own, 2 * below, axis=1)
     right_tall = _doubled(right, diagonals, axis=1)
@@ -73,9 +73,12 @@ class _NeighbourProducts(torch.autograd.Function):
         return of_features, of_weight
 
 
+_neighbour_products: Callable[[Tensor, Tensor], tuple[Tensor, ...]] = _NeighbourProducts.apply
+
+
 def _parts(batch: Tensor) -> Sequence[Tensor]:
     """Return what is multiplied at a time: a GPU takes all images at once."""
-    return (batch,) if batch.is_cuda else batch.split(1)
+    return (batch,) if batch.is_cuda else torch.split(batch, 1)
 
 
 def _neighbour_pairs(x: Tensor) -> list[list[tuple[Tensor, Tensor]]]:

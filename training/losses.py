@@ -56,7 +56,9 @@ def reliability_loss(
     return loss.masked_fill(~asked, 0).sum() / asked.sum().clamp_min(1)
 
 
-def similarity_loss(first: Tensor, second_seen_from_first: Tensor, valid: Tensor, patch_px: int) -> Tensor:
+def similarity_loss(
+    first: Tensor, second_seen_from_first: Tensor, valid: Tensor, patch_px: int
+) -> Tensor:
     """Return 1 - the mean cosine of patches of two repeatability maps, half a patch apart.
 
     Pixels without a match are left out of both maps, and patches with less than half of their

@@ -100,14 +100,15 @@ class TrainableR2D2(nn.Module):
         with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
             x = self.features(images)
         x = x.float().permute(0, 2, 3, 1)
-        weight = self.heads.weight[:, :, 0, 0]
+        weight, bias = self.heads.weight[:, :, 0, 0], self.heads.bias
+        assert bias is not None
         weight = torch.cat([weight, torch.ones_like(weight[:1])])
         squares = weighted_squares(x, weight, self.architecture.stride)
         reliability, repeatability, squared_length = squares.unbind(dim=1)
-        softplus = F.softplus(repeatability + self.heads.bias[1])
+        softplus = F.softplus(repeatability + bias[1])
         return Maps(
             x,
             squared_length,
-            torch.sigmoid(reliability + self.heads.bias[0]),
+            torch.sigmoid(reliability + bias[0]),
             softplus / (1 + softplus),
         )

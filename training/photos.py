@@ -106,7 +106,8 @@ def read_pack(path: Path, device: torch.device) -> Pack:
         raise InvalidInput(
             "training.pack", f"no pack of photos: {error}", field=str(path)
         ) from error
-    photos, licences = [], {}
+    photos: list[Photo] = []
+    licences: dict[str, int] = {}
     for name in sorted(packed.arrays):
         rgb = read_photo(packed.arrays[name].tobytes()).rgb
         photos.append(Photo(name, photo_levels(rgb, device)))

@@ -67,7 +67,7 @@ def _draw_losses(lines: list[dict[str, Any]], path: Path) -> Path:
 
 def _running_mean(values: NDArray[np.float64], width: int) -> NDArray[np.float64]:
     sums = np.cumsum(np.concatenate([[0.0], values]))
-    return (sums[width:] - sums[:-width]) / width
+    return np.asarray((sums[width:] - sums[:-width]) / width)
 
 
 def _draw_validation(

@@ -88,8 +88,7 @@ class Trainer:
         self.described = described
         self.step = 0
         self.seconds = 0.0
-        network = TrainableR2D2(ARCHITECTURES[settings.architecture])
-        self.network = network.to(sources.device, memory_format=torch.channels_last).train()
+        self.network = TrainableR2D2(ARCHITECTURES[settings.architecture]).to(sources.device)
         self._compiled: Callable[..., Maps] = self.network
         if settings.compiled:
             self._compiled = torch.compile(self.network)
@@ -146,7 +145,7 @@ class Trainer:
             self._compiled(pairs.images, bf16=self.settings.bf16), pairs, self.settings
         )
         self.optimizer.zero_grad(set_to_none=True)
-        losses.total.backward()
+        torch.autograd.backward(losses.total)
         self.optimizer.step()
         self.step += 1
         self.seconds += time.monotonic() - started
@@ -189,13 +188,13 @@ def train(
     decay_step = round(settings.decay_from * settings.steps)
     stopped = False
     while trainer.step < settings.steps and not stopped:
-        if trainer.step == decay_step:
+        if trainer.step == decay_step > 0:
             save_state(folder / BEFORE_DECAY_NAME, trainer.state())
         rate = learning_rate(settings, trainer.step)
         log.note(trainer.step, rate, trainer.advance(), trainer.seconds)
-        if validated is not None and validate_every is not None:
-            if trainer.step % validate_every == 0 or trainer.step == settings.steps:
-                scores.add(trainer.step, validated(trainer.state()))
+        is_due = validate_every is not None and trainer.step % validate_every == 0
+        if validated is not None and (is_due or trainer.step == settings.steps):
+            scores.add(trainer.step, validated(trainer.state()))
         now = time.monotonic()
         stopped = should_stop() or (seconds is not None and now - started >= seconds)
         if now - saved >= checkpoint_every_s:

@@ -106,7 +106,7 @@ PRESETS = {
     # For tests: seconds, and the loss falls.
     "smoke": Settings(
         steps=20,
-        crop_px=48,
+        crop_px=64,
         batch=2,
         learning_rate=3e-3,
         final_learning_rate=1e-3,
@@ -114,6 +114,6 @@ PRESETS = {
         decay_from=0.0,
         patch_px=8,
         border_px=8,
-        mild_steps=20,
+        mild_steps=1_000,
     ),
 }

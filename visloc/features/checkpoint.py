@@ -1,6 +1,7 @@
 """Reads the tensors of a weights file without running anything that the file says.
 
-A safetensors file says nothing that could be run (``visloc.features.safetensors``). PyTorch saves a pickle that describes tensors, beside the raw numbers, in one of two layouts:
+A safetensors file says nothing that could be run (``visloc.features.safetensors``). PyTorch saves
+a pickle that describes tensors, beside the raw numbers, in one of two layouts:
 
 - since 1.6 a zip archive: ``<root>/data.pkl`` and one member ``<root>/data/<key>`` per storage;
 - before, three pickles in a row (byte order and type sizes, the object, the storage keys), then
@@ -109,8 +110,9 @@ class _Tensor(NamedTuple):
 def read_checkpoint(path: Path, max_bytes: int = MAX_FILE_BYTES) -> Checkpoint:
     """Read a safetensors file, or a state dict that PyTorch saved.
 
-    That may be bare or under the key ``state_dict`` or ``model_state`` of a dict. Whatever else the dict holds (the state of an optimizer, options, scores) is not looked at,
-    except for scikit-learn's PCAs by name under ``pca``.
+    That may be bare or under the key ``state_dict`` or ``model_state`` of a dict. Whatever else
+    the dict holds (the state of an optimizer, options, scores) is not looked at, except for
+    scikit-learn's PCAs by name under ``pca``.
 
     Args:
         path: the file.
@@ -118,8 +120,9 @@ def read_checkpoint(path: Path, max_bytes: int = MAX_FILE_BYTES) -> Checkpoint:
 
     Raises:
         WeightsError: ``weights.unreadable`` when the file cannot be read, ``weights.too_large``
-            when it exceeds ``max_bytes``, ``weights.format`` when it is neither
-            safetensors nor a PyTorch file of plain tensors, is damaged, or names anything that a state dict does not need.
+            when it exceeds ``max_bytes``, ``weights.format`` when it is neither safetensors nor a
+            PyTorch file of plain tensors, is damaged, or names anything that a state dict does
+            not need.
     """
     try:
         with path.open("rb") as file:

@@ -71,15 +71,25 @@ class Layer(NamedTuple):
 
     @property
     def padding(self) -> int:
+        """Zeros around the input."""
         return self.dilation * (self.kernel - 1) // 2
 
 
 @dataclass(frozen=True, slots=True)
 class Architecture:
+    """A network but for its weights.
+
+    Attributes:
+        name: of the feature.
+        published: its published weights.
+        layers: of the trunk.
+        pool_after: how many layers come before the pooling; 0 for no pooling.
+    """
+
     name: str
     published: PublishedWeights
     layers: tuple[Layer, ...]
-    pool_after: int  # this many layers; 0 for no pooling
+    pool_after: int
 
     @property
     def stride(self) -> int:
@@ -151,9 +161,7 @@ def _load(
     return R2D2Extractor(architecture, weights_sha256, network)
 
 
-def _read_folded(
-    architecture: Architecture, weights_dir: Path | None
-) -> tuple[FoldedNetwork, str]:
+def _read_folded(architecture: Architecture, weights_dir: Path | None) -> tuple[FoldedNetwork, str]:
     """Return the network and its file's sha256: the published one if there, else our own."""
     published = architecture.published
     if weights_dir is None or not (weights_dir / published.file_name).is_file():
@@ -346,9 +354,7 @@ def unpack_folded(architecture: Architecture, checkpoint: Checkpoint) -> FoldedN
         shapes[f"{name}.convolutions.{number}.weight"] = shape
         shapes[f"{name}.convolutions.{number}.bias"] = (outputs,)
         inputs = outputs
-    check_shapes(
-        checkpoint, shapes, network=architecture.published.network, held="another network"
-    )
+    check_shapes(checkpoint, shapes, network=architecture.published.network, held="another network")
 
     def tensor(of: str) -> NDArray[np.float32]:
         return tensors[f"{name}.{of}"].astype(np.float32)
@@ -400,9 +406,7 @@ class Network(Protocol):
 class R2D2Extractor:
     """Multi-scale extraction with R2D2 or Fast-R2D2."""
 
-    def __init__(
-        self, architecture: Architecture, weights_sha256: str, network: Network
-    ) -> None:
+    def __init__(self, architecture: Architecture, weights_sha256: str, network: Network) -> None:
         self.network = network
         self.fingerprint = Fingerprint(
             name=architecture.name,

@@ -57,11 +57,12 @@ def decode_tensors(data: bytes) -> Tensors:
     start = _LENGTH_BYTES + length
     if len(data) < _LENGTH_BYTES or length > _MAX_HEADER_BYTES or start > len(data):
         raise ValueError("no header of safetensors")
+    text = data[_LENGTH_BYTES:start]
     try:
-        header = json.loads(data[_LENGTH_BYTES:start])
+        header = json.loads(text) if text.startswith(b"{") else None
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise ValueError("its header is no JSON") from error
-    if not isinstance(header, dict):
+    if header is None:
         raise ValueError("its header is no JSON object")
     metadata = header.pop("__metadata__", {})
     if not (isinstance(metadata, dict) and all(isinstance(v, str) for v in metadata.values())):
@@ -71,12 +72,13 @@ def decode_tensors(data: bytes) -> Tensors:
 
 
 def _array(name: str, said: object, values: memoryview) -> NDArray[Any]:
-    if not isinstance(said, dict) or said.get("dtype") not in _DTYPES:
+    said = said if isinstance(said, dict) else {}
+    dtype = _DTYPES.get(str(said.get("dtype")))
+    if dtype is None:
         raise ValueError(f"tensor {name:.60}: not one of the types {', '.join(_DTYPES)}")
-    dtype = _DTYPES[said["dtype"]]
-    shape, span = said.get("shape"), said.get("data_offsets")
-    if not (_are_counts(shape) and _are_counts(span) and len(shape) <= _MAX_DIMENSIONS):
-        raise ValueError(f"tensor {name:.60}: no shape or no span")
+    shape, span = (_counts(said.get(key)) for key in ("shape", "data_offsets"))
+    if len(shape) > _MAX_DIMENSIONS:
+        raise ValueError(f"tensor {name:.60}: more than {_MAX_DIMENSIONS} dimensions")
     if len(span) != 2 or not span[0] <= span[1] <= len(values):
         raise ValueError(f"tensor {name:.60}: its span is not inside the file")
     if span[1] - span[0] != math.prod(shape) * dtype.itemsize:
@@ -84,8 +86,10 @@ def _array(name: str, said: object, values: memoryview) -> NDArray[Any]:
     return np.frombuffer(values[span[0] : span[1]], dtype).reshape(shape)
 
 
-def _are_counts(numbers: Any) -> bool:
-    return isinstance(numbers, list) and all(type(n) is int and 0 <= n < 2**40 for n in numbers)
+def _counts(numbers: object) -> list[int]:
+    if isinstance(numbers, list) and all(type(n) is int and 0 <= n < 2**40 for n in numbers):
+        return numbers
+    raise ValueError("a shape or span that is no list of counts")
 
 
 def encode_tensors(

@@ -237,7 +237,7 @@ def test_big_endian_files_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", [b"", b"PK", b"<html>404</html>", b"PK\x03\x04" + bytes(99)])
 def test_what_is_no_weights_file_is_refused(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "w.pt").write_bytes(content)
-    with pytest.raises(WeightsError, match="expected a state dict saved by"):
+    with pytest.raises(WeightsError, match="a state dict saved by"):
         read_checkpoint(tmp_path / "w.pt")
 
 
