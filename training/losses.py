@@ -14,10 +14,11 @@ _MIN_VALID_SHARE = 0.5  # of a patch, for the patch to count
 def quantized_average_precision(positive: Tensor, negatives: Tensor, bins: int = AP_BINS) -> Tensor:
     """Return a differentiable average precision of queries with one right answer each.
 
-    He et al. 2018: similarities are spread over bins with centres c_k from 1 down to 0, each over
-    the two next to it. A similarity's share of the first k bins is then
-    clip((z - c_k) / width + 1, 0, 1), all of it in the last one, and
-    AP = sum_k (recall_k - recall_(k-1)) * precision_k.
+    He et al. 2018: a similarity is spread over the two of the bins, with centres from 1 down to 0,
+    that it lies between; the last bin takes everything below 0, too. Down to and with the bin of
+    centre c there is clip((z - c) / width + 1, 0, 1) of it, and
+    AP = sum_k (recall_k - recall_(k-1)) * precision_k. With one right answer, recall grows in its
+    own two bins only: no other needs to be looked at.
 
     Args:
         positive: (Q,) similarity of the right answer, cosine.
@@ -27,18 +28,20 @@ def quantized_average_precision(positive: Tensor, negatives: Tensor, bins: int =
     Returns:
         (Q,) in 0 to 1.
     """
-    width = 1 / (bins - 1)
-    right, found = [], []
-    for k in range(bins - 1):
-        centre = 1 - k * width
-        right.append(((positive - centre) / width + 1).clamp(0, 1))
-        wrong = ((negatives - centre) / width + 1).clamp(0, 1).sum(dim=1)
-        found.append(right[-1] + wrong)
-    right.append(torch.ones_like(positive))
-    found.append(torch.full_like(positive, 1 + negatives.shape[1]))
-    recall, answers = torch.stack(right), torch.stack(found)
-    gained = torch.diff(recall, dim=0, prepend=torch.zeros_like(recall[:1]))
-    return (gained * recall / (answers + _LEAST)).sum(dim=0)
+    wrong = negatives.clamp_min(0) * (bins - 1)
+    place = (1 - positive.clamp(0, 1)) * (bins - 1)  # counts bins, from the first centre
+    upper = place.detach().floor().clamp_max(bins - 2)
+    in_lower = place - upper
+    in_upper = 1 - in_lower
+
+    def found(number: Tensor) -> Tensor:
+        """Return how many wrong answers there are down to and with a bin (Q,)."""
+        centre = bins - 1 - number
+        return (wrong - centre[:, None] + 1).clamp(0, 1).sum(dim=1)
+
+    of_upper = in_upper / (in_upper + found(upper) + _LEAST)
+    of_lower = 1 / (1 + found(upper + 1))
+    return in_upper * of_upper + in_lower * of_lower
 
 
 def reliability_loss(

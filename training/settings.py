@@ -39,7 +39,7 @@ class Settings:
     mild_steps: int = _setting(0, "in which pairs grow from mild to as hard as they get")
     parallax_share: float = _setting(0.0, "of the pairs, from synthetic rooms instead of photos")
     bf16: bool = _setting(False, "convolutions in bfloat16, everything else in float32")
-    compiled: bool = _setting(False, "compile the network: faster after a minute, other rounding")
+    compiled: bool = _setting(False, "compile the network: no gain on processors")
 
     def __post_init__(self) -> None:
         for name, is_right, expected in (
@@ -99,6 +99,7 @@ PRESETS = {
         final_learning_rate=1e-5,
         warm_up_steps=100,
         decay_from=0.0,
+        query_step_px=6,
         mild_steps=1_000,
         parallax_share=0.2,
         bf16=True,
