@@ -104,51 +104,59 @@ def rotation_about(axis: NDArray[np.float64], angle: float) -> Matrix:
     return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
 
 
-def flow_between(photo_from_first: Matrix, photo_from_second: Matrix, crop_px: int) -> Tensor:
+def flow_between(
+    photo_from_first: Matrix, photo_from_second: Matrix, crop_px: int, device: torch.device
+) -> Tensor:
     """Return the flow (H, W, 2) float32 from the first crop to the second, NaN outside of it."""
-    flow = _applied(np.linalg.inv(photo_from_second) @ photo_from_first, crop_px)
+    flow = _applied(np.linalg.inv(photo_from_second) @ photo_from_first, crop_px, device)
     inside = ((flow >= 0) & (flow < crop_px)).all(dim=-1, keepdim=True)
     return torch.where(inside, flow, torch.nan).float()
 
 
-def _applied(matrix: Matrix, crop_px: int) -> Tensor:
+def _applied(matrix: Matrix, crop_px: int, device: torch.device) -> Tensor:
     """Return where (H, W, 2) float64 a homography takes the centres of a crop's pixels."""
-    places = torch.arange(crop_px, dtype=torch.float64) + 0.5
+    places = torch.arange(crop_px, dtype=torch.float64, device=device) + 0.5
     y, x = torch.meshgrid(places, places, indexing="ij")
-    m = torch.from_numpy(matrix)
-    u, v, w = (m[row, 0] * x + m[row, 1] * y + m[row, 2] for row in range(3))
+    u, v, w = (a * x + b * y + c for a, b, c in matrix.tolist())
     return torch.stack([u / w, v / w], dim=-1)
 
 
 def look(levels: tuple[Tensor, ...], photo_from_crop: Matrix, crop_px: int) -> Tensor:
     """Return what a camera sees of a photo, (3, H, W) float32 in 0 to 1; mirrored beyond it."""
-    places = _applied(photo_from_crop, crop_px)
-    middle = crop_px // 2
-    # Photo pixels per crop pixel: the root of the area that a crop pixel covers.
-    across = places[middle, middle + 1] - places[middle, middle]
-    down = places[middle + 1, middle] - places[middle, middle]
-    scale = float((across[0] * down[1] - across[1] * down[0]).abs().sqrt())
-    level = min(max(int(np.log2(scale) + 0.5), 0), len(levels) - 1)
+    level = min(max(round(np.log2(_scale(photo_from_crop, crop_px))), 0), len(levels) - 1)
     picture = levels[level]
     height, width = picture.shape[1:]
-    shrunk = places.new_tensor([width / levels[0].shape[2], height / levels[0].shape[1]])
-    places = places * shrunk
-    # Only the part that is seen is turned into floats. It is no smaller than a mirror needs.
-    low = (places.amin(dim=(0, 1)) - 2).floor().long().tolist()
-    high = (places.amax(dim=(0, 1)) + 3).ceil().long().tolist()
-    left, right = _span(low[0], high[0], width)
-    top, bottom = _span(low[1], high[1], height)
+    shrunk = np.array([width / levels[0].shape[2], height / levels[0].shape[1]])
+    # Only the part that is seen is turned into floats; a homography keeps lines straight, so that
+    # the corners say which part it is.
+    corners = shrunk * moved(photo_from_crop, crop_px * np.array([[0, 0], [1, 0], [0, 1], [1, 1]]))
+    low, high = np.floor(corners.min(axis=0)) - 2, np.ceil(corners.max(axis=0)) + 2
+    left, right = _span(int(low[0]), int(high[0]), width)
+    top, bottom = _span(int(low[1]), int(high[1]), height)
     part = picture[None, :, top:bottom, left:right].float() / 255
-    size = places.new_tensor([right - left, bottom - top])
-    grid = (places - places.new_tensor([left, top])) / size * 2 - 1
+    # From photo pixels to -1 and 1 at the outer edges of the part, as grid_sample counts.
+    size = np.array([right - left, bottom - top])
+    scale, shift = 2 * shrunk / size, -2 * np.array([left, top]) / size - 1
+    grid_from_photo = np.array([[scale[0], 0, shift[0]], [0, scale[1], shift[1]], [0, 0, 1]])
+    grid = _applied(grid_from_photo @ photo_from_crop, crop_px, part.device)
     seen = F.grid_sample(
-        part,
-        grid[None].float().to(part.device),
-        mode="bilinear",
-        padding_mode="reflection",
-        align_corners=False,
+        part, grid[None].float(), mode="bilinear", padding_mode="reflection", align_corners=False
     )
     return seen[0]
+
+
+def moved(homography: Matrix, points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return where a homography takes points (N, 2)."""
+    lifted = np.column_stack([points, np.ones(len(points))]) @ homography.T
+    return np.asarray(lifted[:, :2] / lifted[:, 2:])
+
+
+def _scale(photo_from_crop: Matrix, crop_px: int) -> float:
+    """Return photo pixels per crop pixel: the root of the area that the middle pixel covers."""
+    middle = crop_px / 2
+    origin, across, down = moved(photo_from_crop, middle + np.array([[0, 0], [1, 0], [0, 1]]))
+    (a, b), (c, d) = across - origin, down - origin
+    return float(np.sqrt(abs(a * d - b * c)))
 
 
 def _span(low: int, high: int, size: int) -> tuple[int, int]:

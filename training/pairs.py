@@ -63,10 +63,10 @@ def make_pairs(sources: Sources, settings: Settings, step: int) -> Pairs:
             size = photo.levels[0].shape
             looks = random_looks(rng, (size[1], size[2]), crop, strength)
             first, second = (look(photo.levels, each, crop) for each in looks)
-            flow = flow_between(*looks, crop)
+            flow = flow_between(*looks, crop, sources.device)
         firsts.append(first)
         seconds.append(second)
-        flows.append(flow)
+        flows.append(flow.to(sources.device))
     images = augment(torch.stack([*firsts, *seconds]), rng, strength)
     queries, distractors = (
         torch.from_numpy(
@@ -74,4 +74,4 @@ def make_pairs(sources: Sources, settings: Settings, step: int) -> Pairs:
         ).to(sources.device)
         for _ in range(2)
     )
-    return Pairs(images, torch.stack(flows).to(sources.device), queries, distractors)
+    return Pairs(images, torch.stack(flows), queries, distractors)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from training.augmentation import augment
 from training.checkpoint import State
 from training.export import export
-from training.homographies import Matrix, look, random_looks
+from training.homographies import Matrix, look, moved, random_looks
 from training.photos import Photo
 from visloc.features import LocalFeatureExtractor, make_local_features
 from visloc.matching.correspondences import mutual_nearest_neighbours
@@ -112,12 +112,6 @@ def _scored(extractor: LocalFeatureExtractor, pair: Pair, max_keypoints: int) ->
         (len(first) + len(second)) / 2,
         float((gaps[inside].min(axis=1) < 3.0).mean()) if inside.any() else 0.0,
     ]
-
-
-def moved(homography: Matrix, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return where a homography takes points (N, 2)."""
-    lifted = np.column_stack([points, np.ones(len(points))]) @ homography.T
-    return np.asarray(lifted[:, :2] / lifted[:, 2:])
 
 
 def features_of(state: State) -> LocalFeatureExtractor:

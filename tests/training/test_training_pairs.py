@@ -32,7 +32,7 @@ def test_flow_of_a_shift_and_an_enlargement_is_exact_at_pixel_centres() -> None:
     # The first crop shows the photo from (10, 20), the second from (11, 20) at twice the size.
     first = np.array([[1.0, 0, 10], [0, 1, 20], [0, 0, 1]])
     second = np.array([[0.5, 0, 11], [0, 0.5, 20], [0, 0, 1]])
-    flow = flow_between(first, second, 16)
+    flow = flow_between(first, second, 16, CPU)
     # The centre of pixel (3, 2) is (3.5, 2.5): in the photo (13.5, 22.5), in the second (5, 5).
     assert flow[2, 3].tolist() == [5.0, 5.0]
     assert flow[0, 0].isnan().all()  # (10.5, 20.5) is left of the second
@@ -42,7 +42,7 @@ def test_flow_of_a_shift_and_an_enlargement_is_exact_at_pixel_centres() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_flow_of_random_looks_joins_pixels_that_see_the_same_spot(seed: int) -> None:
     first, second = random_looks(np.random.default_rng(seed), (400, 500), 64, 1.0)
-    flow = flow_between(first, second, 64)
+    flow = flow_between(first, second, 64, CPU)
     known = ~flow[..., 0].isnan()
     assert known.float().mean() > 0.3
     for y, x in known.nonzero()[::97].tolist():
@@ -57,7 +57,7 @@ def test_both_looks_show_the_same_photo_where_the_flow_says(seed: int) -> None:
     levels = photo_levels(_smooth_photo(400, 500), CPU)
     looks = random_looks(np.random.default_rng(seed), (400, 500), 64, 1.0)
     first, second = (look(levels, each, 64) for each in looks)
-    flow = flow_between(*looks, 64)
+    flow = flow_between(*looks, 64, CPU)
     grid = torch.nan_to_num(flow / 64 * 2 - 1, nan=5.0)
     seen = F.grid_sample(second[None], grid[None], align_corners=False, padding_mode="border")[0]
     known = ~flow[..., 0].isnan()
