@@ -10,7 +10,7 @@ PAGE_SOURCES := $(shell find web/src web/index.html web/*.json web/*.ts -type f)
 .DEFAULT_GOAL := help
 # Vite needs this much; without it the service has no page, and says so.
 NODE_IS_THERE = command -v npm >/dev/null && node -e 'const [a, b] = process.versions.node.split(".").map(Number); process.exit(a > 22 || (a === 22 && b >= 12) || (a === 20 && b >= 19) ? 0 : 1)'
-.PHONY: help install page check-page browser demo test test-all fuzz fuzz-api bench bench-scale fmt lint types contracts proto proto-check check serve clean
+.PHONY: help install page check-page browser demo test test-all fuzz fuzz-api train-smoke bench bench-scale fmt lint types contracts proto proto-check check serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -60,6 +60,9 @@ fuzz: install ## fuzz what reads strangers' bytes: RUNS inputs for each target
 
 fuzz-api: install ## send CASES requests made from our OpenAPI
 	$(BIN)/python -m tests.fuzz.api --cases $(or $(CASES),5000)
+
+train-smoke: install ## train 20 steps on the sample: the loss falls
+	$(BIN)/pytest tests/training/test_training_run.py -k twenty_steps
 
 bench: install ## seconds and accuracy beside the peer and the machine's limit, of DATASET with FEATURES
 	$(BIN)/python -m benchmarks.speed $(or $(DATASET),../shared/data/redkitchen) \

@@ -1,6 +1,7 @@
-"""Reads the tensors of a PyTorch file without running anything that the file says.
+"""Reads the tensors of a weights file without running anything that the file says.
 
-PyTorch saves a pickle that describes tensors, beside the raw numbers, in one of two layouts:
+A safetensors file says nothing that could be run (``visloc.features.safetensors``). PyTorch saves
+a pickle that describes tensors, beside the raw numbers, in one of two layouts:
 
 - since 1.6 a zip archive: ``<root>/data.pkl`` and one member ``<root>/data/<key>`` per storage;
 - before, three pickles in a row (byte order and type sizes, the object, the storage keys), then
@@ -34,6 +35,7 @@ from numpy.typing import NDArray
 
 from visloc.errors import WeightsError
 from visloc.features.pickled_pca import PickledPca, stand_in
+from visloc.features.safetensors import decode_tensors, is_safetensors
 
 MAX_FILE_BYTES = 256 * 2**20
 # A state dict with the state of an optimizer has some 10,000, a long training log 150,000.
@@ -106,10 +108,11 @@ class _Tensor(NamedTuple):
 
 
 def read_checkpoint(path: Path, max_bytes: int = MAX_FILE_BYTES) -> Checkpoint:
-    """Read a state dict, bare or under the key ``state_dict`` or ``model_state`` of a dict.
+    """Read a safetensors file, or a state dict that PyTorch saved.
 
-    Whatever else the dict holds (the state of an optimizer, options, scores) is not looked at,
-    except for scikit-learn's PCAs by name under ``pca``.
+    That may be bare or under the key ``state_dict`` or ``model_state`` of a dict. Whatever else
+    the dict holds (the state of an optimizer, options, scores) is not looked at, except for
+    scikit-learn's PCAs by name under ``pca``.
 
     Args:
         path: the file.
@@ -117,8 +120,9 @@ def read_checkpoint(path: Path, max_bytes: int = MAX_FILE_BYTES) -> Checkpoint:
 
     Raises:
         WeightsError: ``weights.unreadable`` when the file cannot be read, ``weights.too_large``
-            when it exceeds ``max_bytes``, ``weights.format`` when it is not a PyTorch file of
-            plain tensors, is damaged, or names anything that a state dict does not need.
+            when it exceeds ``max_bytes``, ``weights.format`` when it is neither safetensors nor a
+            PyTorch file of plain tensors, is damaged, or names anything that a state dict does
+            not need.
     """
     try:
         with path.open("rb") as file:
@@ -135,13 +139,13 @@ def read_checkpoint(path: Path, max_bytes: int = MAX_FILE_BYTES) -> Checkpoint:
             expected=f"at most {max_bytes} bytes",
         )
     try:
-        content, tensors = _read_zip(data) if data[:2] == b"PK" else _read_old_layout(data)
+        content, tensors = _read(data)
     except _MALFORMED as error:
         raise WeightsError(
             "weights.format",
-            "not a whole PyTorch file of plain tensors",
+            "not a whole file of plain tensors",
             field=str(path),
-            expected="a state dict saved by torch.save",
+            expected="safetensors, or a state dict saved by torch.save",
             got=f"{type(error).__name__}: {error}",
         ) from error
     return Checkpoint(path, hashlib.sha256(data).hexdigest(), tensors, _pca_of(content))
@@ -156,6 +160,14 @@ def _pca_of(content: object) -> dict[str, PickledPca]:
         for name, pca in found.items()
         if isinstance(name, str) and isinstance(pca, PickledPca)
     }
+
+
+def _read(data: bytes) -> tuple[object, Mapping[str, NDArray[Any]]]:
+    if data[:2] == b"PK":
+        return _read_zip(data)
+    if is_safetensors(data):
+        return None, decode_tensors(data).arrays
+    return _read_old_layout(data)
 
 
 def _read_old_layout(data: bytes) -> tuple[object, dict[str, NDArray[Any]]]:

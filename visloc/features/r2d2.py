@@ -1,6 +1,7 @@
 """R2D2 (Revaud et al., NeurIPS 2019) and Fast-R2D2 (Humenberger et al. 2020, appendix).
 
-Written from the papers and from the published weights' own shapes. One trunk of nine
+Written from the papers and from the published weights' own shapes. Our own weights come from
+``training``. One trunk of nine
 convolutions gives 128 channels x per pixel; two 1x1 heads on x^2 give reliability and
 repeatability, x / |x| is the descriptor. Fast-R2D2 pools once, so that most of the trunk works
 at half resolution, and interpolates x back to full resolution before the heads.
@@ -29,6 +30,7 @@ from visloc.features.weights import (
     R2D2_WASF_N16,
     PublishedWeights,
     check_shapes,
+    read_own_weights,
     read_weights,
 )
 from visloc.types import Extraction, Inference, LocalFeatures
@@ -58,7 +60,7 @@ MEAN = (0.485 * 255, 0.456 * 255, 0.406 * 255)
 STD = (0.229 * 255, 0.224 * 255, 0.225 * 255)
 
 
-class _Layer(NamedTuple):
+class Layer(NamedTuple):
     """One convolution; padding keeps the size."""
 
     kernel: int
@@ -69,15 +71,25 @@ class _Layer(NamedTuple):
 
     @property
     def padding(self) -> int:
+        """Zeros around the input."""
         return self.dilation * (self.kernel - 1) // 2
 
 
 @dataclass(frozen=True, slots=True)
-class _Architecture:
+class Architecture:
+    """A network but for its weights.
+
+    Attributes:
+        name: of the feature.
+        published: its published weights.
+        layers: of the trunk.
+        pool_after: how many layers come before the pooling; 0 for no pooling.
+    """
+
     name: str
     published: PublishedWeights
-    layers: tuple[_Layer, ...]
-    pool_after: int  # this many layers; 0 for no pooling
+    layers: tuple[Layer, ...]
+    pool_after: int
 
     @property
     def stride(self) -> int:
@@ -85,19 +97,19 @@ class _Architecture:
         return 2 if self.pool_after else 1
 
 
-def _layers(dilations: tuple[int, ...]) -> tuple[_Layer, ...]:
+def _layers(dilations: tuple[int, ...]) -> tuple[Layer, ...]:
     kernels = (3, 3, 3, 3, 3, 3, 2, 2, 2)
     widths = (1, 1, 2, 2, 4, 4, 4, 4, 0)
     return tuple(
-        _Layer(kernel, dilation, width, normalized=number < 9, relu=number < 7)
+        Layer(kernel, dilation, width, normalized=number < 9, relu=number < 7)
         for number, (kernel, dilation, width) in enumerate(
             zip(kernels, dilations, widths, strict=True), start=1
         )
     )
 
 
-R2D2 = _Architecture("r2d2", R2D2_WASF_N16, _layers((1, 1, 1, 2, 2, 4, 4, 8, 16)), pool_after=0)
-FAST_R2D2 = _Architecture(
+R2D2 = Architecture("r2d2", R2D2_WASF_N16, _layers((1, 1, 1, 2, 2, 4, 4, 8, 16)), pool_after=0)
+FAST_R2D2 = Architecture(
     "faster2d2", FASTER2D2_WASF_N16, _layers((1, 1, 1, 1, 1, 2, 2, 4, 8)), pool_after=3
 )
 
@@ -107,7 +119,7 @@ def load_r2d2(
     inference: Inference = Inference.AUTO,
     threads: int | None = None,
 ) -> LocalFeatureExtractor:
-    """Make R2D2 from ``r2d2_WASF_N16.pt`` in the weights folder.
+    """Make R2D2 from ``r2d2_WASF_N16.pt`` or ``r2d2.safetensors`` in the weights folder.
 
     Raises:
         WeightsError: the file is missing, damaged, or of another network.
@@ -121,7 +133,7 @@ def load_faster2d2(
     inference: Inference = Inference.AUTO,
     threads: int | None = None,
 ) -> LocalFeatureExtractor:
-    """Make Fast-R2D2 from ``faster2d2_WASF_N16.pt`` in the weights folder.
+    """Make Fast-R2D2 from ``faster2d2_WASF_N16.pt`` or ``faster2d2.safetensors`` in the folder.
 
     Raises:
         WeightsError: the file is missing, damaged, or of another network.
@@ -131,9 +143,32 @@ def load_faster2d2(
 
 
 def _load(
-    architecture: _Architecture, weights_dir: Path | None, inference: Inference, threads: int | None
+    architecture: Architecture, weights_dir: Path | None, inference: Inference, threads: int | None
 ) -> R2D2Extractor:
-    checkpoint = read_weights(weights_dir, architecture.published)
+    folded, weights_sha256 = _read_folded(architecture, weights_dir)
+    chosen = choose_inference(inference)
+    network: Network
+    if chosen is Inference.TORCH:
+        from visloc.features.r2d2_torch import TorchNetwork
+
+        network = TorchNetwork(folded)
+    else:
+        from visloc.features.r2d2_openvino import make_openvino_network
+
+        network = make_openvino_network(
+            folded, weights_sha256, in_8_bits=chosen is Inference.INT8, threads=threads
+        )
+    return R2D2Extractor(architecture, weights_sha256, network)
+
+
+def _read_folded(architecture: Architecture, weights_dir: Path | None) -> tuple[FoldedNetwork, str]:
+    """Return the network and its file's sha256: the published one if there, else our own."""
+    published = architecture.published
+    if weights_dir is None or not (weights_dir / published.file_name).is_file():
+        own = read_own_weights(architecture.name, weights_dir)
+        if own is not None:
+            return unpack_folded(architecture, own), own.sha256
+    checkpoint = read_weights(weights_dir, published)
     held = next(
         (
             candidate.published.network
@@ -145,23 +180,10 @@ def _load(
     check_shapes(
         checkpoint,
         _expected_shapes(architecture, checkpoint),
-        network=architecture.published.network,
+        network=published.network,
         held=held,
     )
-    folded = fold(architecture, checkpoint)
-    chosen = choose_inference(inference)
-    network: Network
-    if chosen is Inference.TORCH:
-        from visloc.features.r2d2_torch import TorchNetwork
-
-        network = TorchNetwork(folded)
-    else:
-        from visloc.features.r2d2_openvino import make_openvino_network
-
-        network = make_openvino_network(
-            folded, checkpoint.sha256, in_8_bits=chosen is Inference.INT8, threads=threads
-        )
-    return R2D2Extractor(architecture, checkpoint, network)
+    return fold(architecture, checkpoint), checkpoint.sha256
 
 
 def _shapes_of(checkpoint: Checkpoint) -> dict[str, tuple[int, ...]]:
@@ -175,7 +197,7 @@ class _Index(NamedTuple):
     batch_norm: int
 
 
-def _indices(architecture: _Architecture) -> Iterator[tuple[_Layer, _Index]]:
+def _indices(architecture: Architecture) -> Iterator[tuple[Layer, _Index]]:
     """Count as the published networks do: each batch norm, ReLU and pooling takes a number."""
     position = 0
     for number, layer in enumerate(architecture.layers, start=1):
@@ -189,7 +211,7 @@ def _prefix(checkpoint: Checkpoint) -> str:
 
 
 def _expected_shapes(
-    architecture: _Architecture, checkpoint: Checkpoint
+    architecture: Architecture, checkpoint: Checkpoint
 ) -> dict[str, tuple[int, ...]]:
     """Shapes of all tensors, for the width that the first layer of the checkpoint has."""
     prefix = _prefix(checkpoint)
@@ -256,7 +278,7 @@ class FoldedNetwork:
     stride: int
 
 
-def fold(architecture: _Architecture, checkpoint: Checkpoint) -> FoldedNetwork:
+def fold(architecture: Architecture, checkpoint: Checkpoint) -> FoldedNetwork:
     """Fold the batch norms of a checkpoint of this architecture into the convolutions."""
     prefix = _prefix(checkpoint)
     tensors = {name.removeprefix(prefix): array for name, array in checkpoint.tensors.items()}
@@ -279,7 +301,7 @@ def fold(architecture: _Architecture, checkpoint: Checkpoint) -> FoldedNetwork:
 
 
 def _folded(
-    layer: _Layer, index: _Index, tensors: Mapping[str, NDArray[Any]], *, pool: bool
+    layer: Layer, index: _Index, tensors: Mapping[str, NDArray[Any]], *, pool: bool
 ) -> Convolution:
     name = f"ops.{index.convolution}"
     weight, bias = tensors[f"{name}.weight"], tensors[f"{name}.bias"]
@@ -295,6 +317,65 @@ def _folded(
         layer.padding,
         layer.relu,
         pool,
+    )
+
+
+def pack_folded(folded: FoldedNetwork) -> dict[str, NDArray[Any]]:
+    """Return the tensors of a file of our own: weights in 16 bits, biases in 32.
+
+    ``NAME.convolutions.N.weight`` and ``.bias`` count from 0; ``NAME.heads.weight`` is (2, 128).
+    """
+    tensors: dict[str, NDArray[Any]] = {}
+    for number, each in enumerate(folded.convolutions):
+        tensors[f"{folded.name}.convolutions.{number}.weight"] = each.weight.astype(np.float16)
+        tensors[f"{folded.name}.convolutions.{number}.bias"] = each.bias
+    tensors[f"{folded.name}.heads.weight"] = folded.head_weight.astype(np.float16)
+    tensors[f"{folded.name}.heads.bias"] = folded.head_bias
+    return tensors
+
+
+def unpack_folded(architecture: Architecture, checkpoint: Checkpoint) -> FoldedNetwork:
+    """Return the network of a file of our own, see ``pack_folded``.
+
+    Raises:
+        WeightsError: ``weights.network`` or ``weights.values``.
+    """
+    name, tensors = architecture.name, checkpoint.tensors
+    first = tensors.get(f"{name}.convolutions.0.weight")
+    base_width = first.shape[0] if first is not None and first.ndim else 32
+    shapes: dict[str, tuple[int, ...]] = {
+        f"{name}.heads.weight": (2, DESCRIPTOR_DIM),
+        f"{name}.heads.bias": (2,),
+    }
+    inputs = 3
+    for number, layer in enumerate(architecture.layers):
+        outputs = layer.width * base_width or DESCRIPTOR_DIM
+        shape = (outputs, inputs, layer.kernel, layer.kernel)
+        shapes[f"{name}.convolutions.{number}.weight"] = shape
+        shapes[f"{name}.convolutions.{number}.bias"] = (outputs,)
+        inputs = outputs
+    check_shapes(checkpoint, shapes, network=architecture.published.network, held="another network")
+
+    def tensor(of: str) -> NDArray[np.float32]:
+        return tensors[f"{name}.{of}"].astype(np.float32)
+
+    return FoldedNetwork(
+        name,
+        tuple(
+            Convolution(
+                f"convolutions.{number}",
+                tensor(f"convolutions.{number}.weight"),
+                tensor(f"convolutions.{number}.bias"),
+                layer.dilation,
+                layer.padding,
+                layer.relu,
+                number + 1 == architecture.pool_after,
+            )
+            for number, layer in enumerate(architecture.layers)
+        ),
+        tensor("heads.weight"),
+        tensor("heads.bias"),
+        architecture.stride,
     )
 
 
@@ -325,9 +406,7 @@ class Network(Protocol):
 class R2D2Extractor:
     """Multi-scale extraction with R2D2 or Fast-R2D2."""
 
-    def __init__(
-        self, architecture: _Architecture, checkpoint: Checkpoint, network: Network
-    ) -> None:
+    def __init__(self, architecture: Architecture, weights_sha256: str, network: Network) -> None:
         self.network = network
         self.fingerprint = Fingerprint(
             name=architecture.name,
@@ -340,7 +419,7 @@ class R2D2Extractor:
                 "min_repeatability": MIN_REPEATABILITY,
                 "peak_reach_px": PEAK_REACH_PX,
             },
-            weights_sha256=checkpoint.sha256,
+            weights_sha256=weights_sha256,
         )
 
     @property

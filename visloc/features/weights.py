@@ -1,7 +1,8 @@
-"""Published network weights: where they come from, and whether a file holds the right ones.
+"""Network weights: where they come from, and whether a file holds the right ones.
 
-None are shipped nor fetched: they come with a package, or whoever runs the software downloads
-them and says in which folder they lie. Some, R2D2's for one, are for non-commercial use.
+Published ones are neither shipped nor fetched: they come with a package, or whoever runs the
+software downloads them and says in which folder they lie. Some, R2D2's for one, are for
+non-commercial use. Our own (``training``, docs/models) are shipped, and free to use.
 """
 
 from __future__ import annotations
@@ -60,6 +61,35 @@ FASTER2D2_WASF_N16 = _of_r2d2(
     "Fast-R2D2",
     "217daa3a166bfe9bf2b68c05c1607a09dd4d552ae1bbeda885479d504eefc14b",
 )
+
+
+# Our own weights that lie beside this module: sha256 of ``trained/NAME.safetensors`` by feature.
+SHIPPED: Mapping[str, str] = {}
+_SHIPPED_FOLDER = Path(__file__).parent / "trained"
+
+
+def read_own_weights(feature: str, weights_dir: Path | None) -> Checkpoint | None:
+    """Read ``FEATURE.safetensors`` from the weights folder, or else what is shipped, if any is.
+
+    Raises:
+        WeightsError: ``weights.altered`` if the shipped file is not the one that was shipped; and
+            those of ``read_checkpoint``.
+    """
+    file_name = f"{feature}.safetensors"
+    if weights_dir is not None and (weights_dir / file_name).is_file():
+        return read_checkpoint(weights_dir / file_name)
+    if feature not in SHIPPED:
+        return None
+    checkpoint = read_checkpoint(_SHIPPED_FOLDER / file_name)
+    if checkpoint.sha256 != SHIPPED[feature]:
+        raise WeightsError(
+            "weights.altered",
+            "not the weights that this version was shipped with; install it anew",
+            field=str(checkpoint.path),
+            expected=f"sha256 {SHIPPED[feature]}",
+            got=checkpoint.sha256,
+        )
+    return checkpoint
 
 
 def read_weights(weights_dir: Path | None, published: PublishedWeights) -> Checkpoint:

@@ -23,11 +23,14 @@ from visloc.features.r2d2 import (
     fold,
     load_faster2d2,
     load_r2d2,
+    pack_folded,
     pyramid,
     pyramid_sizes,
+    unpack_folded,
 )
 from visloc.features.r2d2_openvino import OpenVinoNetwork, make_openvino_network
 from visloc.features.r2d2_torch import R2D2Network, TorchNetwork
+from visloc.features.safetensors import encode_tensors
 from visloc.types import Extraction, Inference, LocalFeatures
 
 # The published networks, written down a second time: number of the convolution in the state
@@ -413,3 +416,43 @@ def test_less_effort_looks_at_some_of_the_scales(tmp_path: Path) -> None:
     assert scales[Extraction.FAST] < scales[Extraction.DEFAULT] < scales[Extraction.ACCURATE]
     assert len(scales[Extraction.FAST]) == 1
     assert min(scales[Extraction.ACCURATE]) == PATCH_PX
+
+
+def _save_own(folder: Path, name: str, state: dict[str, Tensor]) -> Path:
+    checkpoint = read_checkpoint(_save(folder, name, state))
+    checkpoint.path.unlink()
+    path = folder / f"{name}.safetensors"
+    path.write_bytes(encode_tensors(pack_folded(fold(ARCHITECTURES[name], checkpoint))))
+    return path
+
+
+@BOTH
+def test_weights_of_our_own_are_the_network_in_16_bits(name: str, tmp_path: Path) -> None:
+    state = _random_state(name)
+    expected = fold(ARCHITECTURES[name], read_checkpoint(_save(tmp_path, name, state)))
+    own = read_checkpoint(_save_own(tmp_path, name, state))
+    unpacked = unpack_folded(ARCHITECTURES[name], own)
+    assert (unpacked.name, unpacked.stride) == (expected.name, expected.stride)
+    for ours, theirs in zip(unpacked.convolutions, expected.convolutions, strict=True):
+        np.testing.assert_allclose(ours.weight, theirs.weight, rtol=1e-3, atol=1e-6)
+        np.testing.assert_array_equal(ours.bias, theirs.bias)
+        for part in ("dilation", "padding", "relu", "pool"):
+            assert getattr(ours, part) == getattr(theirs, part)
+    np.testing.assert_allclose(unpacked.head_weight, expected.head_weight, rtol=1e-3, atol=1e-6)
+    extractor = LOADERS[name](tmp_path, Inference.FP32)
+    assert extractor.fingerprint.weights_sha256 == own.sha256
+
+
+@BOTH
+def test_published_weights_come_before_our_own(name: str, tmp_path: Path) -> None:
+    _save_own(tmp_path, name, _random_state(name))
+    published = _save(tmp_path, name, _random_state(name))
+    extractor = LOADERS[name](tmp_path, Inference.FP32)
+    assert extractor.fingerprint.weights_sha256 == read_checkpoint(published).sha256
+
+
+def test_our_own_weights_of_another_network_are_refused(tmp_path: Path) -> None:
+    path = _save_own(tmp_path, "faster2d2", _random_state("faster2d2"))
+    path.rename(tmp_path / "r2d2.safetensors")
+    with pytest.raises(WeightsError, match="not the weights of R2D2"):
+        load_r2d2(tmp_path)

@@ -126,7 +126,7 @@ def test_code_in_a_file_is_refused_and_not_run(
     witness = tmp_path / "ran"
     argument = f"open({str(witness)!r}, 'w')" if function in (eval, exec) else f"touch {witness}"
     evil = pickle.dumps({"weight": _Call(function, argument)}, protocol)
-    with pytest.raises(WeightsError, match="not a whole PyTorch file") as caught:
+    with pytest.raises(WeightsError, match="not a whole file of plain tensors") as caught:
         read_checkpoint(write(tmp_path / "w.pt", evil))
     assert caught.value.code == "weights.format"
     assert not witness.exists()
@@ -212,7 +212,7 @@ def test_storage_shorter_than_it_says_is_refused(tmp_path: Path) -> None:
     ):
         if path.name == "declared.pt":
             path.write_bytes(path.read_bytes()[:-4])
-        with pytest.raises(WeightsError, match="not a whole PyTorch file"):
+        with pytest.raises(WeightsError, match="not a whole file of plain tensors"):
             read_checkpoint(path)
 
 
@@ -237,7 +237,7 @@ def test_big_endian_files_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", [b"", b"PK", b"<html>404</html>", b"PK\x03\x04" + bytes(99)])
 def test_what_is_no_weights_file_is_refused(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "w.pt").write_bytes(content)
-    with pytest.raises(WeightsError, match="expected a state dict saved by"):
+    with pytest.raises(WeightsError, match="a state dict saved by"):
         read_checkpoint(tmp_path / "w.pt")
 
 

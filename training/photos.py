@@ -1,0 +1,128 @@
+"""The photographs to learn from: packed into one file, unpacked onto the device.
+
+The pack holds the photos as they are compressed, so that it travels well; on the device they lie
+as 8-bit pixels, each with halves of itself for looking at it from further away.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from training.files import write_whole
+from visloc.errors import InvalidInput, NotFound
+from visloc.features.safetensors import decode_tensors, encode_tensors
+from visloc.images import read_photo
+
+VALIDATION = "validation"
+_RESEARCH_SUFFIX = "_research"  # of folders whose licences do not allow every use
+_SHORTEST_SIDE_PX = 64  # of a halved photo that is still worth looking at
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Photo:
+    """One photo.
+
+    Attributes:
+        name: folder and file.
+        levels: (3, H, W) uint8 RGB each; the first as taken, each further one of half the size.
+    """
+
+    name: str
+    levels: tuple[Tensor, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pack:
+    """A pack of photos.
+
+    Attributes:
+        photos: in the order of their names.
+        sha256: of the file, lower-case hexadecimal.
+        licences: each licence with the number of photos under it.
+    """
+
+    photos: tuple[Photo, ...]
+    sha256: str
+    licences: dict[str, int]
+
+
+def pack_photos(source: Path, output: Path, *, research: bool, validation: bool) -> int:
+    """Pack the photos of a folder of folders, and return their number.
+
+    Args:
+        source: its folders hold ``*.jpg`` and ``SOURCES.tsv`` with columns file and licence.
+        output: file to write.
+        research: also those of folders ``*_research``, whose licences forbid commercial use.
+        validation: only those held back for validation; otherwise all but those.
+
+    Raises:
+        NotFound: ``training.photos`` if there are none.
+    """
+    arrays, licences = {}, {}
+    for path in sorted(source.glob("*/*.jpg")):
+        folder = path.parent.name
+        is_held_back = folder == VALIDATION
+        if is_held_back != validation or (folder.endswith(_RESEARCH_SUFFIX) and not research):
+            continue
+        name = f"{folder}/{path.name}"
+        arrays[name] = np.frombuffer(path.read_bytes(), np.uint8)
+        licences[name] = _licences(path.parent / "SOURCES.tsv").get(path.name, "not stated")
+    if not arrays:
+        raise NotFound("training.photos", "no photos", field=str(source), expected="*/*.jpg")
+    write_whole(output, encode_tensors(arrays, licences))
+    return len(arrays)
+
+
+def _licences(table: Path) -> dict[str, str]:
+    with table.open(encoding="utf-8", newline="") as file:
+        return {row["file"]: row["licence"] for row in csv.DictReader(file, delimiter="\t")}
+
+
+def read_pack(path: Path, device: torch.device) -> Pack:
+    """Read a pack and put its photos onto the device.
+
+    Raises:
+        NotFound: ``training.pack`` if there is no such file.
+        InvalidInput: ``training.pack`` if it is no pack.
+    """
+    if not path.is_file():
+        raise NotFound(
+            "training.pack",
+            "no such pack of photos; make one with: python -m training pack",
+            field=str(path),
+        )
+    data = path.read_bytes()
+    try:
+        packed = decode_tensors(data)
+    except ValueError as error:
+        raise InvalidInput(
+            "training.pack", f"no pack of photos: {error}", field=str(path)
+        ) from error
+    photos: list[Photo] = []
+    licences: dict[str, int] = {}
+    for name in sorted(packed.arrays):
+        rgb = read_photo(packed.arrays[name].tobytes()).rgb
+        photos.append(Photo(name, photo_levels(rgb, device)))
+        licence = packed.metadata.get(name, "not stated")
+        licences[licence] = licences.get(licence, 0) + 1
+    return Pack(tuple(photos), hashlib.sha256(data).hexdigest(), licences)
+
+
+def photo_levels(rgb: np.ndarray, device: torch.device) -> tuple[Tensor, ...]:
+    """Halve a photo (H, W, 3) until its short side would be less than 64 px."""
+    levels = []
+    while True:
+        levels.append(torch.from_numpy(rgb).permute(2, 0, 1).contiguous().to(device))
+        height, width = rgb.shape[0] // 2, rgb.shape[1] // 2
+        if min(height, width) < _SHORTEST_SIDE_PX:
+            return tuple(levels)
+        # Area averaging keeps the outer corners where they are, also for odd sizes.
+        rgb = np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA), np.uint8)

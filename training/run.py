@@ -1,0 +1,257 @@
+"""The training loop."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from training.checkpoint import FILE_NAME, State, load_state, save_state
+from training.losses import peakiness_loss, reliability_loss, similarity_loss
+from training.network import ARCHITECTURES, Maps, TrainableR2D2
+from training.pairs import Pairs, Sources, make_pairs
+from training.sampler import sample
+from training.settings import Settings
+from training.validation import Score
+from visloc.errors import InvalidInput, VislocError
+
+LOG_NAME = "log.jsonl"
+VALIDATION_NAME = "validation.jsonl"
+BEFORE_DECAY_NAME = "before-decay.pt"
+_LOG_EVERY_STEPS = 25  # reading a loss makes a GPU wait
+
+
+class LossIsNaN(VislocError):
+    """Training has diverged; what the last checkpoint holds is from before."""
+
+
+@dataclass(frozen=True, slots=True)
+class Losses:
+    """The parts of what is minimized, their sum being it."""
+
+    reliability: Tensor
+    similarity: Tensor
+    peakiness: Tensor
+
+    @property
+    def total(self) -> Tensor:
+        """Their sum."""
+        return self.reliability + self.similarity + self.peakiness
+
+
+def losses_of(maps: Maps, pairs: Pairs, settings: Settings) -> Losses:
+    """Compare what the network says about the images of pairs."""
+    first, second = maps.halves()
+    sampled = sample(first, second, pairs.flow, pairs.queries, pairs.distractors)
+    valid = ~pairs.flow[..., 0].isnan()
+    # Beyond the border, and not NaN, which would spread.
+    grid = torch.where(valid[..., None], pairs.flow / settings.crop_px * 2 - 1, 2.0)
+    seen = F.grid_sample(
+        second.repeatability[:, None], grid, padding_mode="border", align_corners=False
+    )
+    peakiness = [peakiness_loss(each.repeatability, settings.patch_px) for each in (first, second)]
+    return Losses(
+        reliability_loss(*sampled, settings.good_precision),
+        similarity_loss(first.repeatability, seen[:, 0], valid, settings.patch_px),
+        (peakiness[0] + peakiness[1]) / 2,
+    )
+
+
+def learning_rate(settings: Settings, step: int) -> float:
+    """Return Adam's learning rate for a step: up in a line, level, down half a cosine."""
+    highest, lowest = settings.learning_rate, settings.final_learning_rate
+    if step < settings.warm_up_steps:
+        return highest * (step + 1) / (settings.warm_up_steps + 1)
+    first = max(settings.decay_from * settings.steps, settings.warm_up_steps)
+    if step < first:
+        return highest
+    share = (step - first) / max(settings.steps - 1 - first, 1)
+    return lowest + (highest - lowest) * 0.5 * (1 + math.cos(math.pi * share))
+
+
+class Trainer:
+    """A network, its optimizer, and how far they are."""
+
+    def __init__(self, settings: Settings, sources: Sources, described: dict[str, str]) -> None:
+        torch.manual_seed(settings.seed)  # of the first weights
+        self.settings = settings
+        self.sources = sources
+        self.described = described
+        self.step = 0
+        self.seconds = 0.0
+        self.network = TrainableR2D2(ARCHITECTURES[settings.architecture]).to(sources.device)
+        self._compiled: Callable[..., Maps] = self.network
+        if settings.compiled:
+            self._compiled = torch.compile(self.network)
+        self.optimizer = torch.optim.Adam(
+            self.network.parameters(),
+            lr=settings.learning_rate,
+            weight_decay=settings.weight_decay,
+        )
+
+    def restore(self, state: State) -> None:
+        """Go on where a checkpoint stands.
+
+        Raises:
+            InvalidInput: ``training.settings`` if it is of a run with other settings.
+        """
+        different = self.settings.difference_to(state.settings)
+        if different is not None:
+            raise InvalidInput(
+                "training.settings",
+                "the checkpoint is of a run with other settings",
+                field=different,
+                expected=str(getattr(state.settings, different)),
+                got=getattr(self.settings, different),
+            )
+        self.network.load_state_dict(state.network)
+        self.optimizer.load_state_dict(state.optimizer)
+        self.step, self.seconds = state.step, state.seconds
+
+    def start_from(self, state: State) -> None:
+        """Begin with the weights of another run, at step 0."""
+        self.network.load_state_dict(state.network)
+        self.described = self.described | {
+            "started_from": f"step {state.step} of {json.dumps(state.sources, sort_keys=True)}"
+        }
+
+    def state(self) -> State:
+        """Return what a checkpoint keeps."""
+        return State(
+            self.settings,
+            self.step,
+            self.seconds,
+            self.described,
+            self.network.state_dict(),
+            self.optimizer.state_dict(),
+        )
+
+    def advance(self) -> Losses:
+        """Do one step."""
+        started = time.monotonic()
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(self.settings, self.step)
+        pairs = make_pairs(self.sources, self.settings, self.step)
+        losses = losses_of(
+            self._compiled(pairs.images, bf16=self.settings.bf16), pairs, self.settings
+        )
+        self.optimizer.zero_grad(set_to_none=True)
+        torch.autograd.backward(losses.total)
+        self.optimizer.step()
+        self.step += 1
+        self.seconds += time.monotonic() - started
+        return losses
+
+
+def train(
+    trainer: Trainer,
+    folder: Path,
+    *,
+    seconds: float | None,
+    checkpoint_every_s: float,
+    should_stop: Callable[[], bool] = lambda: False,
+    validate_every: int | None = None,
+    validated: Callable[[State], Score] | None = None,
+) -> bool:
+    """Do steps until the last one, or the time is over, or it should stop; True when finished.
+
+    The folder gets ``checkpoint.pt``, ``log.jsonl`` with a line per step, ``validation.jsonl`` with
+    a line per validation, and ``before-decay.pt``, the state in which the learning rate begins to
+    fall: a longer run can start from there.
+
+    Args:
+        trainer: what is trained.
+        folder: of the run.
+        seconds: after which to stop; None for never.
+        checkpoint_every_s: seconds.
+        should_stop: asked after every step.
+        validate_every: steps; needs ``validated``. The last step is validated as well.
+        validated: the score of a state.
+
+    Raises:
+        LossIsNaN: ``training.diverged``.
+    """
+    settings = trainer.settings
+    folder.mkdir(parents=True, exist_ok=True)
+    log = _Log(folder / LOG_NAME, trainer.step)
+    scores = _Scores(folder / VALIDATION_NAME, trainer.step)
+    started = saved = time.monotonic()
+    decay_step = round(settings.decay_from * settings.steps)
+    stopped = False
+    while trainer.step < settings.steps and not stopped:
+        if trainer.step == decay_step > 0:
+            save_state(folder / BEFORE_DECAY_NAME, trainer.state())
+        rate = learning_rate(settings, trainer.step)
+        log.note(trainer.step, rate, trainer.advance(), trainer.seconds)
+        is_due = validate_every is not None and trainer.step % validate_every == 0
+        if validated is not None and (is_due or trainer.step == settings.steps):
+            scores.add(trainer.step, validated(trainer.state()))
+        now = time.monotonic()
+        stopped = should_stop() or (seconds is not None and now - started >= seconds)
+        if now - saved >= checkpoint_every_s:
+            log.write()
+            save_state(folder / FILE_NAME, trainer.state())
+            saved = time.monotonic()
+    log.write()
+    save_state(folder / FILE_NAME, trainer.state())
+    return trainer.step == settings.steps
+
+
+def resume(trainer: Trainer, folder: Path) -> None:
+    """Go on with the run of a folder."""
+    trainer.restore(load_state(folder / FILE_NAME, trainer.sources.device))
+
+
+class _Log:
+    """Lines of JSON, one per step; those after the checkpoint that a run goes on from are cut."""
+
+    def __init__(self, path: Path, step: int) -> None:
+        self._path = path
+        self._waiting: list[tuple[dict[str, Any], Losses]] = []
+        kept = path.read_text(encoding="utf-8").splitlines()[:step] if path.exists() else []
+        path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+
+    def note(self, step: int, rate: float, losses: Losses, seconds: float) -> None:
+        self._waiting.append(
+            ({"step": step, "learning_rate": rate, "seconds": round(seconds, 2)}, losses)
+        )
+        if len(self._waiting) == _LOG_EVERY_STEPS:
+            self.write()
+
+    def write(self) -> None:
+        lines = []
+        for line, losses in self._waiting:
+            for name in ("reliability", "similarity", "peakiness", "total"):
+                line[name] = round(float(getattr(losses, name).detach()), 5)
+            lines.append(json.dumps(line) + "\n")
+            if not math.isfinite(line["total"]):
+                raise LossIsNaN(
+                    "training.diverged",
+                    f"the loss is no number at step {line['step']}; try a smaller learning rate",
+                )
+        with self._path.open("a", encoding="utf-8") as file:
+            file.writelines(lines)
+        self._waiting.clear()
+
+
+class _Scores:
+    """Lines of JSON, one per validation; those after the checkpoint are cut."""
+
+    def __init__(self, path: Path, step: int) -> None:
+        self._path = path
+        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+        kept = [line for line in lines if json.loads(line)["step"] <= step]
+        path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+
+    def add(self, step: int, score: Score) -> None:
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"step": step, **dataclasses.asdict(score)}) + "\n")

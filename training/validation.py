@@ -1,0 +1,122 @@
+"""How well features match between two looks at photos that were held back: the truth is exact."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from training.augmentation import augment
+from training.checkpoint import State
+from training.export import export
+from training.homographies import Matrix, look, moved, random_looks
+from training.photos import Photo
+from visloc.features import LocalFeatureExtractor, make_local_features
+from visloc.matching.correspondences import mutual_nearest_neighbours
+from visloc.matching.products import in_eight_bits
+from visloc.types import Extraction, Inference
+
+THRESHOLDS_PX = (1.0, 3.0, 5.0)
+SIDE_PX = 320
+SEED = 17
+_STRENGTH = 1.0  # looks as different as the hardest in training
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Means over all pairs.
+
+    Attributes:
+        matching_accuracy: share of the mutual nearest neighbours that are right to within each
+            of ``THRESHOLDS_PX``; 0 for a pair without any.
+        right_matches: number of those within 3 px.
+        keypoints: number per image.
+        repeatability: share of the keypoints of the first image that are seen in the second and
+            have a keypoint there within 3 px.
+    """
+
+    matching_accuracy: tuple[float, ...]
+    right_matches: float
+    keypoints: float
+    repeatability: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """Two looks at a photo.
+
+    Attributes:
+        first: (H, W, 3) uint8.
+        second: (H, W, 3) uint8.
+        second_from_first: (3, 3) homography of pixels.
+    """
+
+    first: NDArray[np.uint8]
+    second: NDArray[np.uint8]
+    second_from_first: Matrix
+
+
+def validation_pairs(photos: Sequence[Photo], per_photo: int = 1) -> list[Pair]:
+    """Make pairs of 320 px that depend on nothing but the photos and their order."""
+    pairs = []
+    for number, photo in enumerate(photos):
+        for repeat in range(per_photo):
+            rng = np.random.default_rng([SEED, number, repeat])
+            height, width = photo.levels[0].shape[1:]
+            looks = random_looks(rng, (height, width), SIDE_PX, _STRENGTH)
+            seen = torch.stack([look(photo.levels, each, SIDE_PX) for each in looks])
+            first, second = augment(seen, rng, _STRENGTH)
+            pairs.append(Pair(_pixels(first), _pixels(second), np.linalg.inv(looks[1]) @ looks[0]))
+    return pairs
+
+
+def _pixels(image: torch.Tensor) -> NDArray[np.uint8]:
+    rounded = (image * 255).round().clamp(0, 255).to(torch.uint8)
+    return np.ascontiguousarray(rounded.permute(1, 2, 0).cpu().numpy())
+
+
+def validate(
+    extractor: LocalFeatureExtractor, pairs: Sequence[Pair], *, max_keypoints: int = 1000
+) -> Score:
+    """Match each pair by mutual nearest neighbours, and compare with the truth."""
+    rows = [_scored(extractor, pair, max_keypoints) for pair in pairs]
+    means = np.mean(rows, axis=0).tolist()
+    count = len(THRESHOLDS_PX)
+    return Score(tuple(means[:count]), *means[count:])
+
+
+def _scored(extractor: LocalFeatureExtractor, pair: Pair, max_keypoints: int) -> list[float]:
+    first, second = (
+        extractor.extract(rgb, max_keypoints=max_keypoints, extraction=Extraction.ACCURATE)
+        for rgb in (pair.first, pair.second)
+    )
+    if not len(first) or not len(second):
+        return [0.0] * len(THRESHOLDS_PX) + [0.0, (len(first) + len(second)) / 2, 0.0]
+    there = moved(pair.second_from_first, first.keypoints.astype(np.float64))
+    gaps = np.linalg.norm(there[:, None] - second.keypoints[None], axis=2)
+    in_first, in_second, _ = mutual_nearest_neighbours(
+        in_eight_bits(first.descriptors), in_eight_bits(second.descriptors)
+    )
+    errors = gaps[in_first, in_second]
+    height, width = pair.second.shape[:2]
+    inside = ((there >= 0) & (there < [width, height])).all(axis=1)
+    accuracy = [float((errors < limit).mean()) if len(errors) else 0.0 for limit in THRESHOLDS_PX]
+    return [
+        *accuracy,
+        float((errors < 3.0).sum()),
+        (len(first) + len(second)) / 2,
+        float((gaps[inside].min(axis=1) < 3.0).mean()) if inside.any() else 0.0,
+    ]
+
+
+def features_of(state: State) -> LocalFeatureExtractor:
+    """Return what ``visloc`` makes of a checkpoint, as it will be shipped."""
+    with tempfile.TemporaryDirectory() as folder:
+        name = state.settings.architecture
+        export(state, Path(folder) / f"{name}.safetensors")
+        return make_local_features(name, Path(folder), Inference.TORCH)
