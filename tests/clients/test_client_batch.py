@@ -97,12 +97,13 @@ def test_a_bad_photo_fails_alone(
 
 
 def test_a_photo_that_takes_too_long_fails_alone(
-    http_url: str, make_dataset: Dataset, tmp_path: Path
+    http_url: str, make_dataset: Dataset, tmp_path: Path, service: Any
 ) -> None:
+    service.slow_s = 4.0
     dataset = make_dataset({"a": b"slow", "b": b"photo"})
     output = tmp_path / "out"
     code = batch(
-        dataset, "--map", "room", "--output", output, "--server", http_url, "--timeout", 0.15
+        dataset, "--map", "room", "--output", output, "--server", http_url, "--timeout", 1.5
     )
     assert code == 0
     assert [line["status"] for line in lines_of(output)] == ["error", "localized"]

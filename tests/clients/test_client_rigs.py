@@ -560,20 +560,20 @@ def test_a_sequence_can_be_left_early(http_url: str, grpc_url: str) -> None:
 def test_a_slow_instant_is_a_timeout_but_a_slow_sender_is_none(
     http_url: str, grpc_url: str, service: Any
 ) -> None:
-    service.slow_s = 0.6
+    service.slow_s = 1.5
 
     def unhurried() -> Iterator[Instant]:
         for timestamp in range(2):
-            time.sleep(0.35)
+            time.sleep(0.7)
             yield instant(timestamp, b"photo")
 
     async def ask(url: str, instants: Iterable[Instant]) -> int:
-        async with AsyncClient(url, timeout_s=0.2) as client:
+        async with AsyncClient(url, timeout_s=0.5) as client:
             return len([a async for a in client.localize_sequence(instants, "room", RIG, "ms")])
 
     for url in (http_url, grpc_url):
         slow = [instant(1, b"photo"), instant(2, b"slow")]
-        with Client(url, timeout_s=0.2) as client:
+        with Client(url, timeout_s=0.5) as client:
             with pytest.raises(Unavailable) as caught:
                 list(client.localize_sequence(slow, "room", RIG, "ms"))
             assert caught.value.code == "server.timeout"
