@@ -169,6 +169,7 @@ def by_hand() -> None:
     say(
         "\nTry it by hand:\n"
         f"  {COMMANDS}/visloc-service --maps-dir {MAPS} &\n"
+        "and open http://127.0.0.1:8000/ in a browser, or\n"
         f"  {COMMANDS}/localize image {query.path_of(record)} --map sample \\\n"
         f"      --camera {','.join(str(word) for word in words)}"
     )
