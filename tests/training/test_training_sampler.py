@@ -92,16 +92,14 @@ def test_queries_see_what_plain_loops_see(stride: int) -> None:
             seen += 1
             wanted = first_vectors[image, y, x]
 
-            def at(dx: int, dy: int) -> tuple[int, int]:
-                return min(max(int(u) + dx, 0), 31), min(max(int(v) + dy, 0), 31)  # noqa: B023
-
+            match = (int(u), int(v))
             right = [
                 (float(wanted @ second_vectors[image, row, column]), row, column)
-                for column, row in (at(*step) for step in offsets(0, 3))
+                for column, row in (_beside(match, step) for step in offsets(0, 3))
             ]
             wrong = [
                 float(wanted @ second_vectors[image, row, column])
-                for column, row in (at(*step) for step in offsets(5, 7))
+                for column, row in (_beside(match, step) for step in offsets(5, 7))
             ]
             for other in range(2):
                 for column, row in distractors[other].tolist():
@@ -130,3 +128,9 @@ def test_identical_images_are_matched_perfectly() -> None:
     sampled = sample(maps, maps, flow, queries, queries)
     assert sampled.asked.all()
     assert (sampled.precision > 0.9).all()
+
+
+def _beside(pixel: tuple[int, int], step: tuple[int, int]) -> tuple[int, int]:
+    """Another pixel of an image of 32 x 32, the nearest inside it."""
+    x, y = (min(max(at + by, 0), 31) for at, by in zip(pixel, step, strict=True))
+    return x, y

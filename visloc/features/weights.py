@@ -2,7 +2,8 @@
 
 Published ones are neither shipped nor fetched: they come with a package, or whoever runs the
 software downloads them and says in which folder they lie. Some, R2D2's for one, are for
-non-commercial use. Our own (``training``, docs/models) are shipped, and free to use.
+non-commercial use. Our own (``training``, docs/models) are free to use, and shipped once there are
+any (``SHIPPED``).
 """
 
 from __future__ import annotations

@@ -22,20 +22,7 @@ export function histogramChart(
   const y = scaleOf(0, most, HEIGHT - EDGE.bottom, EDGE.top);
   const picture = chart(`${title}: ${summaryOf(histogram)}`);
   for (const tick of ticks(0, most, 3)) {
-    picture.append(
-      svg("line", {
-        x1: EDGE.left,
-        x2: WIDTH - EDGE.right,
-        y1: y(tick),
-        y2: y(tick),
-        class: "rule",
-      }),
-      svg(
-        "text",
-        { x: EDGE.left - 6, y: y(tick), dy: "0.35em", "text-anchor": "end" },
-        short(tick),
-      ),
-    );
+    picture.append(...level(y(tick), short(tick)));
   }
   counts.forEach((number, index) => {
     const [from, to] = [x(edges[index] ?? 0), x(edges[index + 1] ?? 0)];
@@ -105,18 +92,7 @@ export function calibrationChart(calibration: ReportData["coverage"]["calibratio
   const picture = chart(`Predicted against measured: ${words.join("; ")}`);
   for (const tick of [0, 0.5, 1]) {
     picture.append(
-      svg("line", {
-        x1: EDGE.left,
-        x2: WIDTH - EDGE.right,
-        y1: y(tick),
-        y2: y(tick),
-        class: "rule",
-      }),
-      svg(
-        "text",
-        { x: EDGE.left - 6, y: y(tick), dy: "0.35em", "text-anchor": "end" },
-        percent(tick),
-      ),
+      ...level(y(tick), percent(tick)),
       svg(
         "text",
         { x: x(tick), y: HEIGHT - EDGE.bottom + 15, "text-anchor": tick === 1 ? "end" : "middle" },
@@ -208,4 +184,12 @@ function short(value: number): string {
   if (Math.abs(value) >= 10000) return `${countText(value / 1000)}k`;
   if (Math.abs(value) >= 100) return countText(value);
   return String(Number(value.toPrecision(3)));
+}
+
+/** A line across the chart, and what it stands for beside it. */
+function level(y: number, name: string): SVGElement[] {
+  return [
+    svg("line", { x1: EDGE.left, x2: WIDTH - EDGE.right, y1: y, y2: y, class: "rule" }),
+    svg("text", { x: EDGE.left - 6, y, dy: "0.35em", "text-anchor": "end" }, name),
+  ];
 }
