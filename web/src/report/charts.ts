@@ -8,19 +8,20 @@ import { percent } from "./words";
 const [WIDTH, HEIGHT] = [320, 190];
 const EDGE = { left: 56, right: 10, top: 10, bottom: 38 };
 
-/** Bars, with both axes named. `unit` is written along the horizontal one. */
+/** Bars, with both axes named. `unit` is written along the horizontal one; `whole`: it is counted. */
 export function histogramChart(
   histogram: Histogram,
   title: string,
   unit: string,
   counted: string,
+  whole = false,
 ): HTMLElement {
   const { edges, counts } = histogram;
   const [low, high] = [edges[0] ?? 0, edges.at(-1) ?? 1];
   const most = Math.max(1, ...counts);
   const x = scaleOf(low, high, EDGE.left, WIDTH - EDGE.right);
   const y = scaleOf(0, most, HEIGHT - EDGE.bottom, EDGE.top);
-  const picture = chart(`${title}: ${summaryOf(histogram)}`);
+  const picture = chart(`${title}: ${summaryOf(histogram, whole)}`);
   for (const tick of ticks(0, most, 3)) {
     picture.append(...level(y(tick), short(tick)));
   }
@@ -57,16 +58,19 @@ export function histogramChart(
   return element(
     "figure",
     { class: "chart" },
-    element("figcaption", {}, element("strong", {}, title), ` ${summaryOf(histogram)}`),
+    element("figcaption", {}, element("strong", {}, title), ` ${summaryOf(histogram, whole)}`),
     picture,
   );
 }
 
 /** Where the values of a histogram lie, in words. */
-function summaryOf(histogram: Histogram): string {
+function summaryOf(histogram: Histogram, whole: boolean): string {
   const total = histogram.counts.reduce((sum, number) => sum + number, 0);
   if (total === 0) return "nothing was counted";
-  const at = (share: number) => short(quantileOf(histogram, share));
+  const at = (share: number): string => {
+    const value = quantileOf(histogram, share);
+    return short(whole ? Math.floor(value) : value);
+  };
   return `median ${at(0.5)}, 10 to 90 %: ${at(0.1)} to ${at(0.9)}`;
 }
 

@@ -88,8 +88,14 @@ function heading(data: ReportData): HTMLElement[] {
 
 function statistics({ statistics: all }: ReportData): HTMLElement {
   const charts = [
-    histogramChart(all.track_length, "Photos that see a landmark.", "photos", "landmarks"),
-    histogramChart(all.landmarks_per_image, "Landmarks that a photo sees.", "landmarks", "photos"),
+    histogramChart(all.track_length, "Photos that see a landmark.", "photos", "landmarks", true),
+    histogramChart(
+      all.landmarks_per_image,
+      "Landmarks that a photo sees.",
+      "landmarks",
+      "photos",
+      true,
+    ),
   ];
   if (all.error_px) {
     charts.push(histogramChart(all.error_px, "Reprojection error.", "pixels", "landmarks"));

@@ -30,7 +30,7 @@ export function length(value: number, metric: boolean): string {
 }
 
 export function degrees(value: number): string {
-  return `${Number(value.toFixed(value < 10 ? 1 : 0))}°`;
+  return `${value < 10 ? Number(value.toPrecision(2)) : Math.round(value)}°`;
 }
 
 /** Twelve o'clock is up on the plan. */
