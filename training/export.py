@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +10,11 @@ import torch
 from torch import Tensor
 
 from training.checkpoint import State
-from training.files import write_whole
+from training.files import write_tensors
 from training.network import ARCHITECTURES
 from visloc.errors import InvalidInput
 from visloc.features.convolution import fold_batch_norm
 from visloc.features.r2d2 import Convolution, FoldedNetwork, pack_folded
-from visloc.features.safetensors import encode_tensors
 
 LICENCE = "BSD-3-Clause"
 _LARGEST_HALF = 65504.0
@@ -71,16 +69,14 @@ def export(state: State, output: Path) -> int:
                 expected=f"less than {_LARGEST_HALF}",
                 got=largest,
             )
-    metadata = {
+    about = {
         "format": "visloc folded R2D2, version 1",
         "architecture": folded.name,
         "licence": LICENCE,
         "step": str(state.step),
         "seconds": f"{state.seconds:.0f}",
-        "settings": json.dumps(dataclasses.asdict(state.settings), sort_keys=True),
+        "settings": dataclasses.asdict(state.settings),
         "torch": torch.__version__,
         **state.sources,
     }
-    data = encode_tensors(pack_folded(folded), metadata)
-    write_whole(output, data)
-    return len(data)
+    return write_tensors(output, pack_folded(folded), about)

@@ -11,12 +11,13 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load
 from torch import Tensor
 
-from training.files import write_whole
+from training.files import write_tensors
 from training.homographies import rotation_about
 from visloc.errors import InvalidInput, NotFound
-from visloc.features.safetensors import decode_tensors, encode_tensors
 from visloc.geometry import Camera, Pose
 from visloc.synthetic.render import render_depth, render_photo
 from visloc.synthetic.scene import make_room
@@ -165,8 +166,7 @@ def pack_rooms(output: Path, *, rooms: int, places: int, seed: int) -> int:
                 arrays[f"{name}.cam_from_world"] = np.column_stack(
                     [pose.rotation, pose.translation]
                 )
-    words = {"rooms": str(rooms), "places": str(places), "seed": str(seed)}
-    write_whole(output, encode_tensors(arrays, words))
+    write_tensors(output, arrays, {"rooms": rooms, "places": places, "seed": seed})
     return len(arrays) // 3
 
 
@@ -197,12 +197,12 @@ def read_rooms(path: Path, device: torch.device) -> tuple[Place, ...]:
             field=str(path),
         )
     try:
-        packed = decode_tensors(path.read_bytes()).arrays
+        packed = load(path.read_bytes())
         names = sorted(name.removesuffix(".image") for name in packed if name.endswith(".image"))
         places: dict[str, list[View]] = {}
         for name in names:
             places.setdefault(name.rpartition("-")[0], []).append(_view(packed, name, device))
-    except (ValueError, KeyError, cv2.error) as error:
+    except (SafetensorError, ValueError, KeyError, cv2.error) as error:
         raise InvalidInput("training.rooms", f"no rooms: {error}", field=str(path)) from error
     return tuple(tuple(views) for views in places.values())
 

@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import csv
 import hashlib
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
+from safetensors import SafetensorError
+from safetensors.numpy import load
 from torch import Tensor
 
-from training.files import write_whole
+from training.files import read_about, write_tensors
 from visloc.errors import InvalidInput, NotFound
-from visloc.features.safetensors import decode_tensors, encode_tensors
 from visloc.images import read_photo
 
 VALIDATION = "validation"
@@ -77,7 +79,7 @@ def pack_photos(source: Path, output: Path, *, research: bool, validation: bool)
         licences[name] = _licences(path.parent / "SOURCES.tsv").get(path.name, "not stated")
     if not arrays:
         raise NotFound("training.photos", "no photos", field=str(source), expected="*/*.jpg")
-    write_whole(output, encode_tensors(arrays, licences))
+    write_tensors(output, arrays, {"licences": licences})
     return len(arrays)
 
 
@@ -101,18 +103,20 @@ def read_pack(path: Path, device: torch.device) -> Pack:
         )
     data = path.read_bytes()
     try:
-        packed = decode_tensors(data)
-    except ValueError as error:
+        packed = load(data)
+        told = read_about(path)["licences"]
+        licences = Counter(str(told[name]) for name in packed)
+    except (SafetensorError, LookupError, TypeError, ValueError) as error:
         raise InvalidInput(
-            "training.pack", f"no pack of photos: {error}", field=str(path)
+            "training.pack",
+            "no pack of photos of this version; make one with: python -m training pack",
+            field=str(path),
+            got=f"{type(error).__name__}: {error}",
         ) from error
     photos: list[Photo] = []
-    licences: dict[str, int] = {}
-    for name in sorted(packed.arrays):
-        rgb = read_photo(packed.arrays[name].tobytes()).rgb
+    for name in sorted(packed):
+        rgb = read_photo(packed[name].tobytes()).rgb
         photos.append(Photo(name, photo_levels(rgb, device)))
-        licence = packed.metadata.get(name, "not stated")
-        licences[licence] = licences.get(licence, 0) + 1
     return Pack(tuple(photos), hashlib.sha256(data).hexdigest(), licences)
 
 

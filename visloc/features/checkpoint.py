@@ -1,6 +1,6 @@
 """Reads the tensors of a weights file without running anything that the file says.
 
-A safetensors file says nothing that could be run (``visloc.features.safetensors``). PyTorch saves
+A safetensors file says nothing that could be run; the library of that name reads it. PyTorch saves
 a pickle that describes tensors, beside the raw numbers, in one of two layouts:
 
 - since 1.6 a zip archive: ``<root>/data.pkl`` and one member ``<root>/data/<key>`` per storage;
@@ -32,12 +32,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load
 
 from visloc.errors import WeightsError
 from visloc.features.pickled_pca import PickledPca, stand_in
-from visloc.features.safetensors import decode_tensors, is_safetensors
 
 MAX_FILE_BYTES = 256 * 2**20
+_SAFETENSORS_LENGTH_BYTES = 8  # of the number that says how long the header is
+# The library allows ten times as much, enough to name millions of empty tensors.
+_MAX_SAFETENSORS_HEADER_BYTES = 10_000_000
 # A state dict with the state of an optimizer has some 10,000, a long training log 150,000.
 _MAX_OPCODES = 1_000_000
 _MAX_TUPLES = 10_000  # bounds how deep tuples can nest: hashing one recurses in C
@@ -62,8 +66,9 @@ _STORAGE_DTYPES: Mapping[str, np.dtype[Any]] = {
     "HalfStorage": np.dtype("<f2"),
     "LongStorage": np.dtype("<i8"),
 }
-# What damaged pickles make Python raise, according to the documentation of ``pickle`` and trial.
+# What damaged files raise, according to the documentation of ``pickle`` and trial.
 _MALFORMED = (
+    SafetensorError,
     pickle.UnpicklingError,
     zipfile.BadZipFile,
     ArithmeticError,
@@ -83,7 +88,7 @@ class Checkpoint:
     Attributes:
         path: where it was read from.
         sha256: of the file, lower-case hexadecimal.
-        tensors: arrays by their names in the state dict; views of the file's bytes, read-only.
+        tensors: arrays by their names in the state dict; read-only.
         pca: what the file holds under ``pca`` beside the state dict, for
             ``pickled_pca.principal_components``; empty without.
     """
@@ -165,9 +170,24 @@ def _pca_of(content: object) -> dict[str, PickledPca]:
 def _read(data: bytes) -> tuple[object, Mapping[str, NDArray[Any]]]:
     if data[:2] == b"PK":
         return _read_zip(data)
-    if is_safetensors(data):
-        return None, decode_tensors(data).arrays
+    if data[_SAFETENSORS_LENGTH_BYTES : _SAFETENSORS_LENGTH_BYTES + 1] == b"{":
+        return None, _read_safetensors(data)
     return _read_old_layout(data)
+
+
+def _read_safetensors(data: bytes) -> dict[str, NDArray[Any]]:
+    header_bytes = int.from_bytes(data[:_SAFETENSORS_LENGTH_BYTES], "little")
+    if header_bytes > _MAX_SAFETENSORS_HEADER_BYTES:
+        raise ValueError(f"a header of {header_bytes} bytes")
+    try:
+        tensors = load(data)
+    except KeyError as error:  # a type that NumPy has not, such as BF16
+        raise ValueError(f"a tensor of type {error.args[0]}") from error
+    for name, array in tensors.items():
+        if array.dtype not in _STORAGE_DTYPES.values():
+            raise ValueError(f"tensor {name:.60} is of type {array.dtype}")
+        array.flags.writeable = False
+    return tensors
 
 
 def _read_old_layout(data: bytes) -> tuple[object, dict[str, NDArray[Any]]]:

@@ -9,6 +9,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
+from safetensors.numpy import save
 from torch import Tensor
 
 from visloc.errors import WeightsError
@@ -30,7 +31,6 @@ from visloc.features.r2d2 import (
 )
 from visloc.features.r2d2_openvino import OpenVinoNetwork, make_openvino_network
 from visloc.features.r2d2_torch import R2D2Network, TorchNetwork
-from visloc.features.safetensors import encode_tensors
 from visloc.types import Extraction, Inference, LocalFeatures
 
 # The published networks, written down a second time: number of the convolution in the state
@@ -422,7 +422,7 @@ def _save_own(folder: Path, name: str, state: dict[str, Tensor]) -> Path:
     checkpoint = read_checkpoint(_save(folder, name, state))
     checkpoint.path.unlink()
     path = folder / f"{name}.safetensors"
-    path.write_bytes(encode_tensors(pack_folded(fold(ARCHITECTURES[name], checkpoint))))
+    path.write_bytes(save(pack_folded(fold(ARCHITECTURES[name], checkpoint))))
     return path
 
 
