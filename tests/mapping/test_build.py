@@ -239,11 +239,11 @@ def test_missing_weights_say_what_to_download_from_where_under_which_licence(
 ) -> None:
     before = MapStore(maps_dir).open("room")
     with pytest.raises(WeightsError) as caught:
-        build(sample / "mapping", maps_dir, local_features="faster2d2", weights_dir=weights_dir)
+        build(sample / "mapping", maps_dir, local_features="r2d2", weights_dir=weights_dir)
     assert caught.value.code == "weights.missing"
     text = str(caught.value)
     for said in (
-        *("faster2d2_WASF_N16.pt", "github.com/naver/r2d2", "CC BY-NC-SA", "non-commercial"),
+        *("r2d2_WASF_N16.pt", "github.com/naver/r2d2", "CC BY-NC-SA", "non-commercial"),
         *("--weights-dir", "VISLOC_WEIGHTS_DIR", str(weights_dir or "no weights folder")),
     ):
         assert said in text

@@ -2,8 +2,8 @@
 
 Published ones are neither shipped nor fetched: they come with a package, or whoever runs the
 software downloads them and says in which folder they lie. Some, R2D2's for one, are for
-non-commercial use. Our own (``training``, docs/models) are free to use, and shipped once there are
-any (``SHIPPED``).
+non-commercial use. Our own of Fast-R2D2 (``training``, docs/models/fast-r2d2.md) are free to use,
+and lie beside this module.
 """
 
 from __future__ import annotations
@@ -65,7 +65,9 @@ FASTER2D2_WASF_N16 = _of_r2d2(
 
 
 # Our own weights that lie beside this module: sha256 of ``trained/NAME.safetensors`` by feature.
-SHIPPED: Mapping[str, str] = {}
+SHIPPED: Mapping[str, str] = {
+    "faster2d2": "8cbe14c8c7764dc850e59f19b2bc952441d8cc8c0a4bc1654125b923bd38eed0",
+}
 _SHIPPED_FOLDER = Path(__file__).parent / "trained"
 
 

@@ -22,11 +22,12 @@ LOADERS = {
     "aliked": load_aliked,
     "aliked-t16": load_aliked_t16,
     "faster2d2": load_faster2d2,
+    "faster2d2, published weights": load_faster2d2,
     "r2d2": load_r2d2,
     "sift": load_sift,
     "xfeat": load_xfeat,
 }
-NEEDS_WEIGHTS = {"aliked", "aliked-t16", "faster2d2", "r2d2"}
+NEEDS_WEIGHTS = {"aliked", "aliked-t16", "faster2d2, published weights", "r2d2"}
 HEIGHT, WIDTH = 192, 256
 
 

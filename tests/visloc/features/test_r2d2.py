@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
@@ -9,10 +10,12 @@ import pytest
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
+from safetensors import safe_open
 from safetensors.numpy import save
 from torch import Tensor
 
 from visloc.errors import WeightsError
+from visloc.features import weights
 from visloc.features.checkpoint import read_checkpoint
 from visloc.features.r2d2 import (
     FAST_R2D2,
@@ -456,3 +459,32 @@ def test_our_own_weights_of_another_network_are_refused(tmp_path: Path) -> None:
     path.rename(tmp_path / "r2d2.safetensors")
     with pytest.raises(WeightsError, match="not the weights of R2D2"):
         load_r2d2(tmp_path)
+
+
+def test_fast_r2d2_needs_no_weights_from_anyone(tmp_path: Path) -> None:
+    for weights_dir in (None, tmp_path):
+        extractor = load_faster2d2(weights_dir, Inference.FP32)
+        assert extractor.fingerprint.weights_sha256 == weights.SHIPPED["faster2d2"]
+
+
+def test_shipped_weights_that_were_changed_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _save_own(tmp_path, "faster2d2", _random_state("faster2d2"))
+    monkeypatch.setattr(weights, "_SHIPPED_FOLDER", tmp_path)
+    with pytest.raises(WeightsError) as caught:
+        load_faster2d2(None)
+    assert caught.value.code == "weights.altered"
+    assert weights.SHIPPED["faster2d2"] in str(caught.value)
+
+
+def test_shipped_weights_say_what_they_were_made_of() -> None:
+    """Of photos that anyone may use, under the licence of this software."""
+    path = weights._SHIPPED_FOLDER / "faster2d2.safetensors"
+    with safe_open(path, framework="numpy") as file:
+        about = json.loads(file.metadata()["about"])
+    assert about["licence"] == "BSD-3-Clause"
+    assert path.stat().st_size < 2_000_000
+    licences = about["licences"]
+    assert licences
+    assert not [name for name in licences if "NC" in name or "ND" in name or "research" in name]
