@@ -74,6 +74,8 @@ _SHIPPED_FOLDER = Path(__file__).parent / "trained"
 def read_own_weights(feature: str, weights_dir: Path | None) -> Checkpoint | None:
     """Read ``FEATURE.safetensors`` from the weights folder, or else what is shipped, if any is.
 
+    None too where the folder that was named is not there: whoever named it meant other weights.
+
     Raises:
         WeightsError: ``weights.altered`` if the shipped file is not the one that was shipped; and
             those of ``read_checkpoint``.
@@ -81,7 +83,7 @@ def read_own_weights(feature: str, weights_dir: Path | None) -> Checkpoint | Non
     file_name = f"{feature}.safetensors"
     if weights_dir is not None and (weights_dir / file_name).is_file():
         return read_checkpoint(weights_dir / file_name)
-    if feature not in SHIPPED:
+    if feature not in SHIPPED or (weights_dir is not None and not weights_dir.is_dir()):
         return None
     checkpoint = read_checkpoint(_SHIPPED_FOLDER / file_name)
     if checkpoint.sha256 != SHIPPED[feature]:

@@ -467,6 +467,12 @@ def test_fast_r2d2_needs_no_weights_from_anyone(tmp_path: Path) -> None:
         assert extractor.fingerprint.weights_sha256 == weights.SHIPPED["faster2d2"]
 
 
+def test_a_weights_folder_that_is_not_there_is_not_passed_over(tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match=r"no such file in .*absent") as caught:
+        load_faster2d2(tmp_path / "absent")
+    assert caught.value.code == "weights.missing"
+
+
 def test_shipped_weights_that_were_changed_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
