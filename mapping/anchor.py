@@ -32,7 +32,7 @@ from mapping.photos import MappingPhoto
 from visloc.archive import Anchor, Geodetic
 from visloc.errors import DatasetError
 from visloc.geodesy import enu_from_geodetic
-from visloc.geometry import Pose
+from visloc.geometry import Pose, Similarity
 from visloc.kapture import Dataset
 
 # A fix of a phone or a consumer receiver is seldom further off.
@@ -52,25 +52,6 @@ _EPSG_WGS84 = "EPSG:4326"
 EPSG_GEODETIC = (_EPSG_WGS84, "EPSG:4979")
 # Universal Transverse Mercator on WGS84, north and south: metres.
 _EPSG_UTM = tuple(f"EPSG:32{half}{zone:02}" for half in (6, 7) for zone in range(1, 61))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Similarity:
-    """x_b = scale R x_a + t."""
-
-    scale: float
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64]
-
-    def apply(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Map points (n, 3)."""
-        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
-
-    def move(self, cam_from_world: Pose) -> Pose:
-        """Return the pose of a camera after its world was mapped."""
-        center = self.apply(cam_from_world.center[None])[0]
-        rotation = cam_from_world.rotation @ self.rotation.T
-        return Pose(rotation, -rotation @ center)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

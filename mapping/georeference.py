@@ -21,7 +21,6 @@ from mapping.anchor import (
     GNSS_ERROR_M,
     MAX_DIRECTION_ERROR_DEG,
     MAX_SCALE_ERROR,
-    Similarity,
     align_positions,
     coordinate_system,
 )
@@ -29,7 +28,7 @@ from mapping.stages import exclusive
 from visloc.archive import Anchor, Geodetic, Map, MapStore, down_of, write_anchored
 from visloc.errors import Conflict, DatasetError, InvalidInput
 from visloc.geodesy import enu_from_geodetic
-from visloc.geometry import Pose
+from visloc.geometry import Pose, Similarity
 from visloc.kapture import Dataset
 
 # Given points further off than this part of their spread are mistakes.

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import JsonValue
 
-from mapping.anchor import Similarity, align_positions, known_positions
+from mapping.anchor import align_positions, known_positions
 from mapping.features import LocalFeaturesSource, Progress
 from mapping.landmarks import MadeLandmarks, Observations, View, assemble_landmarks
 from mapping.matching import Verification, camera_values, match_pairs, pose_values
@@ -32,7 +32,7 @@ from mapping.triangulation import (
 from mapping.workers import Workers
 from visloc.archive import Anchor, GlobalFeatures, Map, sha256_of
 from visloc.errors import DatasetError, InvalidInput
-from visloc.geometry import Camera, Pose
+from visloc.geometry import Camera, Pose, Similarity
 from visloc.kapture import Dataset, read_reconstruction
 
 # Raised when the code of the stage changes what comes out.

@@ -129,6 +129,52 @@ class Pose:
         return Pose(self.rotation.T, -self.rotation.T @ self.translation)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Similarity:
+    """A change of frame and unit: ``a_from_b`` gives ``x_a = scale R @ x_b + t``.
+
+    Attributes:
+        scale: units of frame a in one unit of frame b; positive.
+        rotation: (3, 3) float64, orthonormal, determinant +1.
+        translation: (3,) float64, in frame a and its unit.
+    """
+
+    scale: float
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+
+    @staticmethod
+    def identity() -> Similarity:
+        """Return the similarity that changes nothing."""
+        return Similarity(1.0, np.eye(3), np.zeros(3))
+
+    def __matmul__(self, other: Similarity) -> Similarity:
+        """Chain: ``a_from_b @ b_from_c = a_from_c``."""
+        return Similarity(
+            self.scale * other.scale,
+            self.rotation @ other.rotation,
+            self.apply(other.translation),
+        )
+
+    def apply(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Move points (..., 3) in frame b to frame a."""
+        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
+
+    def inverse(self) -> Similarity:
+        """Turn a_from_b into b_from_a."""
+        rotation = self.rotation.T
+        return Similarity(1 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+
+    def move(self, cam_from_b: Pose) -> Pose:
+        """Return cam_from_a of a camera whose cam_from_b is given, in the unit of frame a.
+
+        Its centre is moved like any point: ``x_cam`` of the result is ``scale`` times that before.
+        """
+        center = self.apply(cam_from_b.center)
+        rotation = cam_from_b.rotation @ self.rotation.T
+        return Pose(rotation, -rotation @ center)
+
+
 def cross_matrix(v: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the matrix (3, 3) with which v x u = matrix @ u."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

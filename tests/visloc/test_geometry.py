@@ -10,7 +10,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from visloc.errors import InvalidInput
-from visloc.geometry import CAMERA_MODELS, MAX_IMAGE_SIDE, Camera, Pose, rotation_angle
+from visloc.geometry import (
+    CAMERA_MODELS,
+    MAX_IMAGE_SIDE,
+    Camera,
+    Pose,
+    Similarity,
+    rotation_angle,
+)
 
 unit = st.floats(-1, 1)
 quaternions = st.tuples(unit, unit, unit, unit).filter(lambda q: np.linalg.norm(q) > 1e-3)
@@ -242,3 +249,33 @@ def test_the_cameras_of_the_shared_data_are_usable(shared_data: Path) -> None:
             fields = [field.strip() for field in line.split(",")]
             if not line.startswith("#") and fields[2] in ("camera", "depth"):
                 assert Camera.from_text(",".join(fields[3:])).width == int(fields[4])
+
+
+small = st.tuples(*[st.floats(-100, 100)] * 3)
+similarities = st.builds(
+    lambda scale, q, t: Similarity(scale, Pose.from_quaternion(q, t).rotation, np.array(t)),
+    st.floats(0.01, 100),
+    quaternions,
+    small,
+)
+
+
+@given(similarities, similarities, small)
+def test_similarities_chain_and_turn_around(
+    a_from_b: Similarity, b_from_c: Similarity, point: tuple[float, float, float]
+) -> None:
+    x = np.array(point)
+    tolerance = 1e-6 * (1 + a_from_b.scale) * (1 + b_from_c.scale)
+    assert np.allclose((a_from_b @ b_from_c).apply(x), a_from_b.apply(b_from_c.apply(x)))
+    assert np.allclose(a_from_b.inverse().apply(a_from_b.apply(x)), x, atol=1e-6, rtol=1e-6)
+    there = a_from_b @ a_from_b.inverse()
+    assert np.allclose(there.apply(x), x, atol=tolerance, rtol=1e-6)
+
+
+@given(similarities, st.builds(Pose.from_quaternion, quaternions, small), small)
+def test_a_moved_camera_sees_moved_points_where_it_saw_them(
+    a_from_b: Similarity, cam_from_b: Pose, point: tuple[float, float, float]
+) -> None:
+    x = np.array(point)
+    before, after = cam_from_b.apply(x), a_from_b.move(cam_from_b).apply(a_from_b.apply(x))
+    assert np.allclose(after, a_from_b.scale * before, atol=1e-6 * (1 + a_from_b.scale))
