@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from mapping.anchor import (
     Alignment,
-    Similarity,
     align_poses,
     align_positions,
     known_positions,
@@ -19,7 +18,7 @@ from mapping.anchor import (
 from mapping.photos import MappingPhoto
 from visloc.errors import DatasetError
 from visloc.evaluation import pose_error
-from visloc.geometry import Camera, Pose
+from visloc.geometry import Camera, Pose, Similarity
 from visloc.kapture import Dataset, FileRecord, GnssRecord, Sensor
 
 RANDOM = np.random.default_rng(0)
