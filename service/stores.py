@@ -85,7 +85,7 @@ def open_store(settings: ServiceSettings) -> Store:
         SettingsError: for a URL that cannot be used, and for what is no folder.
     """
     if "://" in settings.maps_dir:
-        from service.remote_maps import RemoteMapStore  # its libraries take long to load
+        from visloc.archive.remote_store import RemoteMapStore  # its libraries take long to load
 
         try:
             return RemoteMapStore(settings.maps_dir, settings.cache_dir, settings.max_cache_bytes)

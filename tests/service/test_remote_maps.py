@@ -17,12 +17,11 @@ import fsspec
 import pytest
 from moto.server import ThreadedMotoServer
 
-from service import remote_maps
-from service.remote_maps import RemoteMapStore
 from service.settings import ServiceSettings, SettingsError
 from service.stores import open_store
-from visloc.archive import MapStore, open_map, verify_map
+from visloc.archive import MapStore, open_map, remote_store, verify_map
 from visloc.archive.checks import json_text, manifest_hash
+from visloc.archive.remote_store import RemoteMapStore
 from visloc.errors import (
     Conflict,
     InvalidInput,
@@ -152,8 +151,8 @@ def new_reader(shared: RemoteMapStore, tmp_path: Path) -> Callable[..., RemoteMa
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is remembered for longer than an instant."""
-    monkeypatch.setattr(remote_maps, "INDEX_S", 0.0)
-    monkeypatch.setattr(remote_maps, "AWAY_S", 0.1)
+    monkeypatch.setattr(remote_store, "INDEX_S", 0.0)
+    monkeypatch.setattr(remote_store, "AWAY_S", 0.1)
 
 
 def files_of(bucket: str) -> set[str]:
@@ -254,7 +253,7 @@ def test_what_another_server_changes_is_seen_soon(
     published.publish(make("v1", "hall"), "hall", "v1")
     assert other.current_version("room") == "v2"  # a few seconds old
 
-    monkeypatch.setattr(remote_maps, "INDEX_S", 0.0)
+    monkeypatch.setattr(remote_store, "INDEX_S", 0.0)
     assert other.current_version("room") == "v1"
     assert other.ids() == ["hall", "room"]
 
@@ -338,7 +337,7 @@ def test_an_upload_that_was_interrupted_is_not_visible_and_can_be_repeated(
     with pytest.raises(NotFound):
         published.folder("room@v3")
 
-    monkeypatch.setattr(published, "_away_until", remote_maps.NEVER)
+    monkeypatch.setattr(published, "_away_until", remote_store.NEVER)
     published.publish(make("v3", note="again"), "room", "v3")
     assert verify_map(new_store("third").folder("room")).ref == "room@v3"
     assert "room/v3/left-over.npy" not in files_of(bucket)
@@ -490,15 +489,15 @@ def test_only_the_first_request_waits_for_a_storage_that_does_not_answer(
     new_reader: Callable[..., RemoteMapStore], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     new_reader().folder("room")
-    monkeypatch.setattr(remote_maps, "CONNECT_TIMEOUT_S", 1)
-    monkeypatch.setattr(remote_maps, "READ_TIMEOUT_S", 1)
+    monkeypatch.setattr(remote_store, "CONNECT_TIMEOUT_S", 1)
+    monkeypatch.setattr(remote_store, "READ_TIMEOUT_S", 1)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{silent.getsockname()[1]}")
         store = new_reader()
         start = time.monotonic()
         assert store.ids() == ["room"]
         assert time.monotonic() - start < 6
-        monkeypatch.setattr(remote_maps, "AWAY_S", 0.0)
+        monkeypatch.setattr(remote_store, "AWAY_S", 0.0)
         start = time.monotonic()
         for _ in range(100):
             assert store.folder("room").name == "v2"

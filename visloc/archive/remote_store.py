@@ -27,13 +27,14 @@ from urllib.parse import urlsplit
 import fsspec
 from pydantic import RootModel, ValidationError
 
-from visloc.archive import MapOutline, MapStore, read_outline
 from visloc.archive.checks import read_manifest
 from visloc.archive.packed import FILE_NAME, MANIFEST
+from visloc.archive.reader import MapOutline, read_outline
 from visloc.archive.schema import ID_PATTERN
 from visloc.archive.store import (
     CURRENT,
     FULL,
+    MapStore,
     checked_name,
     none_in_use,
     read_published_outline,
@@ -67,7 +68,7 @@ _Index = Mapping[str, _Versions]
 
 
 class RemoteMapStore:
-    """Finds, fetches, publishes and removes the maps of a URL (``service.stores.Store``).
+    """Finds, fetches, publishes and removes the maps of a URL; what ``MapStore`` does for a folder.
 
     One server at a time should publish a given version. Whatever is fetched is verified.
     """
