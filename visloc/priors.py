@@ -114,12 +114,21 @@ class GravityPrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Priors:
-    """What is known; None where nothing is."""
+    """What is known; None where nothing is.
+
+    Attributes:
+        maps: of a set of maps, the tiles that the device may be in: each ``id`` or ``id@version``.
+    """
 
     position: PositionPrior | None = None
     height: HeightBand | None = None
     pose: PosePrior | None = None
     gravity: GravityPrior | None = None
+    maps: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.maps is not None and not self.maps:
+            raise _unusable("maps", None, "tiles of the set that is searched", "none")
 
 
 NO_PRIORS = Priors()

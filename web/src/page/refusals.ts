@@ -66,6 +66,13 @@ export const ADVICE: Readonly<Record<string, Advice>> = {
     meaning: "The best pose is not where the camera is said to be.",
     tries: ["Check what is known before (the priors).", "Leave it out."],
   },
+  ambiguous: {
+    meaning: "Two places far apart explain the photo about equally well.",
+    tries: [
+      "Say where the camera is (the priors).",
+      "Choose a photo that shows more of the scene.",
+    ],
+  },
   contradicts_motion: {
     meaning: "The photo says one thing, its neighbours in time and the motion another.",
     tries: ["Check the odometry.", "Ask about the photo alone."],
