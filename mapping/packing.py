@@ -5,14 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 from mapping.outputs import complete_output, refuse_existing
-from visloc.archive import Manifest, verify_map
+from visloc.archive import verify_any
 from visloc.archive.packed import pack_map
+from visloc.archive.set_rules import AnyManifest
 
 _EXISTS = "pack.output_exists"
 
 
-def write_packed(folder: Path, output: Path) -> Manifest:
-    """Pack a map, every byte of which is checked first.
+def write_packed(folder: Path, output: Path) -> AnyManifest:
+    """Pack a map or a set, every byte of which is checked first.
 
     Args:
         folder: the map.
@@ -23,6 +24,6 @@ def write_packed(folder: Path, output: Path) -> Manifest:
         MapCorrupt: when the map is not what its manifest says.
     """
     refuse_existing(output, _EXISTS)  # before the long part
-    verify_map(folder)
+    verify_any(folder)
     with complete_output(output, _EXISTS) as partial:
         return pack_map(folder, partial)

@@ -19,7 +19,8 @@ from service.jobs import Near, Where
 from service.stores import Store
 from service.worker import MapFolder
 from service.workers import Workers
-from visloc.archive import MapOutline
+from visloc.archive import MapOutline, SetOutline
+from visloc.archive.checks import is_set
 from visloc.archive.store import version_in_use
 from visloc.errors import InvalidInput, MapCorrupt, NotFound, Unavailable, VislocError
 
@@ -413,7 +414,10 @@ class Catalog:
         versions = self._store.versions(map_id)
         outline = self._described.get(wanted) if version in versions else None
         if outline is None:
-            outline = self._store.outline(wanted)
+            found = self._store.outline(wanted)
+            if isinstance(found, SetOutline):
+                raise is_set(found.ref, found.manifest)
+            outline = found
             while len(self._described) >= _MAX_DESCRIBED:
                 self._described.pop(next(iter(self._described)), None)
             self._described[wanted] = outline

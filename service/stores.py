@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from service.settings import ServiceSettings, SettingsError
-from visloc.archive import MapOutline, MapStore
+from visloc.archive import MapOutline, MapStore, SetOutline
 
 logger = logging.getLogger(__name__)
 
@@ -37,7 +37,7 @@ class Store(Protocol):
         """The version in use."""
         ...
 
-    def outline(self, ref: str) -> MapOutline:
+    def outline(self, ref: str) -> MapOutline | SetOutline:
         """What ``id`` or ``id@version`` says about itself; quick, wherever the store is."""
         ...
 

@@ -371,12 +371,13 @@ def test_every_relative_link_leads_somewhere(page: Path) -> None:
 
 CODE = re.compile(
     r"(access|request|image|camera|options|maps?|near|packed|page|features|weights|server|pose"
-    r"|geopose|debug|rig|sequence|upload)"
+    r"|geopose|debug|rig|sequence|set|upload)"
     r"\.[a-z0-9_]+"
 )
 # Modules that take part in an answer, and the codes of theirs that no client meets.
 ANSWERING = (
     *("service/**/*.py", "visloc/*.py", "visloc/archive/*.py", "visloc/features/*.py"),
+    "visloc/sets/*.py",
     *("clients/requests.py", "clients/connection.py", "clients/errors.py", "clients/types.py"),
     "clients/uploads.py",
 )

@@ -14,11 +14,25 @@ from visloc.archive.schema import (
     Manifest,
     World,
 )
+from visloc.archive.set_schema import SetManifest, SetWorld, SimilarityRecord, TileRecord
+from visloc.archive.sets import (
+    CoarseIndex,
+    MapSet,
+    SetContent,
+    SetOutline,
+    open_set,
+    read_any_outline,
+    read_set_outline,
+    verify_any,
+    verify_set,
+    write_set,
+)
 from visloc.archive.store import MapStore
 from visloc.archive.writer import GlobalFeatures, Landmarks, MapContent, write_map
 
 __all__ = [
     "Anchor",
+    "CoarseIndex",
     "FingerprintRecord",
     "GeoCircle",
     "Geodetic",
@@ -29,14 +43,27 @@ __all__ = [
     "Map",
     "MapContent",
     "MapOutline",
+    "MapSet",
     "MapStore",
+    "SetContent",
+    "SetManifest",
+    "SetOutline",
+    "SetWorld",
+    "SimilarityRecord",
+    "TileRecord",
     "World",
     "circle_of",
     "down_of",
     "open_map",
+    "open_set",
+    "read_any_outline",
     "read_outline",
+    "read_set_outline",
     "sha256_of",
+    "verify_any",
     "verify_map",
+    "verify_set",
     "write_anchored",
     "write_map",
+    "write_set",
 ]

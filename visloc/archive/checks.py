@@ -17,7 +17,8 @@ from pydantic import BaseModel, ValidationError
 
 from visloc.archive.npz import read_npy_header, read_npz
 from visloc.archive.schema import FORMAT_MAJOR, FORMAT_MINOR, Manifest
-from visloc.errors import MapCorrupt
+from visloc.archive.set_schema import SET_FORMAT, SET_MAJOR, SET_MINOR, SetManifest
+from visloc.errors import InvalidInput, MapCorrupt
 
 RecordType = TypeVar("RecordType", bound=BaseModel)
 
@@ -67,27 +68,55 @@ def read_manifest(folder: Path) -> Manifest:
     Raises:
         MapCorrupt: ``map.manifest`` when it is missing or not a manifest, ``map.format_version``
             when it is of a newer major format.
+        InvalidInput: ``map.is_set`` when it is that of a set.
+    """
+    manifest = read_any_manifest(folder)
+    if isinstance(manifest, SetManifest):
+        raise is_set(f"{manifest.id}@{manifest.version}", manifest)
+    return manifest
+
+
+def read_any_manifest(folder: Path) -> Manifest | SetManifest:
+    """Read ``manifest.json`` of the folder of a map or a set.
+
+    Raises:
+        MapCorrupt: as ``read_manifest``.
     """
     path = folder / "manifest.json"
     text = _read_text(path, _MAX_MANIFEST_BYTES, "map.manifest")
     try:
-        version = str(json.loads(text).get("format_version", ""))
+        fields = json.loads(text)
+        of_set, version = fields.get("format") == SET_FORMAT, str(fields.get("format_version", ""))
     except (ValueError, AttributeError, RecursionError):
-        version = ""
+        of_set, version = False, ""
+    newest = (SET_MAJOR, SET_MINOR) if of_set else (FORMAT_MAJOR, FORMAT_MINOR)
     major = version.partition(".")[0]
-    if major.isascii() and major.isdigit() and len(major) < 9 and int(major) > FORMAT_MAJOR:
+    if major.isascii() and major.isdigit() and len(major) < 9 and int(major) > newest[0]:
         raise MapCorrupt(
             "map.format_version",
             "the map was written by a newer visloc; upgrade visloc or rebuild the map",
             field=str(path),
-            expected=f"format {FORMAT_MAJOR}.x or older (this program writes "
-            f"{FORMAT_MAJOR}.{FORMAT_MINOR})",
+            expected=f"format {newest[0]}.x or older (this program writes {newest[0]}.{newest[1]})",
             got=version,
         )
+    if of_set:
+        return _parse(SetManifest, text, path, "map.manifest")
     return _parse(Manifest, text, path, "map.manifest")
 
 
-def check_files(folder: Path, manifest: Manifest) -> None:
+def is_set(ref: str, manifest: SetManifest) -> InvalidInput:
+    """``map.is_set``."""
+    some = ", ".join(tile.ref for tile in manifest.tiles[:3])
+    return InvalidInput(
+        "map.is_set",
+        "this is a set of maps, not a map; name one of its tiles",
+        field="map",
+        expected=f"a map, such as {some}",
+        got=ref,
+    )
+
+
+def check_files(folder: Path, manifest: Manifest | SetManifest) -> None:
     """Check that every file of the manifest is there with its size.
 
     Raises:
@@ -120,7 +149,7 @@ def check_files(folder: Path, manifest: Manifest) -> None:
             )
 
 
-def check_checksums(folder: Path, manifest: Manifest) -> None:
+def check_checksums(folder: Path, manifest: Manifest | SetManifest) -> None:
     """Read every byte of a map and compare it with the manifest.
 
     Raises:

@@ -20,8 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
-from visloc.archive.checks import check_files, read_manifest
-from visloc.archive.schema import Manifest
+from visloc.archive.checks import check_files, read_any_manifest
+from visloc.archive.set_rules import AnyManifest
+from visloc.archive.sets import SET_CODES
 from visloc.archive.store import storage_errors
 from visloc.errors import InvalidInput, TooLarge
 
@@ -31,6 +32,8 @@ MAX_ENTRIES = 100_000
 _MAX_DIRECTORY_BYTES = 16 * 2**20
 # Of a manifest, which lists the files and tells how the map was made.
 _MAX_MANIFEST_BYTES, _MAX_MANIFEST_BYTES_PER_FILE = 2**20, 512
+# That of a set lists its tiles too.
+_MAX_SET_MANIFEST_BYTES = 16 * 2**20
 # Names that files of a map have: on every system a path below the map, and nothing else.
 FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}(/[A-Za-z0-9][A-Za-z0-9._-]{0,127}){0,3}")
 _BLOCK_BYTES = 2**20
@@ -44,7 +47,7 @@ _LOCATOR64 = struct.Struct("<4sIQI")  # 4.3.15
 _IN_EXTRA = 0xFFFFFFFF  # the number is in the extra field of 64 bits, 4.5.3
 
 
-def pack_map(folder: Path, output: Path) -> Manifest:
+def pack_map(folder: Path, output: Path) -> AnyManifest:
     """Write a map into one file. Equal maps make equal files, byte by byte.
 
     Args:
@@ -54,7 +57,7 @@ def pack_map(folder: Path, output: Path) -> Manifest:
     Raises:
         MapCorrupt: when it is not a map.
     """
-    manifest = read_manifest(folder)
+    manifest = read_any_manifest(folder)
     check_files(folder, manifest)
     with zipfile.ZipFile(output, "x", zipfile.ZIP_STORED) as archive:
         for name in (MANIFEST, *sorted(manifest.files)):
@@ -68,11 +71,11 @@ def pack_map(folder: Path, output: Path) -> Manifest:
     return manifest
 
 
-def unpack_map(file: Path, target: Path, max_bytes: int) -> Manifest:
+def unpack_map(file: Path, target: Path, max_bytes: int) -> AnyManifest:
     """Write the files of a packed map into a new folder.
 
     Nothing is written outside ``target``, and memory stays small whatever the file says. Whether
-    the bytes are those of the manifest is for ``verify_map``, before the map is used.
+    the bytes are those of the manifest is for ``verify_any``, before the map is used.
 
     Args:
         file: the packed map.
@@ -91,7 +94,7 @@ def unpack_map(file: Path, target: Path, max_bytes: int) -> Manifest:
         entries = _read_entries(source, max_bytes)
         target.mkdir()
         _write_file(source, entries[MANIFEST], target / MANIFEST)
-        manifest = read_manifest(target)
+        manifest = read_any_manifest(target)
         _check_listed(entries, manifest)
         for name, entry in entries.items():
             if entry.is_folder or name == MANIFEST:
@@ -146,6 +149,8 @@ def _read_entries(source: BinaryIO, max_bytes: int) -> dict[str, _Entry]:
             "packed.files", "not a packed map", field="map", expected=f"an entry {MANIFEST}"
         )
     limit = _MAX_MANIFEST_BYTES + _MAX_MANIFEST_BYTES_PER_FILE * len(entries)
+    if SET_CODES in entries:
+        limit = _MAX_SET_MANIFEST_BYTES
     if entries[MANIFEST].size > limit:
         raise TooLarge(
             "packed.too_large",
@@ -274,7 +279,7 @@ def _checked_name(raw: bytes) -> str:
     return name
 
 
-def _check_listed(entries: dict[str, _Entry], manifest: Manifest) -> None:
+def _check_listed(entries: dict[str, _Entry], manifest: AnyManifest) -> None:
     """The archive has the files of the manifest, in their sizes, and no folder beyond theirs."""
     files = {name: entry.size for name, entry in entries.items() if not entry.is_folder}
     del files[MANIFEST]

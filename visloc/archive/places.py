@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive.schema import Geodetic, World
+from visloc.archive.set_schema import SetWorld
 from visloc.geodesy import enu_from_geodetic, geodetic_from_enu, ground_distance
 from visloc.geometry import Pose
 
@@ -50,7 +51,7 @@ def down_of(geodetic: Geodetic) -> NDArray[np.float64]:
     return np.asarray(-rotation[2])
 
 
-def circle_of(world: World) -> GeoCircle | None:
+def circle_of(world: World | SetWorld) -> GeoCircle | None:
     """Return a circle about the middle of the map's extent that holds all of its landmarks.
 
     It is that of the extent's corners, so that no landmark has to be read; None where it is not

@@ -155,10 +155,11 @@ def read_outline(folder: Path) -> MapOutline:
     Raises:
         MapCorrupt: with the file that is wrong.
     """
-    return _outline(folder, read_manifest(folder))
+    return outline_of(folder, read_manifest(folder))
 
 
-def _outline(folder: Path, manifest: Manifest) -> MapOutline:
+def outline_of(folder: Path, manifest: Manifest) -> MapOutline:
+    """Read what a map whose manifest is read says of itself besides; raises ``map.cameras``."""
     cameras = read_record(folder, "cameras.json", CamerasFile)
     try:
         return MapOutline(
@@ -210,7 +211,7 @@ def open_map(folder: Path) -> Map:
             )
     _check_photos(folder, manifest)
     images = read_record(folder, "images.json", ImagesFile).images
-    outline = _outline(folder, manifest)
+    outline = outline_of(folder, manifest)
     if len(images) != n or any(image.camera not in outline.cameras for image in images):
         raise MapCorrupt(
             "map.images",

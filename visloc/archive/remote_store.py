@@ -27,10 +27,18 @@ from urllib.parse import urlsplit
 import fsspec
 from pydantic import RootModel, ValidationError
 
-from visloc.archive.checks import read_manifest
+from visloc.archive.checks import read_any_manifest
 from visloc.archive.packed import FILE_NAME, MANIFEST
-from visloc.archive.reader import MapOutline, read_outline
+from visloc.archive.reader import MapOutline
 from visloc.archive.schema import ID_PATTERN
+from visloc.archive.set_rules import (
+    AnyManifest,
+    refuse_if_tile,
+    refuse_missing_tiles,
+    refuse_other_kind,
+)
+from visloc.archive.set_schema import SetManifest
+from visloc.archive.sets import SetOutline, read_any_outline
 from visloc.archive.store import (
     CURRENT,
     FULL,
@@ -42,7 +50,15 @@ from visloc.archive.store import (
     version_exists,
     version_in_use,
 )
-from visloc.errors import Conflict, MapCorrupt, NotFound, StorageFull, Unavailable, VislocError
+from visloc.errors import (
+    Conflict,
+    InvalidInput,
+    MapCorrupt,
+    NotFound,
+    StorageFull,
+    Unavailable,
+    VislocError,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -156,7 +172,7 @@ class RemoteMapStore:
             os.utime(copy)
         return copy
 
-    def outline(self, ref: str) -> MapOutline:
+    def outline(self, ref: str) -> MapOutline | SetOutline:
         """Say what ``id`` or ``id@version`` is; of one without a copy here, two files are fetched.
 
         Raises:
@@ -172,18 +188,15 @@ class RemoteMapStore:
         copy = self._copies.root / map_id / version
         if copy.is_dir():
             return read_published_outline(copy)
-        with tempfile.TemporaryDirectory() as folder, self._asking():
-            for name in (MANIFEST, "cameras.json"):
-                try:
-                    place = f"{self._place(map_id, version)}/{name}"
-                    if self._fs.size(place) > _MAX_MANIFEST_BYTES:
-                        raise self._damaged(map_id, version, name, "is too large")
-                    self._fs.get_file(place, str(Path(folder, name)))
-                except FileNotFoundError:
-                    raise self._damaged(map_id, version, name, "is missing") from None
-            outline = read_outline(Path(folder))
-            refuse_renamed(outline.manifest, Path(place).parent, map_id, version)
-            return outline
+        with tempfile.TemporaryDirectory() as folder:
+            here = Path(folder)
+            self._fetch_small(map_id, version, MANIFEST, here)
+            if not isinstance(read_any_manifest(here), SetManifest):
+                self._fetch_small(map_id, version, "cameras.json", here)
+            outline = read_any_outline(here)
+        place = Path(self._place(map_id, version))
+        refuse_renamed(outline.manifest, place, map_id, version)
+        return outline
 
     def folder(self, ref: str) -> Path:
         """The copy of ``id`` (its current version) or ``id@version``, fetched when it is not here.
@@ -220,8 +233,7 @@ class RemoteMapStore:
         anew; before ``current``, the version is there and the one before it stays in use.
 
         Raises:
-            Conflict: ``map.version_exists``.
-            MapCorrupt: as of ``MapStore.publish``.
+            Conflict, NotFound, MapCorrupt: as of ``MapStore.publish``.
             Unavailable: ``maps.storage_away``.
         """
         checked_name(map_id, "map")
@@ -230,10 +242,13 @@ class RemoteMapStore:
             known = self._versions_now(map_id)
             if version in known.versions:
                 raise version_exists(map_id, version)
+            manifest = read_any_manifest(incoming)
+            refuse_other_kind(manifest, self._any_version(map_id, known))
+            refuse_missing_tiles(manifest, self._manifest)
             with suppress(NotFound):  # the copy of one that was removed by another server
                 self._copies.remove(map_id, version)
             self._make_room(_size_of(incoming))
-            copy = self._copies.publish(incoming, map_id, version, make_current=False)
+            copy = self._copies.keep_copy(incoming, map_id, version)
             try:
                 self._write(copy, self._place(map_id, version))
                 if make_current:
@@ -253,12 +268,13 @@ class RemoteMapStore:
         """Make a published version the one in use.
 
         Raises:
-            NotFound: ``map.unknown`` or ``map.version``.
+            NotFound, Conflict: as of ``MapStore.set_current``.
             Unavailable: ``maps.storage_away``.
         """
         with self._changing:
             known = self._versions_now(checked_name(map_id, "map"))
             self._refuse_unknown(map_id, version)
+            refuse_missing_tiles(self._manifest(map_id, version), self._manifest)
             self._write_current(map_id, version)
             self._keep_changed(map_id, known.versions, version)
 
@@ -266,8 +282,7 @@ class RemoteMapStore:
         """Remove a version, its manifest first; with the last one, the map.
 
         Raises:
-            NotFound: ``map.unknown`` or ``map.version``.
-            Conflict: ``map.version_in_use`` for the current version of a map that has others.
+            NotFound, Conflict: as of ``MapStore.remove``.
             Unavailable: ``maps.storage_away``.
         """
         with self._changing, self._lock_of(f"{map_id}@{version}"):
@@ -276,6 +291,7 @@ class RemoteMapStore:
             others = [name for name in known.versions if name != version]
             if others and known.current == version:
                 raise version_in_use(map_id, version, others)
+            refuse_if_tile(map_id, version, self._in_use())
             place = self._place(map_id, version)
             with self._asking():
                 if not others and known.current is not None:
@@ -423,6 +439,48 @@ class RemoteMapStore:
             "map.unknown", "no such map", field="map", expected=f"one of: {known}", got=map_id
         )
 
+    # Manifests
+
+    def _manifest(self, map_id: str, version: str) -> AnyManifest:
+        """The manifest of a version, from its copy or from the storage.
+
+        Raises:
+            NotFound: ``map.unknown`` or ``map.version``.
+            MapCorrupt: when it is damaged.
+            Unavailable: ``maps.storage_away``.
+        """
+        self._refuse_unknown(map_id, version)
+        copy = self._copies.root / map_id / version
+        if copy.is_dir():
+            return read_any_manifest(copy)
+        with tempfile.TemporaryDirectory() as folder:
+            self._fetch_small(map_id, version, MANIFEST, Path(folder))
+            return read_any_manifest(Path(folder))
+
+    def _any_version(self, map_id: str, known: _Versions) -> AnyManifest | None:
+        """The manifest of any version of a map or set; None when none can be read."""
+        for version in known.versions:
+            with suppress(MapCorrupt, NotFound):
+                return self._manifest(map_id, version)
+        return None
+
+    def _in_use(self) -> Iterator[tuple[str, AnyManifest]]:
+        """What is in use; without what cannot be read, which is not in use either."""
+        for map_id, known in self._known().items():
+            if known.current is not None:
+                with suppress(MapCorrupt, NotFound, InvalidInput):
+                    yield f"{map_id}@{known.current}", self._manifest(map_id, known.current)
+
+    def _fetch_small(self, map_id: str, version: str, name: str, folder: Path) -> None:
+        place = f"{self._place(map_id, version)}/{name}"
+        with self._asking():
+            try:
+                if self._fs.size(place) > _MAX_MANIFEST_BYTES:
+                    raise self._damaged(map_id, version, name, "is too large")
+                self._fs.get_file(place, str(folder / name))
+            except FileNotFoundError:
+                raise self._damaged(map_id, version, name, "is missing") from None
+
     # Copies
 
     def _is_of_today(self, copy: Path, ref: str) -> bool:
@@ -463,7 +521,7 @@ class RemoteMapStore:
                     raise NotFound(
                         "map.version", "the version was removed", field="map", got=version
                     ) from None
-            manifest = read_manifest(target)
+            manifest = read_any_manifest(target)
             self._make_room(sum(entry.size for entry in manifest.files.values()))
             for name, entry in manifest.files.items():
                 if not FILE_NAME.fullmatch(name) or sizes.get(name) != entry.size:
@@ -472,7 +530,7 @@ class RemoteMapStore:
                 with self._asking():
                     self._fs.get_file(f"{place}/{name}", str(target / name))
             with suppress(Conflict):  # another process with the same cache was faster
-                self._copies.publish(target, map_id, version, make_current=False)
+                self._copies.keep_copy(target, map_id, version)
         logger.info("%s@%s fetched in %.1f s", map_id, version, monotonic() - start)
 
     def _make_room(self, size: int) -> None:

@@ -51,19 +51,21 @@ def photo_file(image: int) -> str:
     return f"photos/{image:06d}.jpg"
 
 
-class _Record(BaseModel):
+class Record(BaseModel):
+    """JSON of ours: frozen, without infinities; of a newer minor format, with more fields."""
+
     # Unknown fields pass: a reader must open maps of a newer minor format.
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
 
-class FileEntry(_Record):
+class FileEntry(Record):
     """Size and checksum of one file of the map."""
 
     size: Annotated[int, Field(ge=0)]
     sha256: Sha256
 
 
-class FingerprintRecord(_Record):
+class FingerprintRecord(Record):
     """``visloc.types.Fingerprint`` as JSON; ready-made features are named ``kapture:TYPE``."""
 
     name: Annotated[
@@ -89,7 +91,7 @@ class FingerprintRecord(_Record):
         return self.name.replace(":", "-")
 
 
-class LocalFeaturesRecord(_Record):
+class LocalFeaturesRecord(Record):
     """The local feature that a map was built with, and how its observations are stored.
 
     ``computed_with`` tells what computed the features, for people.
@@ -105,7 +107,7 @@ class LocalFeaturesRecord(_Record):
     computed_with: str | None = None
 
 
-class GlobalFeaturesRecord(_Record):
+class GlobalFeaturesRecord(Record):
     """One global descriptor of a map.
 
     Attributes:
@@ -119,7 +121,7 @@ class GlobalFeaturesRecord(_Record):
     clusters: Annotated[int, Field(ge=1)] | None = None
 
 
-class RetrievalRecord(_Record):
+class RetrievalRecord(Record):
     """How queries rank the map's photos unless they say otherwise; ``LateFusion`` as JSON."""
 
     fusion: Fusion = Fusion.GHARM
@@ -137,14 +139,14 @@ class RetrievalRecord(_Record):
         return LateFusion(self.fusion, self.weights)
 
 
-class Extent(_Record):
+class Extent(Record):
     """Smallest box along the world's axes that holds all landmarks."""
 
     min: Vector
     max: Vector
 
 
-class Geodetic(_Record):
+class Geodetic(Record):
     """Where the world lies on Earth, WGS84.
 
     ``enu = scale R x + translation`` gives metres east, north and up of the position. Maps of
@@ -159,7 +161,7 @@ class Geodetic(_Record):
     translation: Vector = (0.0, 0.0, 0.0)
 
 
-class Anchor(_Record):
+class Anchor(Record):
     """What the world's position, orientation and scale rest on.
 
     Attributes:
@@ -179,7 +181,7 @@ class Anchor(_Record):
     geodetic: Geodetic | None = None
 
 
-class World(_Record):
+class World(Record):
     """The frame of the map; maps of format 1.0 do not tell their anchor, those of 1.1 no gravity.
 
     ``gravity`` points down. ``visloc.archive.Map.gravity`` knows more: a geodetic anchor tells
@@ -193,7 +195,7 @@ class World(_Record):
     gravity: Direction | None = None
 
 
-class Counts(_Record):
+class Counts(Record):
     """How much of everything."""
 
     images: Annotated[int, Field(ge=1)]
@@ -201,14 +203,14 @@ class Counts(_Record):
     observations: Annotated[int, Field(ge=1)]
 
 
-class Method(_Record):
+class Method(Record):
     """How the landmarks were made."""
 
     name: str
     settings: dict[str, JsonValue]
 
 
-class Manifest(_Record):
+class Manifest(Record):
     """``manifest.json``."""
 
     format: Literal["visloc-map"]
@@ -244,7 +246,7 @@ class Manifest(_Record):
         return retrieval
 
 
-class CameraRecord(_Record):
+class CameraRecord(Record):
     """``visloc.geometry.Camera`` as JSON."""
 
     model: str
@@ -253,7 +255,7 @@ class CameraRecord(_Record):
     params: tuple[float, ...]
 
 
-class CamerasFile(_Record):
+class CamerasFile(Record):
     """``cameras.json``: cameras by sensor id; of each rig, cam_from_rig by sensor id."""
 
     cameras: dict[str, CameraRecord]
@@ -271,7 +273,7 @@ class ImageRecord:
     timestamp: int
 
 
-class ImagesFile(_Record):
+class ImagesFile(Record):
     """``images.json``."""
 
     images: tuple[ImageRecord, ...]

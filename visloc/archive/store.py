@@ -1,5 +1,7 @@
 """A folder of maps: ``<maps-dir>/<id>/<version>/`` and ``<maps-dir>/<id>/current``.
 
+A set of maps lies beside its tiles, in a folder of the same kind.
+
 Several threads and processes may read and change one store. Readers take no lock: every change
 becomes visible by one rename. Whoever changes something holds the lock ``<maps-dir>/.lock``, so
 that what it found is still true when it renames.
@@ -16,9 +18,16 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from visloc.archive.checks import check_files
-from visloc.archive.reader import Map, MapOutline, open_map, read_outline, verify_map
-from visloc.archive.schema import ID_PATTERN, Manifest
+from visloc.archive.checks import check_files, read_any_manifest
+from visloc.archive.reader import Map, MapOutline, open_map
+from visloc.archive.schema import ID_PATTERN
+from visloc.archive.set_rules import (
+    AnyManifest,
+    refuse_if_tile,
+    refuse_missing_tiles,
+    refuse_other_kind,
+)
+from visloc.archive.sets import MapSet, SetOutline, open_set, read_any_outline, verify_any
 from visloc.errors import (
     Conflict,
     Forbidden,
@@ -108,7 +117,14 @@ class MapStore:
         """Open ``id`` or ``id@version``; raises what ``folder`` and ``open_published`` raise."""
         return open_published(self.folder(ref))
 
-    def outline(self, ref: str) -> MapOutline:
+    def open_set(self, ref: str) -> MapSet:
+        """Open the set ``id`` or ``id@version``; raises what ``folder`` and ``open_set`` raise."""
+        folder = self.folder(ref)
+        opened = open_set(folder)
+        refuse_renamed(opened.manifest, folder, folder.parent.name, folder.name)
+        return opened
+
+    def outline(self, ref: str) -> MapOutline | SetOutline:
         """Say what ``id`` or ``id@version`` is, without opening its arrays; raises as ``open``."""
         return read_published_outline(self.folder(ref))
 
@@ -132,13 +148,31 @@ class MapStore:
             The folder of the published version.
 
         Raises:
-            Conflict: ``map.version_exists``.
-            MapCorrupt: what ``verify_map`` finds, or ``map.renamed`` when the manifest names
+            Conflict: ``map.version_exists``; ``set.id_is_map``, ``map.id_is_set``; ``set.tile``,
+                ``set.features``.
+            NotFound: ``set.tile`` when a tile of a set is not in the store.
+            MapCorrupt: what ``verify_any`` finds, or ``map.renamed`` when the manifest names
                 another id or version.
         """
+        return self._place(incoming, map_id, version, make_current=make_current, keeps_rules=True)
+
+    def keep_copy(self, incoming: Path, map_id: str, version: str) -> Path:
+        """Take in a version that another store has published: as ``publish``, not made current.
+
+        What else that store has is not here, so that it is not asked for the tiles of a set.
+        """
+        return self._place(incoming, map_id, version, make_current=False, keeps_rules=False)
+
+    def _place(
+        self, incoming: Path, map_id: str, version: str, *, make_current: bool, keeps_rules: bool
+    ) -> Path:
         target = self.root / checked_name(map_id, "map") / checked_name(version, "map version")
-        refuse_renamed(verify_map(incoming).manifest, incoming, map_id, version)
+        manifest = verify_any(incoming).manifest
+        refuse_renamed(manifest, incoming, map_id, version)
         with self._changing():
+            if keeps_rules:
+                refuse_other_kind(manifest, self._any_version(map_id))
+                refuse_missing_tiles(manifest, self._manifest)
             target.parent.mkdir(parents=True, exist_ok=True)
             if target.exists():
                 raise version_exists(map_id, version)
@@ -158,10 +192,12 @@ class MapStore:
         """Make a published version the one in use, atomically.
 
         Raises:
-            NotFound: ``map.unknown`` or ``map.version``.
+            NotFound: ``map.unknown`` or ``map.version``; ``set.tile``, and
+            Conflict: ``set.tile``, for a set whose tiles are not in the store any more.
         """
         with self._changing():
             parent = self.folder(f"{map_id}@{version}").parent
+            refuse_missing_tiles(read_any_manifest(parent / version), self._manifest)
             _prepare_current(parent, version).replace(parent / CURRENT)
             _sync_folder(parent)
 
@@ -172,10 +208,12 @@ class MapStore:
 
         Raises:
             NotFound: ``map.unknown`` or ``map.version``.
-            Conflict: ``map.version_in_use`` for the current version of a map that has others.
+            Conflict: ``map.version_in_use`` for the current version of a map that has others;
+                ``map.in_set`` for a version that a set in use names.
         """
         with self._changing():
             folder = self.folder(f"{map_id}@{version}")
+            refuse_if_tile(map_id, version, self._in_use())
             others = [name for name in self.versions(map_id) if name != version]
             if others and _current_or_none(self, map_id) == version:
                 raise version_in_use(map_id, version, others)
@@ -227,6 +265,23 @@ class MapStore:
                     holding.callback(path.unlink, missing_ok=True)
                     holding.callback(shutil.rmtree, path.with_suffix(""), ignore_errors=True)
 
+    def _manifest(self, map_id: str, version: str) -> AnyManifest:
+        return read_any_manifest(self.folder(f"{map_id}@{version}"))
+
+    def _any_version(self, map_id: str) -> AnyManifest | None:
+        """The manifest of any version of a map or set; None when none can be read."""
+        for version in self.versions(map_id):
+            with suppress(MapCorrupt):
+                return self._manifest(map_id, version)
+        return None
+
+    def _in_use(self) -> Iterator[tuple[str, AnyManifest]]:
+        """What is in use; without what cannot be read, which is not in use either."""
+        for map_id in self.ids():
+            with suppress(MapCorrupt, NotFound):
+                folder = self.folder(map_id)
+                yield f"{map_id}@{folder.name}", read_any_manifest(folder)
+
     @contextmanager
     def _changing(self) -> Iterator[None]:
         with storage_errors(self.root):
@@ -248,19 +303,19 @@ def open_published(folder: Path) -> Map:
     return opened
 
 
-def read_published_outline(folder: Path) -> MapOutline:
-    """Read what the map in a folder ``<id>/<version>`` says, whose files must be there.
+def read_published_outline(folder: Path) -> MapOutline | SetOutline:
+    """Read what the map or set in a folder ``<id>/<version>`` says, whose files must be there.
 
     Raises:
         MapCorrupt: as ``open_published``, but the arrays are not opened.
     """
-    outline = read_outline(folder)
+    outline = read_any_outline(folder)
     check_files(folder, outline.manifest)
     refuse_renamed(outline.manifest, folder, folder.parent.name, folder.name)
     return outline
 
 
-def refuse_renamed(manifest: Manifest, folder: Path, map_id: str, version: str) -> None:
+def refuse_renamed(manifest: AnyManifest, folder: Path, map_id: str, version: str) -> None:
     """Raise MapCorrupt ``map.renamed`` unless a manifest is of this name."""
     if (manifest.id, manifest.version) != (map_id, version):
         raise MapCorrupt(

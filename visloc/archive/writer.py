@@ -125,7 +125,7 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
         The version.
     """
     landmarks = content.landmarks
-    files = _Files(folder)
+    files = Files(folder)
     files.write_json(
         "cameras.json",
         {
@@ -199,23 +199,14 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
         "notes": list(content.notes),
         "files": files.entries(),
     }
-    digest = content_hash(manifest)
-    manifest["content_hash"] = digest
-    manifest["version"] = version + digest[:8] if version.endswith("-") else version
-    manifest["manifest_hash"] = manifest_hash(manifest)
-    files.write_json("manifest.json", manifest)
-    for path in folder.rglob("*"):
-        if path.is_file():
-            with path.open("rb") as file:
-                os.fsync(file.fileno())
-    return str(manifest["version"])
+    return files.finish(manifest, version)
 
 
 def _row(pose: Pose) -> list[float]:
     return [*pose.rotation_wxyz.tolist(), *pose.translation.tolist()]
 
 
-class _Files:
+class Files:
     """The files of a map as they are written, each with its checksum."""
 
     def __init__(self, folder: Path) -> None:
@@ -223,6 +214,7 @@ class _Files:
         self._written: dict[str, str] = {}
 
     def write_json(self, name: str, value: object) -> None:
+        """Write a JSON file in its one spelling."""
         self._write(name, [json_text(value).encode()])
 
     def write_array(
@@ -250,10 +242,11 @@ class _Files:
         self._write(name, itertools.chain([header.getvalue()], rows))
 
     def write_model(self, name: str, model: Mapping[str, NDArray[Any]]) -> None:
+        """Write the arrays of a model, of which large matrices are stored in 8 bits."""
         path = self._path(name)
         with path.open("xb") as file:
             # The savez stub takes no mapping of arrays as keywords beside allow_pickle.
-            np.savez(file, **model)  # type: ignore[arg-type]
+            np.savez(file, **_stored_model(model))  # type: ignore[arg-type]
         self._written[name] = sha256_of(path)
 
     def entries(self) -> dict[str, dict[str, int | str]]:
@@ -265,6 +258,28 @@ class _Files:
                 sha256 = self._written.get(name) or sha256_of(path)
                 entries[name] = {"size": path.stat().st_size, "sha256": sha256}
         return entries
+
+    def finish(self, manifest: dict[str, Any], version: str) -> str:
+        """Complete a manifest with version and hashes, write it, and see all files on disk.
+
+        Args:
+            manifest: all else; its ``files`` are ``entries()``.
+            version: the version, or a prefix ending in ``-``, to which a part of the content
+                hash is appended.
+
+        Returns:
+            The version.
+        """
+        digest = content_hash(manifest)
+        manifest["content_hash"] = digest
+        manifest["version"] = version + digest[:8] if version.endswith("-") else version
+        manifest["manifest_hash"] = manifest_hash(manifest)
+        self.write_json("manifest.json", manifest)
+        for path in self.folder.rglob("*"):
+            if path.is_file():
+                with path.open("rb") as file:
+                    os.fsync(file.fileno())
+        return str(manifest["version"])
 
     def _write(self, name: str, parts: Iterable[bytes | memoryview]) -> None:
         digest = hashlib.sha256()
@@ -292,7 +307,7 @@ def _within_float16(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _write_keypoints(
-    files: _Files, keypoints: NDArray[np.float32], cameras: Mapping[str, Camera]
+    files: Files, keypoints: NDArray[np.float32], cameras: Mapping[str, Camera]
 ) -> float | None:
     """Store pixels in 16 bits where they fit, and return the step; None for float32."""
     name = "observation_keypoints.npy"
@@ -309,7 +324,7 @@ def _write_keypoints(
 
 
 def _write_descriptors(
-    files: _Files, descriptors: Callable[[], Iterator[NDArray[np.float32]]], shape: tuple[int, int]
+    files: Files, descriptors: Callable[[], Iterator[NDArray[np.float32]]], shape: tuple[int, int]
 ) -> float:
     """Store unit descriptors in 8 bits and return the value of one step.
 
@@ -331,7 +346,7 @@ def _write_descriptors(
     return scale
 
 
-def _write_global(files: _Files, features: GlobalFeatures) -> int | None:
+def _write_global(files: Files, features: GlobalFeatures) -> int | None:
     """Store a global descriptor's rows and model in 8 bits; return how many clusters it has."""
     stem, rows = features.fingerprint.file_stem, features.descriptors
     scales = np.empty(len(rows), np.float32)
@@ -344,7 +359,7 @@ def _write_global(files: _Files, features: GlobalFeatures) -> int | None:
 
     files.write_blocks(f"global/{stem}.npy", "|i1", rows.shape, stored())
     files.write_array(f"global/{stem}.scales.npy", "<f4", scales)
-    files.write_model(f"global/{stem}.model.npz", _stored_model(features.model))
+    files.write_model(f"global/{stem}.model.npz", features.model)
     if len(rows) <= MAX_EXACT:
         return None
     clusters = make_clusters(rows)

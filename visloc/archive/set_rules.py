@@ -1,0 +1,110 @@
+"""What a store refuses so that a set and its tiles stay together, whatever the store."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from visloc.archive.schema import FingerprintRecord, Manifest
+from visloc.archive.set_schema import SetManifest
+from visloc.errors import Conflict, NotFound
+
+AnyManifest = Manifest | SetManifest
+# Of a map id and a version; raises NotFound for what is not in the store.
+ReadManifest = Callable[[str, str], AnyManifest]
+
+
+def refuse_other_kind(incoming: AnyManifest, published: AnyManifest | None) -> None:
+    """Refuse a set under the id of a map, and a map under that of a set.
+
+    Args:
+        incoming: what is to be published.
+        published: a version that the store has under the same id; None for none.
+
+    Raises:
+        Conflict: ``set.id_is_map``, ``map.id_is_set``.
+    """
+    if published is None or isinstance(published, SetManifest) == isinstance(incoming, SetManifest):
+        return
+    if isinstance(incoming, SetManifest):
+        code, is_now, other = "set.id_is_map", "a map", "set"
+    else:
+        code, is_now, other = "map.id_is_set", "a set", "map"
+    raise Conflict(
+        code,
+        f"{is_now} has this id already; give the {other} another one",
+        field="map",
+        expected=f"an id that {is_now} does not have",
+        got=incoming.id,
+    )
+
+
+def refuse_missing_tiles(incoming: AnyManifest, read_manifest: ReadManifest) -> None:
+    """Refuse a set unless each of its tiles is in the store, with the content that it names.
+
+    Raises:
+        NotFound: ``set.tile``: a tile is not there.
+        Conflict: ``set.tile``: it is a set, or another map; ``set.features``: it has other local
+            features than the set says, so that one extraction does not serve all tiles.
+    """
+    if not isinstance(incoming, SetManifest):
+        return
+    for tile in incoming.tiles:
+        try:
+            found = read_manifest(tile.map, tile.version)
+        except NotFound as error:
+            raise NotFound(
+                "set.tile",
+                "a tile of the set is not in this store; publish it first",
+                field="tiles",
+                expected=tile.ref,
+                got=error.message,
+            ) from error
+        if isinstance(found, SetManifest) or found.content_hash != tile.content_hash:
+            raise Conflict(
+                "set.tile",
+                "a tile of the set is another one in this store; make the set anew",
+                field="tiles",
+                expected=f"{tile.ref}, a map of content hash {tile.content_hash}",
+                got="a set" if isinstance(found, SetManifest) else found.content_hash,
+            )
+        refuse_other_features(tile.ref, found.local_features.fingerprint, incoming.local_features)
+
+
+def refuse_other_features(ref: str, found: FingerprintRecord, expected: FingerprintRecord) -> None:
+    """Refuse a tile whose local features are not those of the others.
+
+    Raises:
+        Conflict: ``set.features``.
+    """
+    if found != expected:
+        raise Conflict(
+            "set.features",
+            f"{ref} has other local features than the set; build all of its maps with the same",
+            field="tiles",
+            expected=str(expected),
+            got=str(found),
+        )
+
+
+def refuse_if_tile(map_id: str, version: str, current: Iterable[tuple[str, AnyManifest]]) -> None:
+    """Refuse to remove a version that a set in use names.
+
+    Args:
+        map_id: the map.
+        version: of it.
+        current: reference and manifest of what is in use.
+
+    Raises:
+        Conflict: ``map.in_set``.
+    """
+    for ref, manifest in current:
+        if isinstance(manifest, SetManifest) and any(
+            (tile.map, tile.version) == (map_id, version) for tile in manifest.tiles
+        ):
+            raise Conflict(
+                "map.in_set",
+                "the version is a tile of a set in use; publish the set without it first",
+                field="map",
+                expected=f"a version that {ref} does not name",
+                got=f"{map_id}@{version}",
+            )

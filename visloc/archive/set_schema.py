@@ -1,0 +1,155 @@
+"""The words of a set's manifest (docs/map-format.md): which maps, and where each lies."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from visloc.archive.schema import (
+    ID_PATTERN,
+    Anchor,
+    Direction,
+    Extent,
+    FileEntry,
+    FingerprintRecord,
+    Record,
+    Sha256,
+    UnitQuaternion,
+    Vector,
+)
+from visloc.geometry import Pose, Similarity
+
+SET_FORMAT = "visloc-set"
+SET_MAJOR, SET_MINOR = 1, 0
+# The manifest lists them; with so many it has about 12 MB.
+MAX_TILES = 10_000
+
+
+class SimilarityRecord(Record):
+    """``visloc.geometry.Similarity`` as JSON: ``x_set = scale R x_tile + translation``."""
+
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    rotation_wxyz: UnitQuaternion = (1.0, 0.0, 0.0, 0.0)
+    translation: Vector = (0.0, 0.0, 0.0)
+
+    @staticmethod
+    def of(similarity: Similarity) -> SimilarityRecord:
+        """Return the same as a record."""
+        pose = Pose(similarity.rotation, similarity.translation)
+        w, x, y, z = pose.rotation_wxyz.tolist()
+        tx, ty, tz = similarity.translation.tolist()
+        return SimilarityRecord(
+            scale=similarity.scale, rotation_wxyz=(w, x, y, z), translation=(tx, ty, tz)
+        )
+
+    @property
+    def similarity(self) -> Similarity:
+        """The same as the geometry takes it."""
+        pose = Pose.from_quaternion(self.rotation_wxyz, self.translation)
+        return Similarity(self.scale, pose.rotation, pose.translation)
+
+
+class TileRecord(Record):
+    """One map of a set. Lengths are in the set's frame and unit.
+
+    Attributes:
+        map: id of the map.
+        version: of the map.
+        content_hash: of that version.
+        set_from_tile: where the map's world lies in the set's.
+        extent: smallest box along the set's axes that holds its landmarks and photos.
+        photo_extent: ... its photos' centres only.
+        reach: median distance from its photos to the landmarks that they see.
+        images: mapping photos.
+        landmarks: of the map.
+        size_bytes: of the map's files.
+    """
+
+    map: Annotated[str, Field(pattern=rf"^{ID_PATTERN.pattern}$")]
+    version: Annotated[str, Field(pattern=rf"^{ID_PATTERN.pattern}$")]
+    content_hash: Sha256
+    set_from_tile: SimilarityRecord
+    extent: Extent
+    photo_extent: Extent
+    reach: Annotated[float, Field(ge=0)]
+    images: Annotated[int, Field(ge=1)]
+    landmarks: Annotated[int, Field(ge=1)]
+    size_bytes: Annotated[int, Field(ge=0)]
+
+    @property
+    def ref(self) -> str:
+        """``id@version`` of the map."""
+        return f"{self.map}@{self.version}"
+
+
+class CoarseRecord(Record):
+    """The coarse index over all photos of all tiles.
+
+    Attributes:
+        fingerprint: of the global descriptor that it is made with.
+        dim: numbers of a descriptor.
+        bits: of the code of a photo.
+        centroids: rows that stand for the photos of one tile.
+    """
+
+    fingerprint: FingerprintRecord
+    dim: Annotated[int, Field(ge=1)]
+    bits: Annotated[int, Field(ge=64, multiple_of=64)]
+    centroids: Annotated[int, Field(ge=1, le=64)]
+
+
+class SetWorld(Record):
+    """The frame of the set, as ``World`` is that of a map.
+
+    ``extent`` holds the extents of all tiles. ``gravity`` points down.
+    """
+
+    metric: bool
+    extent: Extent
+    anchor: Anchor | None = None
+    gravity: Direction | None = None
+
+
+class SetCounts(Record):
+    """How much of everything, over all tiles."""
+
+    tiles: Annotated[int, Field(ge=1, le=MAX_TILES)]
+    images: Annotated[int, Field(ge=1)]
+    landmarks: Annotated[int, Field(ge=1)]
+
+
+class SetManifest(Record):
+    """``manifest.json`` of a set."""
+
+    format: Literal["visloc-set"]
+    format_version: Annotated[str, Field(pattern=r"^[0-9]{1,8}\.[0-9]{1,8}$")]
+    id: Annotated[str, Field(pattern=rf"^{ID_PATTERN.pattern}$")]
+    version: Annotated[str, Field(pattern=rf"^{ID_PATTERN.pattern}$")]
+    created: str
+    world: SetWorld
+    local_features: FingerprintRecord
+    tiles: Annotated[tuple[TileRecord, ...], Field(min_length=1, max_length=MAX_TILES)]
+    coarse: CoarseRecord
+    counts: SetCounts
+    notes: tuple[str, ...] = ()
+    content_hash: Sha256
+    manifest_hash: Sha256
+    files: dict[str, FileEntry]
+
+    @model_validator(mode="after")
+    def _counts_its_tiles(self) -> SetManifest:
+        images = sum(tile.images for tile in self.tiles)
+        landmarks = sum(tile.landmarks for tile in self.tiles)
+        if self.counts != SetCounts(tiles=len(self.tiles), images=images, landmarks=landmarks):
+            raise ValueError("the counts are not those of the tiles")
+        return self
+
+    @model_validator(mode="after")
+    def _boxes_are_boxes(self) -> SetManifest:
+        for tile in self.tiles:
+            for box in (tile.extent, tile.photo_extent):
+                if not (np.array(box.min) <= np.array(box.max)).all():
+                    raise ValueError(f"a box of {tile.ref} ends before it begins")
+        return self

@@ -1,0 +1,318 @@
+"""A set of maps on disk: its manifest, and the coarse index over all of its tiles' photos."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.archive.checks import (
+    check_checksums,
+    check_files,
+    is_finite,
+    map_array,
+    read_any_manifest,
+    read_model,
+)
+from visloc.archive.places import GeoCircle, circle_of, down_of
+from visloc.archive.reader import MapOutline, outline_of, verify_map
+from visloc.archive.schema import Extent, FingerprintRecord, Geodetic
+from visloc.archive.set_schema import (
+    SET_FORMAT,
+    SET_MAJOR,
+    SET_MINOR,
+    SetManifest,
+    SetWorld,
+    TileRecord,
+)
+from visloc.archive.writer import Files
+from visloc.errors import InvalidInput, MapCorrupt
+from visloc.retrieval.rows import GlobalRows
+
+SET_CODES = "coarse/codes.npy"
+_OFFSETS, _MODEL = "coarse/offsets.npy", "coarse/model.npz"
+_CENTROIDS, _SCALES = "coarse/centroids.npy", "coarse/centroids.scales.npy"
+_FILES = (SET_CODES, _OFFSETS, _MODEL, _CENTROIDS, _SCALES)
+# The arrays of the model: what localvlad learns, and the planes whose sides are the bits.
+_MODEL_ARRAYS = ("vocabulary", "mean", "axes", "planes")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SetOutline:
+    """What a version of a set says about itself.
+
+    Attributes:
+        manifest: ``manifest.json``.
+        photo_boxes: (T, 2, 3) of each tile, smallest and largest coordinates of its photos'
+            centres in the set's frame.
+        reaches: (T,) how far the photos of each tile see, in the set's unit.
+    """
+
+    manifest: SetManifest
+    photo_boxes: NDArray[np.float64]
+    reaches: NDArray[np.float64]
+
+    @property
+    def ref(self) -> str:
+        """``id@version``."""
+        return f"{self.manifest.id}@{self.manifest.version}"
+
+    @property
+    def tiles(self) -> tuple[TileRecord, ...]:
+        """The maps of the set."""
+        return self.manifest.tiles
+
+    @property
+    def gravity(self) -> NDArray[np.float64] | None:
+        """(3,) unit vector that points down in the set's frame; None where that is not known."""
+        world = self.manifest.world
+        if world.gravity is not None:
+            return np.array(world.gravity)
+        return None if self.geodetic is None else down_of(self.geodetic)
+
+    @property
+    def geodetic(self) -> Geodetic | None:
+        """Where the set's frame lies on Earth; None where that is not known."""
+        anchor = self.manifest.world.anchor
+        return None if anchor is None else anchor.geodetic
+
+    @property
+    def place(self) -> GeoCircle | None:
+        """A circle on Earth that holds all tiles; None where that is not known."""
+        return circle_of(self.manifest.world)
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the set's own files but the manifest; those of its tiles are not counted."""
+        return sum(entry.size for entry in self.manifest.files.values())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoarseIndex:
+    """Every photo of every tile in a few bytes, and every tile in a few rows.
+
+    Attributes:
+        fingerprint: of the global descriptor.
+        model: its arrays, and ``planes`` (D, bits): bit b of a photo's code says on which side of
+            plane b its descriptor lies.
+        codes: (N, bits / 64) uint64, the codes of all photos, tile by tile.
+        offsets: (T + 1,) int64; rows offsets[t]:offsets[t + 1] of ``codes`` belong to tile t.
+        centroids: (T * C, D) rows; the C rows of tile t stand for its photos.
+    """
+
+    fingerprint: FingerprintRecord
+    model: Mapping[str, NDArray[np.float32]]
+    codes: NDArray[np.uint64]
+    offsets: NDArray[np.int64]
+    centroids: GlobalRows
+
+    @property
+    def bits(self) -> int:
+        """Length of a code."""
+        return 64 * int(self.codes.shape[1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapSet(SetOutline):
+    """One version of a set, open for reading. Its tiles are not.
+
+    Attributes:
+        path: its folder.
+        coarse: the index; its codes are mapped from disk while it lives.
+    """
+
+    path: Path
+    coarse: CoarseIndex
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SetContent:
+    """Everything a set holds, but its id, version and creation time."""
+
+    world: SetWorld
+    local_features: FingerprintRecord
+    tiles: tuple[TileRecord, ...]
+    coarse: CoarseIndex
+    notes: tuple[str, ...] = ()
+
+
+def write_set(folder: Path, content: SetContent, *, set_id: str, version: str, created: str) -> str:
+    """Write a set into an empty folder. All files are on disk when this returns.
+
+    Args:
+        folder: exists and is empty.
+        content: the set.
+        set_id: the set's id.
+        version: its version, or a prefix ending in ``-``, to which a part of the content hash
+            is appended.
+        created: ISO 8601 in UTC.
+
+    Returns:
+        The version.
+    """
+    files, coarse, tiles = Files(folder), content.coarse, content.tiles
+    scales = coarse.centroids.scales
+    if scales is None:
+        raise AssertionError("centroids are stored in 8 bits")
+    files.write_array(SET_CODES, "<u8", coarse.codes)
+    files.write_array(_OFFSETS, "<i8", coarse.offsets)
+    files.write_array(_CENTROIDS, "|i1", coarse.centroids.values)
+    files.write_array(_SCALES, "<f4", scales)
+    files.write_model(_MODEL, coarse.model)
+    manifest = {
+        "format": SET_FORMAT,
+        "format_version": f"{SET_MAJOR}.{SET_MINOR}",
+        "id": set_id,
+        "created": created,
+        "world": content.world.model_dump(mode="json"),
+        "local_features": content.local_features.model_dump(mode="json"),
+        "tiles": [tile.model_dump(mode="json") for tile in tiles],
+        "coarse": {
+            "fingerprint": coarse.fingerprint.model_dump(mode="json"),
+            "dim": coarse.centroids.values.shape[1],
+            "bits": coarse.bits,
+            "centroids": len(coarse.centroids) // len(tiles),
+        },
+        "counts": {
+            "tiles": len(tiles),
+            "images": sum(tile.images for tile in tiles),
+            "landmarks": sum(tile.landmarks for tile in tiles),
+        },
+        "notes": list(content.notes),
+        "files": files.entries(),
+    }
+    return files.finish(manifest, version)
+
+
+def read_set_outline(folder: Path) -> SetOutline:
+    """Read the manifest of a set; its arrays need not be there.
+
+    Raises:
+        MapCorrupt: as ``read_manifest``.
+        InvalidInput: ``set.is_map`` when it is a map.
+    """
+    outline = read_any_outline(folder)
+    if not isinstance(outline, SetOutline):
+        raise InvalidInput(
+            "set.is_map",
+            "this is a map, not a set of maps",
+            field="map",
+            expected="a set",
+            got=outline.ref,
+        )
+    return outline
+
+
+def read_any_outline(folder: Path) -> MapOutline | SetOutline:
+    """Read the small files of a map or a set that say what it is.
+
+    Raises:
+        MapCorrupt: with the file that is wrong.
+    """
+    manifest = read_any_manifest(folder)
+    return _outline(manifest) if isinstance(manifest, SetManifest) else outline_of(folder, manifest)
+
+
+def open_set(folder: Path) -> MapSet:
+    """Open a set after checking its manifest and the presence and size of its files.
+
+    Raises:
+        MapCorrupt: with the file that is wrong.
+        InvalidInput: ``set.is_map``.
+    """
+    outline = read_set_outline(folder)
+    manifest = outline.manifest
+    check_files(folder, manifest)
+    for name in _FILES:
+        if name not in manifest.files:
+            raise MapCorrupt(
+                "map.file_missing", "a file that every set has is not listed", field=name
+            )
+    record, num_tiles = manifest.coarse, manifest.counts.tiles
+    num_rows = num_tiles * record.centroids
+    offsets = map_array(folder, _OFFSETS, "<i8", (num_tiles + 1,), load=True)
+    expected = np.cumsum([0, *(tile.images for tile in manifest.tiles)])
+    if not np.array_equal(offsets, expected):
+        raise MapCorrupt(
+            "map.range", "the offsets are not those of the tiles", field=str(folder / _OFFSETS)
+        )
+    coarse = CoarseIndex(
+        fingerprint=record.fingerprint,
+        model=_read_coarse_model(folder, manifest),
+        codes=map_array(folder, SET_CODES, "<u8", (manifest.counts.images, record.bits // 64)),
+        offsets=offsets,
+        # Read with every query: held in memory.
+        centroids=GlobalRows(
+            map_array(folder, _CENTROIDS, "|i1", (num_rows, record.dim), load=True),
+            map_array(folder, _SCALES, "<f4", (num_rows,), load=True),
+        ),
+    )
+    return MapSet(manifest, outline.photo_boxes, outline.reaches, folder, coarse)
+
+
+def verify_set(folder: Path) -> MapSet:
+    """Open a set and read every byte of it: checksums, then ranges.
+
+    Whether its tiles are there is for ``MapStore.publish``.
+
+    Raises:
+        MapCorrupt: with the file and what is wrong.
+    """
+    opened = open_set(folder)
+    check_checksums(folder, opened.manifest)
+    scales = opened.coarse.centroids.scales
+    if scales is None or not is_finite(scales) or scales.min() < 0:
+        raise MapCorrupt("map.range", "numbers are out of their range", field=str(folder / _SCALES))
+    return opened
+
+
+def verify_any(folder: Path) -> MapOutline | SetOutline:
+    """Open a map or a set and read every byte of it.
+
+    Raises:
+        MapCorrupt: with the file and what is wrong.
+    """
+    if isinstance(read_any_manifest(folder), SetManifest):
+        return verify_set(folder)
+    return verify_map(folder)
+
+
+def joined_extent(extents: list[Extent]) -> Extent:
+    """Return the smallest box that holds some boxes."""
+    low = np.min([extent.min for extent in extents], axis=0)
+    high = np.max([extent.max for extent in extents], axis=0)
+    return Extent(min=low.tolist(), max=high.tolist())
+
+
+def _outline(manifest: SetManifest) -> SetOutline:
+    boxes = [(tile.photo_extent.min, tile.photo_extent.max) for tile in manifest.tiles]
+    reaches = [tile.reach for tile in manifest.tiles]
+    return SetOutline(manifest, np.array(boxes), np.array(reaches))
+
+
+def _read_coarse_model(folder: Path, manifest: SetManifest) -> dict[str, NDArray[np.float32]]:
+    """Read the model and check that its arrays fit each other and the manifest."""
+    model = read_model(folder, _MODEL)
+    record = manifest.coarse
+    shapes = {name: model[name].shape if name in model else () for name in _MODEL_ARRAYS}
+    size = math.prod(shapes["vocabulary"])
+    expected = {
+        "vocabulary": shapes["vocabulary"],
+        "mean": (size,),
+        "axes": (size, record.dim),
+        "planes": (record.dim, record.bits),
+    }
+    if len(shapes["vocabulary"]) != 2 or shapes != expected or model.keys() != expected.keys():
+        raise MapCorrupt(
+            "map.array",
+            "the arrays of the coarse model do not fit each other or the manifest",
+            field=str(folder / _MODEL),
+            expected=f"vocabulary (K, d), mean (K d), axes (K d, {record.dim}), planes "
+            f"({record.dim}, {record.bits})",
+            got=str(shapes),
+        )
+    return model
