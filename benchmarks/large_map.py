@@ -17,7 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.archive import GlobalFeatures, ImageRecord, Landmarks, Map, MapContent, write_map
+from visloc.archive import (
+    GlobalFeatures,
+    ImageRecord,
+    Landmarks,
+    Map,
+    MapContent,
+    pose_row,
+    write_map,
+)
 from visloc.features.vlad import VOCABULARY_SIZE
 from visloc.features.whitening import WHITENING_MAX_DIMS
 from visloc.geometry import Pose
@@ -132,15 +140,15 @@ def _images(source: Map, place: Place, num_photos: int) -> tuple[ImageRecord, ..
     return tuple(made)
 
 
-def _poses(source: Map, place: Place, num_photos: int) -> tuple[Pose, ...]:
+def _poses(source: Map, place: Place, num_photos: int) -> NDArray[np.float64]:
     rows = source.image_poses[place.photos]
     poses = [Pose.from_quaternion(row[:4], row[4:]) for row in rows]
     made = []
     for row in range(num_photos):
         number, photo = divmod(row, len(poses))
         pose, shift = poses[photo], np.array([PITCH_M * number, 0.0, 0.0])
-        made.append(Pose(pose.rotation, pose.translation - pose.rotation @ shift))
-    return tuple(made)
+        made.append(pose_row(Pose(pose.rotation, pose.translation - pose.rotation @ shift)))
+    return np.array(made)
 
 
 def _landmarks(source: Map, place: Place, work: Path, num_places: int, last: int) -> Landmarks:

@@ -24,7 +24,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from visloc.archive import GlobalFeatures, ImageRecord, Landmarks, MapContent, write_map
+from visloc.archive import GlobalFeatures, ImageRecord, Landmarks, MapContent, pose_row, write_map
 from visloc.archive.schema import FingerprintRecord
 from visloc.geometry import Camera, Pose
 
@@ -120,7 +120,7 @@ def write_storey(folder: Path, num_points: int) -> None:
             cameras={"camera": Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))},
             rigs={},
             images=tuple(ImageRecord(f"{i:04d}.jpg", "camera", i) for i in range(photos)),
-            image_poses=tuple(_pose(i) for i in range(photos)),
+            image_poses=np.array([pose_row(_pose(i)) for i in range(photos)]),
             landmarks=Landmarks(
                 origin=np.zeros(3),
                 points=points.astype(np.float32),

@@ -6,7 +6,6 @@ import math
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
@@ -32,6 +31,7 @@ from mapping.outputs import refuse_existing
 from mapping.pairing import PAIRINGS, write_pairs
 from mapping.photos import MappingPhoto, collect_photos
 from mapping.previews import keep_photos
+from mapping.publishing import PAIRS, publish_content
 from mapping.rgbd import DepthSettings, landmarks_from_depth, refuse_without_depth
 from mapping.sfm import (
     SfmSettings,
@@ -50,7 +50,7 @@ from visloc.archive import (
     ImageRecord,
     MapContent,
     MapStore,
-    write_map,
+    pose_row,
 )
 from visloc.errors import Conflict, InvalidInput, Unavailable
 from visloc.features import DEFAULT_GLOBAL_FEATURES, DEFAULT_LOCAL_FEATURES
@@ -494,7 +494,7 @@ def _content(
         },
         rigs={
             rig: {
-                sensor: Pose(pose.rotation, pose.translation * made.rig_scale)
+                sensor: pose_row(Pose(pose.rotation, pose.translation * made.rig_scale))
                 for sensor, pose in members.items()
             }
             for rig, members in known_rigs(
@@ -509,7 +509,7 @@ def _content(
             )
             for photo in placed
         ),
-        image_poses=tuple(view.cam_from_world for view in made.views),
+        image_poses=np.array([pose_row(view.cam_from_world) for view in made.views]),
         landmarks=made.landmarks,
         local_fingerprint=FingerprintRecord.of(features.fingerprint),
         computed_with=features.computed_with,
@@ -549,7 +549,6 @@ def _publish(
     workers: Workers,
     progress: Progress,
 ) -> Path:
-    now = datetime.now(UTC)
     incoming = work_root / "incoming"
     shutil.rmtree(incoming, ignore_errors=True)  # of a build that was killed here
     incoming.mkdir(parents=True)
@@ -558,17 +557,10 @@ def _publish(
             keep_photos(incoming, kept, workers, progress)
         progress("archive", 0, 1)
         if made.pairs is not None:
-            write_pairs(incoming / "pairs.txt", *made.pairs)
+            write_pairs(incoming / PAIRS, *made.pairs)
         if made.imported is not None:
             made.imported.write(incoming)
-        version = write_map(
-            incoming,
-            content,
-            map_id=settings.map_id,
-            version=now.strftime("%Y%m%dT%H%M%S.%f")[:-3] + "Z-",
-            created=now.isoformat(timespec="seconds"),
-        )
-        folder = store.publish(incoming, settings.map_id, version)
+        folder = publish_content(store, incoming, content, settings.map_id)
         progress("archive", 1, 1)
         return folder
     finally:

@@ -10,7 +10,6 @@ import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +23,7 @@ from mapping.anchor import (
     align_positions,
     coordinate_system,
 )
+from mapping.publishing import new_version
 from mapping.stages import exclusive
 from visloc.archive import Anchor, Geodetic, Map, MapStore, down_of, write_anchored
 from visloc.errors import Conflict, DatasetError, InvalidInput
@@ -267,19 +267,14 @@ def publish_anchored(opened: Map, found: Georeference, maps_dir: Path, *, force:
             "--force publishes a new version and keeps the old one",
             field="MAP",
         )
-    map_id, now = opened.manifest.id, datetime.now(UTC)
+    map_id = opened.manifest.id
     store = MapStore(maps_dir)
     with (
         exclusive(maps_dir / ".work" / f"{map_id}.lock"),
         store.incoming() as incoming,
     ):
-        version = write_anchored(
-            opened,
-            incoming,
-            found.anchor,
-            version=now.strftime("%Y%m%dT%H%M%S.%f")[:-3] + "Z-",
-            created=now.isoformat(timespec="seconds"),
-        )
+        version, created = new_version()
+        version = write_anchored(opened, incoming, found.anchor, version=version, created=created)
         return store.publish(incoming, map_id, version)
 
 

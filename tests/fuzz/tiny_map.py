@@ -14,6 +14,7 @@ from visloc.archive import (
     ImageRecord,
     Landmarks,
     MapContent,
+    pose_row,
     write_map,
 )
 from visloc.geometry import Camera, Pose
@@ -32,10 +33,13 @@ def write_tiny_map(folder: Path, local_features: str = "sift") -> None:
         settings={"max_error_px": 4.0},
         notes=("one photo has no pose",),
         cameras={"cam": Camera("OPENCV", 64, 48, (50.0, 50.0, 32.0, 24.0, 0.1, 0.0, 0.0, 0.0))},
-        rigs={"rig": {"cam": Pose.from_quaternion([0.6, 0.8, 0.0, 0.0], [1.0, 2.0, 3.0])}},
+        rigs={"rig": {"cam": (0.6, 0.8, 0.0, 0.0, 1.0, 2.0, 3.0)}},
         images=tuple(ImageRecord(name=f"{i}.jpg", camera="cam", timestamp=i) for i in range(3)),
-        image_poses=tuple(
-            Pose.from_quaternion(rng.normal(size=4), rng.normal(size=3)) for _ in range(3)
+        image_poses=np.array(
+            [
+                pose_row(Pose.from_quaternion(rng.normal(size=4), rng.normal(size=3)))
+                for _ in range(3)
+            ]
         ),
         landmarks=Landmarks(
             origin=np.array([500_000.0, 0.0, 10.0]),

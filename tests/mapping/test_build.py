@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import mapping.build
+import mapping.publishing
 from mapping.build import BuildSettings, build_map
 from mapping.rgbd import DepthSettings
 from mapping.stages import exclusive
@@ -413,7 +413,7 @@ def test_a_full_disk_is_named_and_the_same_build_resumes(
 
     before = MapStore(maps_dir).open("room")
     with monkeypatch.context() as full:
-        full.setattr(mapping.build, "write_map", write_on_full_disk)
+        full.setattr(mapping.publishing, "write_map", write_on_full_disk)
         with pytest.raises(Unavailable, match=r"No space left on device.*resumes") as caught:
             build(sample / "mapping", maps_dir)
     assert caught.value.code == "storage.failed"

@@ -21,6 +21,7 @@ from visloc.archive import (
     MapContent,
     MapStore,
     open_map,
+    pose_row,
     write_map,
 )
 from visloc.errors import Conflict, DatasetError, InvalidInput
@@ -59,13 +60,13 @@ def make_map(
         settings={},
         notes=(),
         cameras=CAMERAS,
-        rigs={"rig": {name: Pose.identity() for name in CAMERAS}},
+        rigs={"rig": {name: pose_row(Pose.identity()) for name in CAMERAS}},
         images=tuple(
             ImageRecord(name=name, camera=camera, timestamp=10 * i)
             for i, (name, camera) in enumerate(zip(names, cameras, strict=True))
         ),
-        image_poses=tuple(
-            Pose.from_quaternion(rng.normal(size=4), rng.normal(size=3)) for _ in names
+        image_poses=np.array(
+            [pose_row(Pose.from_quaternion(rng.normal(size=4), rng.normal(size=3))) for _ in names]
         ),
         landmarks=Landmarks(
             origin=ORIGIN,

@@ -28,7 +28,7 @@ from visloc.archive.sets import (
     write_set,
 )
 from visloc.archive.store import MapStore
-from visloc.archive.writer import GlobalFeatures, Landmarks, MapContent, write_map
+from visloc.archive.writer import GlobalFeatures, Landmarks, MapContent, pose_row, write_map
 
 __all__ = [
     "Anchor",
@@ -56,6 +56,7 @@ __all__ = [
     "down_of",
     "open_map",
     "open_set",
+    "pose_row",
     "read_any_outline",
     "read_outline",
     "read_set_outline",

@@ -45,7 +45,7 @@ def write_anchored(opened: Map, folder: Path, anchor: Anchor, *, version: str, c
     world["anchor"] = anchor.model_dump()
     for name in opened.manifest.files:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        _link(opened.path / name, folder / name)
+        link_or_copy(opened.path / name, folder / name)
     digest = content_hash(manifest)
     manifest["content_hash"] = digest
     manifest["version"] = version + digest[:8] if version.endswith("-") else version
@@ -58,7 +58,8 @@ def write_anchored(opened: Map, folder: Path, anchor: Anchor, *, version: str, c
     return str(manifest["version"])
 
 
-def _link(source: Path, target: Path) -> None:
+def link_or_copy(source: Path, target: Path) -> None:
+    """Make a file of a map that of another one too: as a hard link where there are such."""
     try:
         target.hardlink_to(source)
     except OSError as error:

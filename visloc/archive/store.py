@@ -129,7 +129,13 @@ class MapStore:
         return read_published_outline(self.folder(ref))
 
     def publish(
-        self, incoming: Path, map_id: str, version: str, *, make_current: bool = True
+        self,
+        incoming: Path,
+        map_id: str,
+        version: str,
+        *,
+        make_current: bool = True,
+        based_on: str | None = None,
     ) -> Path:
         """Verify a finished map folder, give it its place, and make it current.
 
@@ -143,18 +149,27 @@ class MapStore:
             version: the version's name.
             make_current: whether it takes over from the version in use. A map without a current
                 version is not among ``ids``.
+            based_on: the version that it was made from, if it was made from one, which must still
+                be the one in use: what another one brought would be lost.
 
         Returns:
             The folder of the published version.
 
         Raises:
-            Conflict: ``map.version_exists``; ``set.id_is_map``, ``map.id_is_set``; ``set.tile``,
-                ``set.features``.
+            Conflict: ``map.version_exists``, ``map.outdated``; ``set.id_is_map``,
+                ``map.id_is_set``; ``set.tile``, ``set.features``.
             NotFound: ``set.tile`` when a tile of a set is not in the store.
             MapCorrupt: what ``verify_any`` finds, or ``map.renamed`` when the manifest names
                 another id or version.
         """
-        return self._place(incoming, map_id, version, make_current=make_current, keeps_rules=True)
+        return self._place(
+            incoming,
+            map_id,
+            version,
+            make_current=make_current,
+            keeps_rules=True,
+            based_on=based_on,
+        )
 
     def keep_copy(self, incoming: Path, map_id: str, version: str) -> Path:
         """Take in a version that another store has published: as ``publish``, not made current.
@@ -164,7 +179,14 @@ class MapStore:
         return self._place(incoming, map_id, version, make_current=False, keeps_rules=False)
 
     def _place(
-        self, incoming: Path, map_id: str, version: str, *, make_current: bool, keeps_rules: bool
+        self,
+        incoming: Path,
+        map_id: str,
+        version: str,
+        *,
+        make_current: bool,
+        keeps_rules: bool,
+        based_on: str | None = None,
     ) -> Path:
         target = self.root / checked_name(map_id, "map") / checked_name(version, "map version")
         manifest = verify_any(incoming).manifest
@@ -176,6 +198,8 @@ class MapStore:
             target.parent.mkdir(parents=True, exist_ok=True)
             if target.exists():
                 raise version_exists(map_id, version)
+            if based_on is not None and _current_or_none(self, map_id) != based_on:
+                raise _outdated(map_id, based_on, _current_or_none(self, map_id))
             for folder in (*(path for path in incoming.rglob("*") if path.is_dir()), incoming):
                 _sync_folder(folder)
             if make_current:  # first what a full disk could refuse
@@ -369,6 +393,16 @@ def version_in_use(map_id: str, version: str, others: Sequence[str]) -> Conflict
         field="map",
         expected=f"one of: {', '.join(others)}",
         got=f"{map_id}@{version}",
+    )
+
+
+def _outdated(map_id: str, based_on: str, current: str | None) -> Conflict:
+    return Conflict(
+        "map.outdated",
+        "another version of the map came into use meanwhile; run the same command again on it",
+        field="map",
+        expected=f"{map_id}@{based_on}",
+        got="no version" if current is None else f"{map_id}@{current}",
     )
 
 

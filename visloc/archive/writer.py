@@ -42,6 +42,9 @@ _MAX_KEYPOINT_STEP_PX = 0.25
 # Matrices of a model with more numbers than this are stored in 8 bits.
 _MAX_FLOAT_MODEL = 2**16
 
+# qw qx qy qz tx ty tz
+PoseRow = tuple[float, ...]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Landmarks:
@@ -72,11 +75,18 @@ class Landmarks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GlobalFeatures:
-    """One global descriptor of all mapping photos, with its model: empty if it is ready-made."""
+    """One global descriptor of all mapping photos.
+
+    Attributes:
+        fingerprint: which.
+        descriptors: (n, D) unit rows; zero rows for blank photos.
+        model: its float32 arrays, or as a map stores them: large ones in int8 beside their scales.
+            Empty if the descriptor is ready-made.
+    """
 
     fingerprint: FingerprintRecord
     descriptors: NDArray[np.float32]
-    model: Mapping[str, NDArray[np.float32]]
+    model: Mapping[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,8 +94,11 @@ class MapContent:
     """Everything a map holds, but its id, version and creation time.
 
     ``descriptors()`` yields, photo by photo, the unit descriptors (m_i, D) float32 of that photo's
-    observations in the order of ``landmarks``; it is read twice. ``gravity`` is the unit vector
-    that points down in the world, None where that is not known. ``computed_with`` tells what
+    observations in the order of ``landmarks``; it is read twice. ``descriptor_scale`` is the value
+    of one of the steps they are stored in: that of the map they were read from, so that they are
+    stored as they were; None for one that fits the largest. ``image_poses`` are cam_from_world
+    (n, 7), and those of rigs cam_from_rig (7,), as ``pose_row`` has them. ``gravity`` is the unit
+    vector that points down in the world, None where that is not known. ``computed_with`` tells what
     computed the local features, for people. ``fusion`` is how queries rank the photos unless they
     say otherwise. Arrays may be mapped from files: none is copied whole.
     """
@@ -95,9 +108,9 @@ class MapContent:
     settings: Mapping[str, JsonValue]
     notes: tuple[str, ...]
     cameras: Mapping[str, Camera]
-    rigs: Mapping[str, Mapping[str, Pose]]
+    rigs: Mapping[str, Mapping[str, PoseRow]]
     images: tuple[ImageRecord, ...]
-    image_poses: tuple[Pose, ...]
+    image_poses: NDArray[np.float64]
     landmarks: Landmarks
     local_fingerprint: FingerprintRecord
     max_keypoints: int
@@ -108,6 +121,15 @@ class MapContent:
     gravity: Vector | None = None
     computed_with: str | None = None
     fusion: LateFusion = EQUAL_GHARM
+    descriptor_scale: float | None = None
+
+
+def pose_row(pose: Pose) -> PoseRow:
+    """Return a pose as it is stored: qw qx qy qz tx ty tz.
+
+    Of a row that was read as a pose, the last digit can differ; rows that stay are passed on.
+    """
+    return (*pose.rotation_wxyz.tolist(), *pose.translation.tolist())
 
 
 def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, created: str) -> str:
@@ -134,14 +156,13 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
                 for key, c in content.cameras.items()
             },
             "rigs": {
-                rig: {key: _row(pose) for key, pose in members.items()}
+                rig: {key: list(row) for key, row in members.items()}
                 for rig, members in content.rigs.items()
             },
         },
     )
     files.write_json("images.json", {"images": [asdict(image) for image in content.images]})
-    poses = np.array([_row(pose) for pose in content.image_poses])
-    files.write_array("image_poses.npy", "<f8", poses)
+    files.write_array("image_poses.npy", "<f8", content.image_poses)
     files.write_array("landmarks.npy", "<f4", landmarks.points)
     files.write_array("landmark_track_length.npy", "<u2", landmarks.track_lengths)
     files.write_array("landmark_error_px.npy", "<f2", landmarks.errors_px, _within_float16)
@@ -153,7 +174,10 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
     files.write_array("observation_landmarks.npy", "<u4", landmarks.observed)
     keypoint_step = _write_keypoints(files, landmarks.keypoints, content.cameras)
     scale = _write_descriptors(
-        files, content.descriptors, (len(landmarks.observed), content.descriptor_dim)
+        files,
+        content.descriptors,
+        (len(landmarks.observed), content.descriptor_dim),
+        content.descriptor_scale,
     )
     clusters = [_write_global(files, features) for features in content.global_features]
     extent = landmarks.points.min(axis=0), landmarks.points.max(axis=0)
@@ -200,10 +224,6 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
         "files": files.entries(),
     }
     return files.finish(manifest, version)
-
-
-def _row(pose: Pose) -> list[float]:
-    return [*pose.rotation_wxyz.tolist(), *pose.translation.tolist()]
 
 
 class Files:
@@ -324,21 +344,28 @@ def _write_keypoints(
 
 
 def _write_descriptors(
-    files: Files, descriptors: Callable[[], Iterator[NDArray[np.float32]]], shape: tuple[int, int]
+    files: Files,
+    descriptors: Callable[[], Iterator[NDArray[np.float32]]],
+    shape: tuple[int, int],
+    scale: float | None,
 ) -> float:
     """Store unit descriptors in 8 bits and return the value of one step.
 
-    One step for the whole map: it keeps products of stored integers comparable.
+    One step for the whole map: it keeps products of stored integers comparable. Values beyond
+    what a given step can hold become the largest.
     """
-    largest = max((float(np.abs(block).max(initial=0.0)) for block in descriptors()), default=0.0)
-    scale = (largest or 1.0) / 127.0
+    if scale is None:
+        blocks = descriptors()
+        largest = max((float(np.abs(block).max(initial=0.0)) for block in blocks), default=0.0)
+        scale = (largest or 1.0) / 127.0
+    step = np.float32(scale)
     num_rows = 0
 
     def stored() -> Iterator[NDArray[np.int8]]:
         nonlocal num_rows
         for block in descriptors():
             num_rows += len(block)
-            yield np.rint(block / np.float32(scale)).astype(np.int8)
+            yield np.clip(np.rint(block / step), -127, 127).astype(np.int8)
 
     files.write_blocks("observation_descriptors.npy", "|i1", shape, stored())
     if num_rows != shape[0]:
@@ -369,11 +396,11 @@ def _write_global(files: Files, features: GlobalFeatures) -> int | None:
     return len(clusters.centers)
 
 
-def _stored_model(model: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[Any]]:
+def _stored_model(model: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """A model with its large matrices in 8 bits, which have a scale for each column."""
     stored: dict[str, NDArray[Any]] = {}
     for name, array in model.items():
-        if array.ndim != 2 or array.size <= _MAX_FLOAT_MODEL:
+        if array.ndim != 2 or array.size <= _MAX_FLOAT_MODEL or array.dtype == np.int8:
             stored[name] = array
             continue
         largest = np.abs(array).max(axis=0)

@@ -18,6 +18,7 @@ from visloc.archive import (
     Map,
     MapContent,
     open_map,
+    pose_row,
     write_map,
 )
 from visloc.geometry import Camera, Pose
@@ -110,12 +111,15 @@ def make_map(tmp_path_factory: pytest.TempPathFactory) -> MakeMap:
             settings={},
             notes=(),
             cameras=dict.fromkeys(names, CAMERA),
-            rigs=rigs or {},
+            rigs={
+                rig: {key: pose_row(pose) for key, pose in members.items()}
+                for rig, members in (rigs or {}).items()
+            },
             images=tuple(
                 ImageRecord(f"{i}.jpg", name, i if timestamps is None else timestamps[i])
                 for i, name in enumerate(names)
             ),
-            image_poses=tuple(poses),
+            image_poses=np.array([pose_row(pose) for pose in poses]),
             landmarks=Landmarks(
                 origin=np.zeros(3),
                 points=points[known],

@@ -29,7 +29,7 @@ from visloc.archive import write_map as write_map_to
 from visloc.archive.checks import SCALES, content_hash, json_text, manifest_hash, read_model
 from visloc.archive.packed import pack_map, unpack_map
 from visloc.errors import MapCorrupt
-from visloc.geometry import Camera, Pose
+from visloc.geometry import Camera
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def content_of(opened: Map) -> MapContent:
         cameras=opened.cameras,
         rigs={},
         images=opened.images,
-        image_poses=tuple(Pose.from_quaternion(p[:4], p[4:]) for p in opened.image_poses),
+        image_poses=opened.image_poses,
         landmarks=visloc.archive.Landmarks(
             origin=np.array(manifest.world.origin),
             points=opened.landmarks,

@@ -1,0 +1,90 @@
+"""Publishing what a job made: how versions are named, and what lies beside the arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+from mapping.imported_points import FILE_NAME as IMPORTED_POINTS
+from visloc.archive import Map, MapContent, MapStore, write_map
+from visloc.archive.anchoring import link_or_copy
+from visloc.archive.schema import photo_file
+
+PAIRS = "pairs.txt"
+
+
+def photo_files(opened: Map) -> list[Path]:
+    """The small pictures that a map keeps of its photos, in their order; none without them."""
+    names = [photo_file(row) for row in range(len(opened.images))]
+    return [opened.path / name for name in names if name in opened.manifest.files]
+
+
+def files_beside(opened: Map) -> list[Path]:
+    """The pairs and imported points that a map keeps.
+
+    They stay true while all its photos stay, in their order and where they are.
+    """
+    names = [name for name in (PAIRS, IMPORTED_POINTS) if name in opened.manifest.files]
+    return [opened.path / name for name in names]
+
+
+def publish_edited(
+    store: MapStore,
+    content: MapContent,
+    map_id: str,
+    *,
+    photos: Sequence[Path] = (),
+    beside: Sequence[Path] = (),
+    based_on: str | None = None,
+) -> Path:
+    """Publish content that was made from maps as the current version of a map.
+
+    Args:
+        store: where.
+        content: the map.
+        map_id: its id.
+        photos: small pictures of all photos, in their order; or none.
+        beside: other files that stay true, which keep their names.
+        based_on: the version that it was made from, if it is one of the same map.
+
+    Returns:
+        The folder of the new version.
+
+    Raises:
+        Conflict: ``map.outdated`` when ``based_on`` is no longer the version in use.
+    """
+    if photos and len(photos) != len(content.images):
+        raise AssertionError(f"{len(photos)} pictures of {len(content.images)} photos")
+    with store.incoming() as incoming:
+        for row, path in enumerate(photos):
+            target = incoming / photo_file(row)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            link_or_copy(path, target)
+        for path in beside:
+            link_or_copy(path, incoming / path.name)
+        return publish_content(store, incoming, content, map_id, based_on=based_on)
+
+
+def publish_content(
+    store: MapStore,
+    incoming: Path,
+    content: MapContent,
+    map_id: str,
+    *,
+    based_on: str | None = None,
+) -> Path:
+    """Write content beside the files that are in a folder already, and publish it.
+
+    Raises:
+        Conflict: ``map.outdated``, as ``MapStore.publish``.
+    """
+    version, created = new_version()
+    version = write_map(incoming, content, map_id=map_id, version=version, created=created)
+    return store.publish(incoming, map_id, version, based_on=based_on)
+
+
+def new_version() -> tuple[str, str]:
+    """Name a version by this moment: a prefix for its content hash, and ISO 8601 in UTC."""
+    now = datetime.now(UTC)
+    return now.strftime("%Y%m%dT%H%M%S.%f")[:-3] + "Z-", now.isoformat(timespec="seconds")
