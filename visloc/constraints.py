@@ -27,14 +27,14 @@ from visloc.priors import Priors
 
 # How far beyond an area a photo may have been taken and still show it, in units of how far the
 # map's photos see; within that, photos further away count less.
-_REACH = 2.0
+REACH = 2.0
 _LEAST_REACH = 1e-9  # of a map whose photos see nothing
 # How far beyond a height band a photo may have been taken, in units of its height. On the floors
 # above and below, photos are further away than this from the band of a floor: they are taken from
 # the middle half of their own.
-_HEIGHT_REACH = 0.25
+HEIGHT_REACH = 0.25
 # An area of so many standard deviations around a pose prior is searched.
-_POSE_PRIOR_STDS = 3.0
+POSE_PRIOR_STDS = 3.0
 # A pose contradicts a prior when it is further away than so many of its own standard deviations.
 _OWN_STDS = 3.0
 # Chi-square with six degrees of freedom is above this once in 10 000 times.
@@ -146,7 +146,7 @@ class Constraints:
             prior = self._priors.position
             spheres.append((prior.position - self._geometry.origin, prior.radius))
         if self._pose is not None:
-            spheres.append((self._pose[0].center, _POSE_PRIOR_STDS * _largest_std(*self._pose)))
+            spheres.append((self._pose[0].center, POSE_PRIOR_STDS * largest_std(*self._pose)))
         if not spheres and self._priors.height is None:
             return None
         centers = self._geometry.centers
@@ -154,10 +154,10 @@ class Constraints:
         reach = max(self._geometry.reach, _LEAST_REACH)
         for center, radius in spheres:
             beyond = (np.linalg.norm(centers - center, axis=1) - radius) / reach
-            weights *= np.where(beyond <= _REACH, np.exp(-0.5 * np.maximum(beyond, 0.0) ** 2), 0.0)
+            weights *= np.where(beyond <= REACH, np.exp(-0.5 * np.maximum(beyond, 0.0) ** 2), 0.0)
         band = self._priors.height
         if band is not None and self._up is not None:
-            slack = _HEIGHT_REACH * (band.max - band.min)
+            slack = HEIGHT_REACH * (band.max - band.min)
             heights = (centers + self._geometry.origin) @ self._up
             weights[(heights < band.min - slack) | (heights > band.max + slack)] = 0.0
         return weights
@@ -169,7 +169,7 @@ class Constraints:
             pose: ``device_from_world`` relative to the origin.
             covariance: (6, 6) of it.
         """
-        own = _OWN_STDS * _largest_std(pose, covariance)
+        own = _OWN_STDS * largest_std(pose, covariance)
         center = pose.center + self._geometry.origin
         position = self._priors.position
         if position is not None:
@@ -215,8 +215,8 @@ class Constraints:
         if self._pose is None:
             return None
         pose, covariance = self._pose
-        turn = _POSE_PRIOR_STDS * math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
-        move = _POSE_PRIOR_STDS * _largest_std(pose, covariance)
+        turn = POSE_PRIOR_STDS * math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+        move = POSE_PRIOR_STDS * largest_std(pose, covariance)
         kept = []
         for view in views:
             seen = (view.cam_from_rig @ pose).apply(view.points)
@@ -256,8 +256,8 @@ def _nearest_rays(view: MatchedView, expected: NDArray[np.float64]) -> NDArray[n
     return np.column_stack([np.sin(angle)[:, None] * side, np.cos(angle)])
 
 
-def _largest_std(pose: Pose, covariance: NDArray[np.float64]) -> float:
-    """Standard deviation of a device's position along its worst axis."""
+def largest_std(pose: Pose, covariance: NDArray[np.float64]) -> float:
+    """Return the standard deviation of a device's position along its worst axis."""
     return math.sqrt(max(float(np.linalg.eigvalsh(position_covariance(pose, covariance))[-1]), 0.0))
 
 

@@ -1,0 +1,231 @@
+"""One coarse index over all photos of all tiles: which tiles a photo may show.
+
+A photo's stored descriptors are pooled to one vector (``localvlad``, with one vocabulary and one
+projection for all tiles), of which the signs along some planes are kept: a code of a few bytes.
+A query looks at a few rows of every tile first, then at the codes of the photos of the best tiles.
+Nothing here loops over tiles or photos in Python (docs/decisions/0022-map-sets.md).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.archive import CoarseIndex, FingerprintRecord, Map, MapSet
+from visloc.features import GlobalDescriptor, make_global_descriptor
+from visloc.features.vlad import KMEANS_MAX_WORDS, learn_words
+from visloc.features.whitening import WHITENING_MAX_PHOTOS, unit_rows
+from visloc.fingerprints import check_fingerprint
+from visloc.retrieval.rows import GlobalRows, in_8_bits
+from visloc.types import LocalFeatures
+
+CoarseModel = Mapping[str, NDArray[np.float32]]
+
+BITS = 256
+# Rows that stand for a tile: the middles of what its photos look like.
+CENTROIDS = 4
+# Tiles whose photos are looked at: so many, or this share of a larger set.
+_MIN_LOOKED_AT, _SHARE_LOOKED_AT = 400, 0.04
+# A tile is as similar to a query as its best photos are on average: one alone may be so by chance.
+_NUM_BEST = 3
+# Of a large set, so many tiles teach vocabulary and projection.
+_MAX_TEACHERS = 256
+_BLOCK_ROWS = 2**18
+_NO_PIXELS = np.empty((0, 0, 3), np.uint8)
+
+
+@dataclass(frozen=True, slots=True)
+class TileScore:
+    """How much a tile looks like a query.
+
+    Attributes:
+        tile: its row in the set.
+        score: estimated cosine similarity of its best photos, comparable within one query.
+    """
+
+    tile: int
+    score: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DescribedTile:
+    """What the index holds of one tile.
+
+    Attributes:
+        codes: (n, bits / 64) uint64, one row for each photo.
+        centroids: (CENTROIDS, D) unit rows.
+    """
+
+    codes: NDArray[np.uint64]
+    centroids: NDArray[np.float32]
+
+
+def learn(
+    open_tile: Callable[[int], Map], num_tiles: int, *, bits: int = BITS, seed: int = 0
+) -> CoarseModel:
+    """Learn the model of an index on a seeded sample of the tiles' photos.
+
+    Args:
+        open_tile: opens a tile of the set by its row.
+        num_tiles: how many there are.
+        bits: of a photo's code, a multiple of 64.
+        seed: of the sample, the vocabulary and the planes.
+    """
+    random = np.random.default_rng(seed)
+    descriptor = _descriptor()
+    teachers = np.sort(
+        random.choice(num_tiles, min(num_tiles, _MAX_TEACHERS), replace=False)
+    ).tolist()
+    opened = [open_tile(tile) for tile in teachers]
+    most = math.ceil(WHITENING_MAX_PHOTOS / len(opened))
+    photos = [
+        (tile, photo)
+        for tile in opened
+        for photo in np.unique(np.linspace(0, len(tile.images) - 1, most).astype(int)).tolist()
+    ]
+    words = [_sample(_words(*photo), KMEANS_MAX_WORDS // len(photos), random) for photo in photos]
+    model = descriptor.learn_vocabulary(np.concatenate(words), seed)
+    pooled = [descriptor.pool(_NO_PIXELS, _local(_words(*photo)), model) for photo in photos]
+    projection = descriptor.learn_projection(np.array(pooled))
+    dim = min(projection["axes"].shape[1], bits)
+    axes = np.ascontiguousarray(projection["axes"][:, :dim])
+    return {**model, "mean": projection["mean"], "axes": axes, "planes": _planes(dim, bits, random)}
+
+
+def describe(opened: Map, model: CoarseModel, *, seed: int = 0) -> DescribedTile:
+    """Describe the photos of a tile by what the map stores of them.
+
+    Args:
+        opened: the map.
+        model: of this set, or of another whose tiles have the same local features.
+        seed: of the clustering.
+    """
+    descriptor = _descriptor()
+    rows = np.array(
+        [
+            descriptor.describe(_NO_PIXELS, _local(_words(opened, photo)), model)
+            for photo in range(len(opened.images))
+        ]
+    )
+    centers = unit_rows(learn_words(rows, CENTROIDS, seed))
+    # A tile of fewer photos has some rows again.
+    centroids = centers[np.arange(CENTROIDS) % len(centers)]
+    return DescribedTile(codes_of(rows, model["planes"]), centroids)
+
+
+def coarse_index(described: Iterator[DescribedTile], model: CoarseModel) -> CoarseIndex:
+    """Return the index of tiles that were described one after another."""
+    codes, counts, centroids = [], [0], []
+    for tile in described:
+        codes.append(tile.codes)
+        counts.append(len(tile.codes))
+        centroids.append(tile.centroids)
+    return CoarseIndex(
+        fingerprint=FingerprintRecord.of(_descriptor().fingerprint),
+        model=model,
+        codes=np.concatenate(codes),
+        offsets=np.cumsum(counts, dtype=np.int64),
+        centroids=GlobalRows(*in_8_bits(np.concatenate(centroids))),
+    )
+
+
+def rank_tiles(
+    map_set: MapSet, local: LocalFeatures, allowed: NDArray[np.bool_] | None = None
+) -> tuple[TileScore, ...]:
+    """Rank tiles by how much their photos look like a query, best first.
+
+    Of a large set only those tiles are ranked that its centroids propose.
+
+    Args:
+        map_set: the set.
+        local: the query's features.
+        allowed: (T,) the tiles that may be ranked; None for all.
+
+    Raises:
+        Conflict: ``map.features`` when the index was made with another revision of the descriptor.
+    """
+    coarse = map_set.coarse
+    descriptor = _descriptor()
+    check_fingerprint(coarse.fingerprint, descriptor.fingerprint, map_set.ref)
+    return ranked(coarse, descriptor.describe(_NO_PIXELS, local, coarse.model), allowed)
+
+
+def ranked(
+    coarse: CoarseIndex, query: NDArray[np.float32], allowed: NDArray[np.bool_] | None = None
+) -> tuple[TileScore, ...]:
+    """Rank tiles by a query's descriptor (D,); as ``rank_tiles``."""
+    tiles = _proposed(coarse, query, allowed)
+    counts = coarse.offsets[tiles + 1] - coarse.offsets[tiles]
+    ends = np.cumsum(counts)
+    place = np.repeat(np.arange(len(tiles)), counts)
+    rows = np.arange(len(place)) + np.repeat(coarse.offsets[tiles] - (ends - counts), counts)
+    code = codes_of(query[None], coarse.model["planes"])[0]
+    length = coarse.bits + 1
+    # Photos by tile and by how many bits differ; of which the fewest count.
+    histogram = np.zeros((len(tiles), length), np.int64)
+    for start in range(0, len(rows), _BLOCK_ROWS):
+        some = slice(start, start + _BLOCK_ROWS)
+        differing = np.bitwise_count(coarse.codes[rows[some]] ^ code).sum(axis=1, dtype=np.int64)
+        cells = place[some] * length + differing
+        histogram += np.bincount(cells, minlength=histogram.size).reshape(histogram.shape)
+    best = np.diff(np.minimum(np.cumsum(histogram, axis=1), _NUM_BEST), axis=1, prepend=0)
+    # Two vectors lie on different sides of a random plane as often as their angle says.
+    cosines = np.cos(np.pi * np.arange(length) / coarse.bits)
+    scores = best @ cosines / np.minimum(counts, _NUM_BEST)
+    order = np.argsort(-scores, kind="stable")
+    return tuple(TileScore(int(tiles[i]), float(scores[i])) for i in order)
+
+
+def codes_of(rows: NDArray[np.float32], planes: NDArray[np.float32]) -> NDArray[np.uint64]:
+    """Return the codes (n, bits / 64) of descriptors (n, D)."""
+    packed = np.packbits(rows @ planes > 0, axis=1, bitorder="little")
+    return packed.view("<u8").astype(np.uint64)
+
+
+def _proposed(
+    coarse: CoarseIndex, query: NDArray[np.float32], allowed: NDArray[np.bool_] | None
+) -> NDArray[np.int64]:
+    """The tiles whose photos are looked at, in the order of the set."""
+    num_tiles = len(coarse.offsets) - 1
+    tiles = np.arange(num_tiles) if allowed is None else np.flatnonzero(allowed)
+    most = max(_MIN_LOOKED_AT, math.ceil(_SHARE_LOOKED_AT * num_tiles))
+    if len(tiles) <= most:
+        return tiles
+    closest = coarse.centroids.cosines(query).reshape(num_tiles, -1).max(axis=1)[tiles]
+    return np.sort(tiles[np.argpartition(-closest, most)[:most]])
+
+
+def _descriptor() -> GlobalDescriptor:
+    return make_global_descriptor("localvlad")
+
+
+def _words(opened: Map, photo: int) -> NDArray[np.float32]:
+    scale = np.float32(opened.manifest.local_features.descriptor_scale)
+    return opened.observations(photo)[1].astype(np.float32) * scale
+
+
+def _local(words: NDArray[np.float32]) -> LocalFeatures:
+    """Descriptors as local features; where they lie does not matter."""
+    nowhere = np.zeros(len(words), np.float32)
+    return LocalFeatures(np.zeros((len(words), 2), np.float32), words, nowhere, nowhere)
+
+
+def _sample(
+    words: NDArray[np.float32], most: int, random: np.random.Generator
+) -> NDArray[np.float32]:
+    if len(words) <= most:
+        return words
+    return words[np.sort(random.choice(len(words), most, replace=False))]
+
+
+def _planes(dim: int, bits: int, random: np.random.Generator) -> NDArray[np.float32]:
+    """Normals (dim, bits) of random planes; orthogonal to each other as far as there is room."""
+    blocks = []
+    for start in range(0, bits, dim):
+        square, _ = np.linalg.qr(random.normal(size=(dim, dim)))
+        blocks.append(square[:, : bits - start])
+    return np.concatenate(blocks, axis=1).astype(np.float32)

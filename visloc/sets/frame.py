@@ -1,0 +1,135 @@
+"""Between the frame of a set and that of one of its tiles, where a query is answered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.errors import InvalidInput
+from visloc.geometry import Pose, Similarity, cross_matrix
+from visloc.pose.covariance import position_covariance
+from visloc.priors import HeightBand, PosePrior, PositionPrior, Priors
+from visloc.types import InstantAnswer, Localized, NotLocalized, RigPose
+
+AnyAnswer = TypeVar("AnyAnswer", Localized, NotLocalized, InstantAnswer)
+
+
+def answer_in_set(answer: AnyAnswer, set_from_tile: Similarity) -> AnyAnswer:
+    """Move an answer of a tile to the set's frame and unit: poses, covariances, points."""
+    if isinstance(answer, Localized):
+        pose, covariance = moved_pose(answer.cam_from_world, answer.covariance, set_from_tile)
+        return replace(
+            answer,
+            cam_from_world=pose,
+            covariance=covariance,
+            position_std=_position_std(answer.cam_from_world, answer.covariance, set_from_tile),
+            inlier_points=set_from_tile.apply(answer.inlier_points),
+        )
+    if isinstance(answer, InstantAnswer):
+        images = tuple(
+            replace(image, cam_from_rig=scaled_device(image.cam_from_rig, set_from_tile.scale))
+            for image in answer.images
+        )
+        rig = None if answer.pose is None else _moved_rig(answer.pose, set_from_tile)
+        return replace(answer, images=images, pose=rig)
+    return answer
+
+
+def down_in_set(priors: Priors, down: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    """Return the unit vector (3,) that points down in a set's frame; None where it does not matter.
+
+    Args:
+        priors: in the set's frame.
+        down: (3,) what the set knows of it; None where it does not.
+
+    Raises:
+        InvalidInput: ``priors.height`` when it matters and neither of them knows.
+    """
+    if priors.height is None:
+        return None
+    if priors.gravity is not None and priors.gravity.world is not None:
+        return priors.gravity.world
+    if down is None:
+        raise InvalidInput(
+            "priors.height",
+            "this set does not know which way is down",
+            field="priors.height",
+            expected="a set of maps that were built with --gravity, or priors.gravity with its "
+            "world",
+        )
+    return down
+
+
+def priors_in_tile(
+    priors: Priors, set_from_tile: Similarity, down: NDArray[np.float64] | None
+) -> Priors:
+    """Say what priors of the set's frame mean in that of a tile.
+
+    Args:
+        priors: in the set's frame.
+        set_from_tile: of the tile.
+        down: (3,) what the set knows of down in its frame; None where it does not.
+
+    Returns:
+        The same without ``maps``, which chose the tile.
+
+    Raises:
+        InvalidInput: as ``down_in_set``.
+    """
+    tile_from_set = set_from_tile.inverse()
+    scale, position, height = tile_from_set.scale, priors.position, priors.height
+    gravity, pose, down = priors.gravity, priors.pose, down_in_set(priors, down)
+    if position is not None:
+        position = PositionPrior(tile_from_set.apply(position.position), scale * position.radius)
+    if height is not None and down is not None:
+        # Heights count from each frame's own (0, 0, 0).
+        lift = float(down @ set_from_tile.translation)
+        height = HeightBand(scale * (height.min + lift), scale * (height.max + lift))
+    if pose is not None:
+        pose = PosePrior(*moved_pose(pose.device_from_world, pose.covariance, tile_from_set))
+    if gravity is not None and gravity.world is not None:
+        gravity = replace(gravity, world=tile_from_set.rotation @ gravity.world)
+    return Priors(position=position, height=height, pose=pose, gravity=gravity)
+
+
+def moved_pose(
+    device_from_b: Pose, covariance: NDArray[np.float64], a_from_b: Similarity
+) -> tuple[Pose, NDArray[np.float64]]:
+    """Move a pose and its covariance (6, 6) to another frame and unit.
+
+    The translation t_a = scale t_b - R_a t, with R_a and t_a of the result and t of ``a_from_b``,
+    moves with that of b, and with the rotation as far as the origins lie apart.
+    """
+    pose = a_from_b.move(device_from_b)
+    jacobian = np.eye(6)
+    jacobian[3:, 3:] *= a_from_b.scale
+    jacobian[3:, :3] = cross_matrix(pose.rotation @ a_from_b.translation)
+    moved = jacobian @ covariance @ jacobian.T
+    return pose, (moved + moved.T) / 2
+
+
+def scaled_device(cam_from_rig: Pose, scale: float) -> Pose:
+    """Return where a camera sits in a rig, in units of which ``scale`` make an old one."""
+    return Pose(cam_from_rig.rotation, scale * cam_from_rig.translation)
+
+
+def _moved_rig(rig: RigPose, set_from_tile: Similarity) -> RigPose:
+    pose, covariance = moved_pose(rig.rig_from_world, rig.covariance, set_from_tile)
+    return replace(
+        rig,
+        rig_from_world=pose,
+        covariance=covariance,
+        position_std=_position_std(rig.rig_from_world, rig.covariance, set_from_tile),
+    )
+
+
+def _position_std(
+    pose: Pose, covariance: NDArray[np.float64], a_from_b: Similarity
+) -> NDArray[np.float64]:
+    """Standard deviations of a position along the axes of frame a, from the pose in frame b."""
+    # Taken in b: far from the origin of a, digits are lost.
+    turned = a_from_b.rotation @ position_covariance(pose, covariance) @ a_from_b.rotation.T
+    return np.asarray(a_from_b.scale * np.sqrt(np.maximum(np.diag(turned), 0.0)))
