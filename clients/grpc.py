@@ -23,6 +23,7 @@ from clients.messages import (
     rig_message,
     version_message,
 )
+from clients.replicas import GRPC_OPTIONS, map_header
 from clients.requests import (
     CheckReady,
     DeleteVersion,
@@ -53,12 +54,12 @@ class GrpcTransport:
 
     def __init__(self, connection: Connection) -> None:
         self._server, self._timeout_s = connection.server, connection.timeout_s
-        self._metadata = _metadata(connection)
+        self._connection = connection
         target, credentials = _target(connection), _credentials(connection)
         if credentials is None:
-            self._channel = grpc.insecure_channel(target)
+            self._channel = grpc.insecure_channel(target, GRPC_OPTIONS)
         else:
-            self._channel = grpc.secure_channel(target, credentials)
+            self._channel = grpc.secure_channel(target, credentials, GRPC_OPTIONS)
 
     def send(self, request: AnyRequest) -> JsonObject:
         """Return the answer as plain JSON, the same as over HTTP.
@@ -70,7 +71,7 @@ class GrpcTransport:
         call = self._channel.unary_unary(path, None, None)
         try:
             answer, context = call.with_call(
-                message, timeout=self._timeout_s, metadata=self._metadata
+                message, timeout=self._timeout_s, metadata=_metadata(self._connection, request)
             )
         except grpc.RpcError as error:
             raise grpc_failure(self._server, self._timeout_s, error) from error
@@ -82,7 +83,8 @@ class GrpcTransport:
         Raises:
             VislocError: as ``send``.
         """
-        call = partial(self._channel.stream_stream(_SEQUENCE, None, None), metadata=self._metadata)
+        metadata = _metadata(self._connection, start)
+        call = partial(self._channel.stream_stream(_SEQUENCE, None, None), metadata=metadata)
         yield from stream_answers(call, self._server, self._timeout_s, start, instants)
 
     def upload(self, upload: Upload, on_progress: OnProgress) -> JsonObject:
@@ -94,10 +96,9 @@ class GrpcTransport:
         feed = UploadFeed(upload, on_progress)
         call = self._channel.stream_unary(_PUT_VERSION, None, None)
         within_s = upload.done_within_s(self._timeout_s)
+        metadata = _metadata(self._connection, upload)
         try:
-            answer, context = call.with_call(
-                feed.messages(), timeout=within_s, metadata=self._metadata
-            )
+            answer, context = call.with_call(feed.messages(), timeout=within_s, metadata=metadata)
         except grpc.RpcError as error:
             raise feed.failure or grpc_failure(self._server, within_s, error) from error
         return _decoded(self._server, _read_map, answer, context.initial_metadata())
@@ -112,7 +113,6 @@ class AsyncGrpcTransport:
 
     def __init__(self, connection: Connection) -> None:
         self._server, self._timeout_s = connection.server, connection.timeout_s
-        self._metadata = _metadata(connection)
         self._connection = connection
         self._channel: grpc.aio.Channel | None = None
 
@@ -120,20 +120,21 @@ class AsyncGrpcTransport:
         """As ``GrpcTransport.send``."""
         path, message, decode = _encode(request)
         make_call = self._opened().unary_unary(path, None, None)
-        call = make_call(message, timeout=self._timeout_s, metadata=self._metadata)
+        metadata = _metadata(self._connection, request)
+        call = make_call(message, timeout=self._timeout_s, metadata=metadata)
         try:
             answer = await call
-            metadata = await call.initial_metadata()
+            said = await call.initial_metadata()
         except grpc.aio.AioRpcError as error:
             raise grpc_failure(self._server, self._timeout_s, error) from error
-        return _decoded(self._server, decode, answer, metadata)
+        return _decoded(self._server, decode, answer, said)
 
     async def stream(
         self, start: SequenceStart, instants: AsyncIterable[SentInstant]
     ) -> AsyncGenerator[JsonObject, None]:
         """As ``GrpcTransport.stream``."""
         make_call: Any = self._opened().stream_stream(_SEQUENCE, None, None)
-        call = partial(make_call, metadata=self._metadata)
+        call = partial(make_call, metadata=_metadata(self._connection, start))
         answers = stream_answers_async(call, self._server, self._timeout_s, start, instants)
         async with aclosing(answers):
             async for answer in answers:
@@ -157,9 +158,9 @@ class AsyncGrpcTransport:
         if self._channel is None:  # not in the constructor: it binds to the running loop
             target, credentials = _target(self._connection), _credentials(self._connection)
             if credentials is None:
-                self._channel = grpc.aio.insecure_channel(target)
+                self._channel = grpc.aio.insecure_channel(target, GRPC_OPTIONS)
             else:
-                self._channel = grpc.aio.secure_channel(target, credentials)
+                self._channel = grpc.aio.secure_channel(target, credentials, GRPC_OPTIONS)
         return self._channel
 
 
@@ -177,9 +178,12 @@ def _credentials(connection: Connection) -> grpc.ChannelCredentials | None:
     return grpc.ssl_channel_credentials(None if authorities is None else authorities.encode())
 
 
-def _metadata(connection: Connection) -> tuple[tuple[str, str], ...]:
+def _metadata(
+    connection: Connection, request: AnyRequest | SequenceStart | Upload
+) -> tuple[tuple[str, str], ...]:
     key = connection.api_key
-    return () if key is None else (("authorization", f"Bearer {key}"),)
+    of_key = {} if key is None else {"authorization": f"Bearer {key}"}
+    return tuple((of_key | map_header(request)).items())
 
 
 def _encode(request: AnyRequest) -> tuple[str, bytes, _Decode]:

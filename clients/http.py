@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import ssl
+import time
 from collections.abc import AsyncGenerator, AsyncIterable, Iterable, Iterator, Mapping
 from typing import Any
 
@@ -12,6 +14,7 @@ import httpx
 from clients import errors
 from clients.connection import Connection
 from clients.http_requests import NDJSON, encode_request, encode_sequence, encode_upload
+from clients.replicas import RESEND_PAUSE_S, may_resend
 from clients.requests import CheckReady, JsonObject
 from clients.rig_requests import AnyRequest, SentInstant, SequenceStart
 from clients.uploads import OnProgress, Upload, pieces, pieces_async
@@ -53,12 +56,18 @@ class HttpTransport:
         Raises:
             VislocError: what the server refused, or ``server.*``.
         """
+        got = self._ask(request)
+        if may_resend(request, got):
+            time.sleep(RESEND_PAUSE_S)
+            got = self._ask(request)
+        return _answer(self._server, self._timeout_s, request, got)
+
+    def _ask(self, request: AnyRequest) -> httpx.Response | httpx.HTTPError:
         method, path, parts = encode_request(request, self._timeout_s)
         try:
-            response = self._http.request(method, path, **parts)
+            return self._http.request(method, path, **parts)
         except httpx.HTTPError as error:
-            raise _failure(self._server, self._timeout_s, error) from error
-        return _decode(self._server, request, response)
+            return error
 
     def stream(self, start: SequenceStart, instants: Iterable[SentInstant]) -> Iterator[JsonObject]:
         """Send all instants in one request, and give each answer as it comes.
@@ -109,12 +118,18 @@ class AsyncHttpTransport:
 
     async def send(self, request: AnyRequest) -> JsonObject:
         """As ``HttpTransport.send``."""
+        got = await self._ask(request)
+        if may_resend(request, got):
+            await asyncio.sleep(RESEND_PAUSE_S)
+            got = await self._ask(request)
+        return _answer(self._server, self._timeout_s, request, got)
+
+    async def _ask(self, request: AnyRequest) -> httpx.Response | httpx.HTTPError:
         method, path, parts = encode_request(request, self._timeout_s)
         try:
-            response = await self._http.request(method, path, **parts)
+            return await self._http.request(method, path, **parts)
         except httpx.HTTPError as error:
-            raise _failure(self._server, self._timeout_s, error) from error
-        return _decode(self._server, request, response)
+            return error
 
     async def stream(
         self, start: SequenceStart, instants: AsyncIterable[SentInstant]
@@ -164,6 +179,14 @@ def _options(connection: Connection) -> dict[str, Any]:
     if connection.authorities is not None:
         options["verify"] = ssl.create_default_context(cadata=connection.authorities)
     return options
+
+
+def _answer(
+    server: str, timeout_s: float, request: AnyRequest, got: httpx.Response | httpx.HTTPError
+) -> JsonObject:
+    if isinstance(got, httpx.HTTPError):
+        raise _failure(server, timeout_s, got) from got
+    return _decode(server, request, got)
 
 
 def _decode(server: str, request: AnyRequest | None, response: httpx.Response) -> JsonObject:

@@ -10,6 +10,7 @@ import httpx
 
 from clients.features import Features
 from clients.priors import priors_as_json
+from clients.replicas import map_header
 from clients.requests import (
     CheckReady,
     DeleteVersion,
@@ -41,6 +42,11 @@ NDJSON = "application/x-ndjson"
 
 def encode_request(request: AnyRequest, timeout_s: float) -> tuple[str, str, dict[str, Any]]:
     """Return method, path and the rest of what httpx wants."""
+    method, path, parts = _encode(request, timeout_s)
+    return method, path, {**parts, "headers": map_header(request) | parts.get("headers", {})}
+
+
+def _encode(request: AnyRequest, timeout_s: float) -> tuple[str, str, dict[str, Any]]:
     match request:
         case Localize():
             headers = _headers(request.search, timeout_s)
@@ -88,13 +94,14 @@ def encode_sequence(
         asked["time_unit"] = start.time_unit
     if start.max_gap_s is not None:
         asked["max_gap_s"] = start.max_gap_s
-    headers = _headers(start.search, timeout_s) | {"Accept": NDJSON}
+    headers = _headers(start.search, timeout_s) | map_header(start) | {"Accept": NDJSON}
     return "POST", "/localize/sequence", files.form(asked, headers)
 
 
 def encode_upload(upload: Upload, timeout_s: float) -> tuple[str, str, dict[str, Any]]:
     """As ``encode_request``, for a packed map, whose bytes are the caller's to add."""
     headers = {"Content-Type": "application/zip", "Content-Length": str(upload.size_bytes)}
+    headers |= map_header(upload)
     timeout = httpx.Timeout(timeout_s, read=upload.verified_within_s(timeout_s))
     path = version_path(upload.map_id, upload.version)
     return "PUT", path, {"headers": headers, "timeout": timeout}

@@ -110,7 +110,7 @@ class Engine:
         self._uploads = Uploads(store, max_upload_bytes)
         self._following: asyncio.Task[None] | None = None
         self._started = False
-        self._draining = False
+        self._withdrawn = self._draining = False
 
     async def start(self) -> None:
         """Open and warm up all current maps. One that is broken does not keep back the others.
@@ -125,13 +125,17 @@ class Engine:
         self._following = asyncio.create_task(self._catalog.follow(self.workers))
         self._started = True
 
-    def drain(self) -> None:
+    def withdraw(self) -> None:
         """Say that the server is not ready any more, so that nobody sends it new work."""
-        self._draining = True
+        self._withdrawn = True
+
+    def drain(self) -> None:
+        """Refuse new work."""
+        self._withdrawn = self._draining = True
 
     async def close(self) -> None:
         """End the worker processes; what they work on is given up."""
-        self._draining = True
+        self._withdrawn = self._draining = True
         if self._following is not None:
             self._following.cancel()
         self.scenes.close()
@@ -142,14 +146,14 @@ class Engine:
     def status(self) -> Status:
         """What is loaded now."""
         return Status(
-            self._started and not self._draining and self.workers.alive > 0,
+            self._started and not self._withdrawn and self.workers.alive > 0,
             tuple(sorted(self.workers.loaded)),
             self._catalog.not_loaded,
         )
 
     @property
     def draining(self) -> bool:
-        """Whether the server is being stopped."""
+        """Whether new work is refused, for the server is being stopped."""
         return self._draining
 
     @property

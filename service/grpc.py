@@ -91,7 +91,7 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
         """
         first = await anext(request_iterator, None)
         id_ = request_id(first.start.request_id if first is not None else None)
-        async with self._envelope("LocalizeSequence", id_, context):
+        async with self._envelope("LocalizeSequence", id_, context, streams=True):
             start = await asyncio.to_thread(sequence_start_of, first)
             with self._engine.admit_batch():
                 async with (

@@ -80,24 +80,33 @@ class Envelope:
         self._observer = observer
 
     @asynccontextmanager
-    async def __call__(self, method: str, id_: str, context: Context) -> AsyncIterator[None]:
+    async def __call__(
+        self, method: str, id_: str, context: Context, *, streams: bool = False
+    ) -> AsyncIterator[None]:
         """Serve a call in the block.
+
+        The headers of a single answer go with it, not before: until something was answered, a
+        call that is cut off may be made again elsewhere, by the client's gRPC itself.
 
         Args:
             method: its name.
             id_: of the request.
             context: of the call.
+            streams: whether the block writes answers to the context.
         """
         caller = dict(context.invocation_metadata() or ()).get("traceparent")
         traceparent = caller if isinstance(caller, str) else None
         with self._observer.request("grpc", id_, route=method, traceparent=traceparent) as record:
             record.status = grpc.StatusCode.CANCELLED.name
+            headers = [(VERSION_KEY, visloc.__version__)]
+            if record.trace is not None:
+                headers.append(("traceresponse", record.trace.traceparent))
             try:
-                headers = [(VERSION_KEY, visloc.__version__)]
-                if record.trace is not None:
-                    headers.append(("traceresponse", record.trace.traceparent))
-                await context.send_initial_metadata(headers)
+                if streams:
+                    await context.send_initial_metadata(headers)
                 yield
+                if not streams:
+                    await context.send_initial_metadata(headers)
                 record.status = grpc.StatusCode.OK.name
             except VislocError as error:
                 await self._refuse(error, id_, context, record)

@@ -131,9 +131,14 @@ class Server:
         await self._grpc.set_serving()
 
     async def close(self, grace_s: float) -> None:
-        """Accept nothing new, and give running requests ``grace_s`` seconds to end."""
-        self.engine.drain()
+        """Accept nothing new, and give running requests ``grace_s`` seconds to end.
+
+        For ``drain_delay_s`` before that, new requests are taken although it is not ready.
+        """
+        self.engine.withdraw()
         await self._grpc.set_not_serving()
+        await asyncio.sleep(self._settings.drain_delay_s)
+        self.engine.drain()
         for server in self._http:
             server.config.timeout_graceful_shutdown = max(1, int(grace_s))
             server.should_exit = True

@@ -106,6 +106,9 @@ class ServiceSettings(BaseModel):
     arrival_timeout_s: Seconds = 20.0
     """longest time for the head of a request to arrive, and for its body, to which a second is
     added for every 100 kB; also the longest silence within a stream"""
+    drain_delay_s: Annotated[float, Field(ge=0, le=3600)] = 0.0
+    """time after SIGTERM in which new requests are still taken, and /readyz says no already: for
+    balancers to notice"""
     drain_timeout_s: Seconds = 30.0
     """time for running requests to end after SIGTERM"""
     max_image_bytes: Count = 20 * 2**20

@@ -43,6 +43,12 @@ STATUSES: Mapping[type[VislocError], tuple[HTTPStatus, grpc.StatusCode]] = {
     Forbidden: (HTTPStatus.FORBIDDEN, grpc.StatusCode.PERMISSION_DENIED),
 }
 
+# Of which the status is not their kind's. Balancers and gRPC clients send what is Unavailable once
+# more, to the next server: a photo that ended one process there would end another one here.
+_STATUSES_OF_CODES = {
+    "server.worker_died": (HTTPStatus.INTERNAL_SERVER_ERROR, grpc.StatusCode.INTERNAL)
+}
+
 RETRY_AFTER_S = 1
 
 _REQUEST_ID = re.compile(r"[\x21-\x7e]{1,128}")
@@ -50,6 +56,8 @@ _REQUEST_ID = re.compile(r"[\x21-\x7e]{1,128}")
 
 def statuses_of(error: VislocError) -> tuple[HTTPStatus, grpc.StatusCode]:
     """Return the HTTP and the gRPC status of an error, by the nearest class in the table."""
+    if error.code in _STATUSES_OF_CODES:
+        return _STATUSES_OF_CODES[error.code]
     return next(STATUSES[kind] for kind in type(error).__mro__ if kind in STATUSES)
 
 

@@ -27,7 +27,7 @@ from benchmarks.reliability.maps import (
 from benchmarks.reliability.service_process import ServiceProcess, is_alive
 from benchmarks.reliability.soak import Expected, unloaded_answers
 
-WORKER_DIED = frozenset({"503 server.worker_died", "UNAVAILABLE server.worker_died"})
+WORKER_DIED = frozenset({"500 server.worker_died", "INTERNAL server.worker_died"})
 AWAY = frozenset({"503 server.starting", "UNAVAILABLE server.starting"})
 CLIENTS = 4
 BACK_WITHIN_S = 10.0
