@@ -176,7 +176,7 @@ def moved(content: MapContent, new_from_old: Similarity, *, metric: bool) -> Map
             origin=new_from_old.apply(old.origin),
             points=turn.apply(old.points.astype(np.float64)).astype(np.float32),
         ),
-        anchor=None if content.anchor is None else _moved_anchor(content.anchor, new_from_old),
+        anchor=None if content.anchor is None else moved_anchor(content.anchor, new_from_old),
         gravity=None if gravity is None else tuple((gravity / np.linalg.norm(gravity)).tolist()),
     )
 
@@ -306,7 +306,8 @@ def _free_name(name: str, value: object, taken: Mapping[str, object]) -> str:
     return candidate
 
 
-def _moved_anchor(anchor: Anchor, new_from_old: Similarity) -> Anchor:
+def moved_anchor(anchor: Anchor, new_from_old: Similarity) -> Anchor:
+    """Return what a world rests on, in another frame of it."""
     geodetic = anchor.geodetic
     if geodetic is not None:
         pose = Pose.from_quaternion(geodetic.rotation_wxyz, geodetic.translation)
