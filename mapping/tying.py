@@ -1,0 +1,254 @@
+"""How one frame lies in another, from photos of the one that were localized in the other.
+
+Each photo says it alone, since its pose is known in both; a few centimetres of error in each would
+turn and shift the whole. So the similarity that most photos agree with is only the beginning: it
+is then refined over the 2D-3D matches of all those photos together, with one robust loss.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from mapping.anchor import MAX_SCALE_ERROR, align_poses
+from visloc.evaluation import pose_error
+from visloc.geometry import Camera, Pose, Similarity
+from visloc.pose.colmap import project
+from visloc.pose.refinement import LOSS_SCALE_PX
+from visloc.solving import registration_for
+from visloc.types import LocalizeOptions
+
+MIN_PHOTOS = 3
+# Pairs of photos that propose a similarity.
+_NUM_TRIALS = 200
+# Matches of each photo that judge a proposal, and that refine what was chosen.
+_JUDGING, _REFINING = 32, 256
+# What one photo or two say is a few times as inexact as what all of them say.
+_COARSE = 4.0
+_ROUNDS = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """A photo that was localized in another frame than its own.
+
+    Attributes:
+        pose_here: cam_from_here, in the frame that it comes from.
+        camera: intrinsics.
+        pixels: (n, 2) float64, inliers of ``pose_there``.
+        points: (n, 3) float64, what they see, in the other frame.
+        pose_there: cam_from_there, as it was localized.
+    """
+
+    pose_here: Pose
+    camera: Camera
+    pixels: NDArray[np.float64]
+    points: NDArray[np.float64]
+    pose_there: Pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tie:
+    """How the frame of some photos lies in another one.
+
+    Attributes:
+        there_from_here: the similarity.
+        tied: (n,) the photos that agree with it.
+        errors_px: (n,) of each photo, the median reprojection error of its matches from where the
+            similarity puts it; infinity for one that looks away.
+        distances: (n,) from where the similarity puts it to where it was localized, in the other
+            frame's unit.
+        angles_deg: (n,) likewise.
+        num_back: photos of the other frame, localized in this one, that agree too.
+    """
+
+    there_from_here: Similarity
+    tied: NDArray[np.bool_]
+    errors_px: NDArray[np.float64]
+    distances: NDArray[np.float64]
+    angles_deg: NDArray[np.float64]
+    num_back: int
+
+
+def tie(
+    photos: Sequence[Seen], back: Sequence[Seen] = (), *, rigid: bool, seed: int = 0
+) -> Tie | str:
+    """Find the similarity that photos of one frame, localized in another, agree on.
+
+    Args:
+        photos: of this frame, seen in the other.
+        back: of the other frame, seen in this one; with them the similarity is also that which
+            explains what they see here. May be empty.
+        rigid: whether both frames have one unit.
+        seed: equal seeds give equal ties.
+
+    Returns:
+        The tie; or why there is none, in words to follow "but": fewer than three photos, not more
+        than half of them agree, or they stand too close together to tell the scale.
+    """
+    if len(photos) < MIN_PHOTOS:
+        return f"only {len(photos)} photos were localized, and {MIN_PHOTOS} are needed"
+    views = [_View(seen, forward=True) for seen in photos]
+    views += [_View(seen, forward=False) for seen in back]
+    similarity = _proposed(views, rigid=rigid, seed=seed)
+    agrees = _agreeing(views, similarity, _COARSE)
+    for _ in range(_ROUNDS):
+        if agrees[: len(photos)].sum() < MIN_PHOTOS:
+            break
+        chosen = [view for view, use in zip(views, agrees, strict=True) if use]
+        similarity = _refined(chosen, similarity, rigid=rigid)
+        agrees = _agreeing(views, similarity, 1.0)
+    tied = agrees[: len(photos)]
+    if tied.sum() < max(MIN_PHOTOS, len(photos) // 2 + 1):
+        return (
+            f"only {tied.sum()} of {len(photos)} localized photos agree on how the frames lie to "
+            f"each other, and more than half must, {MIN_PHOTOS} at least"
+        )
+    errors = [pose_error(similarity.move(seen.pose_here), seen.pose_there) for seen in photos]
+    distances, angles = np.array(errors).T
+    doubt = None if rigid else _scale_doubt(photos, tied, distances)
+    if doubt is not None:
+        return doubt
+    medians = np.array([view.median_error(similarity) for view in views[: len(photos)]])
+    return Tie(similarity, tied, medians, distances, angles, int(agrees[len(photos) :].sum()))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    """A photo with what it sees in the other frame: there, or here if it goes back."""
+
+    seen: Seen
+    forward: bool
+
+    def thinned(self, count: int) -> _View:
+        """Keep at most so many matches, evenly."""
+        step = -(-len(self.seen.pixels) // count)
+        thin = replace(self.seen, pixels=self.seen.pixels[::step], points=self.seen.points[::step])
+        return _View(thin, self.forward)
+
+    def estimate(self) -> tuple[Pose, Pose]:
+        """The photo's pose in this frame and in the other."""
+        seen = self.seen
+        own, other = seen.pose_here, seen.pose_there
+        return (own, other) if self.forward else (other, own)
+
+    def errors(self, there_from_here: Similarity) -> NDArray[np.float64]:
+        """(n, 2) pixels, projected less seen; NaN behind the camera."""
+        other_from_own = there_from_here if self.forward else there_from_here.inverse()
+        cam_from_other = other_from_own.move(self.seen.pose_here)
+        in_cam = cam_from_other.apply(self.seen.points)
+        return np.asarray(project(self.seen.camera, in_cam) - self.seen.pixels)
+
+    def median_error(self, there_from_here: Similarity) -> float:
+        """Pixels; those behind the camera are infinitely far off."""
+        x, y = self.errors(there_from_here).T
+        return float(np.median(np.nan_to_num(np.hypot(x, y), nan=np.inf)))
+
+    @property
+    def max_error_px(self) -> float:
+        """That of an inlier when it was localized."""
+        return registration_for(LocalizeOptions(), [self.seen.camera]).max_error_px
+
+
+def _proposed(views: Sequence[_View], *, rigid: bool, seed: int) -> Similarity:
+    """What two photos say that most agree with; of equally many, with the smaller errors."""
+    random = np.random.default_rng(seed)
+    judging = [view.thinned(_JUDGING) for view in views]
+    limits = np.array([_COARSE * view.max_error_px for view in judging])
+    best, best_score = Similarity.identity(), (-1, 0.0)
+    for _ in range(_NUM_TRIALS):
+        pair = random.choice(len(views), 2, replace=False)
+        similarity = _aligned([views[row] for row in pair], rigid=rigid)
+        errors = np.array([view.median_error(similarity) for view in judging])
+        within = errors <= limits
+        score = int(within.sum()), -float((errors[within] / limits[within]).sum())
+        if score > best_score:
+            best, best_score = similarity, score
+    return best
+
+
+def _aligned(views: Sequence[_View], *, rigid: bool) -> Similarity:
+    here, there = zip(*(view.estimate() for view in views), strict=True)
+    found = align_poses(here, there)
+    if not rigid:
+        return found
+    own = np.mean([pose.center for pose in here], axis=0)
+    other = np.mean([pose.center for pose in there], axis=0)
+    return Similarity(1.0, found.rotation, other - found.rotation @ own)
+
+
+def _agreeing(views: Sequence[_View], similarity: Similarity, times: float) -> NDArray[np.bool_]:
+    """Photos half of whose matches are within so many times the error of an inlier."""
+    return np.array(
+        [view.median_error(similarity) <= times * view.max_error_px for view in views], np.bool_
+    )
+
+
+def _refined(views: Sequence[_View], start: Similarity, *, rigid: bool) -> Similarity:
+    """Minimize a robust reprojection error over all matches of photos.
+
+    Rotations and scale are about the middle of the photos, whatever the frames count from.
+    """
+    thin = [view.thinned(_REFINING) for view in views]
+    middle = np.mean([view.estimate()[0].center for view in views], axis=0)
+    middle_there = start.apply(middle)
+
+    def changed(step: NDArray[np.float64]) -> Similarity:
+        rotation = Rotation.from_rotvec(step[:3]).as_matrix() @ start.rotation
+        scale = start.scale if rigid else start.scale * float(np.exp(step[6]))
+        shift = middle_there + start.scale * size * step[3:6] - scale * rotation @ middle
+        return Similarity(scale, rotation, shift)
+
+    # Steps of the translation are in units of how far away the points are, as those of the others.
+    size = _distance(views) / start.scale
+
+    def errors(step: NDArray[np.float64]) -> NDArray[np.float64]:
+        similarity = changed(step)
+        found = [view.errors(similarity) / view.max_error_px for view in thin]
+        # Behind the camera, or far off: all the same, so that they pull nowhere.
+        return np.nan_to_num(np.concatenate(found), nan=_COARSE).clip(-_COARSE, _COARSE).ravel()
+
+    # The loss of a pose, in units of its largest error.
+    full = registration_for(LocalizeOptions(), [replace(views[0].seen.camera, width=10**6)])
+    solved = least_squares(
+        errors,
+        np.zeros(6 if rigid else 7),
+        jac="3-point",
+        loss="cauchy",
+        f_scale=LOSS_SCALE_PX / full.max_error_px,
+        x_scale="jac",
+    )
+    return changed(solved.x)
+
+
+def _distance(views: Sequence[_View]) -> float:
+    """Median distance, in the other frame's unit, from photos to what they see there."""
+    far = [
+        np.median(np.linalg.norm(view.seen.points - view.seen.pose_there.center, axis=1))
+        for view in views
+        if view.forward
+    ]
+    return float(np.median(far))
+
+
+def _scale_doubt(
+    photos: Sequence[Seen], tied: NDArray[np.bool_], distances: NDArray[np.float64]
+) -> str | None:
+    """Why the photos do not tell the scale, if they do not."""
+    centers = np.array(
+        [seen.pose_there.center for seen, use in zip(photos, tied, strict=True) if use]
+    )
+    squares = float(((centers - centers.mean(axis=0)) ** 2).sum())
+    rms = float(np.sqrt((distances[tied] ** 2).mean()))
+    error = 2 * rms / np.sqrt(squares) if squares > 0 else np.inf
+    if error <= MAX_SCALE_ERROR:
+        return None
+    return (
+        f"the {len(centers)} photos that agree stand too close together to tell the scale: to "
+        f"{error:.0%}, and {MAX_SCALE_ERROR:.0%} are needed"
+    )
