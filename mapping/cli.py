@@ -58,6 +58,7 @@ from mapping.options import (
     TopKOption,
     WeightsDirOption,
     WorkersOption,
+    is_map_folder,
     map_folder,
 )
 from mapping.packing import write_packed
@@ -67,10 +68,12 @@ from mapping.report.command import report
 from mapping.rgbd import DepthSettings
 from mapping.rig_calibration import calibrate_rig, refuse_known_rigs, write_calibration
 from mapping.sample import write_sample
+from mapping.set_commands import print_set, set_maps, set_summary, split, verify_tiles
 from mapping.sfm import SfmSettings
 from mapping.triangulation import MAPPER_CONFIGS, REFINABLE
 from mapping.workers import DEFAULT_WORKERS
-from visloc.archive import open_map, verify_map
+from visloc.archive import SetManifest, open_map, open_set, verify_map, verify_set
+from visloc.archive.checks import read_any_manifest
 from visloc.errors import InvalidInput, VislocError
 from visloc.features import (
     DEFAULT_LOCAL_FEATURES,
@@ -552,12 +555,18 @@ def inspect(
     maps_dir: MapsDirOption = Path("maps"),
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
-    """Show what a map holds."""
-    opened = open_map(map_folder(map_ref, maps_dir))
-    if as_json:
-        sys.stdout.write(json.dumps(summary_of(opened), indent=2) + "\n")
+    """Show what a map or a set holds."""
+    folder = map_folder(map_ref, maps_dir)
+    if isinstance(read_any_manifest(folder), SetManifest):
+        tiles = open_set(folder)
+        summary, show = set_summary(tiles), partial(print_set, _out, tiles)
     else:
-        print_map(_out, opened)
+        opened = open_map(folder)
+        summary, show = summary_of(opened), partial(print_map, _out, opened)
+    if as_json:
+        sys.stdout.write(json.dumps(summary, indent=2) + "\n")
+    else:
+        show()
 
 
 @app.command()
@@ -566,8 +575,15 @@ def verify(
     maps_dir: MapsDirOption = Path("maps"),
     weights_dir: WeightsDirOption = None,
 ) -> None:
-    """Read every byte of a map: checksums and ranges; then compare its features with ours."""
-    opened = verify_map(map_folder(map_ref, maps_dir))
+    """Read every byte of a map: checksums and ranges; then compare its features with ours.
+
+    Of a set, its own files; its tiles are maps of their own.
+    """
+    folder = map_folder(map_ref, maps_dir)
+    if isinstance(read_any_manifest(folder), SetManifest):
+        verify_tiles(_out, verify_set(folder), None if is_map_folder(map_ref) else maps_dir)
+        return
+    opened = verify_map(folder)
     num_files = len(opened.manifest.files)
     read_imported_points(opened)  # raises when they are damaged
     _out.print(f"{opened.ref}: {num_files} files, every byte as published", soft_wrap=True)
@@ -580,6 +596,8 @@ def verify(
 
 
 app.command()(report)
+app.command("set")(set_maps)
+app.command()(split)
 
 
 @app.command("export-features")

@@ -148,10 +148,18 @@ def rank_tiles(
     Raises:
         Conflict: ``map.features`` when the index was made with another revision of the descriptor.
     """
-    coarse = map_set.coarse
-    descriptor = _descriptor()
-    check_fingerprint(coarse.fingerprint, descriptor.fingerprint, map_set.ref)
-    return ranked(coarse, descriptor.describe(_NO_PIXELS, local, coarse.model), allowed)
+    check_descriptor(map_set)
+    query = _descriptor().describe(_NO_PIXELS, local, map_set.coarse.model)
+    return ranked(map_set.coarse, query, allowed)
+
+
+def check_descriptor(map_set: MapSet) -> None:
+    """Refuse a set whose coarse index was made with another revision of the descriptor.
+
+    Raises:
+        Conflict: ``map.features``.
+    """
+    check_fingerprint(map_set.coarse.fingerprint, _descriptor().fingerprint, map_set.ref)
 
 
 def ranked(

@@ -1,0 +1,193 @@
+"""Cutting a large map into tiles on a grid, and these into a set (docs/map-sets.md)."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.editing import content_of, selected
+from mapping.publishing import new_version, photo_files
+from mapping.sets import Progress, publish_set, same_content
+from visloc.archive import Map, MapContent, MapStore, SetManifest, write_map
+from visloc.archive.anchoring import link_or_copy
+from visloc.archive.checks import read_any_manifest
+from visloc.archive.schema import photo_file
+from visloc.archive.set_schema import MAX_TILES
+from visloc.archive.store import checked_name, open_published
+from visloc.constraints import MapGeometry
+from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound
+from visloc.geometry import Similarity
+
+# Fewer photos localize too little to be a map of their own.
+MIN_PHOTOS = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cut:
+    """One tile of a map.
+
+    Attributes:
+        cell: its place on the grid, from (0, 0).
+        photos: (n,) the photos of the map that it has, those of the overlap among them.
+    """
+
+    cell: tuple[int, int]
+    photos: NDArray[np.bool_]
+
+
+def split_map(
+    store: MapStore,
+    ref: str,
+    set_id: str,
+    progress: Progress,
+    *,
+    tile: float,
+    overlap: float,
+) -> Path:
+    """Cut a map into tiles and publish them and their set, all in the frame of the map.
+
+    A tile has the photos of its cell and of a margin around it, the landmarks that these see, and
+    the map's own global models. Interrupted, the same call goes on: tiles that are there with the
+    same content stay as they are.
+
+    Args:
+        store: holds the map; the tiles and the set are published there.
+        ref: ``id`` or ``id@version`` of the map.
+        set_id: id of the set; tiles are called ``<set id>-<i>-<j>``.
+        progress: told how far each stage is.
+        tile: side of a cell in units of the world.
+        overlap: width of the margin, likewise.
+
+    Returns:
+        The folder of the set's version.
+
+    Raises:
+        InvalidInput: ``split.tile``, ``split.overlap``; ``map.is_set`` for a set.
+        Conflict: ``set.id_is_map`` and what ``publish_set`` raises.
+    """
+    checked_name(set_id, "set")
+    opened = open_published(store.folder(ref))
+    _refuse_map_of_this_name(store, set_id)
+    cuts = cut(opened, tile, overlap)
+    if len(cuts) > MAX_TILES:
+        raise InvalidInput(
+            "split.tile",
+            "too many tiles",
+            field="--tile",
+            expected=f"a side that makes at most {MAX_TILES} tiles",
+            got=f"{len(cuts)} tiles",
+        )
+    content, pictures, tiles = content_of(opened), photo_files(opened), []
+    for number, one in enumerate(cuts, 1):
+        part = selected(content, images=one.photos)
+        part = replace(part, notes=(*part.notes, f"a tile of {opened.ref}"))
+        some = [pictures[row] for row in np.flatnonzero(one.photos)] if pictures else []
+        tile_id = f"{set_id}-{one.cell[0]}-{one.cell[1]}"
+        tiles.append((_publish_tile(store, tile_id, part, some), Similarity.identity()))
+        progress("cutting", number, len(cuts))
+    notes = [f"cut from {opened.ref}"]
+    if opened.gravity is None:
+        notes.append("the map does not know which way is down: it was cut along its x and y")
+    return publish_set(store, set_id, tiles, progress, notes=notes)
+
+
+def cut(opened: Map, tile: float, overlap: float) -> tuple[Cut, ...]:
+    """Share the photos of a map out to cells of a grid in the plane across gravity.
+
+    The grid begins at the outermost photos. Cells of fewer than five photos join the nearest cell
+    of more, by where the photos of both were taken.
+
+    Args:
+        opened: the map; where it does not know down, the plane is that of its x and y.
+        tile: side of a cell in units of the world.
+        overlap: photos of others that are as near to a cell belong to it too.
+
+    Raises:
+        InvalidInput: ``split.tile``, ``split.overlap``.
+    """
+    if not (np.isfinite(tile) and tile > 0):
+        raise InvalidInput(
+            "split.tile", "not a length", field="--tile", expected="more than 0", got=tile
+        )
+    if not 0 <= overlap <= tile:
+        raise InvalidInput(
+            "split.overlap",
+            "not the width of a margin",
+            field="--overlap",
+            expected=f"0 to the side of a tile, {tile:g}",
+            got=overlap,
+        )
+    centers = MapGeometry(opened).centers @ _across(opened.gravity).T
+    centers -= centers.min(axis=0)
+    cells, cell_of = np.unique((centers // tile).astype(np.int64), axis=0, return_inverse=True)
+    cell_of = cell_of.ravel()
+    # A map of photos that see nothing could not be.
+    counts = np.bincount(cell_of, weights=np.diff(opened.observation_offsets) > 0)
+    middles = np.array([centers[cell_of == cell].mean(axis=0) for cell in range(len(cells))])
+    large = np.flatnonzero(counts >= MIN_PHOTOS)
+    if len(large) == 0:
+        large = np.array([int(counts.argmax())])
+    owner = np.array(
+        [
+            cell if cell in large else large[_nearest(middles[cell], middles[large])]
+            for cell in range(len(cells))
+        ]
+    )
+    cuts = []
+    for cell in large:
+        own = np.isin(cell_of, np.flatnonzero(owner == cell))
+        for part in np.flatnonzero(owner == cell):
+            low = cells[part] * tile
+            away = np.linalg.norm(centers - np.clip(centers, low, low + tile), axis=1)
+            own |= away <= overlap
+        i, j = cells[cell].tolist()
+        cuts.append(Cut((i, j), own))
+    return tuple(cuts)
+
+
+def _across(down: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """Two unit vectors (2, 3) across down; the first as near to an axis of the world as may be."""
+    if down is None:
+        return np.eye(3)[:2]
+    axis = np.eye(3)[int(np.abs(down).argmin())]
+    first = axis - (axis @ down) * down
+    first /= np.linalg.norm(first)
+    return np.array([first, np.cross(first, down)])
+
+
+def _nearest(point: NDArray[np.float64], others: NDArray[np.float64]) -> int:
+    return int(np.linalg.norm(others - point, axis=1).argmin())
+
+
+def _publish_tile(store: MapStore, tile_id: str, content: MapContent, pictures: list[Path]) -> str:
+    """Publish a tile unless a version of it is the same already; return ``id@version``."""
+    prefix, created = new_version()
+    with store.incoming() as incoming:
+        for row, picture in enumerate(pictures):
+            target = incoming / photo_file(row)
+            target.parent.mkdir(exist_ok=True)
+            link_or_copy(picture, target)
+        version = write_map(incoming, content, map_id=tile_id, version=prefix, created=created)
+        for known in store.versions(tile_id):
+            with suppress(MapCorrupt):
+                if same_content(store.root / tile_id / known, incoming):
+                    store.set_current(tile_id, known)
+                    return f"{tile_id}@{known}"
+        store.publish(incoming, tile_id, version)
+    return f"{tile_id}@{version}"
+
+
+def _refuse_map_of_this_name(store: MapStore, set_id: str) -> None:
+    """Before the long part."""
+    with suppress(NotFound, MapCorrupt):
+        if not isinstance(read_any_manifest(store.folder(set_id)), SetManifest):
+            raise Conflict(
+                "set.id_is_map",
+                "a map has this id already; give the set another one",
+                field="--set",
+                got=set_id,
+            )
