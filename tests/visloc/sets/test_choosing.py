@@ -1,0 +1,241 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from visloc.archive import SetOutline
+from visloc.errors import InvalidInput, NotFound
+from visloc.geometry import Camera, Pose
+from visloc.pose.covariance import position_covariance
+from visloc.priors import NO_PRIORS, GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
+from visloc.sets.choosing import Found, allowed_tiles, is_clear, judge, plan
+from visloc.sets.coarse import TileScore
+from visloc.trajectory import PoseSource
+from visloc.types import (
+    CameraSource,
+    Evidence,
+    ImageAnswer,
+    InstantAnswer,
+    Localized,
+    NotLocalized,
+    ReadAs,
+    Reason,
+    Refusal,
+    RigPose,
+)
+
+MakeOutline = Callable[..., SetOutline]
+CAMERA = Camera("PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
+# Two floors of a house and a house 100 away.
+HOUSES = [
+    ((0, 0, 1), (10, 10, 2)),
+    ((0, 0, 4), (10, 10, 5)),
+    ((100, 0, 1), (110, 10, 2)),
+]
+DOWN = (0.0, 0.0, -1.0)
+
+
+def localized(inliers: int, center: Any = (0, 0, 0), turn: float = 0.0, std: float = 0.01) -> Any:
+    rotation = Rotation.from_rotvec([0, 0, turn]).as_matrix()
+    pose = Pose(rotation, -rotation @ np.asarray(center, dtype=np.float64))
+    # Of the centre, as large in all directions.
+    covariance = np.diag([1e-8] * 3 + [std**2] * 3)
+    evidence = Evidence(
+        CAMERA,
+        CameraSource.GIVEN,
+        1,
+        ReadAs.STORED,
+        num_correspondences=2 * inliers,
+        num_inliers=inliers,
+    )
+    spread = np.sqrt(np.diag(position_covariance(pose, covariance)))
+    return Localized(
+        evidence,
+        pose,
+        covariance,
+        spread,
+        np.full(3, 1e-4),
+        np.zeros((0, 2), np.float32),
+        np.zeros((0, 3)),
+    )
+
+
+def refused(inliers: int) -> NotLocalized:
+    return NotLocalized(localized(inliers).evidence, "gate", Reason.TOO_FEW_INLIERS, "few")
+
+
+def of_rig(inliers: int, center: Any = (0, 0, 0)) -> InstantAnswer:
+    one = localized(inliers, center)
+    rig = RigPose(
+        one.cam_from_world,
+        one.covariance,
+        one.position_std,
+        one.orientation_std,
+        PoseSource.ESTIMATED,
+    )
+    image = ImageAnswer("cam", Pose.identity(), one.evidence, None)
+    return InstantAnswer(0, (image,), rig, None, {})
+
+
+# Which tiles
+
+
+def test_without_priors_all_tiles_are_allowed(outline: MakeOutline) -> None:
+    assert allowed_tiles(outline(HOUSES), NO_PRIORS).tolist() == [True, True, True]
+
+
+@pytest.mark.parametrize(
+    ("x", "radius", "expected"),
+    [
+        (5, 1, [True, True, False]),
+        # Photos see 3, and count up to twice that beyond the sphere: 10 + 6 + 1.
+        (16.9, 1, [True, True, False]),
+        (93.1, 1, [False, False, True]),
+        (50, 50, [True, True, True]),
+    ],
+)
+def test_a_sphere_allows_tiles_whose_photos_may_show_it(
+    outline: MakeOutline, x: float, radius: float, expected: list[bool]
+) -> None:
+    priors = Priors(position=PositionPrior(np.array([x, 5.0, 3.0]), radius))
+
+    assert allowed_tiles(outline(HOUSES), priors).tolist() == expected
+
+
+def test_a_pose_prior_narrows_as_far_as_it_is_sure(outline: MakeOutline) -> None:
+    pose = Pose(np.eye(3), -np.array([105.0, 5.0, 1.5]))
+    sure = PosePrior(pose, np.diag([1e-10] * 3 + [0.25] * 3))
+    unsure = PosePrior(pose, np.diag([1e-10] * 3 + [40.0**2] * 3))
+
+    assert allowed_tiles(outline(HOUSES), Priors(pose=sure)).tolist() == [False, False, True]
+    assert allowed_tiles(outline(HOUSES), Priors(pose=unsure)).all()
+
+
+def test_a_height_band_takes_one_floor(outline: MakeOutline) -> None:
+    made = outline(HOUSES, gravity=DOWN)
+
+    upper = allowed_tiles(made, Priors(height=HeightBand(3.5, 6.0)))
+    both = allowed_tiles(made, Priors(height=HeightBand(1.0, 5.0)))
+
+    assert upper.tolist() == [False, True, False]
+    assert both.all()
+
+
+def test_a_height_band_takes_down_from_the_priors_too(outline: MakeOutline) -> None:
+    # Down is x: heights are -x.
+    priors = Priors(
+        height=HeightBand(-12.0, 0.0),
+        gravity=GravityPrior(np.array([0, 1.0, 0]), 0.02, np.array([1.0, 0, 0])),
+    )
+
+    assert allowed_tiles(outline(HOUSES), priors).tolist() == [True, True, False]
+    with pytest.raises(InvalidInput) as caught:
+        allowed_tiles(outline(HOUSES), Priors(height=HeightBand(0.0, 3.0)))
+    assert caught.value.code == "priors.height"
+
+
+def test_tiles_are_named_by_id_or_version(outline: MakeOutline) -> None:
+    made = outline(HOUSES, names=("floor", "floor", "barn"))
+
+    assert allowed_tiles(made, Priors(maps=("floor",))).tolist() == [True, True, False]
+    assert allowed_tiles(made, Priors(maps=("barn@v1",))).tolist() == [False, False, True]
+    with pytest.raises(InvalidInput, match="not a tile") as caught:
+        allowed_tiles(made, Priors(maps=("barn", "attic")))
+    assert (caught.value.code, caught.value.got) == ("priors.maps", "attic")
+
+
+def test_priors_that_no_tile_obeys_are_an_error(outline: MakeOutline) -> None:
+    priors = Priors(
+        position=PositionPrior(np.array([105.0, 5.0, 1.0]), 1.0), maps=("tile-0", "tile-1")
+    )
+
+    with pytest.raises(NotFound) as caught:
+        allowed_tiles(outline(HOUSES), priors)
+    assert caught.value.code == "set.no_tile"
+
+
+# In which order
+
+
+def test_tiles_about_as_good_as_the_best_are_searched_with_it() -> None:
+    scores = [TileScore(row, score) for row, score in ((4, 0.5), (2, 0.41), (7, 0.39), (1, 0.1))]
+
+    assert plan(scores) == ((4, 2), (7, 1))
+
+
+def test_five_tiles_are_searched_at_most() -> None:
+    assert plan([TileScore(row, 0.5) for row in range(9)]) == ((0, 1, 2, 3, 4), ())
+    assert plan([TileScore(row, 0.5 / (row + 1)) for row in range(9)]) == ((0,), (1, 2, 3, 4))
+
+
+def test_scores_that_say_nothing_leave_one_tile_first() -> None:
+    assert plan([TileScore(0, -0.01), TileScore(1, -0.02)]) == ((0,), (1,))
+
+
+def test_an_answer_is_clear_with_many_inliers() -> None:
+    assert is_clear(localized(100))
+    assert is_clear(of_rig(150))
+    assert not is_clear(localized(99))
+    assert not is_clear(refused(500))
+
+
+# Which answer
+
+
+def test_most_inliers_win(outline: MakeOutline) -> None:
+    found = [Found(0, localized(40)), Found(1, localized(200)), Found(2, refused(300))]
+
+    assert judge(outline(HOUSES), found) == 1
+
+
+def test_of_similar_answers_that_agree_the_more_certain_one_counts(outline: MakeOutline) -> None:
+    found = [
+        Found(0, localized(200, std=0.05)),
+        Found(1, localized(170, (0.1, 0, 0), std=0.01)),
+        Found(2, localized(120, (0.1, 0, 0), std=0.001)),
+    ]
+
+    assert judge(outline(HOUSES), found) == 1
+
+
+@pytest.mark.parametrize("make", [localized, of_rig])
+def test_two_places_that_explain_it_are_refused(
+    outline: MakeOutline, make: Callable[..., Any]
+) -> None:
+    found = [Found(0, make(200)), Found(2, make(100, (100, 0, 0)))]
+
+    answer = judge(outline(HOUSES), found)
+
+    assert isinstance(answer, Refusal)
+    assert answer.reason is Reason.AMBIGUOUS
+    assert "tile-0@v1" in answer.message
+    assert "tile-2@v1" in answer.message
+
+
+def test_a_rival_of_few_inliers_is_no_reason_to_refuse(outline: MakeOutline) -> None:
+    assert judge(outline(HOUSES), [Found(2, localized(99, (100, 0, 0))), Found(0, localized(200))])
+
+
+def test_the_same_position_the_other_way_round_is_another_place(outline: MakeOutline) -> None:
+    found = [Found(0, localized(200)), Found(1, localized(190, turn=np.pi))]
+
+    assert isinstance(judge(outline(HOUSES), found), Refusal)
+
+
+def test_how_well_tiles_are_tied_is_no_contradiction(outline: MakeOutline) -> None:
+    # A tenth of how far photos see: 0.3.
+    near = [Found(0, localized(200)), Found(1, localized(190, (0.25, 0, 0), np.radians(3)))]
+    far = [Found(0, localized(200)), Found(1, localized(190, (0.5, 0, 0)))]
+    unsure = [Found(0, localized(200)), Found(1, localized(190, (0.5, 0, 0), std=0.2))]
+
+    assert judge(outline(HOUSES), near) == 0
+    assert isinstance(judge(outline(HOUSES), far), Refusal)
+    assert judge(outline(HOUSES), unsure) == 0
+
+
+def test_without_a_pose_the_answer_that_came_furthest_counts(outline: MakeOutline) -> None:
+    assert judge(outline(HOUSES), [Found(0, refused(5)), Found(1, refused(25))]) == 1

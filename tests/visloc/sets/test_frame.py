@@ -1,0 +1,183 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from visloc.errors import InvalidInput
+from visloc.geometry import Camera, Pose, Similarity
+from visloc.pose.covariance import position_covariance
+from visloc.pose.distance import mahalanobis2
+from visloc.priors import NO_PRIORS, GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
+from visloc.sets.frame import answer_in_set, moved_pose, priors_in_tile, scaled_device
+from visloc.trajectory import PoseSource
+from visloc.types import (
+    CameraSource,
+    Evidence,
+    ImageAnswer,
+    InstantAnswer,
+    Localized,
+    NotLocalized,
+    ReadAs,
+    Reason,
+    RigPose,
+)
+
+RANDOM = np.random.default_rng(0)
+SET_FROM_TILE = Similarity(
+    2.5, Rotation.from_rotvec([0.3, -1.2, 0.4]).as_matrix(), np.array([30.0, -400.0, 7.0])
+)
+CAM_FROM_TILE = Pose(Rotation.from_rotvec([0.1, 0.2, -2.0]).as_matrix(), np.array([3.0, 1.0, 8.0]))
+ROOT = RANDOM.normal(size=(6, 6)) * 0.01
+COVARIANCE = ROOT @ ROOT.T
+CAMERA = Camera("PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
+EVIDENCE = Evidence(CAMERA, CameraSource.GIVEN, 1, ReadAs.STORED)
+LOCALIZED = Localized(
+    EVIDENCE,
+    CAM_FROM_TILE,
+    COVARIANCE,
+    np.sqrt(np.diag(position_covariance(CAM_FROM_TILE, COVARIANCE))),
+    np.sqrt(np.diag(COVARIANCE)[:3]),
+    RANDOM.uniform(0, 40, (9, 2)).astype(np.float32),
+    RANDOM.normal(size=(9, 3)),
+)
+
+
+def perturbed(pose: Pose, by: NDArray[np.float64]) -> Pose:
+    turn = Rotation.from_rotvec(by[:3]).as_matrix()
+    return Pose(turn @ pose.rotation, pose.translation + by[3:])
+
+
+def test_points_and_camera_move_together() -> None:
+    moved = answer_in_set(LOCALIZED, SET_FROM_TILE)
+
+    seen = CAM_FROM_TILE.apply(LOCALIZED.inlier_points)
+    np.testing.assert_allclose(
+        moved.cam_from_world.apply(moved.inlier_points), SET_FROM_TILE.scale * seen, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        moved.cam_from_world.center, SET_FROM_TILE.apply(CAM_FROM_TILE.center), atol=1e-9
+    )
+
+
+def test_a_covariance_moves_as_the_pose_it_belongs_to() -> None:
+    pose, covariance = moved_pose(CAM_FROM_TILE, COVARIANCE, SET_FROM_TILE)
+
+    step = 1e-6
+    columns = []
+    for axis in np.eye(6):
+        there = SET_FROM_TILE.move(perturbed(CAM_FROM_TILE, step * axis))
+        turned = Rotation.from_matrix(there.rotation @ pose.rotation.T).as_rotvec()
+        columns.append(np.concatenate([turned, there.translation - pose.translation]) / step)
+    jacobian = np.array(columns).T
+    np.testing.assert_allclose(covariance, jacobian @ COVARIANCE @ jacobian.T, rtol=1e-3)
+
+
+def test_standard_deviations_scale_with_the_unit_and_turn_with_the_axes() -> None:
+    moved = answer_in_set(LOCALIZED, SET_FROM_TILE)
+
+    expected = position_covariance(moved.cam_from_world, moved.covariance)
+    np.testing.assert_allclose(moved.position_std, np.sqrt(np.diag(expected)), rtol=1e-6)
+    np.testing.assert_array_equal(moved.orientation_std, LOCALIZED.orientation_std)
+
+
+def test_an_answer_moved_there_and_back_is_what_it_was() -> None:
+    back = answer_in_set(answer_in_set(LOCALIZED, SET_FROM_TILE), SET_FROM_TILE.inverse())
+
+    np.testing.assert_allclose(back.cam_from_world.translation, CAM_FROM_TILE.translation)
+    np.testing.assert_allclose(back.covariance, COVARIANCE, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(back.inlier_points, LOCALIZED.inlier_points)
+
+
+def test_a_refusal_has_nothing_to_move() -> None:
+    refused = NotLocalized(EVIDENCE, "pose", Reason.NO_POSE, "none")
+
+    assert answer_in_set(refused, SET_FROM_TILE) is refused
+
+
+def test_a_rig_moves_with_its_cameras() -> None:
+    cam_from_rig = Pose(np.eye(3), np.array([0.5, 0.0, 0.0]))
+    answer = InstantAnswer(
+        7,
+        (ImageAnswer("cam", cam_from_rig, EVIDENCE, None),),
+        RigPose(
+            CAM_FROM_TILE,
+            COVARIANCE,
+            LOCALIZED.position_std,
+            LOCALIZED.orientation_std,
+            PoseSource.ESTIMATED,
+        ),
+        None,
+        {},
+    )
+
+    moved = answer_in_set(answer, SET_FROM_TILE)
+
+    assert moved.pose is not None
+    cam_from_set = moved.images[0].cam_from_rig @ moved.pose.rig_from_world
+    expected = SET_FROM_TILE.move(cam_from_rig @ CAM_FROM_TILE)
+    np.testing.assert_allclose(cam_from_set.translation, expected.translation)
+    assert answer_in_set(replace(answer, pose=None), SET_FROM_TILE).pose is None
+    # A rig that is sent is in the set's unit.
+    sent = scaled_device(moved.images[0].cam_from_rig, SET_FROM_TILE.inverse().scale)
+    np.testing.assert_allclose(sent.translation, cam_from_rig.translation)
+
+
+def test_priors_say_the_same_of_a_place_in_both_frames() -> None:
+    place = RANDOM.normal(size=3) * 10
+    in_set = SET_FROM_TILE.apply(place)
+    down = SET_FROM_TILE.rotation @ np.array([0.0, 0.0, -1.0])
+    height = float(-down @ in_set)
+    pose, covariance = moved_pose(CAM_FROM_TILE, COVARIANCE, SET_FROM_TILE)
+
+    priors = priors_in_tile(
+        Priors(
+            position=PositionPrior(in_set, 5.0),
+            height=HeightBand(height - 1.0, height + 2.0),
+            pose=PosePrior(pose, covariance),
+            gravity=GravityPrior(np.array([0.0, 1.0, 0.0]), 0.02, down),
+            maps=("room",),
+        ),
+        SET_FROM_TILE,
+        None,
+    )
+
+    assert priors.position is not None
+    np.testing.assert_allclose(priors.position.position, place, atol=1e-9)
+    assert priors.position.radius == pytest.approx(2.0)
+    assert priors.height is not None
+    # In the tile, z is up.
+    assert (priors.height.min, priors.height.max) == pytest.approx((place[2] - 0.4, place[2] + 0.8))
+    assert priors.pose is not None
+    there = Pose(CAM_FROM_TILE.rotation, CAM_FROM_TILE.translation + 0.02)
+    assert mahalanobis2(
+        priors.pose.device_from_world, priors.pose.covariance, there, COVARIANCE
+    ) == pytest.approx(mahalanobis2(CAM_FROM_TILE, COVARIANCE, there, COVARIANCE), rel=1e-6)
+    assert priors.gravity is not None
+    assert priors.gravity.world is not None
+    np.testing.assert_allclose(priors.gravity.world, [0, 0, -1], atol=1e-9)
+    assert priors.maps is None
+
+
+def test_down_of_the_set_serves_a_height_band() -> None:
+    moved = priors_in_tile(
+        Priors(height=HeightBand(10.0, 13.0)),
+        Similarity(1.0, np.eye(3), np.array([0.0, 0.0, 9.0])),
+        np.array([0.0, 0.0, -1.0]),
+    )
+
+    assert moved.height == HeightBand(1.0, 4.0)
+
+
+def test_a_height_band_without_any_down_is_refused() -> None:
+    with pytest.raises(InvalidInput, match="which way is down") as caught:
+        priors_in_tile(Priors(height=HeightBand(0.0, 3.0)), SET_FROM_TILE, None)
+
+    assert caught.value.code == "priors.height"
+
+
+def test_no_priors_stay_none() -> None:
+    assert priors_in_tile(NO_PRIORS, SET_FROM_TILE, None).position is None
