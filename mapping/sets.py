@@ -217,7 +217,7 @@ def _down(placed: Sequence[_Placed]) -> NDArray[np.float64] | None:
                 "set.gravity",
                 f"{one.record.ref} has another down than the other maps, where it lies in the set",
                 field="--poses",
-                expected=f"at most {math.degrees(_MAX_DOWN_DIFFERENCE):g} degrees between them",
+                expected=f"at most {math.degrees(_MAX_DOWN_DIFFERENCE):g} degrees from their mean",
                 got=f"{math.degrees(angle):.3g} degrees",
             )
     return np.asarray(mean)

@@ -1,0 +1,355 @@
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mapping.sets import publish_set
+from visloc.archive import (
+    MapSet,
+    MapStore,
+    SetOutline,
+    open_map,
+    open_set,
+    read_any_outline,
+    read_set_outline,
+    verify_any,
+    verify_set,
+)
+from visloc.archive.checks import content_hash, json_text, manifest_hash, sha256_of
+from visloc.archive.packed import pack_map, unpack_map
+from visloc.archive.remote_store import RemoteMapStore
+from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound
+from visloc.geometry import Similarity
+
+LARGE = 2**30
+SECOND = Similarity(1.0, np.eye(3), np.array([100.0, 0.0, 3.0]))
+
+
+def quiet(_stage: str, _done: int, _total: int) -> None:
+    pass
+
+
+def renamed(folder: Path, map_id: str, version: str, **changes: Any) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest.update(id=map_id, version=version, **changes)
+    manifest["content_hash"] = content_hash(manifest)
+    manifest["manifest_hash"] = manifest_hash(manifest)
+    (folder / "manifest.json").write_text(json_text(manifest))
+
+
+@pytest.fixture(scope="module")
+def made(built_maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store with the maps ``hall`` and ``attic``, and the set ``house``; only to be read."""
+    root = tmp_path_factory.mktemp("maps with a set")
+    store = MapStore(root)
+    for map_id in ("hall", "attic"):
+        copy = root / ".copy"
+        shutil.copytree(MapStore(built_maps).folder("room"), copy)
+        renamed(copy, map_id, "v1")
+        store.publish(copy, map_id, "v1")
+    publish_set(store, "house", [("hall", Similarity.identity()), ("attic@v1", SECOND)], quiet)
+    return root
+
+
+@pytest.fixture
+def store(made: Path, tmp_path: Path) -> MapStore:
+    return MapStore(Path(shutil.copytree(made, tmp_path / "maps")))
+
+
+@pytest.fixture
+def incoming(store: MapStore, tmp_path: Path) -> Callable[..., Path]:
+    """Copies of what the store has, under other names."""
+    names: Iterator[str] = iter("abcdefgh")
+
+    def copy(ref: str, map_id: str, version: str, **changes: Any) -> Path:
+        target = Path(shutil.copytree(store.folder(ref), tmp_path / next(names)))
+        renamed(target, map_id, version, **changes)
+        return target
+
+    return copy
+
+
+def test_a_set_says_what_it_holds(store: MapStore) -> None:
+    outline = store.outline("house")
+
+    assert isinstance(outline, SetOutline)
+    assert outline.ref == f"house@{store.current_version('house')}"
+    assert [tile.ref for tile in outline.tiles] == ["hall@v1", "attic@v1"]
+    hall, attic = outline.tiles
+    opened = store.open("hall")
+    assert hall.content_hash == opened.manifest.content_hash
+    assert (hall.images, hall.landmarks) == (len(opened.images), len(opened.landmarks))
+    assert hall.size_bytes == opened.size_bytes
+    np.testing.assert_allclose(np.array(attic.extent.min) - hall.extent.min, [100, 0, 3])
+    np.testing.assert_allclose(outline.photo_boxes[1] - outline.photo_boxes[0], [[100, 0, 3]] * 2)
+    assert attic.reach == pytest.approx(hall.reach)
+    assert outline.reaches.tolist() == [hall.reach, attic.reach]
+    assert outline.manifest.world.metric
+    assert outline.manifest.world.extent.min == hall.extent.min
+    assert outline.manifest.world.extent.max == attic.extent.max
+
+
+def test_boxes_hold_landmarks_and_photos(store: MapStore) -> None:
+    tile, opened = store.open_set("house").tiles[0], store.open("hall")
+    points = opened.landmarks + np.array(opened.manifest.world.origin)
+
+    assert (np.array(tile.extent.min) <= points.min(axis=0) + 1e-6).all()
+    assert (np.array(tile.extent.max) >= points.max(axis=0) - 1e-6).all()
+    assert (np.array(tile.extent.min) <= tile.photo_extent.min).all()
+    assert (np.array(tile.extent.max) >= tile.photo_extent.max).all()
+
+
+def test_a_set_is_open_with_its_index(store: MapStore) -> None:
+    opened = store.open_set("house")
+
+    assert isinstance(opened, MapSet)
+    photos = len(store.open("hall").images)
+    assert opened.coarse.offsets.tolist() == [0, photos, 2 * photos]
+    assert isinstance(opened.coarse.codes, np.memmap)
+    assert opened.coarse.bits == 256
+    # Both tiles are the same map.
+    np.testing.assert_array_equal(opened.coarse.codes[:photos], opened.coarse.codes[photos:])
+    assert verify_set(opened.path).ref == opened.ref
+
+
+def test_a_map_and_a_set_are_not_taken_for_each_other(store: MapStore) -> None:
+    for wrong in (store.open, lambda ref: open_map(store.folder(ref))):
+        with pytest.raises(InvalidInput, match="name one of its tiles") as caught:
+            wrong("house")
+        assert caught.value.code == "map.is_set"
+        assert "hall@v1" in str(caught.value.expected)
+    with pytest.raises(InvalidInput) as caught:
+        read_set_outline(store.folder("hall"))
+    assert caught.value.code == "set.is_map"
+
+
+def test_an_id_is_that_of_a_map_or_of_a_set(store: MapStore, incoming: Callable[..., Path]) -> None:
+    with pytest.raises(Conflict) as caught:
+        store.publish(incoming("house", "hall", "v2"), "hall", "v2")
+    assert caught.value.code == "set.id_is_map"
+    with pytest.raises(Conflict) as caught:
+        store.publish(incoming("hall", "house", "v2"), "house", "v2")
+    assert caught.value.code == "map.id_is_set"
+
+
+def test_a_set_is_published_only_beside_its_tiles(
+    incoming: Callable[..., Path], tmp_path: Path
+) -> None:
+    elsewhere = MapStore(tmp_path / "elsewhere")
+    for missing in ("hall", "attic"):
+        with pytest.raises(NotFound) as caught:
+            elsewhere.publish(incoming("house", "house", "v2"), "house", "v2")
+        assert (caught.value.code, caught.value.expected) == ("set.tile", f"{missing}@v1")
+        elsewhere.publish(incoming(missing, missing, "v1"), missing, "v1")
+    assert not (tmp_path / "elsewhere" / "house").exists()
+
+    elsewhere.publish(incoming("house", "house", "v2"), "house", "v2")
+    assert elsewhere.ids() == ["attic", "hall", "house"]
+
+
+def test_a_tile_of_other_content_is_not_that_tile(
+    incoming: Callable[..., Path], tmp_path: Path
+) -> None:
+    elsewhere = MapStore(tmp_path / "elsewhere")
+    elsewhere.publish(incoming("hall", "hall", "v1", notes=["another"]), "hall", "v1")
+
+    with pytest.raises(Conflict, match="another one") as caught:
+        elsewhere.publish(incoming("house", "house", "v2"), "house", "v2")
+    assert caught.value.code == "set.tile"
+
+
+def test_tiles_of_other_features_are_refused(
+    store: MapStore, incoming: Callable[..., Path]
+) -> None:
+    manifest = json.loads((store.folder("attic") / "manifest.json").read_text())
+    manifest["local_features"]["fingerprint"]["revision"] += 1
+    changed = incoming("attic", "attic", "v2", local_features=manifest["local_features"])
+    store.publish(changed, "attic", "v2")
+
+    with pytest.raises(Conflict, match="attic@v2 has other local features") as caught:
+        publish_set(store, "house", [("hall", Similarity.identity()), ("attic", SECOND)], quiet)
+    assert caught.value.code == "set.features"
+
+
+def test_a_tile_of_a_set_in_use_stays(store: MapStore, incoming: Callable[..., Path]) -> None:
+    store.publish(incoming("hall", "hall", "v2"), "hall", "v2")
+
+    with pytest.raises(Conflict, match="tile of a set in use") as caught:
+        store.remove("hall", "v1")
+    assert caught.value.code == "map.in_set"
+    assert store.folder("hall@v1").is_dir()
+
+    # Once the set in use is one without it, it may go; and the old version does not come back.
+    old = store.current_version("house")
+    publish_set(store, "house", [("hall", Similarity.identity()), ("attic", SECOND)], quiet)
+    store.remove("hall", "v1")
+    with pytest.raises(NotFound) as missing:
+        store.set_current("house", old)
+    assert missing.value.code == "set.tile"
+    assert store.current_version("house") != old
+
+
+def test_without_the_set_its_tiles_may_go(store: MapStore) -> None:
+    store.remove("house", store.current_version("house"))
+    store.remove("hall", "v1")
+
+    assert store.ids() == ["attic"]
+
+
+def test_a_packed_set_is_the_same_set(store: MapStore, tmp_path: Path) -> None:
+    pack_map(store.folder("house"), tmp_path / "house.zip")
+    unpack_map(tmp_path / "house.zip", tmp_path / "again", LARGE)
+
+    assert verify_any(tmp_path / "again").manifest == store.outline("house").manifest
+
+
+def test_a_url_keeps_the_same_rules(incoming: Callable[..., Path], tmp_path: Path) -> None:
+    (tmp_path / "bucket").mkdir()
+
+    def remote(name: str) -> RemoteMapStore:
+        return RemoteMapStore(f"file://{tmp_path}/bucket", tmp_path / name, LARGE)
+
+    def publish(ref: str, map_id: str, version: str) -> None:
+        with server.incoming() as folder:
+            made = Path(shutil.copytree(incoming(ref, map_id, version), folder / "map"))
+            server.publish(made, map_id, version)
+
+    server = remote("cache")
+    with pytest.raises(NotFound, match="not in this store"):
+        publish("house", "house", "v2")
+    publish("hall", "hall", "v1")
+    publish("attic", "attic", "v1")
+    publish("house", "house", "v2")
+    with pytest.raises(Conflict, match="has this id already"):
+        publish("hall", "house", "v3")
+    with pytest.raises(Conflict, match="tile of a set in use"):
+        server.remove("hall", "v1")
+
+    # Another server, without copies: the outline needs no tile, the set no other file.
+    other = remote("cache of another")
+    outline = other.outline("house")
+    assert isinstance(outline, SetOutline)
+    assert [tile.ref for tile in outline.tiles] == ["hall@v1", "attic@v1"]
+    assert open_set(other.folder("house")).ref == "house@v2"
+    other.set_current("house", "v2")
+    assert [path.name for path in (tmp_path / "cache of another").glob("*/[!.]*")] == ["house"]
+    other.remove("house", "v2")
+    other.remove("hall", "v1")
+
+
+# Damage
+
+
+def rewritten(folder: Path, change: Callable[[dict[str, Any]], None]) -> Path:
+    """A set whose manifest says something else, with hashes that fit."""
+    manifest = json.loads((folder / "manifest.json").read_text())
+    for name in manifest["files"]:
+        path = folder / name
+        if path.exists():
+            manifest["files"][name] = {"size": path.stat().st_size, "sha256": sha256_of(path)}
+    change(manifest)
+    manifest["content_hash"] = content_hash(manifest)
+    manifest["manifest_hash"] = manifest_hash(manifest)
+    (folder / "manifest.json").write_text(json_text(manifest))
+    return folder
+
+
+def keep(_manifest: dict[str, Any]) -> None:
+    pass
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        (lambda m: m.update(format_version="2.0"), "map.format_version"),
+        (lambda m: m.update(format="visloc-town"), "map.manifest"),
+        (lambda m: m.update(tiles=[]), "map.manifest"),
+        (lambda m: m["counts"].update(images=3), "map.manifest"),
+        (lambda m: m["coarse"].update(bits=100), "map.manifest"),
+        (lambda m: m["coarse"].update(bits=512), "map.array"),
+        (lambda m: m["coarse"].update(dim=5), "map.array"),
+        (lambda m: m["tiles"][0]["set_from_tile"].update(scale=0), "map.manifest"),
+        (
+            lambda m: m["tiles"][0]["set_from_tile"].update(rotation_wxyz=[1, 1, 0, 0]),
+            "map.manifest",
+        ),
+        (lambda m: m["tiles"][0]["photo_extent"].update(max=[-1e6] * 3), "map.manifest"),
+        (lambda m: m["files"].pop("coarse/codes.npy"), "map.file_missing"),
+        (lambda m: m["tiles"].reverse(), None),
+    ],
+)
+def test_a_manifest_that_is_wrong_is_refused(
+    store: MapStore, change: Callable[[dict[str, Any]], None], code: str | None
+) -> None:
+    folder = rewritten(store.folder("house"), change)
+    if code is None:  # as good a set
+        verify_set(folder)
+        return
+    with pytest.raises(MapCorrupt) as caught:
+        open_set(folder)
+    assert caught.value.code == code
+
+
+def test_every_byte_is_checked(store: MapStore) -> None:
+    folder = store.folder("house")
+    names = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    for path in names:
+        good = path.read_bytes()
+        path.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
+        with pytest.raises(MapCorrupt):
+            verify_any(folder)
+        path.write_bytes(good[:-1])
+        with pytest.raises(MapCorrupt):
+            verify_any(folder)
+        path.write_bytes(good)
+    assert verify_any(folder)
+    assert len(names) == 6
+
+
+def test_offsets_are_those_of_the_tiles(store: MapStore) -> None:
+    folder = store.folder("house")
+    offsets = np.load(folder / "coarse" / "offsets.npy")
+    offsets[1] += 1
+    np.save(folder / "coarse" / "offsets.npy", offsets)
+
+    with pytest.raises(MapCorrupt) as caught:
+        open_set(rewritten(folder, keep))
+    assert caught.value.code == "map.range"
+
+
+def test_scales_are_numbers(store: MapStore) -> None:
+    folder = store.folder("house")
+    np.save(folder / "coarse" / "centroids.scales.npy", np.full(8, np.nan, np.float32))
+
+    with pytest.raises(MapCorrupt) as caught:
+        verify_set(rewritten(folder, keep))
+    assert caught.value.code == "map.range"
+
+
+def test_an_outline_needs_no_arrays(store: MapStore) -> None:
+    folder = store.folder("house")
+    shutil.rmtree(folder / "coarse")
+
+    assert read_any_outline(folder).ref == f"house@{folder.name}"
+    with pytest.raises(MapCorrupt) as caught:
+        store.outline("house")
+    assert caught.value.code == "map.file_missing"
+
+
+def test_the_same_set_is_not_published_again(store: MapStore) -> None:
+    tiles = [("hall", Similarity.identity()), ("attic", SECOND)]
+    before = store.folder("house")
+
+    assert publish_set(store, "house", tiles, quiet) == before
+    moved = publish_set(
+        store, "house", [tiles[0], ("attic", replace(SECOND, translation=np.zeros(3)))], quiet
+    )
+    assert moved != before
+    assert store.folder("house") == moved
