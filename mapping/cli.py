@@ -64,6 +64,7 @@ from mapping.options import (
 from mapping.packing import write_packed
 from mapping.pairing import PairSettings
 from mapping.progress import StageProgress
+from mapping.pruning.command import prune
 from mapping.report.command import report
 from mapping.rgbd import DepthSettings
 from mapping.rig_calibration import calibrate_rig, refuse_known_rigs, write_calibration
@@ -596,6 +597,7 @@ def verify(
 
 
 app.command()(report)
+app.command()(prune)
 app.command("set")(set_maps)
 app.command()(split)
 

@@ -57,10 +57,7 @@ def publish_edited(
     if photos and len(photos) != len(content.images):
         raise AssertionError(f"{len(photos)} pictures of {len(content.images)} photos")
     with store.incoming() as incoming:
-        for row, path in enumerate(photos):
-            target = incoming / photo_file(row)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            link_or_copy(path, target)
+        link_photos(incoming, photos)
         for path in beside:
             link_or_copy(path, incoming / path.name)
         return publish_content(store, incoming, content, map_id, based_on=based_on)
@@ -79,9 +76,22 @@ def publish_content(
     Raises:
         Conflict: ``map.outdated``, as ``MapStore.publish``.
     """
-    version, created = new_version()
-    version = write_map(incoming, content, map_id=map_id, version=version, created=created)
+    version = write_content(incoming, content, map_id)
     return store.publish(incoming, map_id, version, based_on=based_on)
+
+
+def link_photos(folder: Path, photos: Sequence[Path]) -> None:
+    """Give a map small pictures of its photos, in their order, that another one has."""
+    for row, path in enumerate(photos):
+        target = folder / photo_file(row)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        link_or_copy(path, target)
+
+
+def write_content(folder: Path, content: MapContent, map_id: str) -> str:
+    """Write content beside the files that are in a folder already; return its version."""
+    version, created = new_version()
+    return write_map(folder, content, map_id=map_id, version=version, created=created)
 
 
 def new_version() -> tuple[str, str]:

@@ -18,20 +18,19 @@ from numpy.typing import NDArray
 
 from mapping.report.viewpoints import Viewpoints
 from mapping.stages import Item, WorkFolder, key_of
+from mapping.stored_queries import match_stored, solve_stored
 from mapping.workers import Workers
 from visloc import __version__
 from visloc.archive import Map, open_map
 from visloc.constraints import MapGeometry
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose
-from visloc.matching.correspondences import Correspondences, match_landmarks
-from visloc.matching.products import EightBitRows
+from visloc.matching.correspondences import Correspondences
 from visloc.pose.reprojection import reprojection_errors
 from visloc.pose.views import MatchedView
-from visloc.priors import NO_PRIORS
 from visloc.retrieval.index import retrieve
-from visloc.solving import Look, Matches, SeenImage, registration_for, solve_instant
-from visloc.types import CameraSource, Evidence, LocalizeOptions, ReadAs
+from visloc.solving import registration_for
+from visloc.types import LocalizeOptions
 
 _REVISION = 1
 # Photos that are localized; of larger maps evenly many.
@@ -144,18 +143,7 @@ def localize_held_out(
     errors_px = reprojection_errors(view, pose) if len(view) else np.empty(0)
     correct = errors_px <= registration_for(options, [camera]).max_error_px  # False for NaN
 
-    evidence = Evidence(
-        camera,
-        CameraSource.GIVEN,
-        1,
-        ReadAs.STORED,
-        num_keypoints=len(opened.observations(image)[0]),
-        num_correspondences=len(matched),
-    )
-    look = Look(evidence, Matches(pixels, points), matched.landmarks, Matches.none())
-    solved = solve_instant(
-        [SeenImage("camera", Pose.identity(), look)], MapGeometry(opened), options, NO_PRIORS
-    )
+    solved = solve_stored(opened, image, opened, MapGeometry(opened), matched, options)
     refusal, position_error, orientation_error = solved.answer.refusal, np.inf, np.inf
     if refusal is None and solved.pose is not None:
         position_error, orientation_error = pose_error(solved.pose.rig_from_world, pose)
@@ -203,18 +191,8 @@ def _match(
     rows = opened.global_descriptors
     query = {name: rows[name][image] for name in opened.fusion.counted(rows)}
     retrieved = retrieve(query, rows, options.top_k, remaining, opened.fusion)
-    scale = opened.manifest.local_features.descriptor_scale
     gone = vanishing(opened, left_out)
-
-    def observed(photo: int) -> tuple[NDArray[np.integer], EightBitRows]:
-        landmarks, descriptors = opened.observations(photo)
-        there = ~np.isin(landmarks, gone)
-        return landmarks[there], EightBitRows(descriptors[there], scale)
-
-    return match_landmarks(
-        EightBitRows(opened.observations(image)[1], scale),
-        [observed(int(photo)) for photo in retrieved.images],
-    )
+    return match_stored(opened, image, opened, retrieved.images.tolist(), gone)
 
 
 def _key(opened: Map, image: int) -> str:
