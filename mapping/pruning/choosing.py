@@ -28,7 +28,7 @@ _CELLS = (8, 6)
 _DISTINCT = 2
 # Photos are dropped rather than that each keeps fewer observations than this, while others cover
 # them: stand within so many radians, of turn and of parallax together.
-_ENOUGH = 200
+_ENOUGH = 80
 _COVERED_WITHIN = 0.4
 # With fewer in a photo, its neighbourhood is lost: a pose needs 30 inliers.
 _LEAST = 50

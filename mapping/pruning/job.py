@@ -58,7 +58,7 @@ def prune_map(
     with exclusive(store.root / ".work" / f"{map_id}.lock"):
         before = store.open(map_id)
         progress("choosing", 0, 1)
-        kept = _chosen(before, max_bytes, max_landmarks)
+        kept = keep_within(before, max_bytes, max_landmarks)
         progress("choosing", 1, 1)
         content = selected(content_of(before), kept.images, observations=kept.observations)
         content = _noted(before, content)
@@ -83,7 +83,8 @@ def prune_map(
         return Pruned(before, open_map(folder), accuracy)
 
 
-def _chosen(opened: Map, max_bytes: int | None, max_landmarks: int | None) -> Kept:
+def keep_within(opened: Map, max_bytes: int | None, max_landmarks: int | None) -> Kept:
+    """Choose what stays of a map; errors as of ``prune_map``."""
     size, count = opened.size_bytes, len(opened.landmarks)
     if (max_bytes is None or size <= max_bytes) and (
         max_landmarks is None or count <= max_landmarks
