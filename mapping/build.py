@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from mapping.anchor import MAX_DIRECTION_ERROR_DEG, known_positions
 from mapping.colours import landmark_colours
+from mapping.costs import Costs, wrote
+from mapping.executors import EXECUTORS, Executor, open_executor
 from mapping.features import (
     ExtractedFeatures,
     LocalFeaturesSource,
@@ -42,7 +44,6 @@ from mapping.sfm import (
 )
 from mapping.stages import WorkFolder, exclusive
 from mapping.triangulation import MAPPER_CONFIGS, REFINABLE
-from mapping.workers import Workers
 from visloc.archive import (
     Anchor,
     FingerprintRecord,
@@ -97,6 +98,8 @@ class BuildSettings:
         keep_colours: whether it keeps the colours of the landmarks, for the same. Those that a
             model brings along stay in any case.
         workers: processes that work on photos and pairs.
+        executor: where they are, a name of ``EXECUTORS``.
+        ray_address: of the cluster, for ``ray``.
         force: publish a new version of a map that exists.
     """
 
@@ -120,14 +123,21 @@ class BuildSettings:
     keep_photos: bool = False
     keep_colours: bool = False
     workers: int = 1
+    executor: str = EXECUTORS[0]
+    ray_address: str = "auto"
     force: bool = False
 
 
-def build_map(settings: BuildSettings, progress: Progress) -> Path:
+def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None = None) -> Path:
     """Build a map and publish it as the current version.
 
     Killed at any moment, the same call finds its finished work again; the map that was current
     before stays so until the new one is complete and verified.
+
+    Args:
+        settings: what it is made of.
+        progress: told the stage, how much of it is done, and how much there is.
+        costs: told what the stages cost.
 
     Returns:
         The folder of the new version.
@@ -135,7 +145,7 @@ def build_map(settings: BuildSettings, progress: Progress) -> Path:
     Raises:
         Conflict: ``map.exists`` without ``force``; ``build.running``.
         DatasetError, WeightsError, InvalidInput: with the file or the setting that is wrong.
-        Unavailable: ``storage.failed`` when the disk is full or broken.
+        Unavailable: ``storage.failed`` when the disk is full or broken; what executors raise.
     """
     _check(settings)
     store = MapStore(settings.maps_dir)
@@ -154,7 +164,11 @@ def build_map(settings: BuildSettings, progress: Progress) -> Path:
     work_root = settings.maps_dir / ".work" / settings.map_id
     try:
         with exclusive(work_root.with_name(f"{work_root.name}.lock")):
-            with Workers(settings.workers) as workers:
+            with open_executor(
+                settings.executor, settings.workers, settings.ray_address
+            ) as workers:
+                if costs is not None:
+                    progress = costs.measured(progress, workers)
                 folder = _build(settings, dataset, store, work_root, workers, progress)
             shutil.rmtree(work_root, ignore_errors=True)
     except OSError as error:
@@ -221,6 +235,7 @@ def _check(settings: BuildSettings) -> None:
             expected=f"one of {', '.join(METHODS)}",
             got=settings.method,
         )
+    _check_names("--executor", (settings.executor,), EXECUTORS)
     names = settings.global_features
     if not names or "" in names or len(set(names)) < len(names):
         raise InvalidInput(
@@ -312,7 +327,7 @@ def _build(
     dataset: Dataset,
     store: MapStore,
     work_root: Path,
-    workers: Workers,
+    workers: Executor,
     progress: Progress,
 ) -> Path:
     work = WorkFolder(work_root)
@@ -434,7 +449,7 @@ def _make_landmarks(
     photos: Sequence[MappingPhoto],
     features: LocalFeaturesSource,
     global_features: Sequence[GlobalFeatures],
-    workers: Workers,
+    workers: Executor,
     progress: Progress,
 ) -> MadeLandmarks:
     metric = settings.method != "model" if settings.metric is None else settings.metric
@@ -546,7 +561,7 @@ def _publish(
     kept: Sequence[MappingPhoto],
     store: MapStore,
     work_root: Path,
-    workers: Workers,
+    workers: Executor,
     progress: Progress,
 ) -> Path:
     incoming = work_root / "incoming"
@@ -554,13 +569,14 @@ def _publish(
     incoming.mkdir(parents=True)
     try:
         if kept:
-            keep_photos(incoming, kept, workers, progress)
+            keep_photos(WorkFolder(work_root), incoming, kept, workers, progress)
         progress("archive", 0, 1)
         if made.pairs is not None:
             write_pairs(incoming / PAIRS, *made.pairs)
         if made.imported is not None:
             made.imported.write(incoming)
         folder = publish_content(store, incoming, content, settings.map_id)
+        wrote(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
         progress("archive", 1, 1)
         return folder
     finally:

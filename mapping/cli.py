@@ -13,14 +13,17 @@ import typer
 from rich.console import Console
 
 from mapping.build import METHODS, BuildSettings, build_map, write_pairs_of
+from mapping.costs import Costs
 from mapping.display import (
     peak_memory_bytes,
+    print_costs,
     print_georeference,
     print_import,
     print_map,
     print_rig,
     summary_of,
 )
+from mapping.executors import EXECUTORS
 from mapping.export import EXPORTERS, export_map
 from mapping.export_features import export_features
 from mapping.georeference import (
@@ -33,6 +36,7 @@ from mapping.georeference import (
 from mapping.imported_points import read_imported_points
 from mapping.importers import IMPORTERS, ImportSummary, import_dataset, imported
 from mapping.options import (
+    CLUSTER_PANEL,
     GLOBAL_DEFAULT,
     RGBD_PANEL,
     SFM_PANEL,
@@ -148,6 +152,22 @@ def build(
         ),
     ] = False,
     workers: WorkersOption = DEFAULT_WORKERS,
+    executor: Annotated[
+        str,
+        typer.Option(
+            help="Where they are. local: processes of this machine. ray: a Ray cluster.",
+            rich_help_panel=CLUSTER_PANEL,
+        ),
+    ] = EXECUTORS[0],
+    ray_address: Annotated[
+        str,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Of the cluster: HOST:PORT, ray://HOST:PORT, auto for the one that this machine "
+            "is part of, or local for one of this machine that ends with the build.",
+            rich_help_panel=CLUSTER_PANEL,
+        ),
+    ] = "auto",
     force: Annotated[
         bool, typer.Option("--force", help="Publish a new version of a map that exists.")
     ] = False,
@@ -249,6 +269,8 @@ def build(
         keep_photos=keep_photos,
         keep_colours=keep_colours,
         workers=workers,
+        executor=executor,
+        ray_address=ray_address,
         force=force,
     )
     _build(settings)
@@ -333,9 +355,11 @@ def calibrate_rig_command(
 
 
 def _build(settings: BuildSettings) -> None:
+    costs = Costs()
     with StageProgress(_err) as progress:
-        folder = build_map(settings, progress)
+        folder = build_map(settings, progress, costs)
     print_map(_out, open_map(folder))
+    print_costs(_out, costs.table())
     _out.print(f"peak memory {peak_memory_bytes() / 2**30:.2f} GiB")
 
 

@@ -11,10 +11,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.executors import Executor
 from mapping.features import Progress
 from mapping.photos import MappingPhoto
 from mapping.stages import Item, WorkFolder, key_of
-from mapping.workers import Workers
 from visloc.archive import Landmarks
 from visloc.errors import DatasetError
 from visloc.images import read_photo_file
@@ -27,7 +27,7 @@ def landmark_colours(
     work: WorkFolder,
     photos: Sequence[MappingPhoto],
     landmarks: Landmarks,
-    workers: Workers,
+    workers: Executor,
     progress: Progress,
 ) -> NDArray[np.uint8]:
     """Return the mean colour (P, 3) RGB of the pixels where the photos see each landmark.

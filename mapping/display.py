@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import resource
+from collections.abc import Sequence
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from mapping.costs import StageCost
 from mapping.georeference import Georeference
 from mapping.importers import ImportSummary
 from mapping.rig_calibration import OUTLIER_MULTIPLE, RigCalibration, Spread
@@ -157,6 +159,23 @@ def print_georeference(out: Console, found: Georeference) -> None:
         highlight=False,
         soft_wrap=True,
     )
+
+
+def print_costs(out: Console, costs: Sequence[StageCost]) -> None:
+    """Show what each stage of a build cost."""
+    table = Table(box=None)
+    table.add_column("stage")
+    for name in ("items", "seconds", "CPU seconds", "MiB written"):
+        table.add_column(name, justify="right")
+    for cost in costs:
+        table.add_row(
+            escape(cost.stage),
+            "" if cost.items is None else str(cost.items),
+            f"{cost.wall_s:.1f}",
+            f"{cost.spent.cpu_s:.1f}",
+            f"{cost.spent.written_bytes / 2**20:.1f}",
+        )
+    out.print(table)
 
 
 def peak_memory_bytes() -> int:

@@ -13,9 +13,9 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.executors import Executor
 from mapping.photos import MappingPhoto
 from mapping.stages import Item, WorkFolder, key_of
-from mapping.workers import Workers
 from visloc.archive import FingerprintRecord, GlobalFeatures
 from visloc.errors import DatasetError, InvalidInput
 from visloc.features import (
@@ -227,7 +227,7 @@ class ReadyMadeFeatures:
 def open_extractor(
     name: str, weights_dir: Path | None, inference: Inference
 ) -> LocalFeatureExtractor:
-    """Return the extractor of this process; it uses one thread, as ``Workers`` has it.
+    """Return the extractor of this process; it uses one thread, as all executors have it.
 
     Raises:
         WeightsError, InvalidInput: what ``make_local_features`` raises.
@@ -237,7 +237,7 @@ def open_extractor(
 
 @cache
 def open_descriptor(name: str, weights_dir: Path | None, inference: Inference) -> GlobalDescriptor:
-    """Return the global descriptor of this process; it uses one thread, as ``Workers`` has it.
+    """Return the global descriptor of this process; it uses one thread, as all executors have it.
 
     Raises:
         WeightsError, InvalidInput: what ``make_global_descriptor`` raises.
@@ -248,7 +248,7 @@ def open_descriptor(name: str, weights_dir: Path | None, inference: Inference) -
 def find_local_features(
     source: LocalFeaturesSource,
     photos: Sequence[MappingPhoto],
-    workers: Workers,
+    workers: Executor,
     progress: Progress,
 ) -> None:
     """Have the features of all photos, so that reading them is quick from now on."""
@@ -262,7 +262,7 @@ def describe_photos(
     name: str,
     weights_dir: Path | None,
     inference: Inference,
-    workers: Workers,
+    workers: Executor,
     progress: Progress,
 ) -> GlobalFeatures:
     """Learn one global descriptor's model on the photos, and describe them with it.

@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.executors import Executor
 from mapping.features import LocalFeaturesSource, Progress, ReadyMadeFeatures
 from mapping.imported_points import ImportedPoints
 from mapping.landmarks import (
@@ -26,7 +27,6 @@ from mapping.landmarks import (
 from mapping.photos import MappingPhoto
 from mapping.sfm import SfmSettings, landmarks_from_matches
 from mapping.stages import WorkFolder
-from mapping.workers import Workers
 from visloc.archive import Anchor
 from visloc.errors import DatasetError
 from visloc.geometry import PixelOrigin
@@ -41,7 +41,7 @@ def landmarks_from_reconstruction(
     origin: PixelOrigin,
     settings: SfmSettings,
     metric: bool,
-    workers: Workers,
+    workers: Executor,
     progress: Progress,
 ) -> MadeLandmarks:
     """Take the dataset's points as landmarks, or match its photos anew.

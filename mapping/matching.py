@@ -15,11 +15,11 @@ import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
 from numpy.typing import NDArray
 
+from mapping.executors import Executor
 from mapping.features import LocalFeaturesSource, Progress
 from mapping.landmarks import View
 from mapping.photos import MappingPhoto
 from mapping.stages import Item, WorkFolder, key_of
-from mapping.workers import Workers
 from visloc.geometry import Camera, Pose
 from visloc.matching.correspondences import mutual_nearest_neighbours
 from visloc.matching.products import in_eight_bits
@@ -74,7 +74,7 @@ def match_pairs(
     features: LocalFeaturesSource,
     pairs: NDArray[np.int64],
     verification: Verification,
-    workers: Workers,
+    workers: Executor,
     progress: Progress,
 ) -> tuple[list[Matches], str]:
     """Match and verify pairs (m, 2) of photos.

@@ -14,7 +14,7 @@ from visloc.geometry import PixelOrigin
 from visloc.types import Fusion, Inference
 
 GLOBAL_DEFAULT = ",".join(DEFAULT_GLOBAL_FEATURES)
-RGBD_PANEL, SFM_PANEL = "Method rgbd", "Method sfm"
+RGBD_PANEL, SFM_PANEL, CLUSTER_PANEL = "Method rgbd", "Method sfm", "On a cluster"
 
 MapsDirOption = Annotated[
     Path, typer.Option("--maps-dir", envvar="VISLOC_MAPS_DIR", help="Folder of maps.")

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.depth import depth_at, photo_depth
+from mapping.executors import Executor
 from mapping.features import LocalFeaturesSource, Progress
 from mapping.landmarks import MadeLandmarks, Observations, View, assemble_landmarks
 from mapping.matching import camera_values, pose_values
 from mapping.photos import MappingPhoto
 from mapping.stages import Item, WorkFolder, key_of
-from mapping.workers import Workers
 from visloc.archive import Anchor, Landmarks
 from visloc.errors import DatasetError, InvalidInput
 from visloc.kapture import Dataset
@@ -65,7 +65,7 @@ def landmarks_from_depth(
     features: LocalFeaturesSource,
     settings: DepthSettings,
     metric: bool,
-    workers: Workers,
+    workers: Executor,
     progress: Progress,
 ) -> MadeLandmarks:
     """Lift the keypoints of all photos and merge them.
@@ -74,7 +74,7 @@ def landmarks_from_depth(
         DatasetError: what ``lift_keypoints`` raises.
         InvalidInput: what ``merge_landmarks`` raises.
     """
-    task = _LiftTask(work, dataset, features, settings.depth_scale)
+    task = _LiftTask(work, dataset.without_records(), features, settings.depth_scale)
     workers.run(task.lift, photos, partial(progress, "depth"))
     progress("landmarks", 0, 1)
     lifted = (LiftedKeypoints(**work.read(task.key(photo))) for photo in photos)

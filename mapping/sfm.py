@@ -6,8 +6,9 @@ estimated poses also for photos without poses.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,10 @@ from numpy.typing import NDArray
 from pydantic import JsonValue
 
 from mapping.anchor import align_positions, known_positions
+from mapping.executors import Executor
 from mapping.features import LocalFeaturesSource, Progress
 from mapping.landmarks import MadeLandmarks, Observations, View, assemble_landmarks
-from mapping.matching import Verification, camera_values, match_pairs, pose_values
+from mapping.matching import Matches, Verification, camera_values, match_pairs, pose_values
 from mapping.pairing import Pairs, PairSettings, Scene, pair_photos, read_pairs
 from mapping.photos import MappingPhoto
 from mapping.stages import Item, WorkFolder, key_of
@@ -29,7 +31,6 @@ from mapping.triangulation import (
     reconstruct,
     triangulate,
 )
-from mapping.workers import Workers
 from visloc.archive import Anchor, GlobalFeatures, Map, sha256_of
 from visloc.errors import DatasetError, InvalidInput
 from visloc.geometry import Camera, Pose, Similarity
@@ -71,7 +72,7 @@ def landmarks_from_matches(
     global_features: Sequence[GlobalFeatures],
     settings: SfmSettings,
     metric: bool,
-    workers: Workers,
+    workers: Executor,
     progress: Progress,
 ) -> MadeLandmarks:
     """Pair, match and verify the photos, and make landmarks of what was matched.
@@ -94,17 +95,20 @@ def landmarks_from_matches(
         work, photos, features, pairs.rows, verification, workers, progress
     )
 
-    def compute() -> Item:
-        rigs = known_rigs(dataset, {photo.record.sensor_id for photo in photos})
-        given = [_sfm_photo(photo, features, settings) for photo in photos]
-        if settings.estimate_poses:
-            return _to_item(reconstruct(given, rigs, matches, config, settings.refine, work.root))
-        return _to_item(triangulate(given, rigs, matches, config, settings.refine, work.root))
-
-    progress("triangulation", 0, 1)
-    item = work.get(_model_key(matches_key, photos, dataset, config, settings), compute)
-    progress("triangulation", 1, 1)
-    model = _from_item(item, photos)
+    rigs = known_rigs(dataset, {photo.record.sensor_id for photo in photos})
+    task = _ModelTask(
+        work,
+        tuple(photos),
+        features,
+        rigs,
+        matches,
+        config,
+        settings.refine,
+        settings.estimate_poses,
+    )
+    key = _model_key(matches_key, photos, dataset, config, settings)
+    workers.run(task.make, [key], partial(progress, "triangulation"))
+    model = _from_item(work.read(key), photos)
     placed = np.array([row for row, view in enumerate(model.views) if view is not None])
     views = [view for view in model.views if view is not None]
     points, notes = model.points, []
@@ -215,18 +219,38 @@ def _tracks(dataset: Dataset, names: Sequence[str], covisible_in: Map | None) ->
     return np.column_stack([points, images])[images >= 0]
 
 
-def _sfm_photo(
-    photo: MappingPhoto, features: LocalFeaturesSource, settings: SfmSettings
-) -> SfmPhoto:
-    return SfmPhoto(
-        name=photo.name,
-        sensor=photo.record.sensor_id,
-        timestamp=photo.record.timestamp,
-        camera=photo.camera,
-        camera_known=photo.camera_known,
-        cam_from_world=None if settings.estimate_poses else photo.pose,
-        keypoints=features.read(photo).keypoints,
-    )
+@dataclass(frozen=True, slots=True, eq=False)
+class _ModelTask:
+    """What a worker does for the whole map, once all matches are there."""
+
+    work: WorkFolder
+    photos: tuple[MappingPhoto, ...]
+    features: LocalFeaturesSource
+    rigs: Mapping[str, Mapping[str, Pose]]
+    matches: Sequence[Matches]
+    config: MapperConfig
+    refine: tuple[str, ...]
+    estimate_poses: bool
+
+    def make(self, key: str) -> None:
+        def compute() -> Item:
+            make = reconstruct if self.estimate_poses else triangulate
+            given = [self._given(photo) for photo in self.photos]
+            model = make(given, self.rigs, self.matches, self.config, self.refine, self.work.root)
+            return _to_item(model)
+
+        self.work.get(key, compute)
+
+    def _given(self, photo: MappingPhoto) -> SfmPhoto:
+        return SfmPhoto(
+            name=photo.name,
+            sensor=photo.record.sensor_id,
+            timestamp=photo.record.timestamp,
+            camera=photo.camera,
+            camera_known=photo.camera_known,
+            cam_from_world=None if self.estimate_poses else photo.pose,
+            keypoints=self.features.read(photo).keypoints,
+        )
 
 
 def _anchored(

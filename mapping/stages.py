@@ -14,6 +14,7 @@ import fcntl
 import hashlib
 import json
 import os
+import platform
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.costs import wrote
 from visloc.archive.npz import read_npz
 from visloc.errors import Conflict, Unavailable
 
@@ -79,9 +81,11 @@ class WorkFolder:
             item = compute()
         path = self._path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_suffix(f".{os.getpid()}.tmp")
+        # Machines may share the folder.
+        unfinished = path.with_suffix(f".{platform.node()}.{os.getpid()}.tmp")
         with unfinished.open("wb") as file:
             np.savez(file, **item)  # type: ignore[arg-type]  # the stub knows no **arrays
+            wrote(file.tell())
         unfinished.replace(path)
         return item
 

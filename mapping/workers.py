@@ -1,4 +1,4 @@
-"""Worker processes: the same task for many items, in any order."""
+"""Worker processes of this machine: the same task for many items, in any order."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from typing import TypeVar
 
 import cv2
 
+from mapping.costs import Spent, spent_here
 from visloc.errors import Unavailable
 
 T = TypeVar("T")
@@ -25,12 +26,12 @@ DEFAULT_WORKERS = min(os.cpu_count() or 1, 8)
 
 # Each library would otherwise start as many threads as there are processors, in every worker. They
 # read these when they are loaded; torch reads the first.
-_THREADS = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "OPENCV_FOR_THREADS_NUM",
-)
+ONE_THREAD = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENCV_FOR_THREADS_NUM": "1",
+}
 
 # Items that travel together: few, so that progress is seen, and all workers have work to the end.
 _MAX_BATCH, _MIN_BATCHES = 16, 200
@@ -39,12 +40,10 @@ _MAX_BATCH, _MIN_BATCHES = 16, 200
 class Workers:
     """Does work in ``count`` processes, which end with the ``with`` block; one means this process.
 
-    Every process uses one thread, so that their number does not change what comes out. Where a task
-    of this process is the first to load torch, it uses all: for products of whole numbers, which
-    are the same with any number of threads.
-
-    A task and its items travel to other processes: the task is a module's function, a method of a
-    dataclass or a ``functools.partial`` of one, and leaves its result in the work folder.
+    A single item is done in this process as well: Ctrl-C ends it at once, where it would wait for
+    another one. Every process uses one thread, so that their number does not change what comes out.
+    Where a task of this process is the first to load torch, it uses all: for products of whole
+    numbers, which are the same with any number of threads.
     """
 
     def __init__(self, count: int) -> None:
@@ -55,6 +54,7 @@ class Workers:
             if count > 1
             else None
         )
+        self._spent = Spent()
 
     def __enter__(self) -> Workers:
         return self
@@ -68,6 +68,11 @@ class Workers:
         if self._pool is not None:
             self._pool.shutdown(wait=True, cancel_futures=True)
 
+    @property
+    def spent(self) -> Spent:
+        """What the other processes have used up for the items that are done."""
+        return self._spent
+
     def run(
         self, task: Callable[[T], object], items: Sequence[T], progress: Callable[[int, int], None]
     ) -> None:
@@ -78,21 +83,20 @@ class Workers:
             Exception: what the task raised first; waiting items are dropped.
         """
         progress(0, len(items))
-        if self._pool is None:
+        if self._pool is None or len(items) == 1:
             with _one_thread_here():
                 for done, item in enumerate(items, 1):
                     task(item)
                     progress(done, len(items))
             return
         try:
-            # A task can hold a whole dataset: many items share one journey of it.
-            size = max(1, min(_MAX_BATCH, len(items) // _MIN_BATCHES))
-            batches = [items[start : start + size] for start in range(0, len(items), size)]
             with _one_thread_each(), _interrupted_later():
-                futures = [self._pool.submit(_do_all, task, batch) for batch in batches]
+                futures = [self._pool.submit(do_batch, task, batch) for batch in in_batches(items)]
             done = 0
             for future in as_completed(futures):
-                done += future.result()
+                count, spent = future.result()
+                done += count
+                self._spent += spent
                 progress(done, len(items))
         except BrokenProcessPool as error:
             raise Unavailable(
@@ -103,10 +107,18 @@ class Workers:
             ) from error
 
 
-def _do_all(task: Callable[[T], object], items: Sequence[T]) -> int:
+def in_batches(items: Sequence[T]) -> list[Sequence[T]]:
+    """Return the items in batches: many share one journey of the task."""
+    size = max(1, min(_MAX_BATCH, len(items) // _MIN_BATCHES))
+    return [items[start : start + size] for start in range(0, len(items), size)]
+
+
+def do_batch(task: Callable[[T], object], items: Sequence[T]) -> tuple[int, Spent]:
+    """Do the task for the items in this process; return how many, and what that used up."""
+    before = spent_here()
     for item in items:
         task(item)
-    return len(items)
+    return len(items), spent_here() - before
 
 
 def _start_worker() -> None:
@@ -164,8 +176,8 @@ def _one_thread_here() -> Iterator[None]:
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
     """Processes that start meanwhile use one thread in libraries that read the environment."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(ONE_THREAD)
     try:
         yield
     finally:

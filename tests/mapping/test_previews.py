@@ -11,6 +11,7 @@ import pytest
 
 from mapping.build import BuildSettings, build_map
 from mapping.previews import keep_photos
+from mapping.stages import WorkFolder
 from mapping.workers import Workers
 from visloc.archive import Map, MapStore, open_map, verify_map
 from visloc.errors import MapCorrupt
@@ -54,11 +55,11 @@ def test_photos_become_at_most_640_pixels_and_lose_their_exif(tmp_path: Path) ->
     for name, pixels in (("large", large), ("noise", noise)):
         path = tmp_path / f"{name}.png"
         cv2.imwrite(str(path), pixels)
-        photos.append(type("Photo", (), {"path": path})())
+        photos.append(type("Photo", (), {"path": path, "sha256": name})())
     folder = tmp_path / "map"
 
     with Workers(1) as workers:
-        keep_photos(folder, photos, workers, quiet)
+        keep_photos(WorkFolder(tmp_path / "work"), folder, photos, workers, quiet)
 
     kept = [path.read_bytes() for path in sorted((folder / "photos").iterdir())]
     first = read_photo(kept[0]).rgb

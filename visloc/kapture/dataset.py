@@ -141,6 +141,10 @@ class Dataset:
         """Return where the record's file should lie; it may be missing."""
         return self.root / "sensors" / "records_data" / record.path
 
+    def without_records(self) -> Dataset:
+        """Return what it takes to find files: this dataset, light enough to be sent to others."""
+        return replace(self, trajectories={}, images=(), depth_maps=(), gnss=(), notes=())
+
     def with_pixels_from(self, origin: PixelOrigin) -> Dataset:
         """Return this dataset in our convention, when its calibrations count from ``origin``."""
         sensors = {

@@ -1,0 +1,113 @@
+"""What each stage of a build cost: time, work of all processes, and bytes that were kept."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+Progress = Callable[[str, int, int], None]
+_written_bytes = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Spent:
+    """What processes have used up.
+
+    Attributes:
+        cpu_s: seconds of processors, of all threads.
+        written_bytes: of finished work and of maps.
+    """
+
+    cpu_s: float = 0.0
+    written_bytes: int = 0
+
+    def __add__(self, other: Spent) -> Spent:
+        return Spent(self.cpu_s + other.cpu_s, self.written_bytes + other.written_bytes)
+
+    def __sub__(self, other: Spent) -> Spent:
+        return Spent(self.cpu_s - other.cpu_s, self.written_bytes - other.written_bytes)
+
+
+def wrote(num_bytes: int) -> None:
+    """Count bytes that this process has written."""
+    global _written_bytes
+    _written_bytes += num_bytes
+
+
+def spent_here() -> Spent:
+    """Return what this process has used up so far."""
+    return Spent(time.process_time(), _written_bytes)
+
+
+@dataclass(frozen=True, slots=True)
+class StageCost:
+    """What one stage cost.
+
+    Attributes:
+        stage: its name.
+        items: how many it had; None for more than one stage.
+        wall_s: seconds from its begin to its end.
+        spent: by all processes.
+    """
+
+    stage: str
+    items: int | None
+    wall_s: float
+    spent: Spent
+
+
+class _Workers(Protocol):
+    @property
+    def spent(self) -> Spent:
+        """What other processes have used up so far."""
+        ...
+
+
+class Costs:
+    """Measures the stages of a build, which come one after the other."""
+
+    def __init__(self) -> None:
+        self._workers: _Workers | None = None
+        self._begun: dict[str, _Moment] = {}
+        self._stages: dict[str, StageCost] = {}
+        self._start = self._now()
+
+    def measured(self, progress: Progress, workers: _Workers) -> Progress:
+        """Return a progress that measures what it is told, and tells it to ``progress``."""
+        self._workers = workers
+
+        def note(stage: str, done: int, total: int) -> None:
+            begin = self._begun.setdefault(stage, self._now())
+            if done == total:
+                self._stages[stage] = _cost(stage, total, begin, self._now())
+            progress(stage, done, total)
+
+        return note
+
+    def table(self) -> list[StageCost]:
+        """Return the finished stages, what lies between them, and the whole so far."""
+        stages = list(self._stages.values())
+        whole = _cost("in all", None, self._start, self._now())
+        between = StageCost(
+            "between",
+            None,
+            whole.wall_s - sum(one.wall_s for one in stages),
+            whole.spent - sum((one.spent for one in stages), Spent()),
+        )
+        return [*stages, between, whole]
+
+    def _now(self) -> _Moment:
+        elsewhere = Spent() if self._workers is None else self._workers.spent
+        return _Moment(time.monotonic(), spent_here() + elsewhere)
+
+
+@dataclass(frozen=True, slots=True)
+class _Moment:
+    clock_s: float
+    spent: Spent
+
+
+def _cost(stage: str, items: int | None, begin: _Moment, end: _Moment) -> StageCost:
+    return StageCost(stage, items, end.clock_s - begin.clock_s, end.spent - begin.spent)
