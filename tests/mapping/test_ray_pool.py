@@ -1,0 +1,182 @@
+"""Builds on a Ray cluster of this machine, with workers that are killed."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from benchmarks.cluster import busy_workers
+from mapping import ray_pool
+from mapping.build import BuildSettings, build_map
+from mapping.executors import open_executor
+from mapping.ray_pool import RayPool
+from visloc.archive import Map, open_map
+from visloc.errors import InvalidInput, Unavailable
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Path]:
+    """The folder of a cluster with two processors that ``auto`` finds."""
+    # Short: the names of sockets are within it.
+    folder = Path(tempfile.mkdtemp(prefix="ray", dir="/tmp"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_TMPDIR", str(folder))
+        patch.setenv("RAY_AUTH_TOKEN", secrets.token_hex(32))
+        patch.setenv("PYTHONPATH", str(ROOT))
+        options = [
+            *("--head", "--block", "--num-cpus=2", "--port=0", "--node-ip-address=127.0.0.1"),
+            *("--include-dashboard=false", "--disable-usage-stats"),
+            *(f"--temp-dir={folder}", f"--object-store-memory={2**27}"),
+        ]
+        with (folder / "log").open("wb") as log:
+            head = subprocess.Popen(
+                [Path(sys.executable).with_name("ray"), "start", *options], stdout=log, stderr=log
+            )
+        try:
+            while "Ray runtime started" not in (folder / "log").read_text():
+                assert head.poll() is None, (folder / "log").read_text()
+            yield folder
+        finally:
+            head.terminate()
+            head.wait()
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture
+def pool(cluster: Path) -> Iterator[RayPool]:  # noqa: ARG001
+    with RayPool(2, "auto") as pool:
+        yield pool
+
+
+def write_square(folder: Path, number: int) -> None:
+    threads = os.environ["OMP_NUM_THREADS"]
+    (folder / f"{number}").write_text(f"{number * number} {os.getpid()} {threads}")
+
+
+def die_once(folder: Path, number: int) -> None:
+    """Take the worker along, the first time that a number is met."""
+    if number % 2 and not (folder / f"{number}.met").exists():
+        (folder / f"{number}.met").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    write_square(folder, number)
+
+
+def refuse_3(number: int) -> None:
+    if number == 3:
+        raise InvalidInput("test.number", "not a number", field="n", expected="2", got=number)
+
+
+def use_up(number: int) -> None:
+    sum(range(10_000_000 * number))
+
+
+def ignore(_done: int, _total: int) -> None:
+    pass
+
+
+def test_every_item_is_done_elsewhere_with_one_thread(pool: RayPool, tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+    pool.run(partial(write_square, tmp_path), range(5), lambda *now: told.append(now))
+    assert told == [(done, 5) for done in range(6)]
+    found = [(tmp_path / f"{number}").read_text().split() for number in range(5)]
+    assert [int(square) for square, _, _ in found] == [0, 1, 4, 9, 16]
+    assert {threads for _, _, threads in found} == {"1"}
+    assert str(os.getpid()) not in {pid for _, pid, _ in found}
+
+
+def test_nothing_to_do_is_done(pool: RayPool) -> None:
+    told: list[tuple[int, int]] = []
+    pool.run(refuse_3, [], lambda *now: told.append(now))
+    assert told == [(0, 0)]
+
+
+def test_what_workers_use_up_is_counted(pool: RayPool) -> None:
+    pool.run(use_up, [0], ignore)
+    little = pool.spent.cpu_s
+    pool.run(use_up, [3], ignore)
+    assert pool.spent.cpu_s > 2 * little > 0
+
+
+def test_a_batch_whose_worker_was_killed_is_done_again(pool: RayPool, tmp_path: Path) -> None:
+    pool.run(partial(die_once, tmp_path), range(4), ignore)
+    assert {path.name for path in tmp_path.glob("*.met")} == {"1.met", "3.met"}
+    squares = [(tmp_path / f"{number}").read_text().split()[0] for number in range(4)]
+    assert squares == ["0", "1", "4", "9"]
+
+
+def test_an_error_of_ours_arrives_as_it_was_raised(pool: RayPool) -> None:
+    with pytest.raises(InvalidInput, match="not a number") as caught:
+        pool.run(refuse_3, range(5), ignore)
+    error = caught.value
+    assert type(error) is InvalidInput
+    assert (error.code, error.field, error.expected) == ("test.number", "n", "2")
+
+
+def test_a_batch_that_always_ends_its_worker_is_an_error_with_advice(
+    pool: RayPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Three retries take seconds, and show no more than none.
+    monkeypatch.setattr(pool, "_do_batch", pool._do_batch.options(max_retries=0))
+    with pytest.raises(Unavailable, match=r"killed.*memory.*resumes") as caught:
+        pool.run(os._exit, [1], ignore)
+    assert (caught.value.code, caught.value.field) == ("build.worker_died", "--executor")
+
+
+def test_a_machine_with_another_version_is_refused(
+    pool: RayPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ray_pool, "__version__", "0.0.1")
+    with pytest.raises(Unavailable) as caught:
+        pool.run(ignore, [(1, 2)], ignore)
+    assert (caught.value.code, caught.value.expected) == ("build.other_version", "0.0.1")
+
+
+@pytest.mark.parametrize("method", ["rgbd", "sfm"])
+def test_a_build_whose_workers_are_killed_makes_the_map_of_a_local_build(
+    cluster: Path,
+    walk: Path,
+    tmp_path: Path,
+    request: pytest.FixtureRequest,
+    method: str,
+) -> None:
+    local: Map = request.getfixturevalue(f"{method}_walk")
+    killed: list[int] = []
+
+    def kill_one(stage: str, done: int, _total: int) -> None:
+        if stage in ("local features", "matches") and done == 2:
+            [pid, *_] = busy_workers(cluster)
+            os.kill(pid, signal.SIGKILL)
+            killed.append(pid)
+
+    settings = BuildSettings(
+        walk / "mapping",
+        "walk",
+        tmp_path,
+        method=method,
+        local_features="sift",
+        global_features=("localvlad",),
+        max_keypoints=500,
+        executor="ray",
+        workers=2,
+    )
+    built = open_map(build_map(settings, kill_one))
+    assert len(killed) == (2 if method == "sfm" else 1)
+    assert built.manifest.content_hash == local.manifest.content_hash
+
+
+def test_an_address_where_nothing_listens_is_refused() -> None:
+    with pytest.raises(Unavailable) as caught:
+        open_executor("ray", 1, "ray//nowhere")
+    assert (caught.value.code, caught.value.field) == ("build.no_cluster", "--ray-address")
