@@ -21,7 +21,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "visloc needs Python 3.11 or newer")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-		--editable '.[mapping,service,gem,s3,tracing,clients,compare,dev]'
+		--editable '.[mapping,service,gem,s3,cluster,tracing,clients,compare,dev]'
 	touch $(INSTALLED)
 
 page: ## build the page from web/

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Protocol, TypeVar
@@ -13,6 +14,13 @@ from visloc.errors import InvalidInput
 T = TypeVar("T")
 
 EXECUTORS = ("local", "ray")
+# Ray reads these when it is loaded. Nothing is reported to anyone; no worker is shown other GPUs
+# than its machine has; an address where nothing listens is an error within a minute, not thirteen.
+_RAY_SETTINGS = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_NUM_REDIS_GET_RETRIES": "1",
+}
 
 
 class Executor(Protocol):
@@ -54,6 +62,8 @@ def open_executor(name: str, workers: int, ray_address: str) -> AbstractContextM
     """
     if name == "local":
         return Workers(workers)
+    for setting, value in _RAY_SETTINGS.items():
+        os.environ.setdefault(setting, value)
     try:
         from mapping.ray_pool import RayPool  # ray is optional
     except ImportError as error:

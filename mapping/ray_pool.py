@@ -7,16 +7,10 @@ a machine that dies takes nothing along but the batches that it was at, which Ra
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Sequence
 from itertools import islice
 from types import TracebackType
 from typing import Any, TypeVar
-
-# Before ray is loaded, which reads them then: nothing is reported to anyone, and no worker is
-# shown other GPUs than its machine has.
-os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
 
 import ray
 
