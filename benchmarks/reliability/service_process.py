@@ -25,6 +25,8 @@ class ServiceProcess:
     Args:
         maps_dir: folder or URL of maps.
         log: file that its log is appended to.
+        host: address of this machine to listen on.
+        ports: of HTTP and gRPC; free ones when None.
         before: words before the command, such as ``unshare``'s.
         environment: variables besides this process's own.
         settings: further settings, by name.
@@ -35,16 +37,19 @@ class ServiceProcess:
         maps_dir: Path | str,
         log: Path,
         *,
+        host: str = "127.0.0.1",
+        ports: tuple[int, int] | None = None,
         before: Sequence[str] = (),
         environment: Mapping[str, str] | None = None,
         **settings: object,
     ) -> None:
-        self.http_port, self.grpc_port = free_port(), free_port()
-        self.url = f"http://127.0.0.1:{self.http_port}"
-        self.grpc = f"127.0.0.1:{self.grpc_port}"
+        self.http_port, self.grpc_port = ports or (free_port(), free_port())
+        self.url = f"http://{host}:{self.http_port}"
+        self.grpc = f"{host}:{self.grpc_port}"
         self.log = log
         given = {
             "maps_dir": maps_dir,
+            "host": host,
             "http_port": self.http_port,
             "grpc_port": self.grpc_port,
             "threads_per_worker": 1,
