@@ -44,7 +44,8 @@ def compose(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     stand_in.chmod(0o755)
     done = subprocess.run(
         [
-            *(sys.executable, "-m", "podman_compose", "--profile", "tools"),
+            *(sys.executable, "-m", "podman_compose"),
+            *("--profile", "tools", "--profile", "replicas"),
             *("-f", str(ROOT / "docker-compose.yml"), "config"),
         ],
         env={"PATH": f"{stand_in.parent}:{os.environ['PATH']}"},
@@ -59,10 +60,24 @@ def compose(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 def test_compose_has_the_service_and_what_watches_it(compose: dict[str, Any]) -> None:
-    tools = {name for name, service in compose["services"].items() if service.get("profiles")}
+    profiles = {
+        name: service["profiles"]
+        for name, service in compose["services"].items()
+        if service.get("profiles")
+    }
 
-    assert tools == {"mapping", "localize"}
-    assert compose["services"].keys() - tools == {"keys", "service", "prometheus", "grafana"}
+    assert profiles == {
+        "mapping": ["tools"],
+        "localize": ["tools"],
+        "replica": ["replicas"],
+        "balancer": ["replicas"],
+    }
+    assert compose["services"].keys() - profiles.keys() == {
+        "keys",
+        "service",
+        "prometheus",
+        "grafana",
+    }
 
 
 def test_nothing_is_published_beyond_this_machine(compose: dict[str, Any]) -> None:
@@ -86,7 +101,7 @@ def test_every_container_has_a_read_only_file_system_and_no_rights(
 def test_images_of_others_have_a_version(compose: dict[str, Any]) -> None:
     others = [s["image"] for s in compose["services"].values() if "build" not in s]
 
-    assert len(others) == 2
+    assert len(others) == 3
     assert all(re.fullmatch(r"docker\.io/[a-z/]+:v?\d+\.\d+\.\d+", image) for image in others)
 
 
@@ -104,7 +119,28 @@ def test_the_service_takes_the_settings_that_compose_gives(compose: dict[str, An
     published = {int(port.rsplit(":", 1)[1]) for port in service["ports"]}
     assert published == {settings.http_port, settings.grpc_port}
     grace_s = int(service["stop_grace_period"].removesuffix("s"))
-    assert grace_s > settings.drain_timeout_s
+    assert grace_s > settings.drain_delay_s + settings.drain_timeout_s
+
+
+def test_the_second_replica_is_as_the_first_with_a_cache_of_its_own(
+    compose: dict[str, Any],
+) -> None:
+    service, replica = dict(compose["services"]["service"]), compose["services"]["replica"]
+    assert service["networks"] == replica["networks"]
+    assert service["environment"] == replica["environment"]
+    assert service["image"] == replica["image"]
+    of_both = set(service["volumes"]) & set(replica["volumes"])
+    assert of_both == {"maps:/maps", "keys:/keys:ro"}
+    assert not replica.get("ports")
+
+
+def test_the_balancers_ports_are_free(compose: dict[str, Any]) -> None:
+    published = [
+        str(port).split(":")[1]
+        for service in compose["services"].values()
+        for port in service.get("ports", ())
+    ]
+    assert len(published) == len(set(published))
 
 
 def test_the_keys_are_made_first_and_only_read_by_the_service(compose: dict[str, Any]) -> None:
