@@ -43,7 +43,7 @@ from service.wire import STATUSES
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
-from visloc.pose.covariance import position_covariance
+from visloc.pose.centre import position_covariance
 from visloc.priors import Priors
 from visloc.types import (
     PRESETS,

@@ -17,24 +17,15 @@ from scipy.spatial.transform import Rotation
 from visloc.archive import Map
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose
+from visloc.pose.centre import largest_std, with_origin
 from visloc.pose.colmap import normalized_rays
-from visloc.pose.covariance import position_covariance, with_origin
 from visloc.pose.distance import mahalanobis2
 from visloc.pose.generalized import MAX_FOCAL, MIN_FOCAL
 from visloc.pose.gravity import KnownGravity, gravity_deviation
 from visloc.pose.views import MatchedView
-from visloc.priors import Priors
+from visloc.priors import HEIGHT_REACH, POSE_PRIOR_STDS, REACH, Priors
 
-# How far beyond an area a photo may have been taken and still show it, in units of how far the
-# map's photos see; within that, photos further away count less.
-REACH = 2.0
 _LEAST_REACH = 1e-9  # of a map whose photos see nothing
-# How far beyond a height band a photo may have been taken, in units of its height. On the floors
-# above and below, photos are further away than this from the band of a floor: they are taken from
-# the middle half of their own.
-HEIGHT_REACH = 0.25
-# An area of so many standard deviations around a pose prior is searched.
-POSE_PRIOR_STDS = 3.0
 # A pose contradicts a prior when it is further away than so many of its own standard deviations.
 _OWN_STDS = 3.0
 # Chi-square with six degrees of freedom is above this once in 10 000 times.
@@ -254,11 +245,6 @@ def _nearest_rays(view: MatchedView, expected: NDArray[np.float64]) -> NDArray[n
         np.arctan(tangent * focal / MIN_FOCAL),
     )
     return np.column_stack([np.sin(angle)[:, None] * side, np.cos(angle)])
-
-
-def largest_std(pose: Pose, covariance: NDArray[np.float64]) -> float:
-    """Return the standard deviation of a device's position along its worst axis."""
-    return math.sqrt(max(float(np.linalg.eigvalsh(position_covariance(pose, covariance))[-1]), 0.0))
 
 
 def _angles(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -18,6 +18,15 @@ from visloc.geometry import Pose
 
 # A gravity prior of a larger spread says too little to search by.
 MAX_GRAVITY_STD = math.radians(15.0)
+# How far beyond an area a photo may have been taken and still show it, in units of how far the
+# map's photos see; within that, photos further away count less.
+REACH = 2.0
+# How far beyond a height band a photo may have been taken, in units of its height. On the floors
+# above and below, photos are further away than this from the band of a floor: they are taken from
+# the middle half of their own.
+HEIGHT_REACH = 0.25
+# An area of so many standard deviations around a pose prior is searched.
+POSE_PRIOR_STDS = 3.0
 # Further than any place, wider than any doubt; squares and products of it are still numbers.
 _MOST = 1e15
 # Of a covariance without units. That of a pose 5000 km from the origin is within a hair of singular

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from visloc.constraints import Constraints, MapGeometry
 from visloc.errors import InvalidInput
 from visloc.geometry import rotation_angle
-from visloc.pose.covariance import with_origin
+from visloc.pose.centre import with_origin
 from visloc.pose.motion import RelativeMotion, default_motion_covariance, link_from_motion
 from visloc.pose.window import WindowInstant, WindowPose, solve_window
 from visloc.priors import Priors

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from visloc.constraints import Constraints, MapGeometry
 from visloc.errors import InvalidInput, VislocError
 from visloc.geometry import Camera, Pose
-from visloc.pose.covariance import position_covariance, with_origin
+from visloc.pose.centre import position_covariance, with_origin
 from visloc.pose.distance import mahalanobis2
 from visloc.pose.generalized import (
     GeneralizedPose,

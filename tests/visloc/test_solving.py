@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
+from visloc.pose.centre import with_origin
 from visloc.pose.colmap import normalized_rays
-from visloc.pose.covariance import with_origin
 from visloc.priors import (
     NO_PRIORS,
     GravityPrior,

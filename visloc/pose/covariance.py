@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.geometry import Pose, cross_matrix
+from visloc.geometry import Pose
 from visloc.pose.reprojection import has_derivative, linearized
 from visloc.pose.views import MatchedView
 
@@ -98,35 +98,6 @@ def pose_covariance(
     return np.asarray(
         (wider + (_PRINCIPAL_POINT_STD * longer_side) ** 2 * by_point @ by_point.T)[:6, :6]
     )
-
-
-def position_covariance(
-    cam_from_world: Pose, covariance: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Covariance (3, 3) of the camera centre in the world, from that of the pose (6, 6).
-
-    The centre is -R^T t; moving R by Exp(w) and t by dt moves it by -R^T (dt + [t] w), with [t]
-    the matrix of the cross product.
-    """
-    jacobian = -cam_from_world.rotation.T @ np.hstack(
-        [cross_matrix(cam_from_world.translation), np.eye(3)]
-    )
-    return np.asarray(jacobian @ covariance @ jacobian.T)
-
-
-def with_origin(
-    cam_from_local: Pose, covariance: NDArray[np.float64], origin: NDArray[np.float64]
-) -> tuple[Pose, NDArray[np.float64]]:
-    """Move a pose found in coordinates relative to ``origin`` (3,) to the world.
-
-    x_local = x_world - origin, so t_world = t_local - R origin; the covariance of t_world
-    gains the part that the rotation causes at that distance.
-    """
-    offset = cam_from_local.rotation @ origin
-    pose = Pose(cam_from_local.rotation, cam_from_local.translation - offset)
-    jacobian = np.eye(6)
-    jacobian[3:, :3] = cross_matrix(offset)
-    return pose, jacobian @ covariance @ jacobian.T
 
 
 def _squared(rows: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import SetOutline
-from visloc.constraints import HEIGHT_REACH, POSE_PRIOR_STDS, REACH, largest_std
 from visloc.errors import InvalidInput, NotFound
 from visloc.geometry import Pose, rotation_angle
-from visloc.pose.covariance import position_covariance
-from visloc.priors import Priors
-from visloc.sets.coarse import TileScore
+from visloc.pose.centre import largest_std, position_covariance
+from visloc.priors import HEIGHT_REACH, POSE_PRIOR_STDS, REACH, Priors
 from visloc.sets.frame import down_in_set
 from visloc.types import Answer, InstantAnswer, Localized, Reason, Refusal
 
@@ -33,6 +31,19 @@ _RIVAL_SHARE, _SIMILAR_SHARE = 0.5, 0.8
 _STDS = 3.0
 _REACH_SHARE, _ANGLE = 0.1, math.radians(5.0)
 _NAMED = 5
+
+
+@dataclass(frozen=True, slots=True)
+class TileScore:
+    """How much a tile looks like a query.
+
+    Attributes:
+        tile: its row in the set.
+        score: estimated cosine similarity of its best photos, comparable within one query.
+    """
+
+    tile: int
+    score: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,7 +127,7 @@ def plan(scores: Sequence[TileScore]) -> tuple[tuple[int, ...], tuple[int, ...]]
 
 def is_clear(answer: Answer | InstantAnswer) -> bool:
     """Tell whether no other tile needs to be searched: a pose of many inliers."""
-    return _pose(answer) is not None and _inliers(answer) >= CLEAR_INLIERS
+    return _pose(answer) is not None and inliers_of(answer) >= CLEAR_INLIERS
 
 
 def judge(outline: SetOutline, found: Sequence[Found]) -> int | Refusal:
@@ -137,18 +148,18 @@ def judge(outline: SetOutline, found: Sequence[Found]) -> int | Refusal:
     localized = [row for row, one in enumerate(found) if _pose(one.answer) is not None]
     if not localized:
         return max(range(len(found)), key=lambda row: _progress(found[row].answer))
-    best = max(localized, key=lambda row: _inliers(found[row].answer))
-    most = _inliers(found[best].answer)
+    best = max(localized, key=lambda row: inliers_of(found[row].answer))
+    most = inliers_of(found[best].answer)
     agreeing = [best]
     for row in localized:
-        count = _inliers(found[row].answer)
+        count = inliers_of(found[row].answer)
         if row == best or count < _RIVAL_SHARE * most:
             continue
         if _agree(outline, found[best], found[row]):
             agreeing.append(row)
         else:
             return _ambiguous(outline, found[best], found[row])
-    similar = [row for row in agreeing if _inliers(found[row].answer) >= _SIMILAR_SHARE * most]
+    similar = [row for row in agreeing if inliers_of(found[row].answer) >= _SIMILAR_SHARE * most]
     return min(similar, key=lambda row: _spread(found[row].answer))
 
 
@@ -176,7 +187,8 @@ def _pose(answer: Answer | InstantAnswer) -> tuple[Pose, NDArray[np.float64]] | 
     return None
 
 
-def _inliers(answer: Answer | InstantAnswer) -> int:
+def inliers_of(answer: Answer | InstantAnswer) -> int:
+    """Return the inliers of the best pose, accepted or not."""
     if isinstance(answer, InstantAnswer):
         return answer.num_inliers
     return answer.evidence.num_inliers
@@ -210,9 +222,10 @@ def _agree(outline: SetOutline, a: Found, b: Found) -> bool:
 
 def _ambiguous(outline: SetOutline, a: Found, b: Found) -> Refusal:
     ref_a, ref_b = (outline.tiles[one.tile].ref for one in (a, b))
+    count_a, count_b = (inliers_of(one.answer) for one in (a, b))
     return Refusal(
         "gate",
         Reason.AMBIGUOUS,
-        f"{ref_a} and {ref_b} both explain it, at different places, with {_inliers(a.answer)} and "
-        f"{_inliers(b.answer)} inliers; say where it is (priors)",
+        f"{ref_a} and {ref_b} both explain it, at different places, with {count_a} and "
+        f"{count_b} inliers; say where it is (priors)",
     )

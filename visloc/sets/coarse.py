@@ -21,6 +21,7 @@ from visloc.features.vlad import KMEANS_MAX_WORDS, learn_words
 from visloc.features.whitening import WHITENING_MAX_PHOTOS, unit_rows
 from visloc.fingerprints import check_fingerprint
 from visloc.retrieval.rows import GlobalRows, in_8_bits
+from visloc.sets.choosing import TileScore
 from visloc.types import LocalFeatures
 
 CoarseModel = Mapping[str, NDArray[np.float32]]
@@ -36,19 +37,6 @@ _NUM_BEST = 3
 _MAX_TEACHERS = 256
 _BLOCK_ROWS = 2**18
 _NO_PIXELS = np.empty((0, 0, 3), np.uint8)
-
-
-@dataclass(frozen=True, slots=True)
-class TileScore:
-    """How much a tile looks like a query.
-
-    Attributes:
-        tile: its row in the set.
-        score: estimated cosine similarity of its best photos, comparable within one query.
-    """
-
-    tile: int
-    score: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

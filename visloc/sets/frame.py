@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose, Similarity, cross_matrix
-from visloc.pose.covariance import position_covariance
+from visloc.pose.centre import position_covariance
 from visloc.priors import HeightBand, PosePrior, PositionPrior, Priors
 from visloc.types import InstantAnswer, Localized, NotLocalized, RigPose
 

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from visloc.geometry import Camera, Pose
+from visloc.pose.centre import position_covariance, with_origin
 from visloc.pose.colmap import normalized_rays, project
-from visloc.pose.covariance import pose_covariance, position_covariance, with_origin
+from visloc.pose.covariance import pose_covariance
 from visloc.pose.generalized import estimate_generalized_pose
 from visloc.pose.refinement import LOSS_SCALE_PX
 from visloc.pose.views import MatchedView

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from visloc.archive import SetOutline
 from visloc.errors import InvalidInput, NotFound
 from visloc.geometry import Camera, Pose
-from visloc.pose.covariance import position_covariance
+from visloc.pose.centre import position_covariance
 from visloc.priors import NO_PRIORS, GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
 from visloc.sets.choosing import Found, allowed_tiles, is_clear, judge, plan
 from visloc.sets.coarse import TileScore

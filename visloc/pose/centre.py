@@ -1,0 +1,47 @@
+"""A pose and its covariance, seen from the camera's centre or from another origin.
+
+As in ``covariance``: R <- Exp(w) R, t <- t + dt; 6 x 6, w (rad) before dt.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.geometry import Pose, cross_matrix
+
+
+def position_covariance(
+    cam_from_world: Pose, covariance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Covariance (3, 3) of the camera centre in the world, from that of the pose (6, 6).
+
+    The centre is -R^T t; moving R by Exp(w) and t by dt moves it by -R^T (dt + [t] w), with [t]
+    the matrix of the cross product.
+    """
+    jacobian = -cam_from_world.rotation.T @ np.hstack(
+        [cross_matrix(cam_from_world.translation), np.eye(3)]
+    )
+    return np.asarray(jacobian @ covariance @ jacobian.T)
+
+
+def with_origin(
+    cam_from_local: Pose, covariance: NDArray[np.float64], origin: NDArray[np.float64]
+) -> tuple[Pose, NDArray[np.float64]]:
+    """Move a pose found in coordinates relative to ``origin`` (3,) to the world.
+
+    x_local = x_world - origin, so t_world = t_local - R origin; the covariance of t_world
+    gains the part that the rotation causes at that distance.
+    """
+    offset = cam_from_local.rotation @ origin
+    pose = Pose(cam_from_local.rotation, cam_from_local.translation - offset)
+    jacobian = np.eye(6)
+    jacobian[3:, :3] = cross_matrix(offset)
+    return pose, jacobian @ covariance @ jacobian.T
+
+
+def largest_std(pose: Pose, covariance: NDArray[np.float64]) -> float:
+    """Return the standard deviation of a device's position along its worst axis."""
+    return math.sqrt(max(float(np.linalg.eigvalsh(position_covariance(pose, covariance))[-1]), 0.0))
