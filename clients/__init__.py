@@ -30,6 +30,7 @@ from clients.types import (
     RetrievedImage,
     RigInfo,
     ServerInfo,
+    TileInfo,
     VersionInfo,
 )
 from visloc.priors import GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
@@ -71,5 +72,6 @@ __all__ = [
     "RigPose",
     "RigSensor",
     "ServerInfo",
+    "TileInfo",
     "VersionInfo",
 ]

@@ -28,6 +28,7 @@ from clients.types import (
     RetrievedImage,
     RigInfo,
     ServerInfo,
+    TileInfo,
     VersionInfo,
 )
 from visloc.errors import InvalidInput
@@ -77,6 +78,7 @@ def parse_result(raw: JsonObject) -> LocalizeResult:
         geopose=parse_geopose(raw.get("geopose")),
         geopose_ypr=parse_geopose_ypr(raw.get("geopose_ypr")),
         debug=_parse_debug(raw.get("debug")),
+        tile=raw.get("tile"),
     )
 
 
@@ -121,6 +123,7 @@ def parse_instant(raw: JsonObject) -> InstantResult:
         # A server that does not know them leaves them out.
         geopose=parse_geopose(raw.get("geopose")),
         geopose_ypr=parse_geopose_ypr(raw.get("geopose_ypr")),
+        tile=raw.get("tile"),
     )
 
 
@@ -131,19 +134,18 @@ def parse_maps(raw: JsonObject) -> list[MapInfo]:
 
 def parse_map(raw: JsonObject) -> MapInfo:
     """Parse a MapInfo."""
-    extent = raw["extent"]
     return MapInfo(
         id=raw["id"],
         version=raw["version"],
         created=raw["created"],
         metric=bool(raw["metric"]),
-        method=raw["method"],
+        method=raw["method"] or None,
         local_features=raw["local_features"],
         global_features=tuple(raw["global_features"]),
         images=int(raw["images"]),
         landmarks=int(raw["landmarks"]),
-        observations=int(raw["observations"]),
-        extent=(_numbers(extent["min"]), _numbers(extent["max"])),
+        observations=None if raw["observations"] is None else int(raw["observations"]),
+        extent=_parse_extent(raw["extent"]),
         size_bytes=int(raw["size_bytes"]),
         down=_numbers(raw["down"]) if raw["down"] else None,
         rigs=tuple(RigInfo(rig["id"], tuple(rig["sensors"])) for rig in raw["rigs"]),
@@ -155,6 +157,9 @@ def parse_map(raw: JsonObject) -> MapInfo:
         # A server that does not know them leaves them out.
         fusion=raw.get("fusion") or None,
         fusion_weights=_numbers_by_name(raw.get("fusion_weights") or {}),
+        kind=raw.get("kind") or "map",
+        num_tiles=None if raw.get("num_tiles") is None else int(raw["num_tiles"]),
+        tiles=tuple(_parse_tile(tile) for tile in raw.get("tiles") or ()),
     )
 
 
@@ -166,6 +171,23 @@ def parse_server(raw: JsonObject) -> ServerInfo:
 def parse_ready(raw: JsonObject) -> bool:
     """Parse whether a server can answer now."""
     return bool(raw["ready"])
+
+
+def _parse_extent(raw: JsonObject) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    return _numbers(raw["min"]), _numbers(raw["max"])
+
+
+def _parse_tile(raw: JsonObject) -> TileInfo:
+    set_from_tile = raw["set_from_tile"]
+    return TileInfo(
+        map=raw["map"],
+        version=raw["version"],
+        scale=float(set_from_tile["scale"]),
+        rotation_wxyz=_numbers(set_from_tile["rotation_wxyz"]),
+        translation=_numbers(set_from_tile["translation"]),
+        extent=_parse_extent(raw["extent"]),
+        images=int(raw["images"]),
+    )
 
 
 def _parse_debug(raw: JsonObject | None) -> Debug | None:

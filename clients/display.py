@@ -51,6 +51,8 @@ def print_result(console: Console, result: LocalizeResult, unit: str) -> None:
         print_line(console, "not localized", result.refusal.message, "bold yellow")
         print_line(console, "gave up at", f"{result.refusal.stage} ({result.refusal.reason})")
         print_line(console, "map", f"{result.map.id}@{result.map.version}")
+    if result.tile is not None:
+        print_line(console, "tile", result.tile)
     print_line(
         console,
         "inliers",

@@ -9,6 +9,8 @@ from rich.console import Console
 from clients.display import print_line, unit_of
 from clients.types import Anchor, MapInfo
 
+_NUM_TILES_SHOWN = 20
+
 
 def print_maps(console: Console, maps: Sequence[MapInfo]) -> None:
     """Print a line for each map."""
@@ -18,6 +20,8 @@ def print_maps(console: Console, maps: Sequence[MapInfo]) -> None:
     width = max(len(info.ref) for info in maps)
     for info in maps:
         parts = [f"{info.images} photos", _features(info), _size(info.size_bytes)]
+        if info.num_tiles is not None:
+            parts.insert(0, f"a set of {info.num_tiles} maps")
         if place := _place(info):
             parts.append(place)
         print_line(console, info.ref.ljust(width), ", ".join(parts))
@@ -30,15 +34,16 @@ def print_map(console: Console, info: MapInfo) -> None:
     sides = " x ".join(f"{b - a:.2f}" for a, b in zip(low, high, strict=True))
     print_line(console, "map", info.ref, "bold green" if info.current else "bold")
     print_line(console, "in use", "yes" if info.current else "no")
-    print_line(console, "created", f"{info.created}, by {info.method}")
+    by = "" if info.method is None else f", by {info.method}"
+    print_line(console, "created", f"{info.created}{by}")
     print_line(console, "features", _features(info))
     if info.fusion is not None:
         print_line(console, "fusion", _fusion(info))
+    seen = "" if info.observations is None else f"{info.observations} observations, "
     print_line(
         console,
         "content",
-        f"{info.images} photos, {info.landmarks} landmarks, {info.observations} observations, "
-        f"{_size(info.size_bytes)}",
+        f"{info.images} photos, {info.landmarks} landmarks, {seen}{_size(info.size_bytes)}",
     )
     print_line(console, "extent", f"{sides} {unit}")
     print_line(console, "on Earth", _place(info) or "not known; mapping anchor tells it")
@@ -46,6 +51,10 @@ def print_map(console: Console, info: MapInfo) -> None:
         print_line(console, "anchor", _anchor(info.anchor))
     for number, rig in enumerate(info.rigs):
         print_line(console, "" if number else "rigs", f"{rig.id}: {', '.join(rig.sensors)}")
+    for number, tile in enumerate(info.tiles[:_NUM_TILES_SHOWN]):
+        print_line(console, "" if number else "tiles", f"{tile.ref}  {tile.images} photos")
+    if len(info.tiles) > _NUM_TILES_SHOWN:
+        print_line(console, "", f"and {len(info.tiles) - _NUM_TILES_SHOWN} more")
     for number, version in enumerate(info.versions):
         used = "  in use" if version.current else ""
         print_line(console, "" if number else "versions", f"{version.version}{used}")

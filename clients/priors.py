@@ -53,6 +53,8 @@ def priors_as_json(priors: Priors) -> dict[str, Any]:
         if priors.gravity.world is not None:
             gravity["world"] = priors.gravity.world.tolist()
         given["gravity"] = gravity
+    if priors.maps is not None:
+        given["maps"] = list(priors.maps)
     return given
 
 
@@ -88,9 +90,9 @@ def priors_from_json(raw: object) -> Priors:
 
     Raises:
         InvalidInput: ``request.unknown_field``, ``request.invalid``, ``priors.position``,
-            ``priors.height``, ``priors.pose``, ``priors.gravity``, or ``pose.*``.
+            ``priors.height``, ``priors.pose``, ``priors.gravity``, ``priors.maps``, or ``pose.*``.
     """
-    given = _given("priors", raw, tuple(_FIELDS))
+    given = _given("priors", raw, (*_FIELDS, "maps"))
     parts = {
         name: _given(f"priors.{name}", given[name], fields)
         for name, fields in _FIELDS.items()
@@ -108,6 +110,7 @@ def priors_from_json(raw: object) -> Priors:
         else HeightBand(_number("height.min", height), _number("height.max", height)),
         None if pose is None else _pose_prior(pose),
         None if gravity is None else _gravity_prior(gravity),
+        None if "maps" not in given else _tiles(given["maps"]),
     )
 
 
@@ -158,6 +161,12 @@ def _gravity_prior(raw: Mapping[str, Any]) -> GravityPrior:
     std_deg = _number("gravity.std_deg", raw) if "std_deg" in raw else _DEFAULT_GRAVITY_STD_DEG
     world = _numbers("gravity.world", raw) if "world" in raw else None
     return GravityPrior(_numbers("gravity.direction", raw), math.radians(std_deg), world)
+
+
+def _tiles(names: object) -> tuple[str, ...]:
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise _unusable("maps", "a list of maps of the set", names)
+    return tuple(names)
 
 
 def _given(where: str, raw: object, fields: tuple[str, ...]) -> dict[str, Any]:

@@ -158,6 +158,7 @@ class InstantResult:
         geopose: of the rig, whose frame is read like a camera's (x right, y down, z forward); None
             without a pose, or when the map is not anchored to the Earth.
         geopose_ypr: the same in angles, when asked for.
+        tile: as of ``LocalizeResult``.
     """
 
     request_id: str
@@ -175,6 +176,7 @@ class InstantResult:
     raw: Mapping[str, Any]
     geopose: GeoPose | None = None
     geopose_ypr: GeoPoseYpr | None = None
+    tile: str | None = None
 
     @property
     def localized(self) -> bool:

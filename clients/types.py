@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from clients.geopose import GeoPose, GeoPoseYpr
 from visloc.errors import InvalidInput
-from visloc.geometry import Camera, Pose
+from visloc.geometry import Camera, Pose, Similarity
 
 OptionValue = int | float | str | Mapping[str, float]
 
@@ -258,6 +258,8 @@ class LocalizeResult:
         geopose: of the camera; None without a pose, or when the map is not anchored to the Earth.
         geopose_ypr: the same in angles, when asked for.
         debug: the matches; None when they were not asked for.
+        tile: of a set of maps, ``id@version`` of the map in it that the answer rests on, or that
+            came closest; None for a map on its own.
     """
 
     request_id: str
@@ -276,6 +278,7 @@ class LocalizeResult:
     geopose: GeoPose | None = None
     geopose_ypr: GeoPoseYpr | None = None
     debug: Debug | None = None
+    tile: str | None = None
 
     @property
     def localized(self) -> bool:
@@ -391,20 +394,54 @@ class VersionInfo:
 
 
 @dataclass(frozen=True, slots=True)
+class TileInfo:
+    """One map of a set: ``x_set = scale R x + translation`` of a point x in its world.
+
+    Attributes:
+        map: its id.
+        version: of it.
+        scale: units of the set's world in one of its own.
+        rotation_wxyz: R as a unit quaternion (w, x, y, z).
+        translation: in the set's world.
+        extent: least and greatest x, y, z of its landmarks and photos, in the world of the set.
+        images: mapping photos.
+    """
+
+    map: str
+    version: str
+    scale: float
+    rotation_wxyz: tuple[float, ...]
+    translation: tuple[float, ...]
+    extent: tuple[tuple[float, ...], tuple[float, ...]]
+    images: int
+
+    @property
+    def ref(self) -> str:
+        """``id@version``."""
+        return f"{self.map}@{self.version}"
+
+    @property
+    def set_from_tile(self) -> Similarity:
+        """From its world to that of the set."""
+        pose = Pose.from_quaternion(self.rotation_wxyz, self.translation)
+        return Similarity(self.scale, pose.rotation, pose.translation)
+
+
+@dataclass(frozen=True, slots=True)
 class MapInfo:
-    """A map that the server has.
+    """A map that the server has, or a set of maps.
 
     Attributes:
         id: its name.
         version: of the map that ``id`` alone stands for, or the one asked for.
         created: ISO 8601, UTC.
         metric: whether one unit of the world is a metre.
-        method: how its landmarks were made.
+        method: how its landmarks were made; None of a set.
         local_features: registry name.
         global_features: registry names.
         images: mapping photos.
         landmarks: 3D points.
-        observations: sightings of landmarks in mapping photos.
+        observations: sightings of landmarks in mapping photos; None of a set.
         extent: least and greatest x, y, z of the landmarks, in the world.
         size_bytes: on the server's disk.
         down: unit vector that points down in the world; None when the map does not know it.
@@ -414,21 +451,24 @@ class MapInfo:
         current: whether this version is in use.
         versions: all published ones of the map, oldest first.
         content_hash: equal maps have equal ones, whatever they are called.
-        fusion: of the global features, unless a query says otherwise; None when an older server
-            does not say.
+        fusion: of the global features, unless a query says otherwise; None of a set, and when an
+            older server does not say.
         fusion_weights: by global feature; empty when all count alike.
+        kind: map, or set.
+        num_tiles: maps of a set; None of a map.
+        tiles: of a set that was asked for alone; empty in lists.
     """
 
     id: str
     version: str
     created: str
     metric: bool
-    method: str
+    method: str | None
     local_features: str
     global_features: tuple[str, ...]
     images: int
     landmarks: int
-    observations: int
+    observations: int | None
     extent: tuple[tuple[float, ...], tuple[float, ...]]
     size_bytes: int
     down: tuple[float, ...] | None
@@ -440,6 +480,9 @@ class MapInfo:
     content_hash: str
     fusion: str | None = None
     fusion_weights: Mapping[str, float] = field(default_factory=dict)
+    kind: str = "map"
+    num_tiles: int | None = None
+    tiles: tuple[TileInfo, ...] = ()
 
     @property
     def ref(self) -> str:

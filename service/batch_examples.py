@@ -128,6 +128,7 @@ RIG: dict[str, Any] = {
     },
     "geopose": None,
     "geopose_ypr": None,
+    "tile": None,
 }
 # The first two of three instants; of the second the photo was damaged.
 SEQUENCE: dict[str, Any] = {
@@ -218,6 +219,7 @@ SEQUENCE: dict[str, Any] = {
             },
             "geopose": None,
             "geopose_ypr": None,
+            "tile": None,
         },
         {
             "request_id": "c1e5dd49e9f247828a097a859433480d",
@@ -281,6 +283,7 @@ SEQUENCE: dict[str, Any] = {
             },
             "geopose": None,
             "geopose_ypr": None,
+            "tile": None,
         },
     ],
 }

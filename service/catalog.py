@@ -19,8 +19,7 @@ from service.jobs import Near, Where
 from service.stores import Store
 from service.worker import MapFolder
 from service.workers import Workers
-from visloc.archive import MapOutline, SetOutline
-from visloc.archive.checks import is_set
+from visloc.archive import MapOutline, SetOutline, read_any_outline
 from visloc.archive.store import version_in_use
 from visloc.errors import InvalidInput, MapCorrupt, NotFound, Unavailable, VislocError
 
@@ -40,6 +39,9 @@ _FORGET_LIMIT_S = 600.0
 _MAX_FETCHES = 4
 # Descriptions of so many versions stay in memory; their arrays stay on disk.
 _MAX_DESCRIBED = 1000
+# Tiles of sets that are opened at the start; others are when they are asked for. A set may have
+# thousands.
+_MAX_TILES_AT_START = 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,12 +49,12 @@ class ServedMap:
     """A version of a map.
 
     Attributes:
-        outline: what it says about itself.
+        outline: what it, or a set of maps, says about itself.
         current: whether it is the one in use.
         versions: all published ones of the map, oldest first, and which is in use.
     """
 
-    outline: MapOutline
+    outline: MapOutline | SetOutline
     current: bool
     versions: tuple[tuple[str, bool], ...]
 
@@ -91,7 +93,8 @@ class Catalog:
         self._serving: dict[str, MapFolder] = {}  # by map id
         self._refused: dict[str, _Refused] = {}  # by map id
         self._taking_over: dict[str, asyncio.Task[None]] = {}  # by map id
-        self._described: dict[str, MapOutline] = {}  # by id@version
+        self._described: dict[str, MapOutline | SetOutline] = {}  # by id@version
+        self._sets: dict[str, SetOutline | None] = {}  # by id@version; None: it is a map
         self._users: Counter[str] = Counter()  # requests under way, by id@version
         self._leaving: set[str] = set()  # id@version of what is being deleted
         self._background: set[asyncio.Task[None]] = set()
@@ -109,9 +112,10 @@ class Catalog:
     async def load_all(self, workers: Workers, max_bytes: int) -> None:
         """Open all current maps, as far as there is room; others are opened when asked for.
 
-        One that is broken does not keep back the others.
+        Sets come first, and their tiles last, the first ones only. One that is broken does not
+        keep back the others.
         """
-        for map_id in await asyncio.to_thread(self._store.ids):
+        for map_id in await asyncio.to_thread(self._opened_at_start):
             if sum(workers.loaded.values()) >= max_bytes:
                 logger.info("max_loaded_bytes is full: other maps are opened when they are asked")
                 break
@@ -175,8 +179,7 @@ class Catalog:
         Raises:
             VislocError: as ``using``; then nothing has changed.
         """
-        ref = f"{map_id}@{version}"
-        of = MapFolder(ref, await self._folder(ref))
+        of = await self._at_hand(f"{map_id}@{version}")
         await workers.run(worker.load, of)
         await asyncio.to_thread(self._store.set_current, map_id, version)
         self._serve(map_id, of, workers)
@@ -212,9 +215,16 @@ class Catalog:
         finally:
             self._leaving.discard(ref)
         self._described.pop(ref, None)
+        self._sets.pop(ref, None)
         if map_id in self._serving and not others:
             del self._serving[map_id]
         await workers.run_everywhere(worker.forget, ref)
+
+    def set_outline(self, of: MapFolder) -> SetOutline:
+        """Return what a set says about itself that ``using`` gave."""
+        outline = self._sets[of.ref]
+        assert outline is not None  # the caller has looked
+        return outline
 
     async def describe(self, ref: str) -> ServedMap:
         """Describe ``id``, in the version that is served, or ``id@version``.
@@ -241,6 +251,24 @@ class Catalog:
 
         return await asyncio.to_thread(described)
 
+    def _opened_at_start(self) -> tuple[str, ...]:
+        """Say which maps to open at the start, and in which order; in a thread."""
+        sets, maps, tiles = [], [], set[str]()
+        for map_id in self._store.ids():
+            try:
+                outline = self._describe(map_id).outline
+            except VislocError:
+                maps.append(map_id)  # opening it says what is wrong
+                continue
+            if isinstance(outline, SetOutline):
+                sets.append(map_id)
+                tiles.update(tile.map for tile in outline.tiles)
+            else:
+                maps.append(map_id)
+        alone = [map_id for map_id in maps if map_id not in tiles]
+        in_sets = [map_id for map_id in maps if map_id in tiles]
+        return (*sets, *alone, *in_sets[:_MAX_TILES_AT_START])
+
     async def _take(self, ref: str, workers: Workers) -> MapFolder:
         """Return a map, which stays until it is given back."""
         while True:
@@ -259,8 +287,7 @@ class Catalog:
             raise NotFound("map.version", "the version is being deleted", field="map", got=ref)
         self._users[ref] += 1
         try:
-            # Asked every time: copies of a remote store come and go by their use.
-            return MapFolder(ref, await self._folder(ref))
+            return await self._at_hand(ref)
         except BaseException:
             self._give_back(ref)
             raise
@@ -283,7 +310,9 @@ class Catalog:
             await workers.run_everywhere(worker.forget, ref)
 
     async def _ids_near(self, near: Near) -> tuple[str, ...]:
-        found = [served.outline.manifest.id for served in await self.list(near)]
+        # A set is searched instead of its tiles.
+        listed = _without_tiles(await self.list(near))
+        found = [served.outline.manifest.id for served in listed]
         if not found:
             raise NotFound(
                 "map.none_near",
@@ -342,7 +371,7 @@ class Catalog:
 
     async def _take_over(self, map_id: str, current: str, workers: Workers) -> None:
         try:
-            of = MapFolder(current, await self._folder(current))
+            of = await self._at_hand(current)
             await workers.run(worker.load, of)
         except VislocError as error:
             self._refuse(map_id, current, error)
@@ -373,6 +402,15 @@ class Catalog:
         before = self._serving.pop(map_id, None)
         if before is not None:
             self._in_background(self._forget(before.ref, workers))
+
+    async def _at_hand(self, ref: str) -> MapFolder:
+        """Return a version on this machine's disk, and whether it is a set."""
+        # Asked every time: copies of a remote store come and go by their use.
+        folder = await self._folder(ref)
+        if ref not in self._sets:
+            outline = await asyncio.to_thread(read_any_outline, folder)
+            self._sets[ref] = outline if isinstance(outline, SetOutline) else None
+        return MapFolder(ref, folder, self._sets[ref] is not None)
 
     async def _folder(self, ref: str) -> Path:
         """Return where a version lies on this machine, fetched once for all who wait for it."""
@@ -414,10 +452,7 @@ class Catalog:
         versions = self._store.versions(map_id)
         outline = self._described.get(wanted) if version in versions else None
         if outline is None:
-            found = self._store.outline(wanted)
-            if isinstance(found, SetOutline):
-                raise is_set(found.ref, found.manifest)
-            outline = found
+            outline = self._store.outline(wanted)
             while len(self._described) >= _MAX_DESCRIBED:
                 self._described.pop(next(iter(self._described)), None)
             self._described[wanted] = outline
@@ -428,6 +463,13 @@ def _gone_meanwhile(map_id: str) -> NotFound:
     return NotFound("map.unknown", "the map was deleted a moment ago", field="map", got=map_id)
 
 
-def _reaches(outline: MapOutline, near: Near) -> bool:
+def _without_tiles(maps: Sequence[ServedMap]) -> list[ServedMap]:
+    """Return maps without those that are tiles of a set among them."""
+    outlines = [served.outline for served in maps]
+    tiles = {tile.map for of in outlines if isinstance(of, SetOutline) for tile in of.tiles}
+    return [served for served in maps if served.outline.manifest.id not in tiles]
+
+
+def _reaches(outline: MapOutline | SetOutline, near: Near) -> bool:
     place = outline.place
     return place is not None and place.distance_to(near.latitude, near.longitude) <= near.radius

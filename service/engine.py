@@ -6,28 +6,30 @@ import asyncio
 import logging
 from collections.abc import AsyncGenerator, AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import aclosing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from time import time
 
 from service import worker
 from service.catalog import Catalog, ServedMap
+from service.instant_tasks import look, solve_rig, without_photos
 from service.jobs import (
-    ImageJob,
     Instant,
     InstantLocalization,
     Localization,
     LocalizeJob,
     Near,
-    Rig,
     RigJob,
     SequenceStart,
 )
 from service.metrics import Metrics
 from service.scenes import Scenes
+from service.set_search import SetSearch
+from service.set_sequences import SetSequence
 from service.stores import Store
+from service.together import together
 from service.uploads import Uploads
 from service.wire import stopping_error
-from service.worker import MapFolder, Seen, WorkerSettings
+from service.worker import MapFolder, WorkerSettings
 from service.workers import Workers
 from visloc.errors import (
     InvalidInput,
@@ -35,8 +37,8 @@ from visloc.errors import (
     Unavailable,
     VislocError,
 )
-from visloc.priors import Priors
-from visloc.types import LocalizeOptions
+from visloc.priors import NO_PRIORS, Priors
+from visloc.types import Localized
 
 logger = logging.getLogger(__name__)
 
@@ -101,6 +103,7 @@ class Engine:
             warm=lambda: self._catalog.serving,
             on_death=metrics.observe_worker_death,
         )
+        self._sets = SetSearch(self._catalog, self.workers, metrics)
         self._max_loaded_bytes = settings.max_loaded_bytes
         self._limit_s = limit_s
         self._max_photos = workers + max_queue
@@ -178,7 +181,17 @@ class Engine:
         self._photos += 1
         try:
             async with self._catalog.using(job.maps, self.workers) as maps:
-                return await self.workers.run(worker.localize, job, maps, time())
+                sets, alone = _parted(maps, job.priors)
+                found = [self._sets.localize(job, of) for of in sets]
+                if alone:
+                    found.append(self.workers.run(worker.localize, job, alone, time()))
+                return max(
+                    await together(found),
+                    key=lambda one: (
+                        isinstance(one.answer, Localized),
+                        one.answer.evidence.num_inliers,
+                    ),
+                )
         finally:
             self._photos -= 1
 
@@ -222,11 +235,15 @@ class Engine:
         """
         if not job.images:
             raise InvalidInput("rig.empty", "there is no image", field="images")
-        bare = replace(job, images=tuple(_without_photo(image) for image in job.images))
         async with self._catalog.using(job.maps, self.workers) as maps:
-            await self.workers.run(worker.check_rig, bare, maps)
-            seen = await self._look(maps, job.rig, job.images, job.options, job.priors)
-            return await self.workers.run(worker.solve_rig, bare, maps, seen)
+            sets, alone = _parted(maps, job.priors)
+            found = [self._sets.localize_rig(job, of) for of in sets]
+            if alone:
+                found.append(solve_rig(self.workers, job, alone))
+            return max(
+                await together(found),
+                key=lambda one: (one.answer.pose is not None, one.answer.num_inliers),
+            )
 
     async def localize_sequence(
         self, start: SequenceStart, instants: AsyncIterator[Instant] | Sequence[Instant]
@@ -243,12 +260,24 @@ class Engine:
             Unavailable: ``server.worker_died``.
             VislocError: what the store raises.
         """
-        async with (
-            self._catalog.using(start.maps, self.workers) as maps,
-            aclosing(self._answers(start, instants, maps)) as answers,
-        ):
-            async for answer in answers:
-                yield answer
+        async with self._catalog.using(start.maps, self.workers) as maps:
+            sets, alone = _parted(maps, start.priors)
+            if sets and len(maps) > 1:
+                raise InvalidInput(
+                    "sequence.set",
+                    "a sequence is localized in one set of maps, or in maps",
+                    field="maps",
+                    expected=f"one set, such as {sets[0].ref}, or no set",
+                    got=", ".join(of.ref for of in maps),
+                )
+            if sets:
+                sequence = SetSequence(self._sets, self._catalog, self.workers, start, sets[0])
+                found = sequence.answers(_in_turn(instants))
+            else:
+                found = self._answers(start, instants, alone)
+            async with aclosing(found) as answers:
+                async for answer in answers:
+                    yield answer
 
     async def _answers(
         self,
@@ -259,20 +288,23 @@ class Engine:
         run = self.workers.run
         state = await run(worker.open_sequence, start, maps)
         if isinstance(instants, Sequence):
-            bare = [_without_photos(instant) for instant in instants]
+            for instant in instants:
+                _check_no_tiles(maps, instant.priors or NO_PRIORS)
+            bare = [without_photos(instant) for instant in instants]
             state, _ = await run(worker.check_instants, state, maps, 0, bare)
-            instants = _one_by_one(instants)
         index = 0
         try:
-            async for instant in instants:
-                bare = [_without_photos(instant)]
+            async for instant in _in_turn(instants):
+                bare = [without_photos(instant)]
                 state, (priors,) = await run(worker.check_instants, state, maps, index, bare)
-                seen = await self._look(maps, start.rig, instant.images, start.options, priors)
-                state, kept, answers = await run(
-                    worker.add_instant, state, maps, bare[0], seen, priors
+                _check_no_tiles(maps, priors)
+                seen = await look(
+                    self.workers, maps, start.rig, instant.images, start.options, priors
                 )
-                maps = tuple(of for of in maps if of.ref in kept)
-                for answer in answers:
+                added = await run(worker.add_instant, state, maps, bare[0], seen, priors)
+                state = added.state
+                maps = tuple(of for of in maps if of.ref in added.maps)
+                for answer in added.answers:
                     yield answer
                 index += 1
         except VislocError:
@@ -360,37 +392,37 @@ class Engine:
         if not self._started:
             raise Unavailable("server.starting", "the maps are being loaded; try again shortly")
 
-    async def _look(
-        self,
-        maps: Sequence[MapFolder],
-        rig: Rig | None,
-        images: Sequence[ImageJob],
-        options: LocalizeOptions,
-        priors: Priors,
-    ) -> list[Seen]:
-        """Look at all images of an instant."""
-        now = time()
-        tasks = [
-            asyncio.ensure_future(
-                self.workers.run(worker.look_at_image, image, maps, rig, options, priors, now)
-            )
-            for image in images
-        ]
-        try:
-            return await asyncio.gather(*tasks)
-        finally:
-            for task in tasks:
-                task.cancel()  # when one refuses the request, nobody waits for the others
+
+def _parted(
+    maps: Sequence[MapFolder], priors: Priors
+) -> tuple[tuple[MapFolder, ...], tuple[MapFolder, ...]]:
+    """Part sets of maps from maps on their own.
+
+    Raises:
+        InvalidInput: ``priors.maps`` when it names tiles where there is none.
+    """
+    sets = tuple(of for of in maps if of.is_set)
+    alone = tuple(of for of in maps if not of.is_set)
+    if alone:
+        _check_no_tiles(alone, priors)
+    return sets, alone
 
 
-def _without_photo(image: ImageJob) -> ImageJob:
-    return replace(image, query=b"")
+def _check_no_tiles(maps: Sequence[MapFolder], priors: Priors) -> None:
+    if priors.maps is not None:
+        raise InvalidInput(
+            "priors.maps",
+            "only a set of maps has tiles",
+            field="priors.maps",
+            expected="a set of maps, or none of this",
+            got=", ".join(of.ref for of in maps),
+        )
 
 
-def _without_photos(instant: Instant) -> Instant:
-    return replace(instant, images=tuple(_without_photo(image) for image in instant.images))
+def _in_turn(instants: AsyncIterator[Instant] | Sequence[Instant]) -> AsyncIterator[Instant]:
+    return _one_by_one(instants) if isinstance(instants, Sequence) else instants
 
 
-async def _one_by_one(instants: Sequence[Instant]) -> AsyncIterator[Instant]:
+async def _one_by_one(instants: Sequence[Instant]) -> AsyncGenerator[Instant]:
     for instant in instants:
         yield instant

@@ -64,6 +64,7 @@ LOCALIZED: dict[str, Any] = {
     "geopose": None,
     "geopose_ypr": None,
     "debug": None,
+    "tile": None,
 }
 NOT_LOCALIZED: dict[str, Any] = {
     "request_id": "0a6d0ac8ef994eeeab1467fce2531da0",
@@ -113,6 +114,7 @@ NOT_LOCALIZED: dict[str, Any] = {
     "geopose": None,
     "geopose_ypr": None,
     "debug": None,
+    "tile": None,
 }
 MAP: dict[str, Any] = {
     "id": "sample",
@@ -134,9 +136,37 @@ MAP: dict[str, Any] = {
     "content_hash": "7f9cafe0f2a3c1d54d0d8f3a5f3be7cf13a3f0a4e6c8b5d90b1c2d3e4f506172",
     "fusion": "gharm",
     "fusion_weights": {},
+    "kind": "map",
+    "num_tiles": None,
+    "tiles": [],
     "anchor": {"kind": "dataset", "images": 60, "rms": None, "geodetic": None},
     "place": None,
 }
+SET: dict[str, Any] = MAP | {
+    "id": "site",
+    "method": None,
+    "global_features": [],
+    "observations": None,
+    "size_bytes": 412345,
+    "rigs": [],
+    "fusion": None,
+    "kind": "set",
+    "num_tiles": 1,
+    "tiles": [
+        {
+            "map": "sample",
+            "version": MAP["version"],
+            "set_from_tile": {
+                "rotation_wxyz": [1.0, 0.0, 0.0, 0.0],
+                "translation": [12.5, 0.0, 3.0],
+                "scale": 1.0,
+            },
+            "extent": {"min": [9.5, -2.25, 3.0], "max": [15.5, 2.25, 5.8]},
+            "images": 60,
+        }
+    ],
+}
+
 NEW_MAP: dict[str, Any] = MAP | {
     "version": "20261122T090500.120Z-51c09f3e",
     "created": "2026-11-22T09:05:00+00:00",

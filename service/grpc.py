@@ -120,7 +120,7 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
         """List the maps that can be opened, in the version that is served."""
         async with self._envelope("ListMaps", request_id(None), context):
             served = await self._engine.maps(near_of(request))
-            maps = [MapInfo.from_served(each) for each in served]
+            maps = [MapInfo.from_served(each, in_list=True) for each in served]
             return message_of(ListMapsResponse(maps=maps), pb2.ListMapsResponse())
 
     async def GetMap(  # noqa: N802

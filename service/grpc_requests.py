@@ -29,6 +29,7 @@ _OPTIONAL_LISTS = {
     "visloc.v1.LocalizeRigRequest.maps",
     "visloc.v1.SequenceStart.maps",
     "visloc.v1.LocalizeOptions.fusion_weights",
+    "visloc.v1.Priors.maps",
     "visloc.v1.GravityPrior.world",
     "visloc.v1.Odometry.covariance",
 }
@@ -128,7 +129,7 @@ def _plain(message: Message) -> dict[str, Any]:
         if _is_there(message, field.name)
     }
     plain.pop("request_id", None)  # of the envelope
-    if ("maps" in plain or "near" in plain) and not plain["map"]:
+    if ("maps" in plain or "near" in plain) and plain.get("map") == "":
         del plain["map"]
     return plain
 

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from time import perf_counter
 
-from service.jobs import ONLY_SENSOR, ImageJob, InstantLocalization, Rig, RigSensor
+from service.jobs import (
+    ONLY_SENSOR,
+    ImageJob,
+    InstantLocalization,
+    Query,
+    Rig,
+    RigSensor,
+)
+from service.tiles import Read, summed
 from visloc.archive import Map
 from visloc.constraints import Constraints
 from visloc.errors import InvalidInput, NotFound, TooLarge
 from visloc.geometry import Pose
-from visloc.images import ImageLimits, Photo, read_photo
+from visloc.images import Photo
 from visloc.localizer import FeatureCache, Localizer
 from visloc.priors import Priors
 from visloc.solving import Look, SeenImage
@@ -160,26 +167,31 @@ def look_at(
     targets: Sequence[Target],
     options: LocalizeOptions,
     priors: Priors,
-    limits: ImageLimits,
+    read: Callable[[Query], Read],
     queued_s: float,
 ) -> list[SeenImage]:
-    """Look at one image, that waited so long, for every target. One that is unusable fails alone.
+    """Look at one image for every target. One that is unusable fails alone.
+
+    Args:
+        image: of an instant.
+        targets: the maps.
+        options: thresholds and the like.
+        priors: what is known of the rig.
+        read: reads a photo, or what was found in it.
+        queued_s: how long it waited.
 
     Raises:
         VislocError: what concerns more than this image.
     """
     seconds = {"queued": queued_s}
     photo: Photo | QueryFeatures | InvalidInput
-    if isinstance(image.query, QueryFeatures):
-        photo = image.query
-    else:
-        started = perf_counter()
-        try:
-            photo = read_photo(image.query, limits)
-        except InvalidInput as error:
-            photo = error
-        seconds["decode"] = perf_counter() - started
     found: FeatureCache = {}
+    try:
+        known = read(image.query)
+        photo, found = known.query, known.found
+        seconds = summed(seconds, known.seconds)
+    except InvalidInput as error:
+        photo = error
     return [_look(image, photo, target, options, priors, found, seconds) for target in targets]
 
 
@@ -206,5 +218,5 @@ def _look(
         if error.code.startswith(_OF_ALL_IMAGES):
             raise
         return SeenImage(image.sensor, sensor.cam_from_rig, None, error)
-    evidence = replace(look.evidence, seconds={**seconds, **look.evidence.seconds})
+    evidence = replace(look.evidence, seconds=summed(seconds, look.evidence.seconds))
     return SeenImage(image.sensor, sensor.cam_from_rig, replace(look, evidence=evidence))

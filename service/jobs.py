@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import Geodetic
+from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.priors import NO_PRIORS, Priors
 from visloc.trajectory import Odometry, TimeUnit
@@ -41,12 +42,29 @@ Where = tuple[str, ...] | Near
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ReadQuery:
+    """A photo, or what was found in it, as a worker process has read it; no other one needs to.
+
+    Attributes:
+        data: the pixels, the features found in them, and how long that took, for worker processes
+            only.
+    """
+
+    data: bytes
+
+
+# An encoded photo, or the features that were found in it; once tiles of a set were chosen by them,
+# what was read.
+Query = bytes | QueryFeatures | ReadQuery
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class LocalizeJob:
     """One photo to localize.
 
     Attributes:
         maps: where to search.
-        query: the encoded photo, or the features that were found in it.
+        query: the photo.
         camera: its intrinsics for the pixels as stored; None when unknown.
         options: thresholds and the like.
         priors: what is known of the camera.
@@ -55,7 +73,7 @@ class LocalizeJob:
     """
 
     maps: Where
-    query: bytes | QueryFeatures
+    query: Query
     camera: Camera | None
     options: LocalizeOptions
     priors: Priors = NO_PRIORS
@@ -86,12 +104,12 @@ class ImageJob:
 
     Attributes:
         sensor: the camera of the rig.
-        query: the encoded photo, or the features that were found in it.
+        query: the photo.
         camera: its intrinsics, instead of those of the rig; None for those.
     """
 
     sensor: str
-    query: bytes | QueryFeatures
+    query: Query
     camera: Camera | None
 
 
@@ -101,7 +119,7 @@ class RigJob:
 
     Attributes:
         maps: where to search.
-        rig: how the cameras sit.
+        rig: how the cameras sit; None for one image of one camera.
         images: each of another sensor.
         timestamp: of all of them; None when unknown.
         options: thresholds and the like.
@@ -110,7 +128,7 @@ class RigJob:
     """
 
     maps: Where
-    rig: Rig
+    rig: Rig | None
     images: tuple[ImageJob, ...]
     timestamp: int | None
     options: LocalizeOptions
@@ -180,9 +198,11 @@ class Localization:
     """An answer and the map that gave it.
 
     Attributes:
+        map_id: of the map, or of the set of maps, in whose frame the answer is.
         geodetic: where that map lies on Earth, when it is known.
         ypr: whether the caller wants the GeoPose in angles too.
         debug: when the caller wants it.
+        tile: of a set, ``id@version`` of the map in it that gave the answer.
     """
 
     answer: Answer
@@ -191,6 +211,7 @@ class Localization:
     geodetic: Geodetic | None = None
     ypr: bool = False
     debug: MatchPicture | None = None
+    tile: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,3 +223,20 @@ class InstantLocalization:
     map_version: str
     geodetic: Geodetic | None = None
     ypr: bool = False
+    tile: str | None = None
+
+
+def check_order(before: int, timestamp: int) -> None:
+    """Refuse an instant of a sequence that is not after the one before it.
+
+    Raises:
+        InvalidInput: ``sequence.timestamps``.
+    """
+    if timestamp <= before:
+        raise InvalidInput(
+            "sequence.timestamps",
+            "instants come in the order of time, each once",
+            field="timestamp",
+            expected=f"more than {before}, that of the instant before",
+            got=timestamp,
+        )

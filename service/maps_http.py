@@ -47,9 +47,10 @@ def add_map_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) -> N
             ),
         ] = None,
     ) -> Response:
-        """List the maps that can be opened, in the version that is served."""
+        """List the maps that can be opened, in the version that is served; sets of maps too."""
         circle = None if near is None else near_from_text(near).to_core()
-        maps = [MapInfo.from_served(served) for served in await engine.maps(circle)]
+        listed = await engine.maps(circle)
+        maps = [MapInfo.from_served(served, in_list=True) for served in listed]
         return json_response(ListMapsResponse(maps=maps))
 
     @app.get("/maps/{ref}", response_model=MapInfo, responses=problems(404, 422, 500))

@@ -142,6 +142,12 @@ class Metrics:
             buckets=_STAGE_BUCKETS,
             registry=self._registry,
         )
+        self._tiles_searched = Histogram(
+            "visloc_tiles_searched",
+            "Maps of a set that were searched for a photo or an instant.",
+            buckets=(1, 2, 3, 4, 5),
+            registry=self._registry,
+        )
         self._map_changes = Counter(
             "visloc_map_changes",
             "Uploads, activations and deletions of map versions, by how they ended.",
@@ -214,6 +220,10 @@ class Metrics:
         self._inliers.labels(map_id, str(localized).lower()).observe(inliers)
         for stage, duration in seconds.items():
             self._stage_seconds.labels(stage).observe(duration)
+
+    def observe_tiles(self, searched: int) -> None:
+        """Count the maps of a set that were searched for a photo or an instant."""
+        self._tiles_searched.observe(searched)
 
     def observe_map_change(self, change: str, done: bool) -> None:
         """Count an ``upload``, ``activate`` or ``delete`` of a map's version."""

@@ -29,7 +29,7 @@ _ANSWERS: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {
     ("/localize/rig", "post", "200"): {"localized": batch_examples.RIG},
     ("/localize/sequence", "post", "200"): {"sequence": batch_examples.SEQUENCE},
     ("/maps", "get", "200"): {"maps": {"maps": [examples.MAP]}},
-    ("/maps/{ref}", "get", "200"): {"map": examples.MAP},
+    ("/maps/{ref}", "get", "200"): {"map": examples.MAP, "set": examples.SET},
     ("/maps/{ref}/images", "get", "200"): {"images": examples.MAP_IMAGES},
     ("/maps/{map_id}/current", "post", "200"): {"map": examples.MAP},
     ("/maps/{map_id}/versions/{version}", "get", "200"): {"map": examples.NEW_MAP},

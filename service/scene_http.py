@@ -14,7 +14,8 @@ from service.engine import Engine
 from service.openapi import problems
 from service.schemas import MapImages
 from service.settings import ServiceSettings
-from visloc.archive import MapOutline
+from visloc.archive import MapOutline, SetOutline
+from visloc.archive.checks import is_set
 from visloc.errors import NotFound
 
 MAX_POINTS, MAX_IMAGES = 262_144, 10_000
@@ -99,14 +100,21 @@ async def _of_version(
     engine: Engine, ref: str, answer: Callable[[MapOutline], Awaitable[Response]]
 ) -> Response:
     """Answer of the version that ``ref`` stands for."""
-    outline = (await engine.map(ref)).outline
+    outline = _of_map((await engine.map(ref)).outline)
     try:
         return await answer(outline)
     except NotFound:
-        now = (await engine.map(ref)).outline
+        now = _of_map((await engine.map(ref)).outline)
         if now.ref == outline.ref:
             raise
         return await answer(now)  # it took over, and the one before was deleted
+
+
+def _of_map(outline: MapOutline | SetOutline) -> MapOutline:
+    """Refuse a set, whose points and photos are those of its tiles: ``map.is_set``."""
+    if isinstance(outline, SetOutline):
+        raise is_set(outline.ref, outline.manifest)
+    return outline
 
 
 def _caching(outline: MapOutline, ref: str, first: int, count: int) -> dict[str, str]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from service.incoming import inside
 from service.instants import Target, check_images, check_options, check_priors
-from service.jobs import Instant, InstantLocalization, SequenceStart
+from service.jobs import Instant, InstantLocalization, SequenceStart, check_order
 from visloc.errors import InvalidInput, TooLarge
 from visloc.priors import Priors
 from visloc.sequence import SeenInstant, SequenceSolver, check_max_gap
@@ -42,7 +42,6 @@ class SequenceRun:
         self._max_images = max_images
         self._max_instants = max_instants
         self._last_checked: tuple[int, int] | None = None  # index, timestamp
-        self._num_added = 0
         self._solvers: list[SequenceSolver] = []
         self._held: list[list[InstantAnswer]] = [[] for _ in targets]
 
@@ -64,14 +63,8 @@ class SequenceRun:
             )
         with inside(f"instants[{index}]"):
             before = self._last_checked
-            if before is not None and before[0] < index and instant.timestamp <= before[1]:
-                raise InvalidInput(
-                    "sequence.timestamps",
-                    "instants come in the order of time, each once",
-                    field="timestamp",
-                    expected=f"more than {before[1]}, that of the instant before",
-                    got=instant.timestamp,
-                )
+            if before is not None and before[0] < index:
+                check_order(before[1], instant.timestamp)
             self._last_checked = index, instant.timestamp
             for target in self.targets:
                 rig = None if self._start.rig is None else target.rig
@@ -98,16 +91,21 @@ class SequenceRun:
         if not self._solvers:
             unit = self._start.time_unit or _guessed_unit(instant.timestamp)
             self._solvers = [self._solver(target, unit) for target in self.targets]
-        with inside(f"instants[{self._num_added}]"):
+        assert self._last_checked is not None  # it was checked before
+        with inside(f"instants[{self._last_checked[0]}]"):
             for solver, held, seen in zip(self._solvers, self._held, images, strict=True):
                 held += solver.add(SeenInstant(instant.timestamp, seen, instant.odometry, priors))
-        self._num_added += 1
         if len(self.targets) > 1 and any(solver.measured for solver in self._solvers):
             best = max(range(len(self.targets)), key=lambda i: self._solvers[i].measured)
             self.targets = [self.targets[best]]
             self._solvers = [self._solvers[best]]
             self._held = [self._held[best]]
         return self._released() if len(self.targets) == 1 else []
+
+    @property
+    def localized(self) -> bool:
+        """Whether its own images localize the newest instant."""
+        return any(solver.measured for solver in self._solvers)
 
     def finish(self) -> list[InstantAnswer]:
         """Return the answers that waited for instants which will not come.

@@ -34,13 +34,15 @@ from service.jobs import (
     Localization,
     LocalizeJob,
     MatchPicture,
+    Query,
     Rig,
     RigJob,
     SequenceStart,
 )
 from service.sequences import SequenceRun
-from service.worker import Abandoned, Loaded, MapFolder, Seen, WorkerSettings
-from visloc.archive.store import open_published
+from service.tiles import Read, TileChooser, read_query, summed, written
+from service.worker import Abandoned, Added, Chosen, Loaded, MapFolder, Seen, WorkerSettings
+from visloc.archive.store import open_published, open_published_set
 from visloc.constraints import MapGeometry
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, VislocError
 from visloc.features import (
@@ -51,8 +53,8 @@ from visloc.features import (
 )
 from visloc.features.lightglue import make_lightglue
 from visloc.features.readymade import is_ready_made
-from visloc.images import ImageLimits, read_photo
-from visloc.localizer import FeatureCache, Localizer
+from visloc.images import ImageLimits, Photo
+from visloc.localizer import Localizer
 from visloc.overlay import draw_overlay
 from visloc.priors import Priors
 from visloc.solving import Look, SeenImage
@@ -75,7 +77,8 @@ class Vision:
         self._settings = settings
         self._limits = ImageLimits(settings.max_image_bytes, settings.max_image_pixels)
         self._abandoned = abandoned
-        self._localizers: OrderedDict[str, Localizer] = OrderedDict()  # most recently used last
+        # Maps and sets, the most recently used last.
+        self._opened: OrderedDict[str, Localizer | TileChooser] = OrderedDict()
         # By name, shared by all maps.
         self._extractors: dict[str, LocalFeatureExtractor] = {}
         self._descriptors: dict[str, GlobalDescriptor] = {}
@@ -83,7 +86,7 @@ class Vision:
     @property
     def loaded(self) -> tuple[Loaded, ...]:
         """Maps that are open."""
-        return tuple(Loaded(ref, one.map.size_bytes) for ref, one in self._localizers.items())
+        return tuple(Loaded(ref, _size_of(one)) for ref, one in self._opened.items())
 
     def _step(self) -> None:
         """Stop here when nobody waits any more."""
@@ -97,32 +100,45 @@ class Vision:
             Conflict: for a map of features that are not here.
             MapCorrupt: when it cannot be used.
         """
-        found = self._localizers.get(of.ref)
+        found = self.open(of)
+        assert isinstance(found, Localizer)  # a set has no localizer
+        return found
+
+    def chooser(self, of: MapFolder) -> TileChooser:
+        """Return what ranks the tiles of a set; as ``localizer``."""
+        found = self.open(of)
+        assert isinstance(found, TileChooser)
+        return found
+
+    def open(self, of: MapFolder) -> Localizer | TileChooser:
+        """Open a map or a set, if it is not open yet, and close what was not used for longest.
+
+        Raises:
+            Conflict: for a map of features that are not here.
+            MapCorrupt: when it cannot be used.
+        """
+        found = self._opened.get(of.ref)
         if found is None:
-            found = self._localizers[of.ref] = self._open(of)
-        self._localizers.move_to_end(of.ref)
-        while len(self._localizers) > 1 and self._size > self._settings.max_loaded_bytes:
-            ref, _ = self._localizers.popitem(last=False)
+            found = self._opened[of.ref] = self._open(of)
+        self._opened.move_to_end(of.ref)
+        while len(self._opened) > 1 and self._size > self._settings.max_loaded_bytes:
+            ref, _ = self._opened.popitem(last=False)
             logger.info("map %s closed, to keep to max_loaded_bytes", ref)
         return found
 
     def forget(self, ref: str) -> None:
         """Close a map that is no longer served."""
-        self._localizers.pop(ref, None)
+        self._opened.pop(ref, None)
 
     @property
     def _size(self) -> int:
-        return sum(one.map.size_bytes for one in self._localizers.values())
+        return sum(_size_of(one) for one in self._opened.values())
 
-    def _open(self, of: MapFolder) -> Localizer:
+    def _open(self, of: MapFolder) -> Localizer | TileChooser:
         start = perf_counter()
         with _damage_named(of.ref):
-            opened = open_published(of.folder)
-            name = opened.manifest.local_features.fingerprint.name
             try:
-                extractor = None if is_ready_made(name) else self._extractor(name)
-                matcher = partial(make_lightglue, weights_dir=self._settings.weights_dir)
-                localizer = Localizer(opened, extractor, self._descriptor, matcher)
+                opened = self._opened_set(of) if of.is_set else self._opened_map(of)
             except InvalidInput as error:  # features that are not here: not the caller's mistake
                 raise Conflict(
                     error.code,
@@ -131,9 +147,19 @@ class Vision:
                     expected=error.expected,
                     got=error.got,
                 ) from error
-            localizer.warm_up()
-        logger.info("map %s loaded in %.1f s", opened.ref, perf_counter() - start)
-        return localizer
+            opened.warm_up()
+        logger.info("map %s loaded in %.1f s", of.ref, perf_counter() - start)
+        return opened
+
+    def _opened_map(self, of: MapFolder) -> Localizer:
+        opened = open_published(of.folder)
+        name = opened.manifest.local_features.fingerprint.name
+        extractor = None if is_ready_made(name) else self._extractor(name)
+        matcher = partial(make_lightglue, weights_dir=self._settings.weights_dir)
+        return Localizer(opened, extractor, self._descriptor, matcher)
+
+    def _opened_set(self, of: MapFolder) -> TileChooser:
+        return TileChooser(open_published_set(of.folder), self._extractor)
 
     def _extractor(self, name: str) -> LocalFeatureExtractor:
         if name not in self._extractors:
@@ -157,21 +183,17 @@ class Vision:
         targets = self._targets(maps, None)
         check_options(targets, job.options)
         loaded = perf_counter()
-        before = {"queued": max(0.0, queued), "open_map": loaded - started}
         found: list[tuple[Localizer, Look, Answer, NDArray[np.bool_]]] = []
-        cache: FeatureCache = {}
-        photo = None
-        if not isinstance(job.query, QueryFeatures):
-            photo = read_photo(job.query, self._limits)
-            before["decode"] = perf_counter() - loaded
+        read = self._read(job.query)
+        query = read.query
+        before = summed({"queued": max(0.0, queued), "open_map": loaded - started}, read.seconds)
         for target in targets:
             self._step()
             localizer = target.localizer
-            if isinstance(job.query, QueryFeatures):
-                look = localizer.look_at_features(job.query, job.camera, job.options, job.priors)
+            if isinstance(query, QueryFeatures):
+                look = localizer.look_at_features(query, job.camera, job.options, job.priors)
             else:
-                assert photo is not None
-                look = localizer.look(photo, job.camera, job.options, job.priors, cache)
+                look = localizer.look(query, job.camera, job.options, job.priors, read.found)
             self._step()
             answer, inliers = localizer.solve_look(look, job.options, job.priors)
             found.append((localizer, look, answer, inliers))
@@ -179,15 +201,15 @@ class Vision:
             found, key=lambda one: (isinstance(one[2], Localized), one[2].evidence.num_inliers)
         )
         picture = None
-        if job.debug and photo is not None:
+        if job.debug and isinstance(query, Photo):
             self._step()
             picture = MatchPicture(
                 look.matches.pixels,
                 look.matches.points + localizer.geometry.origin,
                 inliers,
-                draw_overlay(photo, localizer.map, look, answer, inliers),
+                draw_overlay(query, localizer.map, look, answer, inliers),
             )
-        evidence = replace(answer.evidence, seconds={**before, **answer.evidence.seconds})
+        evidence = replace(answer.evidence, seconds=summed(before, answer.evidence.seconds))
         manifest = localizer.map.manifest
         return Localization(
             replace(answer, evidence=evidence),
@@ -197,6 +219,28 @@ class Vision:
             job.ypr,
             picture,
         )
+
+    def choose_tiles(
+        self,
+        query: Query,
+        of: MapFolder,
+        options: LocalizeOptions,
+        allowed: NDArray[np.bool_] | None,
+        submitted: float,
+    ) -> Chosen:
+        """As ``worker.choose_tiles``."""
+        queued, started = max(0.0, time() - submitted), perf_counter()
+        self._step()
+        chooser = self.chooser(of)
+        loaded = perf_counter()
+        try:
+            read = self._read(query)
+        except InvalidInput:
+            return Chosen(query)  # the tile that is asked says it
+        seconds = {"queued": queued, "open_map": loaded - started}
+        read = replace(read, seconds=summed(seconds, read.seconds))
+        scores = chooser.choose(read, options, allowed)
+        return Chosen(written(read), scores)
 
     def check_rig(self, job: RigJob, maps: Sequence[MapFolder]) -> None:
         """As ``worker.check_rig``."""
@@ -220,7 +264,7 @@ class Vision:
         self._step()
         targets = self._targets(maps, rig)
         return pickle.dumps(
-            look_at(image, targets, options, priors, self._limits, queued), pickle.HIGHEST_PROTOCOL
+            look_at(image, targets, options, priors, self._read, queued), pickle.HIGHEST_PROTOCOL
         )
 
     def solve_rig(
@@ -257,18 +301,22 @@ class Vision:
         instant: Instant,
         seen: Sequence[Seen],
         priors: Priors,
-    ) -> tuple[bytes, tuple[str, ...], list[InstantLocalization]]:
+    ) -> Added:
         """As ``worker.add_instant``."""
         self._step()
         run = self._sequence(state, maps)
         found = run.add(instant, _by_map(seen, len(maps)), priors)
         answers = [run.localization(answer) for answer in found]
-        return _dumped(run), tuple(target.localizer.map.ref for target in run.targets), answers
+        kept = tuple(target.localizer.map.ref for target in run.targets)
+        return Added(_dumped(run), kept, answers, run.localized)
 
     def finish_sequence(self, state: bytes, maps: Sequence[MapFolder]) -> list[InstantLocalization]:
         """As ``worker.finish_sequence``."""
         run = self._sequence(state, maps)
         return [run.localization(answer) for answer in run.finish()]
+
+    def _read(self, query: Query) -> Read:
+        return read_query(query, self._limits, self._extractor)
 
     def _sequence(self, state: bytes, maps: Sequence[MapFolder]) -> SequenceRun:
         run = _Unpickler(state, {of.ref: self.localizer(of) for of in maps}).load()
@@ -302,6 +350,10 @@ class _Unpickler(pickle.Unpickler):
         kind, ref = pid
         localizer = self._localizers[ref]
         return localizer if kind == "localizer" else localizer.geometry
+
+
+def _size_of(opened: Localizer | TileChooser) -> int:
+    return opened.size_bytes if isinstance(opened, TileChooser) else opened.map.size_bytes
 
 
 def _dumped(run: SequenceRun) -> bytes:

@@ -17,12 +17,16 @@ from multiprocessing import parent_process
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from service.jobs import (
     ImageJob,
     Instant,
     InstantLocalization,
     Localization,
     LocalizeJob,
+    Query,
     Rig,
     RigJob,
     SequenceStart,
@@ -30,6 +34,7 @@ from service.jobs import (
 from service.logs import configure_logging
 from visloc.errors import VislocError
 from visloc.priors import Priors
+from visloc.sets.choosing import TileScore
 from visloc.types import Inference, LocalizeOptions
 
 if TYPE_CHECKING:
@@ -70,17 +75,31 @@ class WorkerSettings:
 
 
 class MapFolder(NamedTuple):
-    """A version of a map on this machine's disk: ``id@version`` and its folder."""
+    """A version of a map, or of a set, on this machine's disk: ``id@version`` and its folder."""
 
     ref: str
     folder: Path
+    is_set: bool = False
 
 
 class Loaded(NamedTuple):
-    """A map that is open: ``id@version`` and its bytes."""
+    """A map, or a set, that is open: ``id@version`` and its bytes."""
 
     ref: str
     size: int
+
+
+class Chosen(NamedTuple):
+    """What a photo says of the tiles of a set.
+
+    Attributes:
+        query: the photo, read, if it can be.
+        scores: of the most similar tiles, best first; none when none were asked for, or the photo
+            shows nothing.
+    """
+
+    query: Query
+    scores: tuple[TileScore, ...] = ()
 
 
 class Abandoned(Exception):
@@ -133,13 +152,13 @@ def ping() -> None:
 
 
 def load(of: MapFolder) -> None:
-    """Open a map and warm it up.
+    """Open a map, or a set without its tiles, and warm it up.
 
     Raises:
         Conflict: for a map of features that are not here.
         MapCorrupt: when it cannot be used.
     """
-    _here().localizer(of)
+    _here().open(of)
 
 
 def warm(maps: Sequence[MapFolder]) -> None:
@@ -169,6 +188,28 @@ def localize(job: LocalizeJob, maps: Sequence[MapFolder], submitted: float) -> L
         VislocError: what ``read_photo``, maps and ``Localizer`` raise.
     """
     return _here().localize(job, maps, submitted)
+
+
+def choose_tiles(
+    query: Query,
+    of: MapFolder,
+    options: LocalizeOptions,
+    allowed: NDArray[np.bool_] | None,
+    submitted: float,
+) -> Chosen:
+    """Read a photo, find its features, and rank tiles of a set by them.
+
+    Args:
+        query: the photo; one that cannot be used comes back as it is, and ranks nothing.
+        of: the set.
+        options: how features are found.
+        allowed: (T,) the tiles to rank; None to rank none.
+        submitted: as of ``localize``.
+
+    Raises:
+        VislocError: what sets raise that cannot be opened.
+    """
+    return _here().choose_tiles(query, of, options, allowed, submitted)
 
 
 def check_rig(job: RigJob, maps: Sequence[MapFolder]) -> None:
@@ -208,6 +249,22 @@ def solve_rig(job: RigJob, maps: Sequence[MapFolder], seen: Sequence[Seen]) -> I
     return _here().solve_rig(job, maps, seen)
 
 
+class Added(NamedTuple):
+    """What an instant makes of a sequence.
+
+    Attributes:
+        state: the sequence after it.
+        maps: references of those that are still searched.
+        answers: those that are final.
+        localized: whether the instant's own images localize it.
+    """
+
+    state: bytes
+    maps: tuple[str, ...]
+    answers: list[InstantLocalization]
+    localized: bool
+
+
 # A sequence lives in the main process, as bytes that only worker processes read: which of them
 # takes its next step is open, and none of them dying takes more along than that step.
 
@@ -240,12 +297,8 @@ def add_instant(
     instant: Instant,
     seen: Sequence[Seen],
     priors: Priors,
-) -> tuple[bytes, tuple[str, ...], list[InstantLocalization]]:
-    """Solve the next instant of a sequence, given without its photos.
-
-    Returns:
-        The sequence after it, the maps that are still searched, and the answers that are final.
-    """
+) -> Added:
+    """Solve the next instant of a sequence, given without its photos."""
     return _here().add_instant(state, maps, instant, seen, priors)
 
 

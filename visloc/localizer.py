@@ -66,9 +66,10 @@ _MOST_KEYPOINTS: Mapping[Extraction, int] = {Extraction.FAST: 1000, Extraction.D
 # asked too: they may show that the priors are wrong.
 _NUM_ELSEWHERE = 5
 
-# Of one photo: what an extractor found with a limit, and the pixels it looked at.
+# Of one photo: what an extractor found with a limit, the limit, and the pixels it looked at.
 FeatureCache = dict[
-    tuple[LocalFeatureExtractor, int, ReadAs, Extraction], tuple[LocalFeatures, NDArray[np.uint8]]
+    tuple[LocalFeatureExtractor, ReadAs, Extraction],
+    tuple[LocalFeatures, int, NDArray[np.uint8]],
 ]
 
 
@@ -215,12 +216,8 @@ class Localizer:
         seconds: dict[str, float] = {}
         evidence = Evidence(used, source, photo.exif_orientation, options.read_as, seconds=seconds)
         with timed(seconds, "local_features"):
-            in_map = self.map.manifest.local_features.max_keypoints
-            max_keypoints = min(in_map, _MOST_KEYPOINTS.get(options.extraction, in_map))
-            key = self._extractor, max_keypoints, options.read_as, options.extraction
-            local, rgb = (found or {}).get(key) or _find_features(photo, *key)
-            if found is not None:
-                found[key] = local, rgb
+            most = self.map.manifest.local_features.max_keypoints
+            local, rgb = find_features(photo, self._extractor, most, options, found)
         return self._match(local, rgb, {}, evidence, seconds, options, fusion, constraints)
 
     def look_at_features(
@@ -438,14 +435,50 @@ def _nothing(evidence: Evidence, stage: Stage, reason: Reason, message: str) -> 
     return Look(evidence, Matches.none(), np.empty(0, np.int64), Matches.none(), refusal)
 
 
-def _find_features(
+def find_features(
+    photo: Photo,
+    extractor: LocalFeatureExtractor,
+    most: int,
+    options: LocalizeOptions,
+    found: FeatureCache | None = None,
+) -> tuple[LocalFeatures, NDArray[np.uint8]]:
+    """Find the local features of a photo, unless they were found before.
+
+    Args:
+        photo: pixels as stored.
+        extractor: finds them.
+        most: keypoints of a photo of the map.
+        options: how much effort goes into it, and in which orientation.
+        found: of this photo, what was found before; what is found now is added.
+
+    Returns:
+        Features with keypoints in the stored pixels, and the image they were found in.
+    """
+    most = min(most, _MOST_KEYPOINTS.get(options.extraction, most))
+    key = extractor, options.read_as, options.extraction
+    local, limit, rgb = (found or {}).get(key) or (None, 0, photo.rgb)
+    if local is None or limit < most:
+        local, rgb = _extracted(photo, extractor, most, options.read_as, options.extraction)
+        limit = most
+        if found is not None:
+            found[key] = local, limit, rgb
+    return (local if limit == most else _strongest(local, most)), rgb
+
+
+def _strongest(local: LocalFeatures, most: int) -> LocalFeatures:
+    """Those that an extractor returns that may return so many: they come strongest first."""
+    return LocalFeatures(
+        local.keypoints[:most], local.descriptors[:most], local.scores[:most], local.scales[:most]
+    )
+
+
+def _extracted(
     photo: Photo,
     extractor: LocalFeatureExtractor,
     max_keypoints: int,
     read_as: ReadAs,
     extraction: Extraction,
 ) -> tuple[LocalFeatures, NDArray[np.uint8]]:
-    """Features with keypoints in the stored pixels, and the image they were found in."""
     find = partial(extractor.extract, max_keypoints=max_keypoints, extraction=extraction)
     if read_as is ReadAs.STORED or photo.exif_orientation == 1:
         return find(photo.rgb), photo.rgb

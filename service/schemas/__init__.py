@@ -34,6 +34,8 @@ from service.schemas.maps import (
     ListMapsResponse,
     MapInfo,
     RigInfo,
+    Similarity,
+    Tile,
     UseVersionRequest,
     VersionInfo,
 )
@@ -115,6 +117,8 @@ __all__ = [
     "RigPose",
     "RigSensor",
     "SequenceStart",
+    "Similarity",
+    "Tile",
     "Transform",
     "UseVersionRequest",
     "VersionInfo",

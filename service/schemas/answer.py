@@ -11,7 +11,14 @@ from pydantic.json_schema import WithJsonSchema
 
 import visloc.types
 from service.jobs import Localization, MatchPicture
-from service.schemas.evidence import CameraUsed, MapRef, Orientation, Refusal, RetrievedImage
+from service.schemas.evidence import (
+    CameraUsed,
+    MapRef,
+    Orientation,
+    Refusal,
+    RetrievedImage,
+    TileRef,
+)
 from service.schemas.geometry import Transform
 from service.schemas.geopose import GeoPose, GeoPoseYpr, geoposes_to_words
 
@@ -109,6 +116,7 @@ class LocalizeResponse(BaseModel):
         GeoPoseYpr | None, Field(description="the same in angles, when asked for")
     ] = None
     debug: Annotated[Debug | None, Field(description="the matches, when asked for")] = None
+    tile: TileRef = None
 
     @staticmethod
     def from_localization(found: Localization, request_id: str) -> LocalizeResponse:
@@ -138,6 +146,7 @@ class LocalizeResponse(BaseModel):
             geopose=geopose,
             geopose_ypr=geopose_ypr,
             debug=None if found.debug is None else Debug.of(found.debug),
+            tile=found.tile,
         )
 
 

@@ -75,7 +75,17 @@ class Orientation(BaseModel):
 
 
 class MapRef(BaseModel):
-    """The map that answered."""
+    """The map that answered, or the set of maps."""
 
     id: str
     version: str
+
+
+# Of a set, the map in it that answered.
+TileRef = Annotated[
+    str | None,
+    Field(
+        description="of a set of maps: id@version of the map in it that the answer rests on, or "
+        "that came closest; null for a map on its own"
+    ),
+]

@@ -9,7 +9,14 @@ from pydantic import BaseModel, Field
 
 import visloc.types
 from service.jobs import InstantLocalization
-from service.schemas.evidence import CameraUsed, MapRef, Orientation, Refusal, RetrievedImage
+from service.schemas.evidence import (
+    CameraUsed,
+    MapRef,
+    Orientation,
+    Refusal,
+    RetrievedImage,
+    TileRef,
+)
 from service.schemas.geometry import Transform
 from service.schemas.geopose import GeoPose, GeoPoseYpr, geoposes_to_words
 from visloc.errors import VislocError
@@ -124,6 +131,7 @@ class InstantAnswer(BaseModel):
     geopose_ypr: Annotated[
         GeoPoseYpr | None, Field(description="the same in angles, when asked for")
     ] = None
+    tile: TileRef = None
 
     @staticmethod
     def from_localization(found: InstantLocalization, request_id: str) -> InstantAnswer:
@@ -158,6 +166,7 @@ class InstantAnswer(BaseModel):
             seconds=dict(answer.seconds),
             geopose=geopose,
             geopose_ypr=geopose_ypr,
+            tile=found.tile,
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, Field
 
@@ -58,9 +58,9 @@ class Anchor(BaseModel):
     geodetic: Annotated[Geodetic | None, Field(description="null when not anchored to the Earth")]
 
     @staticmethod
-    def of(world: visloc.archive.World) -> Anchor | None:
+    def of(anchor: visloc.archive.Anchor) -> Anchor:
         """Say it in the API's words."""
-        return None if world.anchor is None else Anchor.model_validate(world.anchor.model_dump())
+        return Anchor.model_validate(anchor.model_dump())
 
 
 class GeoCircle(BaseModel):
@@ -71,10 +71,48 @@ class GeoCircle(BaseModel):
     radius: Annotated[float, Field(description="metres")]
 
     @staticmethod
-    def of(world: visloc.archive.World) -> GeoCircle | None:
+    def of(world: visloc.archive.World | visloc.archive.SetWorld) -> GeoCircle | None:
         """Say it in the API's words."""
         place = visloc.archive.circle_of(world)
         return None if place is None else GeoCircle(**asdict(place))
+
+
+class Similarity(BaseModel):
+    """A change of frame and unit: x_a = scale R x_b + translation for one called a_from_b."""
+
+    rotation_wxyz: Annotated[list[float], Field(description="R as a unit quaternion")]
+    translation: Annotated[list[float], Field(description="in the unit of a")]
+    scale: Annotated[float, Field(description="units of a in one unit of b")]
+
+
+class Tile(BaseModel):
+    """One map of a set."""
+
+    map: str
+    version: str
+    set_from_tile: Annotated[
+        Similarity, Field(description="from the map's world to that of the set")
+    ]
+    extent: Annotated[
+        Extent, Field(description="of its landmarks and photos, in the world of the set")
+    ]
+    images: Annotated[int, Field(description="mapping photos")]
+
+    @staticmethod
+    def of(tile: visloc.archive.TileRecord) -> Tile:
+        """Say it in the API's words."""
+        moved = tile.set_from_tile
+        return Tile(
+            map=tile.map,
+            version=tile.version,
+            set_from_tile=Similarity(
+                rotation_wxyz=list(moved.rotation_wxyz),
+                translation=list(moved.translation),
+                scale=moved.scale,
+            ),
+            extent=Extent(min=list(tile.extent.min), max=list(tile.extent.max)),
+            images=tile.images,
+        )
 
 
 class VersionInfo(BaseModel):
@@ -91,20 +129,25 @@ class UseVersionRequest(IncomingMessage):
 
 
 class MapInfo(BaseModel):
-    """What a map is."""
+    """What a map is, or a set of maps."""
 
     id: str
     version: str
     created: Annotated[str, Field(description="ISO 8601, UTC")]
     metric: Annotated[bool, Field(description="whether one unit of the world is a metre")]
-    method: Annotated[str, Field(description="how the landmarks were made, such as rgbd")]
+    method: Annotated[
+        str | None, Field(description="how the landmarks were made, such as rgbd; null for a set")
+    ]
     local_features: Annotated[str, Field(description="such as xfeat")]
     global_features: list[str]
     images: Annotated[int, Field(description="mapping photos")]
     landmarks: Annotated[int, Field(description="3D points")]
-    observations: Annotated[int, Field(description="sightings of landmarks in mapping photos")]
+    observations: Annotated[
+        int | None,
+        Field(description="sightings of landmarks in mapping photos; null for a set"),
+    ]
     extent: Extent
-    size_bytes: Annotated[int, Field(description="on the server's disk")]
+    size_bytes: Annotated[int, Field(description="on the server's disk; of a set without its maps")]
     down: Annotated[
         list[float],
         Field(description="unit vector that points down in the world; empty when not known"),
@@ -125,17 +168,60 @@ class MapInfo(BaseModel):
         Field(description="sha256 over all that localizes: equal maps have equal ones"),
     ]
     fusion: Annotated[
-        str, Field(description="of the global features, unless a query says otherwise")
+        str | None,
+        Field(description="of the global features, unless a query says otherwise; null for a set"),
     ] = Fusion.GHARM.value
     fusion_weights: Annotated[
         dict[str, float], Field(description="by global feature; empty when all count alike")
     ] = {}
+    kind: Annotated[Literal["map", "set"], Field(description="set: of several maps")] = "map"
+    num_tiles: Annotated[int | None, Field(description="maps of a set; null for a map")] = None
+    tiles: Annotated[
+        list[Tile], Field(description="the maps of a set; left empty in lists of maps")
+    ] = []
 
     @staticmethod
-    def from_served(served: ServedMap) -> MapInfo:
+    def from_served(served: ServedMap, *, in_list: bool = False) -> MapInfo:
         """Say it in the API's words."""
-        opened = served.outline
+        outline = served.outline
+        if isinstance(outline, visloc.archive.SetOutline):
+            return MapInfo._of_set(outline, served, in_list=in_list)
+        return MapInfo._of_map(outline, served)
+
+    @staticmethod
+    def _of_set(outline: visloc.archive.SetOutline, served: ServedMap, *, in_list: bool) -> MapInfo:
+        manifest = outline.manifest
+        world, anchor = manifest.world, manifest.world.anchor
+        return MapInfo(
+            id=manifest.id,
+            version=manifest.version,
+            created=manifest.created,
+            metric=world.metric,
+            method=None,
+            local_features=manifest.local_features.name,
+            global_features=[],
+            images=manifest.counts.images,
+            landmarks=manifest.counts.landmarks,
+            observations=None,
+            extent=Extent(min=list(world.extent.min), max=list(world.extent.max)),
+            size_bytes=outline.size_bytes,
+            down=[] if outline.gravity is None else outline.gravity.tolist(),
+            rigs=[],
+            anchor=None if anchor is None else Anchor.of(anchor),
+            place=GeoCircle.of(world),
+            current=served.current,
+            versions=[VersionInfo(version=name, current=used) for name, used in served.versions],
+            content_hash=manifest.content_hash,
+            fusion=None,
+            kind="set",
+            num_tiles=len(manifest.tiles),
+            tiles=[] if in_list else [Tile.of(tile) for tile in manifest.tiles],
+        )
+
+    @staticmethod
+    def _of_map(opened: visloc.archive.MapOutline, served: ServedMap) -> MapInfo:
         manifest = opened.manifest
+        anchor = manifest.world.anchor
         return MapInfo(
             id=manifest.id,
             version=manifest.version,
@@ -151,7 +237,7 @@ class MapInfo(BaseModel):
             size_bytes=opened.size_bytes,
             down=[] if opened.gravity is None else opened.gravity.tolist(),
             rigs=[RigInfo(id=id_, sensors=list(sensors)) for id_, sensors in opened.rigs.items()],
-            anchor=Anchor.of(manifest.world),
+            anchor=None if anchor is None else Anchor.of(anchor),
             place=GeoCircle.of(manifest.world),
             current=served.current,
             versions=[VersionInfo(version=name, current=used) for name, used in served.versions],

@@ -6,11 +6,12 @@ import math
 from typing import Annotated, ClassVar
 
 import numpy as np
-from pydantic import Field
+from pydantic import FailFast, Field
 
 import visloc.priors
 from service.incoming import IncomingMessage, converted
 from service.schemas.geometry import Numbers, Transform, covariance_to_core
+from visloc.archive.set_schema import MAX_TILES
 
 _GRAVITY_STD_DEG = 1.0
 
@@ -103,6 +104,15 @@ class Priors(IncomingMessage):
     height: HeightBand | None = None
     pose: PosePrior | None = None
     gravity: GravityPrior | None = None
+    maps: Annotated[
+        list[str] | None,
+        FailFast(),
+        Field(
+            max_length=MAX_TILES,
+            description="of a set of maps: the tiles that the device may be in, each id or "
+            "id@version",
+        ),
+    ] = None
 
     def to_core(self) -> visloc.priors.Priors:
         """Return the priors, checked.
@@ -116,6 +126,7 @@ class Priors(IncomingMessage):
             height=None if self.height is None else self.height.to_core(),
             pose=None if self.pose is None else self.pose.to_core(),
             gravity=None if self.gravity is None else self.gravity.to_core(),
+            maps=None if self.maps is None else tuple(self.maps),
         )
 
 

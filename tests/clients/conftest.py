@@ -149,6 +149,7 @@ class CannedService:
             "geopose": None if pose is None else GEOPOSE,
             "geopose_ypr": None,
             "debug": DEBUG if asked.get("debug") and self.draws else None,
+            "tile": None,
         }
 
     def localize_instant(
@@ -246,6 +247,7 @@ class CannedService:
             "seconds": {"features": 0.5, "pose": 0.25},
             "geopose": None,
             "geopose_ypr": None,
+            "tile": None,
         }
 
     def finish_sequence(self, num_instants: int) -> None:
@@ -293,6 +295,9 @@ class CannedService:
             "content_hash": "ab" * 32,
             "fusion": "mean",
             "fusion_weights": {"densevlad": 1 / 3},
+            "kind": "map",
+            "num_tiles": None,
+            "tiles": [],
         }
 
 

@@ -496,7 +496,7 @@ def test_openapi_describes_both_kinds_of_bodies_and_every_reference_resolves(doo
         ("/localize/rig", "post", "200", schemas.InstantAnswer, {"localized"}),
         ("/localize/sequence", "post", "200", schemas.LocalizeSequenceResponse, {"sequence"}),
         ("/maps", "get", "200", schemas.ListMapsResponse, {"maps"}),
-        ("/maps/{ref}", "get", "200", schemas.MapInfo, {"map"}),
+        ("/maps/{ref}", "get", "200", schemas.MapInfo, {"map", "set"}),
         ("/maps/{ref}/images", "get", "200", schemas.MapImages, {"images"}),
         ("/maps/{map_id}/current", "post", "200", schemas.MapInfo, {"map"}),
         ("/maps/{map_id}/versions/{version}", "get", "200", schemas.MapInfo, {"map"}),

@@ -119,10 +119,7 @@ class MapStore:
 
     def open_set(self, ref: str) -> MapSet:
         """Open the set ``id`` or ``id@version``; raises what ``folder`` and ``open_set`` raise."""
-        folder = self.folder(ref)
-        opened = open_set(folder)
-        refuse_renamed(opened.manifest, folder, folder.parent.name, folder.name)
-        return opened
+        return open_published_set(self.folder(ref))
 
     def outline(self, ref: str) -> MapOutline | SetOutline:
         """Say what ``id`` or ``id@version`` is, without opening its arrays; raises as ``open``."""
@@ -323,6 +320,17 @@ def open_published(folder: Path) -> Map:
             renamed: answers would carry the old name.
     """
     opened = open_map(folder)
+    refuse_renamed(opened.manifest, folder, folder.parent.name, folder.name)
+    return opened
+
+
+def open_published_set(folder: Path) -> MapSet:
+    """Open the set in a folder ``<id>/<version>``.
+
+    Raises:
+        MapCorrupt: as ``open_published``.
+    """
+    opened = open_set(folder)
     refuse_renamed(opened.manifest, folder, folder.parent.name, folder.name)
     return opened
 

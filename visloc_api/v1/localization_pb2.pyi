@@ -413,6 +413,7 @@ class Priors(_message.Message):
     HEIGHT_FIELD_NUMBER: _builtins.int
     POSE_FIELD_NUMBER: _builtins.int
     GRAVITY_FIELD_NUMBER: _builtins.int
+    MAPS_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def position(self) -> Global___PositionPrior: ...
     @_builtins.property
@@ -421,6 +422,10 @@ class Priors(_message.Message):
     def pose(self) -> Global___PosePrior: ...
     @_builtins.property
     def gravity(self) -> Global___GravityPrior: ...
+    @_builtins.property
+    def maps(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """of a set of maps: tiles that the device may be in, id or id@version"""
+
     def __init__(
         self,
         *,
@@ -428,10 +433,11 @@ class Priors(_message.Message):
         height: Global___HeightBand | None = ...,
         pose: Global___PosePrior | None = ...,
         gravity: Global___GravityPrior | None = ...,
+        maps: _abc.Iterable[_builtins.str] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_gravity", b"_gravity", "_height", b"_height", "_pose", b"_pose", "_position", b"_position", "gravity", b"gravity", "height", b"height", "pose", b"pose", "position", b"position"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_gravity", b"_gravity", "_height", b"_height", "_pose", b"_pose", "_position", b"_position", "gravity", b"gravity", "height", b"height", "pose", b"pose", "position", b"position"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_gravity", b"_gravity", "_height", b"_height", "_pose", b"_pose", "_position", b"_position", "gravity", b"gravity", "height", b"height", "maps", b"maps", "pose", b"pose", "position", b"position"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__gravity: _TypeAlias = _typing.Literal["gravity"]  # noqa: Y015
     _WhichOneofArgType__gravity: _TypeAlias = _typing.Literal["_gravity", b"_gravity"]  # noqa: Y015
@@ -1187,6 +1193,7 @@ class LocalizeResponse(_message.Message):
     GEOPOSE_FIELD_NUMBER: _builtins.int
     GEOPOSE_YPR_FIELD_NUMBER: _builtins.int
     DEBUG_FIELD_NUMBER: _builtins.int
+    TILE_FIELD_NUMBER: _builtins.int
     request_id: _builtins.str
     status: _builtins.str
     """localized or not_localized"""
@@ -1194,6 +1201,8 @@ class LocalizeResponse(_message.Message):
     correspondences: _builtins.int
     inliers: _builtins.int
     inlier_ratio: _builtins.float
+    tile: _builtins.str
+    """of a set: the map in it that answered, id@version"""
     @_builtins.property
     def pose(self) -> Global___PoseEstimate: ...
     @_builtins.property
@@ -1237,10 +1246,11 @@ class LocalizeResponse(_message.Message):
         geopose: Global___GeoPose | None = ...,
         geopose_ypr: Global___GeoPoseYpr | None = ...,
         debug: Global___Debug | None = ...,
+        tile: _builtins.str | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_geopose", b"_geopose", "_geopose_ypr", b"_geopose_ypr", "_pose", b"_pose", "_refusal", b"_refusal", "camera", b"camera", "debug", b"debug", "geopose", b"geopose", "geopose_ypr", b"geopose_ypr", "map", b"map", "orientation", b"orientation", "pose", b"pose", "refusal", b"refusal"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_geopose", b"_geopose", "_geopose_ypr", b"_geopose_ypr", "_pose", b"_pose", "_refusal", b"_refusal", "_tile", b"_tile", "camera", b"camera", "debug", b"debug", "geopose", b"geopose", "geopose_ypr", b"geopose_ypr", "map", b"map", "orientation", b"orientation", "pose", b"pose", "refusal", b"refusal", "tile", b"tile"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_geopose", b"_geopose", "_geopose_ypr", b"_geopose_ypr", "_pose", b"_pose", "_refusal", b"_refusal", "camera", b"camera", "correspondences", b"correspondences", "debug", b"debug", "geopose", b"geopose", "geopose_ypr", b"geopose_ypr", "inlier_ratio", b"inlier_ratio", "inliers", b"inliers", "keypoints", b"keypoints", "map", b"map", "orientation", b"orientation", "pose", b"pose", "refusal", b"refusal", "request_id", b"request_id", "retrieved", b"retrieved", "seconds", b"seconds", "status", b"status"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_geopose", b"_geopose", "_geopose_ypr", b"_geopose_ypr", "_pose", b"_pose", "_refusal", b"_refusal", "_tile", b"_tile", "camera", b"camera", "correspondences", b"correspondences", "debug", b"debug", "geopose", b"geopose", "geopose_ypr", b"geopose_ypr", "inlier_ratio", b"inlier_ratio", "inliers", b"inliers", "keypoints", b"keypoints", "map", b"map", "orientation", b"orientation", "pose", b"pose", "refusal", b"refusal", "request_id", b"request_id", "retrieved", b"retrieved", "seconds", b"seconds", "status", b"status", "tile", b"tile"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__debug: _TypeAlias = _typing.Literal["debug"]  # noqa: Y015
     _WhichOneofArgType__debug: _TypeAlias = _typing.Literal["_debug", b"_debug"]  # noqa: Y015
@@ -1252,6 +1262,8 @@ class LocalizeResponse(_message.Message):
     _WhichOneofArgType__pose: _TypeAlias = _typing.Literal["_pose", b"_pose"]  # noqa: Y015
     _WhichOneofReturnType__refusal: _TypeAlias = _typing.Literal["refusal"]  # noqa: Y015
     _WhichOneofArgType__refusal: _TypeAlias = _typing.Literal["_refusal", b"_refusal"]  # noqa: Y015
+    _WhichOneofReturnType__tile: _TypeAlias = _typing.Literal["tile"]  # noqa: Y015
+    _WhichOneofArgType__tile: _TypeAlias = _typing.Literal["_tile", b"_tile"]  # noqa: Y015
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__debug) -> _WhichOneofReturnType__debug | None: ...
     @_typing.overload
@@ -1262,6 +1274,8 @@ class LocalizeResponse(_message.Message):
     def WhichOneof(self, oneof_group: _WhichOneofArgType__pose) -> _WhichOneofReturnType__pose | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__refusal) -> _WhichOneofReturnType__refusal | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__tile) -> _WhichOneofReturnType__tile | None: ...
 
 Global___LocalizeResponse: _TypeAlias = LocalizeResponse  # noqa: Y015
 
@@ -1619,6 +1633,7 @@ class InstantAnswer(_message.Message):
     SECONDS_FIELD_NUMBER: _builtins.int
     GEOPOSE_FIELD_NUMBER: _builtins.int
     GEOPOSE_YPR_FIELD_NUMBER: _builtins.int
+    TILE_FIELD_NUMBER: _builtins.int
     request_id: _builtins.str
     timestamp: _builtins.int
     status: _builtins.str
@@ -1628,6 +1643,8 @@ class InstantAnswer(_message.Message):
     correspondences: _builtins.int
     inliers: _builtins.int
     inlier_ratio: _builtins.float
+    tile: _builtins.str
+    """as of LocalizeResponse"""
     @_builtins.property
     def pose(self) -> Global___RigPose: ...
     @_builtins.property
@@ -1665,10 +1682,11 @@ class InstantAnswer(_message.Message):
         seconds: _abc.Mapping[_builtins.str, _builtins.float] | None = ...,
         geopose: Global___GeoPose | None = ...,
         geopose_ypr: Global___GeoPoseYpr | None = ...,
+        tile: _builtins.str | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_geopose", b"_geopose", "_geopose_ypr", b"_geopose_ypr", "_pose", b"_pose", "_refusal", b"_refusal", "_source", b"_source", "_timestamp", b"_timestamp", "geopose", b"geopose", "geopose_ypr", b"geopose_ypr", "map", b"map", "pose", b"pose", "refusal", b"refusal", "source", b"source", "timestamp", b"timestamp"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_geopose", b"_geopose", "_geopose_ypr", b"_geopose_ypr", "_pose", b"_pose", "_refusal", b"_refusal", "_source", b"_source", "_tile", b"_tile", "_timestamp", b"_timestamp", "geopose", b"geopose", "geopose_ypr", b"geopose_ypr", "map", b"map", "pose", b"pose", "refusal", b"refusal", "source", b"source", "tile", b"tile", "timestamp", b"timestamp"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_geopose", b"_geopose", "_geopose_ypr", b"_geopose_ypr", "_pose", b"_pose", "_refusal", b"_refusal", "_source", b"_source", "_timestamp", b"_timestamp", "correspondences", b"correspondences", "geopose", b"geopose", "geopose_ypr", b"geopose_ypr", "images", b"images", "inlier_ratio", b"inlier_ratio", "inliers", b"inliers", "map", b"map", "pose", b"pose", "refusal", b"refusal", "request_id", b"request_id", "seconds", b"seconds", "source", b"source", "status", b"status", "timestamp", b"timestamp"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_geopose", b"_geopose", "_geopose_ypr", b"_geopose_ypr", "_pose", b"_pose", "_refusal", b"_refusal", "_source", b"_source", "_tile", b"_tile", "_timestamp", b"_timestamp", "correspondences", b"correspondences", "geopose", b"geopose", "geopose_ypr", b"geopose_ypr", "images", b"images", "inlier_ratio", b"inlier_ratio", "inliers", b"inliers", "map", b"map", "pose", b"pose", "refusal", b"refusal", "request_id", b"request_id", "seconds", b"seconds", "source", b"source", "status", b"status", "tile", b"tile", "timestamp", b"timestamp"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__geopose: _TypeAlias = _typing.Literal["geopose"]  # noqa: Y015
     _WhichOneofArgType__geopose: _TypeAlias = _typing.Literal["_geopose", b"_geopose"]  # noqa: Y015
@@ -1680,6 +1698,8 @@ class InstantAnswer(_message.Message):
     _WhichOneofArgType__refusal: _TypeAlias = _typing.Literal["_refusal", b"_refusal"]  # noqa: Y015
     _WhichOneofReturnType__source: _TypeAlias = _typing.Literal["source"]  # noqa: Y015
     _WhichOneofArgType__source: _TypeAlias = _typing.Literal["_source", b"_source"]  # noqa: Y015
+    _WhichOneofReturnType__tile: _TypeAlias = _typing.Literal["tile"]  # noqa: Y015
+    _WhichOneofArgType__tile: _TypeAlias = _typing.Literal["_tile", b"_tile"]  # noqa: Y015
     _WhichOneofReturnType__timestamp: _TypeAlias = _typing.Literal["timestamp"]  # noqa: Y015
     _WhichOneofArgType__timestamp: _TypeAlias = _typing.Literal["_timestamp", b"_timestamp"]  # noqa: Y015
     @_typing.overload
@@ -1692,6 +1712,8 @@ class InstantAnswer(_message.Message):
     def WhichOneof(self, oneof_group: _WhichOneofArgType__refusal) -> _WhichOneofReturnType__refusal | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__source) -> _WhichOneofReturnType__source | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__tile) -> _WhichOneofReturnType__tile | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__timestamp) -> _WhichOneofReturnType__timestamp | None: ...
 
@@ -1829,6 +1851,9 @@ class MapInfo(_message.Message):
     CONTENT_HASH_FIELD_NUMBER: _builtins.int
     FUSION_FIELD_NUMBER: _builtins.int
     FUSION_WEIGHTS_FIELD_NUMBER: _builtins.int
+    KIND_FIELD_NUMBER: _builtins.int
+    NUM_TILES_FIELD_NUMBER: _builtins.int
+    TILES_FIELD_NUMBER: _builtins.int
     id: _builtins.str
     version: _builtins.str
     created: _builtins.str
@@ -1836,16 +1861,22 @@ class MapInfo(_message.Message):
     metric: _builtins.bool
     """whether one unit of the world is a metre"""
     method: _builtins.str
+    """not of a set"""
     local_features: _builtins.str
     images: _builtins.int
     landmarks: _builtins.int
     observations: _builtins.int
+    """not of a set"""
     size_bytes: _builtins.int
     current: _builtins.bool
     """whether this version is in use"""
     content_hash: _builtins.str
     fusion: _builtins.str
-    """of the global features, unless a query says otherwise"""
+    """Of the global features, unless a query says otherwise; not of a set."""
+    kind: _builtins.str
+    """map, or set of maps"""
+    num_tiles: _builtins.int
+    """of a set"""
     @_builtins.property
     def global_features(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]: ...
     @_builtins.property
@@ -1870,6 +1901,10 @@ class MapInfo(_message.Message):
     def fusion_weights(self) -> _containers.ScalarMap[_builtins.str, _builtins.float]:
         """empty: all alike"""
 
+    @_builtins.property
+    def tiles(self) -> _containers.RepeatedCompositeFieldContainer[Global___Tile]:
+        """of a set; ListMaps leaves them out"""
+
     def __init__(
         self,
         *,
@@ -1877,12 +1912,12 @@ class MapInfo(_message.Message):
         version: _builtins.str = ...,
         created: _builtins.str = ...,
         metric: _builtins.bool = ...,
-        method: _builtins.str = ...,
+        method: _builtins.str | None = ...,
         local_features: _builtins.str = ...,
         global_features: _abc.Iterable[_builtins.str] | None = ...,
         images: _builtins.int = ...,
         landmarks: _builtins.int = ...,
-        observations: _builtins.int = ...,
+        observations: _builtins.int | None = ...,
         extent: Global___Extent | None = ...,
         size_bytes: _builtins.int = ...,
         down: _abc.Iterable[_builtins.float] | None = ...,
@@ -1892,23 +1927,114 @@ class MapInfo(_message.Message):
         current: _builtins.bool = ...,
         versions: _abc.Iterable[Global___VersionInfo] | None = ...,
         content_hash: _builtins.str = ...,
-        fusion: _builtins.str = ...,
+        fusion: _builtins.str | None = ...,
         fusion_weights: _abc.Mapping[_builtins.str, _builtins.float] | None = ...,
+        kind: _builtins.str = ...,
+        num_tiles: _builtins.int | None = ...,
+        tiles: _abc.Iterable[Global___Tile] | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_anchor", b"_anchor", "_place", b"_place", "anchor", b"anchor", "extent", b"extent", "place", b"place"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_anchor", b"_anchor", "_fusion", b"_fusion", "_method", b"_method", "_num_tiles", b"_num_tiles", "_observations", b"_observations", "_place", b"_place", "anchor", b"anchor", "extent", b"extent", "fusion", b"fusion", "method", b"method", "num_tiles", b"num_tiles", "observations", b"observations", "place", b"place"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_anchor", b"_anchor", "_place", b"_place", "anchor", b"anchor", "content_hash", b"content_hash", "created", b"created", "current", b"current", "down", b"down", "extent", b"extent", "fusion", b"fusion", "fusion_weights", b"fusion_weights", "global_features", b"global_features", "id", b"id", "images", b"images", "landmarks", b"landmarks", "local_features", b"local_features", "method", b"method", "metric", b"metric", "observations", b"observations", "place", b"place", "rigs", b"rigs", "size_bytes", b"size_bytes", "version", b"version", "versions", b"versions"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_anchor", b"_anchor", "_fusion", b"_fusion", "_method", b"_method", "_num_tiles", b"_num_tiles", "_observations", b"_observations", "_place", b"_place", "anchor", b"anchor", "content_hash", b"content_hash", "created", b"created", "current", b"current", "down", b"down", "extent", b"extent", "fusion", b"fusion", "fusion_weights", b"fusion_weights", "global_features", b"global_features", "id", b"id", "images", b"images", "kind", b"kind", "landmarks", b"landmarks", "local_features", b"local_features", "method", b"method", "metric", b"metric", "num_tiles", b"num_tiles", "observations", b"observations", "place", b"place", "rigs", b"rigs", "size_bytes", b"size_bytes", "tiles", b"tiles", "version", b"version", "versions", b"versions"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__anchor: _TypeAlias = _typing.Literal["anchor"]  # noqa: Y015
     _WhichOneofArgType__anchor: _TypeAlias = _typing.Literal["_anchor", b"_anchor"]  # noqa: Y015
+    _WhichOneofReturnType__fusion: _TypeAlias = _typing.Literal["fusion"]  # noqa: Y015
+    _WhichOneofArgType__fusion: _TypeAlias = _typing.Literal["_fusion", b"_fusion"]  # noqa: Y015
+    _WhichOneofReturnType__method: _TypeAlias = _typing.Literal["method"]  # noqa: Y015
+    _WhichOneofArgType__method: _TypeAlias = _typing.Literal["_method", b"_method"]  # noqa: Y015
+    _WhichOneofReturnType__num_tiles: _TypeAlias = _typing.Literal["num_tiles"]  # noqa: Y015
+    _WhichOneofArgType__num_tiles: _TypeAlias = _typing.Literal["_num_tiles", b"_num_tiles"]  # noqa: Y015
+    _WhichOneofReturnType__observations: _TypeAlias = _typing.Literal["observations"]  # noqa: Y015
+    _WhichOneofArgType__observations: _TypeAlias = _typing.Literal["_observations", b"_observations"]  # noqa: Y015
     _WhichOneofReturnType__place: _TypeAlias = _typing.Literal["place"]  # noqa: Y015
     _WhichOneofArgType__place: _TypeAlias = _typing.Literal["_place", b"_place"]  # noqa: Y015
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__anchor) -> _WhichOneofReturnType__anchor | None: ...
     @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__fusion) -> _WhichOneofReturnType__fusion | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__method) -> _WhichOneofReturnType__method | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__num_tiles) -> _WhichOneofReturnType__num_tiles | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__observations) -> _WhichOneofReturnType__observations | None: ...
+    @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__place) -> _WhichOneofReturnType__place | None: ...
 
 Global___MapInfo: _TypeAlias = MapInfo  # noqa: Y015
+
+@_typing.final
+class Tile(_message.Message):
+    """One map of a set."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MAP_FIELD_NUMBER: _builtins.int
+    VERSION_FIELD_NUMBER: _builtins.int
+    SET_FROM_TILE_FIELD_NUMBER: _builtins.int
+    EXTENT_FIELD_NUMBER: _builtins.int
+    IMAGES_FIELD_NUMBER: _builtins.int
+    map: _builtins.str
+    version: _builtins.str
+    images: _builtins.int
+    @_builtins.property
+    def set_from_tile(self) -> Global___Similarity:
+        """from the map's world to the set's"""
+
+    @_builtins.property
+    def extent(self) -> Global___Extent:
+        """of its landmarks and photos, in the world of the set"""
+
+    def __init__(
+        self,
+        *,
+        map: _builtins.str = ...,
+        version: _builtins.str = ...,
+        set_from_tile: Global___Similarity | None = ...,
+        extent: Global___Extent | None = ...,
+        images: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["extent", b"extent", "set_from_tile", b"set_from_tile"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["extent", b"extent", "images", b"images", "map", b"map", "set_from_tile", b"set_from_tile", "version", b"version"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Tile: _TypeAlias = Tile  # noqa: Y015
+
+@_typing.final
+class Similarity(_message.Message):
+    """x_a = scale R x_b + t for one that is called a_from_b."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    ROTATION_WXYZ_FIELD_NUMBER: _builtins.int
+    TRANSLATION_FIELD_NUMBER: _builtins.int
+    SCALE_FIELD_NUMBER: _builtins.int
+    scale: _builtins.float
+    @_builtins.property
+    def rotation_wxyz(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """unit quaternion, w >= 0"""
+
+    @_builtins.property
+    def translation(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """in the unit of a"""
+
+    def __init__(
+        self,
+        *,
+        rotation_wxyz: _abc.Iterable[_builtins.float] | None = ...,
+        translation: _abc.Iterable[_builtins.float] | None = ...,
+        scale: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["rotation_wxyz", b"rotation_wxyz", "scale", b"scale", "translation", b"translation"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Similarity: _TypeAlias = Similarity  # noqa: Y015
 
 @_typing.final
 class Anchor(_message.Message):

@@ -1,0 +1,434 @@
+"""Sets of maps through both doors, with real worker processes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+
+from clients import Client, Instant, LocalizeResult, RigImage, RigSensor
+from clients import Features as SentFeatures
+from mapping.build import BuildSettings, build_map
+from mapping.sample import write_sample
+from mapping.sets import publish_set
+from visloc.archive import MapStore
+from visloc.archive.packed import pack_map
+from visloc.errors import Conflict, InvalidInput, NotFound, Unavailable
+from visloc.features import make_global_descriptor, make_local_features
+from visloc.geometry import Pose, Similarity, rotation_angle
+from visloc.images import read_photo
+from visloc.kapture import read_dataset
+from visloc.priors import PosePrior, PositionPrior, Priors
+
+Serve = Callable[..., AbstractContextManager[Any]]
+NOT_COMPARED = ("seconds", "request_id")
+START = 1_700_000_000_000  # milliseconds
+
+
+def turned(degrees: float, scale: float, *translation: float) -> Similarity:
+    """About the world's z axis."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+    return Similarity(scale, rotation, np.array(translation))
+
+
+# Where the two rooms lie in the set.
+SITE_FROM_ROOM = turned(30, 1.0, 100.0, -20.0, 3.0)
+SITE_FROM_STUDY = turned(-75, 1.0, -50.0, 40.0, 6.0)
+# The same room in a set of another unit.
+MODEL_FROM_ROOM = turned(90, 0.1, 1.0, 2.0, 3.0)
+
+
+def quiet(_stage: str, _done: int, _total: int) -> None:
+    pass
+
+
+def add_copy(maps: Path, map_id: str) -> None:
+    """Publish ``room`` under another id."""
+    target = maps / map_id / "v1"
+    shutil.copytree(MapStore(maps).folder("room"), target)
+    manifest = json.loads((target / "manifest.json").read_text())
+    (target / "manifest.json").write_text(json.dumps(manifest | {"id": map_id, "version": "v1"}))
+    (maps / map_id / "current").write_text("v1")
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Another room of the same shape and quite other pictures; a dataset as the sample is."""
+    folder = tmp_path_factory.mktemp("study")
+    write_sample(folder, images=8, size=(256, 192), seed=1)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def site(built_maps: Path, study: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Maps ``room``, ``study`` and ``copy``, which is the room again, and sets of them."""
+    maps = Path(shutil.copytree(built_maps, tmp_path_factory.mktemp("site") / "maps"))
+    build_map(BuildSettings(study / "mapping", "study", maps, local_features="sift"), quiet)
+    add_copy(maps, "copy")
+    store = MapStore(maps)
+    rooms = [("room", SITE_FROM_ROOM), ("study", SITE_FROM_STUDY)]
+    publish_set(store, "site", rooms, quiet)
+    publish_set(store, "twice", [("room", SITE_FROM_ROOM), ("copy", SITE_FROM_STUDY)], quiet)
+    publish_set(store, "model", [("room", MODEL_FROM_ROOM)], quiet)
+    return maps
+
+
+@pytest.fixture
+def site_copy(site: Path, tmp_path: Path) -> Path:
+    """The same, to be changed."""
+    return Path(shutil.copytree(site, tmp_path / "maps"))
+
+
+@pytest.fixture(scope="module")
+def served(site: Path, serve: Serve) -> Iterator[Any]:
+    with serve(site, workers=2) as doors:
+        yield doors
+
+
+@pytest.fixture(scope="module", params=["http", "grpc"])
+def client(served: Any, request: pytest.FixtureRequest) -> Iterator[Client]:
+    """Over each door."""
+    urls = {"http": served.url, "grpc": f"grpc://127.0.0.1:{served.server.grpc_port}"}
+    with Client(urls[request.param]) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def in_study(study: Path) -> list[Any]:
+    """Photos of the other room with their cameras and poses."""
+    dataset = read_dataset(study / "query")
+    return [
+        (
+            dataset.path_of(record).read_bytes(),
+            dataset.sensors[record.sensor_id].camera,
+            dataset.pose(record),
+        )
+        for record in dataset.images
+    ]
+
+
+def assert_moved(found: LocalizeResult, own: LocalizeResult, moved: Similarity) -> None:
+    """The answer of a set is that of the tile, moved to the set's frame."""
+    assert found.pose is not None
+    assert own.pose is not None
+    expected = moved.move(own.pose.cam_from_world)
+    assert found.pose.position == pytest.approx(expected.center, abs=1e-9)
+    turn = rotation_angle(found.pose.cam_from_world.rotation @ expected.rotation.T)
+    assert turn < 1e-7
+    assert found.pose.orientation_std_deg == pytest.approx(own.pose.orientation_std_deg)
+    # Lengths have the set's unit, and directions the set's axes.
+    spread = np.linalg.norm(own.pose.position_std) * moved.scale
+    assert np.linalg.norm(found.pose.position_std) == pytest.approx(spread)
+    assert (found.inliers, found.keypoints) == (own.inliers, own.keypoints)
+    assert found.raw["retrieved"] == own.raw["retrieved"]
+
+
+@pytest.mark.parametrize(("asked", "moved"), [("site", SITE_FROM_ROOM), ("model", MODEL_FROM_ROOM)])
+def test_a_set_answers_as_its_tile_does_in_its_own_frame(
+    asked: str, moved: Similarity, client: Client, site: Path, queries: list[Any]
+) -> None:
+    store = MapStore(site)
+    for query in queries:
+        own = client.localize(query.image, "room", query.camera)
+        found = client.localize(query.image, asked, query.camera)
+        assert_moved(found, own, moved)
+        assert (found.map.id, found.map.version) == (asked, store.current_version(asked))
+        assert found.tile == f"room@{store.current_version('room')}"
+        assert own.tile is None
+        assert found.seconds["local_features"] > 0
+        assert ("choose_tiles" in found.seconds) == (asked == "site")
+
+
+def test_both_doors_say_the_same(served: Any, query: Any) -> None:
+    answers = []
+    for url in (served.url, f"grpc://127.0.0.1:{served.server.grpc_port}"):
+        with Client(url) as client:
+            raw = client.localize(query.image, "site", query.camera, debug=True).raw
+            answers.append({name: v for name, v in raw.items() if name not in NOT_COMPARED})
+            infos = [client.map("site"), *client.maps()]
+            answers[-1]["maps"] = infos
+    assert answers[0] == answers[1]
+
+
+def test_each_photo_is_found_in_its_own_tile(client: Client, in_study: list[Any]) -> None:
+    for image, camera, cam_from_world in in_study:
+        found = client.localize(image, "site", camera)
+        assert found.pose is not None
+        assert found.tile is not None
+        assert found.tile.startswith("study@")
+        away = found.pose.position - SITE_FROM_STUDY.apply(cam_from_world.center)
+        assert np.linalg.norm(away) < 0.05
+
+
+def test_debug_shows_points_in_the_frame_of_the_set(served: Any, query: Any) -> None:
+    with Client(served.url) as client:
+        own = client.localize(query.image, "room", query.camera, debug=True)
+        found = client.localize(query.image, "site", query.camera, debug=True)
+    assert own.debug is not None
+    assert found.debug is not None
+    assert found.debug.points == pytest.approx(SITE_FROM_ROOM.apply(own.debug.points))
+    assert found.debug.overlay == own.debug.overlay
+
+
+def test_features_are_searched_in_a_set_as_photos_are(
+    client: Client, site: Path, query: Any
+) -> None:
+    rgb = read_photo(query.image).rgb
+    local = make_local_features("sift").extract(rgb, max_keypoints=2500)
+    model = MapStore(site).open("room").global_models["densevlad"]
+    vector = make_global_descriptor("densevlad").describe(rgb, local, model)
+    sent = SentFeatures("sift", local.keypoints, local.descriptors, {"densevlad": vector})
+    own = client.localize(sent, "room", query.camera)
+    assert_moved(client.localize(sent, "site", query.camera), own, SITE_FROM_ROOM)
+    for wrong in (
+        SentFeatures("xfeat", local.keypoints, local.descriptors, {}),
+        SentFeatures("sift", local.keypoints, local.descriptors[:, :64], {}),
+    ):
+        with pytest.raises(InvalidInput) as caught:
+            client.localize(wrong, "site", query.camera)
+        assert caught.value.code.startswith("features.")
+
+
+def test_priors_choose_tiles_and_are_obeyed_in_the_frame_of_the_set(
+    client: Client, query: Any
+) -> None:
+    true_place = SITE_FROM_ROOM.apply(query.cam_from_world.center)
+    own = client.localize(query.image, "site", query.camera)
+    assert own.pose is not None
+    for priors in (
+        Priors(maps=("room",)),
+        Priors(position=PositionPrior(true_place, 0.5)),
+        Priors(pose=PosePrior(own.pose.cam_from_world, own.pose.covariance)),
+    ):
+        found = client.localize(query.image, "site", query.camera, priors=priors)
+        assert found.pose is not None
+        assert found.pose.position == pytest.approx(own.pose.position, abs=0.01)
+
+    wrong_tile = client.localize(query.image, "site", query.camera, priors=Priors(maps=("study",)))
+    assert wrong_tile.pose is None
+    assert wrong_tile.tile is not None
+    assert wrong_tile.tile.startswith("study@")
+    nowhere = Priors(position=PositionPrior(np.array([900.0, 0, 0]), 1.0))
+    with pytest.raises(NotFound) as away:
+        client.localize(query.image, "site", query.camera, priors=nowhere)
+    assert away.value.code == "set.no_tile"
+    # "twice" has no study, and a map has no tiles.
+    for ref in ("twice", "room", ("room", "site")):
+        with pytest.raises(InvalidInput) as caught:
+            client.localize(query.image, ref, query.camera, priors=Priors(maps=("study",)))
+        assert caught.value.code == "priors.maps"
+
+
+def test_two_places_that_look_alike_are_no_answer(client: Client, site: Path, query: Any) -> None:
+    found = client.localize(query.image, "twice", query.camera)
+    assert found.pose is None
+    assert found.refusal is not None
+    assert (found.refusal.stage, found.refusal.reason) == ("gate", "ambiguous")
+    assert f"room@{MapStore(site).current_version('room')}" in found.refusal.message
+    assert "copy@v1" in found.refusal.message
+    assert found.inliers > 0
+    one = client.localize(query.image, "twice", query.camera, priors=Priors(maps=("copy@v1",)))
+    assert one.pose is not None
+    assert one.tile == "copy@v1"
+
+
+def test_of_maps_and_sets_the_best_answer_counts(client: Client, query: Any) -> None:
+    found = client.localize(query.image, ["study", "site"], query.camera)
+    assert found.map.id == "site"
+    assert found.pose is not None
+
+
+def test_what_shows_nothing_is_an_answer_and_what_is_no_photo_an_error(client: Client) -> None:
+    _, blank = cv2.imencode(".png", np.zeros((64, 64), np.uint8))
+    found = client.localize(blank.tobytes(), "site")
+    assert found.refusal is not None
+    assert found.refusal.reason == "no_keypoints"
+    with pytest.raises(InvalidInput) as caught:
+        client.localize(b"not a photo", "site")
+    assert caught.value.code.startswith("image.")
+
+
+@pytest.mark.parametrize(("asked", "moved"), [("site", SITE_FROM_ROOM), ("model", MODEL_FROM_ROOM)])
+def test_a_rig_is_localized_in_a_set(
+    asked: str, moved: Similarity, client: Client, sample: Path
+) -> None:
+    dataset = read_dataset(sample / "query")
+    first = [r for r in dataset.images if r.timestamp == dataset.images[0].timestamp]
+    images = [RigImage(r.sensor_id, dataset.path_of(r).read_bytes()) for r in first]
+
+    def rig(scale: float) -> dict[str, RigSensor]:
+        """Lengths in the unit of the world that is asked."""
+        return {
+            r.sensor_id: RigSensor(
+                Pose(
+                    dataset.rigs["rig"][r.sensor_id].rotation,
+                    scale * dataset.rigs["rig"][r.sensor_id].translation,
+                ),
+                dataset.sensors[r.sensor_id].camera,
+            )
+            for r in first
+        }
+
+    own = client.localize_rig(images, "room", rig(1.0))
+    found = client.localize_rig([*images], asked, rig(moved.scale))
+    assert own.pose is not None
+    assert found.pose is not None
+    expected = moved.move(own.pose.rig_from_world)
+    assert found.pose.position == pytest.approx(expected.center, abs=1e-6)
+    assert found.inliers == own.inliers
+    assert found.tile is not None
+    assert found.tile.startswith("room@")
+    for image, mine in zip(found.images, own.images, strict=True):
+        assert image.cam_from_world is not None
+        assert mine.cam_from_world is not None
+        center = moved.move(mine.cam_from_world).center
+        assert image.cam_from_world.center == pytest.approx(center, abs=1e-6)
+    # One that cannot be read fails alone.
+    broken = [RigImage(images[0].sensor, b"not a photo"), *images[1:]]
+    alone = client.localize_rig(broken, asked, rig(moved.scale))
+    assert alone.pose is not None
+    assert alone.images[0].error is not None
+
+
+def instants(photos: list[bytes], camera: Any) -> list[Instant]:
+    return [
+        Instant(START + 100 * i, (RigImage("camera", photo, camera),))
+        for i, photo in enumerate(photos)
+    ]
+
+
+def test_a_sequence_goes_from_tile_to_tile_in_legs(
+    client: Client, queries: list[Any], in_study: list[Any]
+) -> None:
+    here, there = [q.image for q in queries], [image for image, _, _ in in_study]
+    camera = queries[0].camera
+    photos = [here[0], here[1], there[0], b"no photo", there[1], here[0]]
+    found = list(client.localize_sequence(instants(photos, camera), "site"))
+    assert [each.timestamp for each in found] == [START + 100 * i for i in range(len(photos))]
+    tiles = [(each.tile or "").partition("@")[0] for each in found]
+    assert tiles == ["room", "room", "study", "study", "study", "room"]
+    assert [each.status for each in found[:3]] == ["localized"] * 3
+    assert found[3].status == "filled"  # by the two photos of the same leg around it
+    for each, (image, moved) in zip(
+        found[:2], [(q, SITE_FROM_ROOM) for q in queries[:2]], strict=True
+    ):
+        assert each.pose is not None
+        truth = moved.apply(image.cam_from_world.center)
+        assert np.linalg.norm(each.pose.position - truth) < 0.05
+
+
+def test_a_sequence_is_refused_as_in_a_map(client: Client, query: Any) -> None:
+    two = instants([query.image] * 2, query.camera)
+    with pytest.raises(InvalidInput) as caught:
+        list(client.localize_sequence(two, ["site", "room"]))
+    assert caught.value.code == "sequence.set"
+    found = client.localize_sequence([two[1], two[0]], "site")
+    assert next(found).status == "localized"
+    with pytest.raises(InvalidInput) as caught:
+        next(found)
+    assert (caught.value.code, caught.value.field) == (
+        "sequence.timestamps",
+        "instants[1].timestamp",
+    )
+    with pytest.raises(InvalidInput) as caught:
+        list(client.localize_sequence([], "site"))
+    assert caught.value.code == "sequence.empty"
+
+
+def test_a_place_that_looks_like_another_begins_no_leg(client: Client, query: Any) -> None:
+    sent = instants([query.image] * 2, query.camera)
+    for each in client.localize_sequence(sent, "twice"):
+        assert each.refusal is not None
+        assert each.refusal.reason == "ambiguous"
+        assert each.pose is None
+
+
+def test_sets_are_listed_and_described(client: Client) -> None:
+    listed = {info.id: info for info in client.maps()}
+    assert {info.id: info.kind for info in listed.values()} == {
+        **dict.fromkeys(("copy", "room", "study"), "map"),
+        **dict.fromkeys(("site", "twice", "model"), "set"),
+    }
+    assert (listed["site"].num_tiles, listed["site"].tiles) == (2, ())
+    assert (listed["room"].num_tiles, listed["room"].method) == (None, "rgbd")
+    described = client.map("site")
+    assert [tile.map for tile in described.tiles] == ["room", "study"]
+    moved = described.tiles[0].set_from_tile
+    assert moved.rotation == pytest.approx(SITE_FROM_ROOM.rotation)
+    assert moved.translation == pytest.approx(SITE_FROM_ROOM.translation)
+    assert described.images == listed["room"].images + listed["study"].images
+    assert (described.method, described.observations, described.fusion) == (None, None, None)
+    assert client.map(described.ref).ref == described.ref
+
+
+def test_points_and_photos_are_those_of_the_tiles(served: Any) -> None:
+    for what in ("points", "images"):
+        response: httpx.Response = served.http.get(f"/maps/site/{what}")
+        assert (response.status_code, response.json()["code"]) == (422, "map.is_set")
+        assert "room@" in response.json()["expected"]
+
+
+def test_the_tiles_that_were_searched_are_counted(served: Any, query: Any) -> None:
+    def count() -> float:
+        lines = served.http.get("/metrics").text.splitlines()
+        return float(
+            next(x for x in lines if x.startswith("visloc_tiles_searched_count")).split()[1]
+        )
+
+    before = count()
+    with Client(served.url) as client:
+        client.localize(query.image, "site", query.camera)
+        client.localize(query.image, "room", query.camera)
+    assert count() == before + 1
+
+
+def test_a_tile_in_use_stays_and_one_that_is_gone_is_an_error(
+    site_copy: Path, serve: Serve, queries: list[Any], in_study: list[Any]
+) -> None:
+    store = MapStore(site_copy)
+    version = store.current_version("study")
+    with serve(site_copy) as doors, Client(doors.url) as client:
+        with pytest.raises(Conflict) as kept:
+            client.delete_version("study", version)
+        assert kept.value.code == "map.in_set"
+        image, camera, _ = in_study[0]
+        assert client.localize(image, "site", camera).tile == f"study@{version}"
+
+        (site_copy / "study").rename(site_copy / "away")
+        with pytest.raises(Unavailable) as gone:
+            client.localize(image, "site", camera)
+        assert gone.value.code == "set.tile_unavailable"
+        assert gone.value.expected == f"study@{version}"
+        # A clear answer of another tile is one.
+        assert client.localize(queries[0].image, "site", queries[0].camera).pose is not None
+        (site_copy / "away").rename(site_copy / "study")
+        assert client.localize(image, "site", camera).pose is not None
+
+        site_version = store.current_version("site")
+        client.delete_version("site", site_version)
+        client.delete_version("study", version)
+        assert "site" not in {info.id for info in client.maps()}
+
+
+def test_a_packed_set_is_uploaded_and_put_into_use(
+    site_copy: Path, serve: Serve, query: Any, tmp_path: Path
+) -> None:
+    store = MapStore(site_copy)
+    version = store.current_version("site")
+    packed = tmp_path / "site.zip"
+    pack_map(store.folder("site"), packed)
+    store.remove("site", version)
+    with serve(site_copy) as doors, Client(doors.url) as client:
+        assert client.upload_map(packed).kind == "set"
+        used = client.use_version("site", version)
+        assert (used.kind, used.current, used.num_tiles) == ("set", True, 2)
+        assert client.localize(query.image, "site", query.camera).pose is not None
