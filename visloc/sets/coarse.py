@@ -64,7 +64,6 @@ def learn(
         seed: of the sample, the vocabulary and the planes.
     """
     random = np.random.default_rng(seed)
-    descriptor = _descriptor()
     teachers = np.sort(
         random.choice(num_tiles, min(num_tiles, _MAX_TEACHERS), replace=False)
     ).tolist()
@@ -75,13 +74,39 @@ def learn(
         for tile in opened
         for photo in np.unique(np.linspace(0, len(tile.images) - 1, most).astype(int)).tolist()
     ]
-    words = [_sample(_words(*photo), KMEANS_MAX_WORDS // len(photos), random) for photo in photos]
-    model = descriptor.learn_vocabulary(np.concatenate(words), seed)
-    pooled = [descriptor.pool(_NO_PIXELS, _local(_words(*photo)), model) for photo in photos]
+    return learn_of_words(lambda number: _words(*photos[number]), len(photos), bits, random)
+
+
+def learn_of_words(
+    words_of: Callable[[int], NDArray[np.float32]],
+    num_photos: int,
+    bits: int,
+    random: np.random.Generator,
+) -> CoarseModel:
+    """Learn the model of an index on some photos, whatever they are of.
+
+    Args:
+        words_of: returns the local descriptors (n, d) of a photo by its number; asked twice.
+        num_photos: how many there are.
+        bits: of a photo's code, a multiple of 64.
+        random: draws the words that are used, and the planes.
+    """
+    descriptor = _descriptor()
+    most = KMEANS_MAX_WORDS // num_photos
+    words = [_sample(words_of(number), most, random) for number in range(num_photos)]
+    model = descriptor.learn_vocabulary(np.concatenate(words), int(random.integers(2**32)))
+    pooled = [
+        descriptor.pool(_NO_PIXELS, _local(words_of(number)), model) for number in range(num_photos)
+    ]
     projection = descriptor.learn_projection(np.array(pooled))
     dim = min(projection["axes"].shape[1], bits)
     axes = np.ascontiguousarray(projection["axes"][:, :dim])
-    return {**model, "mean": projection["mean"], "axes": axes, "planes": _planes(dim, bits, random)}
+    return {
+        **model,
+        "mean": projection["mean"],
+        "axes": axes,
+        "planes": random_planes(dim, bits, random),
+    }
 
 
 def describe(opened: Map, model: CoarseModel, *, seed: int = 0) -> DescribedTile:
@@ -92,13 +117,22 @@ def describe(opened: Map, model: CoarseModel, *, seed: int = 0) -> DescribedTile
         model: of this set, or of another whose tiles have the same local features.
         seed: of the clustering.
     """
-    descriptor = _descriptor()
-    rows = np.array(
-        [
-            descriptor.describe(_NO_PIXELS, _local(_words(opened, photo)), model)
-            for photo in range(len(opened.images))
-        ]
-    )
+    return described(descriptors_of(opened, model), model, seed=seed)
+
+
+def descriptors_of(opened: Map, model: CoarseModel) -> NDArray[np.float32]:
+    """Return the descriptors (n, D) of the photos of a map, of what it stores of them."""
+    photos = range(len(opened.images))
+    return np.array([descriptor_of(_words(opened, photo), model) for photo in photos])
+
+
+def descriptor_of(words: NDArray[np.float32], model: CoarseModel) -> NDArray[np.float32]:
+    """Return the descriptor (D,) of a photo by its local descriptors (n, d)."""
+    return _descriptor().describe(_NO_PIXELS, _local(words), model)
+
+
+def described(rows: NDArray[np.float32], model: CoarseModel, *, seed: int = 0) -> DescribedTile:
+    """Describe a tile by the descriptors (n, D) of its photos; as ``describe``."""
     centers = unit_rows(learn_words(rows, CENTROIDS, seed))
     # A tile of fewer photos has some rows again.
     centroids = centers[np.arange(CENTROIDS) % len(centers)]
@@ -218,8 +252,8 @@ def _sample(
     return words[np.sort(random.choice(len(words), most, replace=False))]
 
 
-def _planes(dim: int, bits: int, random: np.random.Generator) -> NDArray[np.float32]:
-    """Normals (dim, bits) of random planes; orthogonal to each other as far as there is room."""
+def random_planes(dim: int, bits: int, random: np.random.Generator) -> NDArray[np.float32]:
+    """Return normals (dim, bits) of planes, orthogonal to each other as far as there is room."""
     blocks = []
     for start in range(0, bits, dim):
         square, _ = np.linalg.qr(random.normal(size=(dim, dim)))
