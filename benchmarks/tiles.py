@@ -1,6 +1,7 @@
 """Coarse index over thousands of generated tiles: memory, time, recall (docs/scale.md).
 
-    python -m benchmarks.tiles --work DIR [--tiles 10000] [--photos 1000] [--queries 200]
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.tiles --work DIR [--tiles 10000] [--photos 1000]
+        [--queries 200] [--out tiles.json]
 
 Makes the index of a set of tiles 25 m wide (``benchmarks.generated_tiles``) by the functions that
 make that of real ones, writes the set into DIR, opens it in a process of its own
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -56,6 +58,7 @@ def main(
     photos: int = 1000,
     queries: int = 200,
     seed: int = 0,
+    out: Annotated[Path | None, typer.Option(help="Where to write the figures, as JSON.")] = None,
 ) -> None:
     """Make, ask, print."""
     city = City(tiles, photos, seed)
@@ -66,6 +69,8 @@ def main(
     seconds = time.perf_counter() - started
     asked = write_queries(folder / "queries.npz", city, queries)
     found = answers(made, asked)
+    if out is not None:
+        out.write_text(json.dumps(found, indent=1) + "\n")
     typer.echo(f"{tiles} tiles of {photos} photos, {queries} queries\n")
     typer.echo("| measure | value |\n|---|---|")
     for name, value in (*rows_of(found), ("made in s", f"{seconds:.0f}")):
@@ -160,7 +165,11 @@ def write_queries(path: Path, city: City, queries: int) -> Path:
 def answers(made: Path, asked: Path) -> dict[str, Any]:
     """What a process of its own found of a set."""
     command = [sys.executable, "-m", "benchmarks.tiles_queries", str(made), str(asked)]
-    printed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+    # One thread, as a worker of the service has.
+    threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    printed = subprocess.run(
+        command, check=True, stdout=subprocess.PIPE, text=True, env={**os.environ, **threads}
+    ).stdout
     found: dict[str, Any] = json.loads(printed)
     return found
 
@@ -177,6 +186,7 @@ def rows_of(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield f"{name}: tiles allowed, ranked", f"{one['allowed']:.0f}, {one['ranked']:.0f}"
         yield f"{name}: ranking, ms p50 / p90", " / ".join(f"{x:.1f}" for x in one["ranking_ms"])
         yield f"{name}: with the query's descriptor", " / ".join(f"{x:.1f}" for x in one["all_ms"])
+        yield f"{name}: tiles searched at once, mean", f"{one['searched']:.2f}"
         shares = [f"{100 * one[key]:.1f} %" for key in ("first", "first_5", "anywhere")]
         yield f"{name}: right tile first, among 5, ranked at all", ", ".join(shares)
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from visloc.archive import MapSet, open_set
 from visloc.features.whitening import unit_rows
 from visloc.priors import PositionPrior, Priors
-from visloc.sets.choosing import MAX_SEARCHED, allowed_tiles
+from visloc.sets.choosing import MAX_SEARCHED, allowed_tiles, plan
 from visloc.sets.coarse import TileScore, rank_tiles, ranked
 from visloc.types import LocalFeatures
 
@@ -55,7 +55,7 @@ def asked(
 ) -> dict[str, Any]:
     """Ask for the tiles of queries."""
     features = some_features(opened)
-    ranks, ranking, whole, allowed, lengths = [], [], [], [], []
+    ranks, ranking, whole, allowed, lengths, searched = [], [], [], [], [], []
     for number in [*range(min(WARM_UP, len(rows))), *range(len(rows))]:
         row, prior = rows[number], priors[number]
         seconds, scores = timed(
@@ -70,10 +70,12 @@ def asked(
         whole.append(seconds)
         allowed.append(np.count_nonzero(allowed_tiles(opened, prior)))
         lengths.append(len(order))
+        searched.append(len(plan(scores)[0]))
     counted = np.array(ranks[-len(rows) :])
     return {
         "allowed": float(np.median(allowed)),
         "ranked": float(np.median(lengths)),
+        "searched": float(np.mean(searched[-len(rows) :])),
         "ranking_ms": percentiles_ms(ranking[-len(rows) :]),
         "all_ms": percentiles_ms(whole[-len(rows) :]),
         "first": float(np.mean(counted == 0)),
