@@ -264,7 +264,7 @@ def table_of_costs(costs: Costs) -> str:
             "models of a map, per photo, to 1024 photos": f"{costs.model_bytes / 1e3:.0f} kB",
             "coarse index on disk, per photo": f"{costs.coarse_bytes:.0f} bytes",
             "a worker process, without pages of files": f"{costs.process_bytes / 1e9:.2f} GB",
-            "coarse index in memory, process and all": f"{costs.coarse_resident_bytes / 1e9:.1f} GB",
+            "a process with the coarse index": f"{costs.coarse_resident_bytes / 1e9:.1f} GB",
             "a query in one map": f"{costs.query_core_s:.2f} s",
             "ranking all tiles": f"{costs.coarse_core_s:.3f} s",
             "matching and pose in one more tile": f"{costs.tile_core_s:.2f} s",

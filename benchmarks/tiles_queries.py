@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from visloc.archive import MapSet, open_set
 from visloc.features.whitening import unit_rows
 from visloc.priors import PositionPrior, Priors
 from visloc.sets.choosing import MAX_SEARCHED, allowed_tiles, plan
-from visloc.sets.coarse import TileScore, rank_tiles, ranked
+from visloc.sets.coarse import rank_tiles, ranked
 from visloc.types import LocalFeatures
 
 RADIUS_M = 30.0
@@ -57,18 +57,16 @@ def asked(
     features = some_features(opened)
     ranks, ranking, whole, allowed, lengths, searched = [], [], [], [], [], []
     for number in [*range(min(WARM_UP, len(rows))), *range(len(rows))]:
-        row, prior = rows[number], priors[number]
-        seconds, scores = timed(
-            lambda row=row, prior=prior: ranked(opened.coarse, row, allowed_tiles(opened, prior))
-        )
-        ranking.append(seconds)
+        started = time.perf_counter()
+        mask = allowed_tiles(opened, priors[number])
+        scores = ranked(opened.coarse, rows[number], mask)
+        ranking.append(time.perf_counter() - started)
+        started = time.perf_counter()
+        rank_tiles(opened, features, allowed_tiles(opened, priors[number]))
+        whole.append(time.perf_counter() - started)
         order = [score.tile for score in scores]
         ranks.append(order.index(tiles[number]) if tiles[number] in order else len(opened.tiles))
-        seconds, _ = timed(
-            lambda prior=prior: rank_tiles(opened, features, allowed_tiles(opened, prior))
-        )
-        whole.append(seconds)
-        allowed.append(np.count_nonzero(allowed_tiles(opened, prior)))
+        allowed.append(np.count_nonzero(mask))
         lengths.append(len(order))
         searched.append(len(plan(scores)[0]))
     counted = np.array(ranks[-len(rows) :])
@@ -91,15 +89,6 @@ def some_features(opened: MapSet) -> LocalFeatures:
     descriptors = unit_rows(random.standard_normal((NUM_FEATURES, dim), dtype=np.float32))
     nothing = np.zeros(NUM_FEATURES, np.float32)
     return LocalFeatures(np.zeros((NUM_FEATURES, 2), np.float32), descriptors, nothing, nothing)
-
-
-def timed(
-    work: Callable[[], tuple[TileScore, ...]],
-) -> tuple[float, tuple[TileScore, ...]]:
-    """Return what some work took, in seconds, and what came out."""
-    started = time.perf_counter()
-    result = work()
-    return time.perf_counter() - started, result
 
 
 def percentiles_ms(seconds: Sequence[float]) -> list[float]:

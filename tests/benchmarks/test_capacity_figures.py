@@ -1,0 +1,104 @@
+"""What a city takes, of figures that are made up."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+
+from benchmarks.capacity import Capacity, City, Costs, Machine, capacity, cell, stage_costs
+from mapping.costs import Spent, StageCost
+from mapping.display import print_costs
+
+COSTS = Costs(
+    build_core_s={"local_features": 1.5, "matching": 0.5},
+    index_core_s=0.002,
+    photo_bytes=300e3,
+    model_bytes=20e3,
+    coarse_bytes=40.0,
+    coarse_resident_bytes=1e9,
+    process_bytes=0.5e9,
+    query_core_s=0.7,
+    tile_core_s=0.2,
+    coarse_core_s=0.1,
+    tiles_searched=2.0,
+    query_bytes=100e3,
+)
+CITY = City(photos=1_000_000, tiles=1000, night_h=10, queries_per_s=100)
+MACHINE = Machine(cores=16, memory_bytes=64e9, disk_bytes=1e12, network_bytes_per_s=1e9)
+
+
+def found(**other: float) -> Capacity:
+    return capacity(replace(COSTS, **other), CITY, MACHINE)
+
+
+def test_storage_is_photos_and_models_which_end_at_1024_dimensions() -> None:
+    assert found().tile_bytes == 1000 * 300e3 + 999 * 20e3
+    assert found().coarse_bytes == 40e6
+    large = capacity(COSTS, replace(CITY, tiles=100), MACHINE)
+    assert large.tile_bytes == 10_000 * 300e3 + 1024 * 20e3
+
+
+def test_machines_build_in_a_night_and_one_is_the_least() -> None:
+    assert found().build_core_s == 2e6
+    assert found().build_machines == 4  # 2e6 / (16 * 36 000) = 3.5
+    assert found(build_core_s={"all": 1e-6}).build_machines == 1
+    assert found().index_core_s == 2000
+
+
+def test_a_query_pays_for_its_index_and_every_tile() -> None:
+    assert found().query_core_s == pytest.approx(0.7 + 0.1 + 0.2)
+    assert found(tiles_searched=5.0).query_core_s == pytest.approx(0.7 + 0.1 + 0.8)
+    assert found().replicas == 7  # 100 / 16
+
+
+def test_memory_and_disk_hold_a_share_of_the_tiles_and_the_network_brings_the_rest() -> None:
+    some = found()
+    tiles_bytes = 1000 * some.tile_bytes
+    assert some.replica_bytes == 16 * 0.5e9 + 1e9
+    assert some.in_memory == pytest.approx((64e9 - 9e9) / tiles_bytes)
+    assert some.on_disk == 1.0
+    assert some.fetched_share == 0.0
+    assert some.received_share == pytest.approx(100 / 7 * 100e3 / 1e9)
+    small = capacity(COSTS, CITY, replace(MACHINE, disk_bytes=tiles_bytes / 4))
+    assert small.on_disk == pytest.approx(0.25)
+    assert small.fetched_share == pytest.approx(100 / 7 * 2 * 0.75 * some.tile_bytes / 1e9)
+
+
+def test_costs_are_read_from_what_a_build_prints() -> None:
+    text = io.StringIO()
+    out = Console(file=text, width=80)
+    out.print(" photos           50 by 2 cameras")
+    costs = [
+        StageCost("local features", 50, 40.0, Spent(75.0, 0)),
+        StageCost("between", None, 1.0, Spent(2.5, 2**20)),
+        StageCost("in all", None, 41.0, Spent(77.5, 2**20)),
+    ]
+    print_costs(out, costs)
+    assert stage_costs(text.getvalue()) == (50, {"local features": 1.5, "between": 0.05})
+    with pytest.raises(ValueError, match="no table of costs"):
+        stage_costs("photos 50\n")
+
+
+def test_numbers_are_read_from_the_chapter_the_row_and_the_column() -> None:
+    text = """# All
+
+## One
+
+| s | fast | all |
+|---|---|---|
+| pose | 0.1 | 12 345.5 (1.0 to 2.0) |
+
+## Two
+
+| s | all |
+|---|---|
+| pose | 7 |
+"""
+    assert cell(text, "One", "pose", "all") == 12345.5
+    assert cell(text, "Two", "pose", "all") == 7
+    for wrong in (("Three", "pose", "all"), ("Two", "pose", "fast"), ("One", "rest", "all")):
+        with pytest.raises(ValueError, match="no cell"):
+            cell(text, *wrong)
