@@ -31,6 +31,8 @@ _JUDGING, _REFINING = 32, 256
 # What one photo or two say is a few times as inexact as what all of them say.
 _COARSE = 4.0
 _ROUNDS = 3
+# After so many the weights of points change no more.
+_POINT_ROUNDS = 50
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,6 +118,54 @@ def tie(
         return doubt
     medians = np.array([view.median_error(similarity) for view in views[: len(photos)]])
     return Tie(similarity, tied, medians, distances, angles, int(agrees[len(photos) :].sum()))
+
+
+def refined_on_points(
+    start: Similarity,
+    here: NDArray[np.float64],
+    there: NDArray[np.float64],
+    *,
+    rigid: bool,
+) -> Similarity:
+    """Refine a similarity on points whose place is known in both frames.
+
+    Projections tell little of a shift that a turn can pass for, and inherit what is wrong with a
+    camera's intrinsics; points that depth gave in both frames do neither. The loss is Cauchy's, in
+    units of the median distance, so that it fits any depth sensor and any unit.
+
+    Args:
+        start: near the result.
+        here: (n, 3) in this frame, n >= 3.
+        there: (n, 3) the same points in the other, some of them wrong.
+        rigid: whether both frames have one unit.
+    """
+    similarity = start
+    for _ in range(_POINT_ROUNDS):
+        distances = np.linalg.norm(similarity.apply(here) - there, axis=1)
+        unit = float(np.median(distances))
+        if unit == 0:
+            break
+        weights = 1 / (1 + (distances / unit) ** 2)
+        similarity = _fitted(here, there, weights, rigid=rigid)
+    return similarity
+
+
+def _fitted(
+    here: NDArray[np.float64],
+    there: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    *,
+    rigid: bool,
+) -> Similarity:
+    """The similarity of the least weighted squares (Umeyama 1991)."""
+    weights = weights / weights.sum()
+    middle, middle_there = weights @ here, weights @ there
+    source, target = here - middle, there - middle_there
+    u, singular, vt = np.linalg.svd((target * weights[:, None]).T @ source)
+    signs = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
+    rotation = u @ np.diag(signs) @ vt
+    scale = 1.0 if rigid else float(singular @ signs / (weights @ (source**2).sum(axis=1)))
+    return Similarity(scale, rotation, middle_there - scale * rotation @ middle)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,6 +272,8 @@ def _refined(views: Sequence[_View], start: Similarity, *, rigid: bool) -> Simil
         loss="cauchy",
         f_scale=LOSS_SCALE_PX / full.max_error_px,
         x_scale="jac",
+        ftol=1e-6,
+        xtol=1e-6,
     )
     return changed(solved.x)
 

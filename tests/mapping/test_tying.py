@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mapping.tying import Seen, Tie, tie
+from mapping.tying import Seen, Tie, refined_on_points, tie
 from visloc.geometry import Camera, Pose, Similarity, rotation_angle
 from visloc.pose.colmap import project
 
@@ -157,3 +157,26 @@ def test_photos_at_one_place_do_not_tell_the_scale_but_a_rigid_tie() -> None:
 
     assert "too close together" in str(tie(together, rigid=False))
     assert isinstance(tie(together, rigid=True), Tie)
+
+
+@pytest.mark.parametrize(("truth", "rigid"), [(THERE_FROM_HERE, True), (SCALED, False)])
+def test_points_known_in_both_frames_tell_it_though_a_third_of_them_is_wrong(
+    truth: Similarity, rigid: bool
+) -> None:
+    random = np.random.default_rng(2)
+    here = random.uniform([-4, -4, 0], [4, 4, 3], (3000, 3))
+    there = truth.apply(here + random.normal(scale=0.02, size=here.shape))
+    there[::3] += truth.scale * random.uniform(0, 2, (1000, 3))
+    turn = Rotation.from_rotvec([0.01, 0.015, -0.01]).as_matrix()
+    start = replace(truth, rotation=truth.rotation @ turn, translation=truth.translation + 0.03)
+    found = refined_on_points(start, here, there, rigid=rigid)
+    distance, angle = error_of(found, truth, np.zeros(3))
+    assert distance / truth.scale < 0.01
+    assert angle < 0.1
+    assert found.scale == pytest.approx(truth.scale, rel=0 if rigid else 3e-3)
+
+
+def test_points_without_noise_tell_it_exactly() -> None:
+    here = np.random.default_rng(3).uniform(-4, 4, (50, 3))
+    found = refined_on_points(SCALED, here, SCALED.apply(here), rigid=False)
+    assert error_of(found, SCALED, here[0])[0] < 1e-6
