@@ -23,6 +23,7 @@ from mapping.features import (
     ReadyMadeFeatures,
     describe_photos,
     find_local_features,
+    local_features_source,
     open_descriptor,
     open_extractor,
     read_global_features,
@@ -57,7 +58,7 @@ from visloc.errors import Conflict, InvalidInput, Unavailable
 from visloc.features import DEFAULT_GLOBAL_FEATURES, DEFAULT_LOCAL_FEATURES
 from visloc.features.readymade import is_ready_made, ready_made_type
 from visloc.geometry import PixelOrigin, Pose
-from visloc.kapture import Dataset, open_features, open_local_features, read_dataset
+from visloc.kapture import Dataset, open_features, read_dataset
 from visloc.retrieval.fusion import EQUAL_GHARM, LateFusion
 from visloc.types import Inference, check_fusion_weights
 
@@ -331,7 +332,16 @@ def _build(
     progress: Progress,
 ) -> Path:
     work = WorkFolder(work_root)
-    features = _local_features(work, settings)
+    features = local_features_source(
+        work,
+        settings.dataset,
+        settings.local_features,
+        max_keypoints=settings.max_keypoints,
+        weights_dir=settings.weights_dir,
+        inference=settings.inference,
+        features_dir=settings.features_dir,
+        pixel_origin=settings.pixel_origin,
+    )
     photos, notes = collect_photos(
         dataset,
         posed=not settings.sfm.estimate_poses,
@@ -420,26 +430,6 @@ def _refuse_gravity_that_is_not_down(settings: BuildSettings) -> None:
             expected=f"0,0,-1 to within {MAX_DIRECTION_ERROR_DEG:g} degrees",
             got=f"{x:g},{y:g},{z:g}, {angle_deg:.1f} degrees off",
         )
-
-
-def _local_features(work: WorkFolder, settings: BuildSettings) -> LocalFeaturesSource:
-    name = settings.local_features
-    if not is_ready_made(name):
-        extractor = open_extractor(name, settings.weights_dir, settings.inference)
-        return ExtractedFeatures(
-            work,
-            name,
-            settings.weights_dir,
-            settings.inference,
-            settings.max_keypoints,
-            extractor.fingerprint,
-            extractor.descriptor_dim,
-            extractor.computed_with,
-        )
-    keypoints, descriptors = open_local_features(
-        settings.dataset, ready_made_type(name), settings.features_dir
-    )
-    return ReadyMadeFeatures(keypoints, descriptors, settings.pixel_origin)
 
 
 def _make_landmarks(

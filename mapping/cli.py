@@ -76,6 +76,7 @@ from mapping.sample import write_sample
 from mapping.set_commands import print_set, set_maps, set_summary, split, verify_tiles
 from mapping.sfm import SfmSettings
 from mapping.triangulation import MAPPER_CONFIGS, REFINABLE
+from mapping.updating.command import update
 from mapping.workers import DEFAULT_WORKERS
 from visloc.archive import SetManifest, open_map, open_set, verify_map, verify_set
 from visloc.archive.checks import read_any_manifest
@@ -624,6 +625,7 @@ app.command()(report)
 app.command()(prune)
 app.command("set")(set_maps)
 app.command()(split)
+app.command()(update)
 
 
 @app.command("export-features")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mapping.executors import Executor
 from mapping.photos import MappingPhoto
 from mapping.stages import Item, WorkFolder, key_of
-from visloc.archive import FingerprintRecord, GlobalFeatures
+from visloc.archive import FingerprintRecord, GlobalFeatures, Map
 from visloc.errors import DatasetError, InvalidInput
 from visloc.features import (
     GlobalDescriptor,
@@ -26,13 +26,15 @@ from visloc.features import (
 )
 from visloc.features.readymade import (
     MAX_READY_MADE_KEYPOINTS,
+    is_ready_made,
     ready_made_fingerprint,
+    ready_made_type,
     to_global_descriptor,
     to_local_features,
 )
 from visloc.geometry import PixelOrigin
 from visloc.images import read_photo_file
-from visloc.kapture import FeatureSet, read_local
+from visloc.kapture import FeatureSet, open_local_features, read_local
 from visloc.types import Fingerprint, Inference, LocalFeatures
 
 T = TypeVar("T")
@@ -53,7 +55,10 @@ _NO_FEATURES = LocalFeatures(
     scales=np.empty(0, np.float32),
 )
 # Raised when the code of a stage here changes what comes out.
-_REVISION = {"local_features": 1, "words": 1, "vocabulary": 1, "pooled": 1, "projection": 1}
+_REVISION = {
+    **{"local_features": 1, "words": 1, "vocabulary": 1, "pooled": 1, "projection": 1},
+    **{"model": 1, "described": 1},
+}
 
 
 class LocalFeaturesSource(Protocol):
@@ -245,6 +250,48 @@ def open_descriptor(name: str, weights_dir: Path | None, inference: Inference) -
     return make_global_descriptor(name, weights_dir, inference, threads=1)
 
 
+def local_features_source(
+    work: WorkFolder,
+    dataset: Path,
+    name: str,
+    *,
+    max_keypoints: int,
+    weights_dir: Path | None,
+    inference: Inference,
+    features_dir: Path | None,
+    pixel_origin: PixelOrigin,
+) -> LocalFeaturesSource:
+    """Return where the local features of a dataset's photos come from.
+
+    Args:
+        work: keeps those that are found here.
+        dataset: kapture folder.
+        name: of the extractor, or ``kapture:TYPE`` for features that the dataset brings along.
+        max_keypoints: strongest ones kept per photo; of ready-made ones all are taken.
+        weights_dir: folder with network weights.
+        inference: how networks are computed.
+        features_dir: where ready-made features lie, when not in the dataset.
+        pixel_origin: what ready-made keypoints count from.
+
+    Raises:
+        WeightsError, InvalidInput, DatasetError: what opening them raises.
+    """
+    if is_ready_made(name):
+        keypoints, descriptors = open_local_features(dataset, ready_made_type(name), features_dir)
+        return ReadyMadeFeatures(keypoints, descriptors, pixel_origin)
+    extractor = open_extractor(name, weights_dir, inference)
+    return ExtractedFeatures(
+        work,
+        name,
+        weights_dir,
+        inference,
+        max_keypoints,
+        extractor.fingerprint,
+        extractor.descriptor_dim,
+        extractor.computed_with,
+    )
+
+
 def find_local_features(
     source: LocalFeaturesSource,
     photos: Sequence[MappingPhoto],
@@ -271,17 +318,7 @@ def describe_photos(
         WeightsError, InvalidInput: what ``make_global_descriptor`` raises.
     """
     descriptor = open_descriptor(name, weights_dir, inference)
-    task = _DescribeTask(
-        work,
-        features,
-        name,
-        weights_dir,
-        inference,
-        _json(descriptor.fingerprint),
-        descriptor.computed_with,
-        descriptor.needs_image,
-        descriptor.needs_local_features,
-    )
+    task = _DescribeTask.of(work, features, name, weights_dir, inference)
 
     def read_all(entry: str, keys: Sequence[str]) -> list[NDArray[np.float32]]:
         return [work.read(key)[entry] for key in keys]
@@ -316,6 +353,31 @@ def describe_photos(
     return GlobalFeatures(
         FingerprintRecord.of(descriptor.fingerprint), np.concatenate(blocks), model
     )
+
+
+def describe_with_model(
+    opened: Map,
+    work: WorkFolder,
+    photos: Sequence[MappingPhoto],
+    features: LocalFeaturesSource,
+    name: str,
+    weights_dir: Path | None,
+    inference: Inference,
+    workers: Executor,
+    progress: Progress,
+) -> NDArray[np.float32]:
+    """Describe photos (n, D) by a global descriptor of a map, with the model that it learned.
+
+    Raises:
+        WeightsError, InvalidInput: what ``make_global_descriptor`` raises.
+    """
+    task = _DescribeTask.of(work, features, name, weights_dir, inference)
+    stem = FingerprintRecord.of(open_descriptor(name, weights_dir, inference).fingerprint).file_stem
+    file = opened.manifest.files[f"global/{stem}.model.npz"]
+    model_key = _key("model", fingerprint=task.fingerprint, sha256=file.sha256)
+    work.get(model_key, lambda: opened.global_models[name])  # where workers find it
+    workers.run(partial(task.describe, model_key), photos, partial(progress, name))
+    return np.stack([work.read(task.described_key(model_key, p))["described"] for p in photos])
 
 
 def _evenly(items: Sequence[T], count: int) -> list[T]:
@@ -369,11 +431,35 @@ class _DescribeTask:
     needs_image: bool
     needs_local_features: bool
 
+    @staticmethod
+    def of(
+        work: WorkFolder,
+        features: LocalFeaturesSource,
+        name: str,
+        weights_dir: Path | None,
+        inference: Inference,
+    ) -> _DescribeTask:
+        descriptor = open_descriptor(name, weights_dir, inference)
+        return _DescribeTask(
+            work,
+            features,
+            name,
+            weights_dir,
+            inference,
+            _json(descriptor.fingerprint),
+            descriptor.computed_with,
+            descriptor.needs_image,
+            descriptor.needs_local_features,
+        )
+
     def words_key(self, photo: MappingPhoto) -> str:
         return _key("words", **self._inputs(photo))
 
     def pooled_key(self, vocabulary_key: str | None, photo: MappingPhoto) -> str:
         return _key("pooled", vocabulary=vocabulary_key, **self._inputs(photo))
+
+    def described_key(self, model_key: str, photo: MappingPhoto) -> str:
+        return _key("described", model=model_key, **self._inputs(photo))
 
     def find_words(self, photo: MappingPhoto) -> None:
         def compute() -> Item:
@@ -384,10 +470,17 @@ class _DescribeTask:
 
     def pool(self, vocabulary_key: str | None, photo: MappingPhoto) -> None:
         def compute() -> Item:
-            vocabulary = {} if vocabulary_key is None else _vocabulary(self.work, vocabulary_key)
+            vocabulary = {} if vocabulary_key is None else _learned(self.work, vocabulary_key)
             return {"pooled": self._descriptor.pool(*self._read(photo), vocabulary)}
 
         self.work.get(self.pooled_key(vocabulary_key, photo), compute)
+
+    def describe(self, model_key: str, photo: MappingPhoto) -> None:
+        def compute() -> Item:
+            model = _learned(self.work, model_key)
+            return {"described": self._descriptor.describe(*self._read(photo), model)}
+
+        self.work.get(self.described_key(model_key, photo), compute)
 
     @property
     def _descriptor(self) -> GlobalDescriptor:
@@ -407,7 +500,7 @@ class _DescribeTask:
 
 
 @cache
-def _vocabulary(work: WorkFolder, key: str) -> Item:
+def _learned(work: WorkFolder, key: str) -> Item:
     return work.read(key)
 
 

@@ -8,7 +8,7 @@ point.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -23,6 +23,7 @@ from mapping.photos import MappingPhoto
 from mapping.stages import Item, WorkFolder, key_of
 from visloc.archive import Anchor, Landmarks
 from visloc.errors import DatasetError, InvalidInput
+from visloc.geometry import Similarity
 from visloc.kapture import Dataset
 from visloc.pose.colmap import normalized_rays, project
 
@@ -67,8 +68,20 @@ def landmarks_from_depth(
     metric: bool,
     workers: Executor,
     progress: Progress,
+    world_from_dataset: Similarity | None = None,
 ) -> MadeLandmarks:
     """Lift the keypoints of all photos and merge them.
+
+    Args:
+        work: keeps finished photos.
+        dataset: what the photos are of.
+        photos: with poses in the dataset's frame, and depth in its unit.
+        features: of the photos.
+        settings: the voxel size is in the unit of the world.
+        metric: whether a unit of the world is a metre.
+        workers: who lifts.
+        progress: told how far it is.
+        world_from_dataset: where the dataset lies in the world; None: its frame is the world.
 
     Raises:
         DatasetError: what ``lift_keypoints`` raises.
@@ -78,6 +91,10 @@ def landmarks_from_depth(
     workers.run(task.lift, photos, partial(progress, "depth"))
     progress("landmarks", 0, 1)
     lifted = (LiftedKeypoints(**work.read(task.key(photo))) for photo in photos)
+    if world_from_dataset is not None:
+        move = world_from_dataset
+        lifted = (replace(one, points=move.apply(one.points)) for one in lifted)
+        photos = [replace(photo, cam_from_world=move.move(photo.pose)) for photo in photos]
     landmarks, rows = merge_landmarks(photos, lifted, settings.voxel_size)
     progress("landmarks", 1, 1)
     return MadeLandmarks(

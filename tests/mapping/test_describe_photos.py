@@ -13,11 +13,17 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
-from mapping.features import ExtractedFeatures, describe_photos, open_descriptor, open_extractor
+from mapping.features import (
+    ExtractedFeatures,
+    describe_photos,
+    describe_with_model,
+    open_descriptor,
+    open_extractor,
+)
 from mapping.photos import MappingPhoto, collect_photos
 from mapping.stages import WorkFolder
 from mapping.workers import Workers
-from visloc.archive import GlobalFeatures
+from visloc.archive import GlobalFeatures, Map
 from visloc.features import GLOBAL_FEATURES, ImageDescriptor
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
@@ -164,3 +170,30 @@ def test_a_descriptor_of_local_features_is_made_again_with_them(
     pooled = set((work.root / "pooled").iterdir())
     describe(work, photos, "localvlad", sift(work, max_keypoints=50))
     assert len(set((work.root / "pooled").iterdir()) - pooled) == len(photos)
+
+
+def test_photos_of_later_are_described_by_the_model_of_the_map(
+    rgbd_walk: Map, work: WorkFolder, photos: list[MappingPhoto]
+) -> None:
+    """As queries are, whatever other photos come with them."""
+
+    def described(some: list[MappingPhoto]) -> NDArray[np.float32]:
+        local = sift(work, rgbd_walk.manifest.local_features.max_keypoints)
+        with Workers(1) as workers:
+            return describe_with_model(
+                rgbd_walk,
+                work,
+                some,
+                local,
+                "localvlad",
+                None,
+                Inference.TORCH,
+                workers,
+                lambda *_: None,
+            )
+
+    found = described(photos)
+    assert_array_equal(described(photos[3:4]), found[3:4])
+    # These are the map's own photos: stored in 8 bits, and so is the model.
+    rows = rgbd_walk.global_descriptors["localvlad"][:5]
+    assert (found * rows).sum(axis=1).min() > 0.999

@@ -196,7 +196,7 @@ class MapStore:
             if target.exists():
                 raise version_exists(map_id, version)
             if based_on is not None and _current_or_none(self, map_id) != based_on:
-                raise _outdated(map_id, based_on, _current_or_none(self, map_id))
+                raise outdated(map_id, based_on, _current_or_none(self, map_id))
             for folder in (*(path for path in incoming.rglob("*") if path.is_dir()), incoming):
                 _sync_folder(folder)
             if make_current:  # first what a full disk could refuse
@@ -404,7 +404,8 @@ def version_in_use(map_id: str, version: str, others: Sequence[str]) -> Conflict
     )
 
 
-def _outdated(map_id: str, based_on: str, current: str | None) -> Conflict:
+def outdated(map_id: str, based_on: str, current: str | None) -> Conflict:
+    """``map.outdated``."""
     return Conflict(
         "map.outdated",
         "another version of the map came into use meanwhile; run the same command again on it",

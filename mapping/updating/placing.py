@@ -1,0 +1,198 @@
+"""Where a new capture lies in the map that it is to join, and whether it fits at all."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.photos import MappingPhoto
+from mapping.tying import Seen, refined_on_points, tie
+from mapping.updating.localizing import Placed
+from visloc.archive import Map
+from visloc.errors import Conflict
+from visloc.evaluation import pose_error
+from visloc.geometry import Pose, Similarity
+from visloc.pose.reprojection import reprojection_errors
+from visloc.pose.views import MatchedView
+from visloc.solving import registration_for
+from visloc.types import LocalizeOptions
+
+T = TypeVar("T")
+Lift = Callable[[MappingPhoto, NDArray[np.float64]], tuple[NDArray[np.int64], NDArray[np.float64]]]
+"""Tells which of some pixels (n, 2) of a photo have a depth, (m,), and their place in the photo's
+own frame of the world (m, 3)."""
+
+# Of the photos that are tried, this part must be localized, and of those agree.
+_MIN_PART = 0.5
+# Matches with depth that a tie is refined on; of fewer, projections tell more.
+_MIN_LIFTED = 100
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placement:
+    """Where a capture lies in a map.
+
+    Attributes:
+        map_from_dataset: takes the dataset's frame to the map's.
+        tried: photos that were to be localized.
+        not_localized: how many of them were not, by reason.
+        tied: photos whose own pose, moved, agrees with what they see of the map.
+        pixels: median distance between where they see landmarks and their projections.
+        position: median distance between where they were localized and their own pose, moved, in
+            units of the map.
+        orientation_deg: the same of directions.
+    """
+
+    map_from_dataset: Similarity
+    tried: int
+    not_localized: dict[str, int]
+    tied: int
+    pixels: float
+    position: float
+    orientation_deg: float
+
+
+def evenly(items: Sequence[T], count: int) -> list[T]:
+    """Return at most ``count`` of the items, evenly chosen."""
+    rows = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
+    return [items[row] for row in rows]
+
+
+def refuse_elsewhere(opened: Map, placed: Sequence[Placed]) -> None:
+    """Refuse a capture of which most photos are not localized.
+
+    Raises:
+        Conflict: ``update.elsewhere``.
+    """
+    localized = sum(one.localized for one in placed)
+    if localized < _MIN_PART * len(placed):
+        reasons = ", ".join(f"{count} {reason}" for reason, count in _reasons(placed).items())
+        raise _elsewhere(
+            f"most of its photos are not localized in map {opened.ref}",
+            f"half of {len(placed)} photos that were tried",
+            f"{localized}; {reasons}",
+        )
+
+
+def place_capture(
+    opened: Map,
+    photos: Sequence[MappingPhoto],
+    placed: Sequence[Placed],
+    poses: str,
+    lift: Lift | None,
+    *,
+    metric: bool,
+) -> Placement:
+    """Find where a capture lies, from where its photos were localized.
+
+    Args:
+        opened: the map.
+        photos: those that were tried; with poses of their own but for ``localize``.
+        placed: where they were localized.
+        poses: a name of ``mapping.updating.settings.POSES``.
+        lift: gives pixels their place by the depth of their photo, for a better tie; None without
+            depth.
+        metric: whether a unit of the photos' own poses is a metre.
+
+    Raises:
+        Conflict: ``update.elsewhere`` when too few are localized, or do not agree.
+    """
+    refuse_elsewhere(opened, placed)
+    both = [(photo, one) for photo, one in zip(photos, placed, strict=True) if one.localized]
+    if poses == "localize":
+        own = [one.cam_from_map for _, one in both]
+        return _placement(Similarity.identity(), placed, both, own, [True] * len(both))
+    localized = (
+        f"{len(both)} of {len(photos)} photos that were tried are localized in map {opened.ref}"
+    )
+    if poses == "given":
+        own = [photo.pose for photo, _ in both]
+        agrees = [_fits(photo, one) for photo, one in both]
+        if sum(agrees) < _MIN_PART * len(both):
+            raise _elsewhere(
+                f"{localized}, but only {sum(agrees)} where --poses given has them",
+                "poses in the map's frame, or --poses tie",
+            )
+        return _placement(Similarity.identity(), placed, both, own, agrees)
+    rigid = metric and opened.manifest.world.metric
+    seen = [
+        Seen(photo.pose, photo.camera, one.pixels, one.points, one.cam_from_map)
+        for photo, one in both
+    ]
+    found = tie(seen, rigid=rigid)
+    if isinstance(found, str):
+        raise _elsewhere(
+            f"{localized}, but {found}",
+            "poses that agree with where the photos are localized, or --poses localize",
+        )
+    similarity, agrees = found.there_from_here, found.tied.tolist()
+    if lift is not None:
+        tied = [pair for pair, agree in zip(both, agrees, strict=True) if agree]
+        similarity = _refined_by_depth(similarity, tied, lift, rigid=rigid)
+    own = [similarity.move(photo.pose) for photo, _ in both]
+    return _placement(similarity, placed, both, own, agrees)
+
+
+def _refined_by_depth(
+    start: Similarity, tied: Sequence[tuple[MappingPhoto, Placed]], lift: Lift, *, rigid: bool
+) -> Similarity:
+    """Refine a tie on the matches whose place the depth of the new photos tells as well."""
+    here, there = [np.empty((0, 3))], [np.empty((0, 3))]
+    for photo, one in tied:
+        rows, points = lift(photo, one.pixels)
+        here.append(points)
+        there.append(one.points[rows])
+    if sum(map(len, here)) < _MIN_LIFTED:
+        return start
+    return refined_on_points(start, np.concatenate(here), np.concatenate(there), rigid=rigid)
+
+
+def _placement(
+    similarity: Similarity,
+    placed: Sequence[Placed],
+    both: Sequence[tuple[MappingPhoto, Placed]],
+    own: Sequence[Pose],
+    agrees: Sequence[bool],
+) -> Placement:
+    tied = [(*pair, pose) for pair, pose, fits in zip(both, own, agrees, strict=True) if fits]
+    errors = np.array([pose_error(pose, one.cam_from_map) for _, one, pose in tied])
+    pixels = np.concatenate([_errors_px(photo, one, pose) for photo, one, pose in tied])
+    return Placement(
+        similarity,
+        len(placed),
+        _reasons(placed),
+        len(tied),
+        float(np.nanmedian(pixels)),
+        *np.median(errors, axis=0).tolist(),
+    )
+
+
+def _fits(photo: MappingPhoto, one: Placed) -> bool:
+    """Whether a photo's own pose explains most of what it sees, as poses of queries must."""
+    most = registration_for(LocalizeOptions(), [photo.camera]).max_error_px
+    return bool(np.mean(_errors_px(photo, one, photo.pose) <= most) >= _MIN_PART)
+
+
+def _errors_px(photo: MappingPhoto, one: Placed, pose: Pose) -> NDArray[np.float64]:
+    """Distances (n,) in pixels between where a photo sees landmarks and where they project."""
+    view = MatchedView(photo.camera, Pose.identity(), one.pixels, one.points)
+    return reprojection_errors(view, pose)
+
+
+def _reasons(placed: Sequence[Placed]) -> dict[str, int]:
+    return dict(Counter(one.reason for one in placed if not one.localized).most_common())
+
+
+def _elsewhere(message: str, expected: str, got: str | None = None) -> Conflict:
+    return Conflict(
+        "update.elsewhere",
+        f"the capture does not fit the map: {message}",
+        field="DATASET",
+        expected=expected,
+        got=got,
+    )

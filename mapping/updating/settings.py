@@ -1,0 +1,91 @@
+"""What an update is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mapping.rgbd import DepthSettings
+from visloc.archive.schema import ID_PATTERN
+from visloc.errors import InvalidInput
+from visloc.geometry import PixelOrigin
+from visloc.types import Inference
+
+# What is known of where the photos were taken.
+POSES = ("tie", "given", "localize")
+# How landmarks of the new photos are made.
+METHODS = ("rgbd", "sfm")
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateSettings:
+    """What an update is made of.
+
+    Attributes:
+        dataset: kapture folder of the new capture.
+        map_ref: the map: id, id@version, or a folder.
+        maps_dir: folder of maps.
+        poses: a name of ``POSES``: ``tie``: of the dataset, in a frame of its own; ``given``: of
+            the dataset, in the map's frame; ``localize``: those that the map gives each photo.
+        method: a name of ``METHODS``; None for the one that made the map.
+        capture: what comes before the names of the photos, to tell captures apart.
+        metric: whether a unit of the dataset's poses is a metre.
+        depth_scale: metres per unit of 16-bit PNG depth.
+        depth_sensor: the depth sensor to use, when several go with a photo.
+        features_dir: where ready-made features lie, when not in the dataset.
+        pixel_origin: what the dataset's principal points and ready-made keypoints count from.
+        weights_dir: folder with network weights.
+        inference: how networks are computed.
+        workers: processes that work on photos and pairs.
+    """
+
+    dataset: Path
+    map_ref: str
+    maps_dir: Path
+    poses: str = POSES[0]
+    method: str | None = None
+    capture: str | None = None
+    metric: bool = True
+    depth_scale: float = DepthSettings().depth_scale
+    depth_sensor: str | None = None
+    features_dir: Path | None = None
+    pixel_origin: PixelOrigin = PixelOrigin.CORNER
+    weights_dir: Path | None = None
+    inference: Inference = Inference.AUTO
+    workers: int = 1
+
+
+def check_settings(settings: UpdateSettings) -> None:
+    """Refuse what would otherwise fail after long work.
+
+    Raises:
+        InvalidInput: ``update.poses``, ``update.method``, ``update.capture``.
+    """
+    for option, value, known in (
+        ("poses", settings.poses, POSES),
+        ("method", settings.method, METHODS),
+    ):
+        if value is not None and value not in known:
+            raise InvalidInput(
+                f"update.{option}",
+                "unknown",
+                field=f"--{option}",
+                expected=f"one of {', '.join(known)}",
+                got=value,
+            )
+    if settings.capture is not None and not ID_PATTERN.fullmatch(settings.capture):
+        raise InvalidInput(
+            "update.capture",
+            "not a name of a capture",
+            field="--capture",
+            expected="up to 64 letters, digits, '.', '_', '-', beginning with a letter or digit",
+            got=settings.capture,
+        )
+    if not (settings.depth_scale > 0 and settings.depth_scale < float("inf")):
+        raise InvalidInput(
+            "update.depth_scale",
+            "not usable",
+            field="--depth-scale",
+            expected="metres, more than 0",
+            got=settings.depth_scale,
+        )
