@@ -234,7 +234,8 @@ def test_the_example_that_reads_points_sees_the_map(built_maps: Path, desk: Desk
         # cp and the service are run above, for the targets of make see below; building takes long
         # and has tests of its own, as have a map of ready-made features, uploads and keys.
         if not re.match(
-            r"make|cp|\.venv/bin/(visloc-service|mapping (build|anchor|set|split|prune|merge|update))"
+            r"make|cp|\.venv/bin/(visloc-service|"
+            r"mapping (build|anchor|set|split|prune|merge|update))"
             r"|.*/mapping import .* --map|.* --features-dir|.*/localize maps push"
             r"|.* https://maps\.example\.org",
             line,
