@@ -12,12 +12,14 @@ export interface MapInfo {
   version: string;
   created: string;
   metric: boolean;
-  method: string;
+  /** Null for a set. */
+  method: string | null;
   local_features: string;
   global_features: string[];
   images: number;
   landmarks: number;
-  observations: number;
+  /** Null for a set. */
+  observations: number | null;
   extent: { min: number[]; max: number[] };
   size_bytes: number;
   /** Unit vector; empty when not known. */
@@ -26,6 +28,17 @@ export interface MapInfo {
   current: boolean;
   /** All published ones, oldest first. */
   versions: { version: string; current: boolean }[];
+  kind: "map" | "set";
+  /** Of a set that was asked for alone. */
+  tiles: Tile[];
+}
+
+/** One map of a set. */
+export interface Tile {
+  map: string;
+  version: string;
+  /** `x_set = scale R x + translation` */
+  set_from_tile: { rotation_wxyz: Quaternion; translation: Vector3; scale: number };
 }
 
 export interface Camera {
@@ -76,6 +89,8 @@ export interface LocalizeResponse {
   camera: Camera & { source: "given" | "given_scaled" | "exif" | "estimated" | "guess" };
   orientation: { exif: number; read_as: string };
   map: { id: string; version: string };
+  /** Of a set: `id@version` of the map in it that the answer rests on. */
+  tile: string | null;
   seconds: Record<string, number>;
   debug: { keypoints: number[]; points: number[]; inliers: boolean[]; overlay: string } | null;
 }
@@ -202,7 +217,7 @@ export function connect(base: URL, key: () => string | null): Service {
       readJson(
         mapPath(ref),
         "a map",
-        ["id", "version", "extent", "down", "versions", "global_features"],
+        ["id", "version", "extent", "down", "versions", "global_features", "tiles"],
         withSignal(signal),
       ),
     async points(ref, first, count, signal) {

@@ -53,6 +53,18 @@ export function rotationMatrix([w, x, y, z]: Quaternion): Matrix3 {
   ];
 }
 
+/** The quaternion of the rotation by `b`, then by `a`. */
+export function product(a: Quaternion, b: Quaternion): Quaternion {
+  const [w1, x1, y1, z1] = a;
+  const [w2, x2, y2, z2] = b;
+  return [
+    w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+    w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+    w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+    w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+  ];
+}
+
 export function apply(m: Matrix3, [x, y, z]: Vector3): Vector3 {
   return [
     m[0] * x + m[1] * y + m[2] * z,

@@ -1,6 +1,7 @@
 import { afterEach, beforeEach, describe, expect, test, vi } from "vitest";
 import { ownError, ServiceError, type MapImages, type MapInfo, type Service } from "../src/api";
-import { loadMap } from "../src/page/map_loading";
+import { loadMap, movedBlock } from "../src/page/map_loading";
+import { parsePoints } from "../src/points";
 import { patiently } from "../src/page/patience";
 import type { Viewer } from "../src/viewer/types";
 
@@ -127,5 +128,40 @@ describe("a map", () => {
     await vi.advanceTimersByTimeAsync(10_000);
     await ended;
     expect(asked).toHaveBeenCalledTimes(1);
+  });
+});
+
+describe("a set", () => {
+  const moved = {
+    // A quarter turn about z, at half the size.
+    rotation_wxyz: [Math.SQRT1_2, 0, 0, Math.SQRT1_2] as [number, number, number, number],
+    translation: [10, 0, 1] as [number, number, number],
+    scale: 0.5,
+  };
+  const tile = { map: "kitchen", version: "7", set_from_tile: moved };
+
+  test("shows its tiles, and asks for each by its version", async () => {
+    const asked: string[] = [];
+    const set = { ...MAP, id: "house", kind: "set", landmarks: 6, images: 2 } as MapInfo;
+    const { done, told } = load(
+      {
+        points: async (ref) => (asked.push(ref), points(3)),
+      },
+      { ...set, tiles: [tile, { ...tile, map: "hall" }] },
+    );
+    await done;
+    expect(asked).toEqual(["kitchen@7", "hall@7"]);
+    expect(told.slice(-3)).toEqual(["points 3", "points 3", "cameras 2"]);
+  });
+
+  test("has the landmarks of a tile in its own frame", () => {
+    const body = points(1);
+    const view = new DataView(body);
+    view.setFloat64(24, 4, true); // the origin is (4, 0, 0)
+    view.setFloat32(48, 2, true); // and the landmark 2 further
+    const block = movedBlock(parsePoints(body), tile);
+    const row = new DataView(block.rows);
+    const at = [0, 1, 2].map((axis) => row.getFloat32(4 * axis, true) + block.origin[axis]!);
+    [10, 3, 1].forEach((value, axis) => expect(at[axis]).toBeCloseTo(value));
   });
 });

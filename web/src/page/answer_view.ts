@@ -47,6 +47,7 @@ export function answerView(
         ["Camera", cameraWords(answer, actions)],
         ...orientationWords(answer),
         ["Map", answer.map.id],
+        ...(answer.tile === null ? [] : [["Tile", answer.tile] as [string, string]]),
         ["Version", answer.map.version],
         ["Request", requestWords(answer.request_id, actions.announce)],
       ]),

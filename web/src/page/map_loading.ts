@@ -5,15 +5,20 @@ import {
   type MapImages,
   type MapInfo,
   type Service,
+  type Tile,
   type Vector3,
 } from "../api";
-import { worldUp } from "../geometry";
-import { MAX_POINTS, streamPoints } from "../points";
+import { add, apply, product, rotationMatrix, scale, worldUp } from "../geometry";
+import { MAX_POINTS, parsePoints, ROW_BYTES, streamPoints } from "../points";
 import type { PointBlock, Viewer } from "../viewer/types";
 
 const IMAGES_PAGE = 5000;
 /** More frusta would hide the landmarks. */
 export const MAX_IMAGES = 20_000;
+/** Of a set: each tile takes two requests. */
+const MAX_TILES = 200;
+/** Landmarks that one request gives at most. */
+const MAX_PAGE = 262_144;
 
 export interface Loading {
   signal: AbortSignal;
@@ -23,13 +28,14 @@ export interface Loading {
   onImages(images: MapImages): void;
 }
 
-/** Show a map. Throws what the service refuses, and PointsError for landmarks that are none. */
+/** Show a map, or the tiles of a set. Throws what the service refuses, and PointsError for landmarks that are none. */
 export async function loadMap(
   map: MapInfo,
   service: Service,
   viewer: Viewer,
   loading: Loading,
 ): Promise<void> {
+  if (map.kind === "set") return loadTiles(map, service, viewer, loading);
   const { signal } = loading;
   const ref = mapRef(map);
   const reset = (known: MapImage[]): void => {
@@ -73,6 +79,62 @@ async function allImages(service: Service, ref: string, signal: AbortSignal): Pr
     Object.assign(all.cameras, next.cameras);
   }
   return all;
+}
+
+/** Show the tiles of a set in its frame: the first ones of a large set, and an even sample of each. */
+async function loadTiles(
+  map: MapInfo,
+  service: Service,
+  viewer: Viewer,
+  loading: Loading,
+): Promise<void> {
+  const { signal } = loading;
+  const tiles = map.tiles.slice(0, MAX_TILES);
+  const share = Math.min(MAX_PAGE, Math.floor(MAX_POINTS / Math.max(1, tiles.length)));
+  const all: MapImages = { map, total: map.images, first: 0, cameras: {}, images: [] };
+  let loaded = 0;
+  viewer.reset({ origin: middle(map), up: worldUp(map.down, []), metric: map.metric });
+  loading.onReset();
+  for (const tile of tiles) {
+    const ref = mapRef({ id: tile.map, version: tile.version });
+    const [images, points] = await Promise.all([
+      service.images(ref, 0, IMAGES_PAGE, signal),
+      service.points(ref, 0, share, signal),
+    ]);
+    signal.throwIfAborted();
+    for (const image of images.images.slice(0, MAX_IMAGES - all.images.length)) {
+      all.images.push({ ...movedImage(image, tile), camera: `${ref}/${image.camera}` });
+    }
+    for (const [id, camera] of Object.entries(images.cameras)) all.cameras[`${ref}/${id}`] = camera;
+    const block = movedBlock(parsePoints(points), tile);
+    viewer.addPoints(block);
+    loaded += block.count;
+    // What is shown is what there is to come: the others are not asked for.
+    loading.onBlock({ ...block, total: Math.max(map.landmarks, loaded) }, loaded);
+  }
+  viewer.setMappingCameras(all.images, all.cameras);
+  loading.onImages(all);
+}
+
+/** A mapping photo of a tile in the frame of the set. */
+function movedImage(image: MapImage, { set_from_tile: to }: Tile): MapImage {
+  const rotation = rotationMatrix(to.rotation_wxyz);
+  const position = add(scale(apply(rotation, image.position), to.scale), to.translation);
+  return { ...image, position, orientation: product(to.rotation_wxyz, image.orientation) };
+}
+
+/** Landmarks of a tile in the frame of the set. */
+export function movedBlock(block: PointBlock, { set_from_tile: to }: Tile): PointBlock {
+  const rotation = rotationMatrix(to.rotation_wxyz);
+  const view = new DataView(block.rows);
+  for (let row = 0; row < block.count; row++) {
+    const at = [0, 4, 8].map((offset) => row * ROW_BYTES + offset) as Vector3;
+    const point = at.map((offset) => view.getFloat32(offset, true)) as Vector3;
+    const moved = scale(apply(rotation, point), to.scale);
+    at.forEach((offset, axis) => view.setFloat32(offset, moved[axis] ?? 0, true));
+  }
+  const origin = add(scale(apply(rotation, block.origin), to.scale), to.translation);
+  return { ...block, origin };
 }
 
 /** Coordinates are kept relative to it, as what is drawn has few digits. */

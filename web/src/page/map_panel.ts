@@ -158,14 +158,15 @@ function mapFacts(map: MapInfo): HTMLElement {
   const rows: [string, string][] = [
     ["Photos", countText(map.images)],
     ["Landmarks", countText(map.landmarks)],
-    ["Observations", countText(map.observations)],
   ];
+  if (map.observations !== null) rows.push(["Observations", countText(map.observations)]);
+  if (map.kind === "set") rows.unshift(["Maps in it", countText(map.tiles.length)]);
   if (map.landmarks > 0 && size.every(Number.isFinite)) {
     const sides = size.map((side) => lengthText(side, map.metric));
     rows.push(["Extent", `${sides.join(" × ")}${map.metric ? "" : " (not metric)"}`]);
   }
   rows.push(
-    ["Method", map.method],
+    ...(map.method === null ? [] : [["Method", map.method] as [string, string]]),
     ["Features", [map.local_features, ...map.global_features].join(", ")],
     ["Created", instantText(map.created)],
     ["Version", map.current ? map.version : `${map.version}, not in use`],

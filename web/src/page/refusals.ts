@@ -69,7 +69,7 @@ export const ADVICE: Readonly<Record<string, Advice>> = {
   ambiguous: {
     meaning: "Two places far apart explain the photo about equally well.",
     tries: [
-      "Say where the camera is (the priors).",
+      "Say where the camera is (the priors), or ask the right map of the set alone.",
       "Choose a photo that shows more of the scene.",
     ],
   },
