@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import logging
+import math
 import shutil
 import socket
 import threading
@@ -256,6 +257,34 @@ def test_what_another_server_changes_is_seen_soon(
     monkeypatch.setattr(remote_store, "INDEX_S", 0.0)
     assert other.current_version("room") == "v1"
     assert other.ids() == ["hall", "room"]
+
+
+def test_what_is_unknown_is_looked_for_sooner(
+    published: RemoteMapStore,
+    new_store: Callable[..., RemoteMapStore],
+    make: Callable[..., Path],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(remote_store, "INDEX_S", math.inf)
+    monkeypatch.setattr(remote_store, "UNKNOWN_S", 0.0)
+    other = new_store("other")
+    assert other.ids() == ["room"]
+
+    published.publish(make("v1", "hall"), "hall", "v1", make_current=False)
+    with pytest.raises(NotFound) as caught:
+        other.current_version("hall")
+    assert caught.value.code == "map.none_in_use"
+    published.set_current("hall", "v1")
+    assert other.current_version("hall") == "v1"
+    published.publish(make("v3"), "room", "v3")
+    assert other.folder("room@v3").name == "v3"
+
+    # Within a second it is not asked again: nobody can make it ask all the time.
+    monkeypatch.setattr(remote_store, "UNKNOWN_S", math.inf)
+    published.publish(make("v1", "cellar"), "cellar", "v1")
+    with pytest.raises(NotFound) as caught:
+        other.current_version("cellar")
+    assert caught.value.code == "map.unknown"
 
 
 def test_removal_takes_the_version_and_with_the_last_the_map(

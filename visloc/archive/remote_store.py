@@ -64,6 +64,9 @@ logger = logging.getLogger(__name__)
 
 # How old an answer may be.
 INDEX_S = 5.0
+# The same for the answer that there is no such map or version: another server may just have
+# published it.
+UNKNOWN_S = 1.0
 # After a failure the storage is left alone for so long.
 AWAY_S = 5.0
 CONNECT_TIMEOUT_S, READ_TIMEOUT_S = 3, 10
@@ -144,6 +147,8 @@ class RemoteMapStore:
         """
         checked_name(map_id, "map")
         known = self._known().get(map_id)
+        if known is None or known.current is None:
+            known = self._known(UNKNOWN_S).get(map_id)
         if known is None:
             raise self._unknown_map(map_id)
         if known.current is None:
@@ -313,27 +318,32 @@ class RemoteMapStore:
 
     # What the storage has
 
-    def _known(self) -> _Index:
-        """The index, asked for anew when it is old; the last one while the storage is away."""
+    def _known(self, age_s: float | None = None) -> _Index:
+        """The index, asked for anew when it is old; the last one while the storage is away.
+
+        Args:
+            age_s: from when on it is old; ``INDEX_S`` when None.
+        """
+        age_s = INDEX_S if age_s is None else min(age_s, INDEX_S)
         index = self._index
         now = monotonic()
-        if index is not None and (now - self._index_at < INDEX_S or now < self._away_until):
+        if index is not None and (now - self._index_at < age_s or now < self._away_until):
             return index
         if not self._indexing.acquire(blocking=index is None):
             assert index is not None
             return index  # another thread is asking
         if index is not None and self._is_away:  # nobody shall wait for it again
-            threading.Thread(target=self._refresh, daemon=True).start()
+            threading.Thread(target=self._refresh, args=(age_s,), daemon=True).start()
             return index
-        self._refresh()
+        self._refresh(age_s)
         if self._index is None:
             raise self._away("nothing is known of it yet")
         return self._index
 
-    def _refresh(self) -> None:
-        """Ask for the index, once ``_indexing`` is held, and release that."""
+    def _refresh(self, age_s: float) -> None:
+        """Ask for an index that is old, once ``_indexing`` is held, and release that."""
         try:
-            if monotonic() - self._index_at >= INDEX_S:
+            if monotonic() - self._index_at >= age_s:
                 self._keep(self._ask())
         except Unavailable:
             if self._index is None:
@@ -422,6 +432,9 @@ class RemoteMapStore:
         checked_name(map_id, "map")
         checked_name(version, "map version")
         versions = self.versions(map_id)
+        if version not in versions:
+            known = self._known(UNKNOWN_S).get(map_id)
+            versions = [] if known is None else list(known.versions)
         if not versions:
             raise self._unknown_map(map_id)
         if version not in versions:
