@@ -2,8 +2,9 @@
 
 A photo's stored descriptors are pooled to one vector (``localvlad``, with one vocabulary and one
 projection for all tiles), of which the signs along some planes are kept: a code of a few bytes.
-A query looks at a few rows of every tile first, then at the codes of the photos of the best tiles.
-Nothing here loops over tiles or photos in Python (docs/decisions/0022-map-sets.md).
+A query looks at a few rows of every tile first, then at the codes of the photos of the best tiles,
+and at the best of these once more, with its own descriptor instead of its code. Nothing here loops
+over all tiles or photos in Python (docs/decisions/0022-map-sets.md).
 """
 
 from __future__ import annotations
@@ -31,11 +32,14 @@ BITS = 256
 CENTROIDS = 4
 # Tiles whose photos are looked at: so many, or this share of a larger set.
 _MIN_LOOKED_AT, _SHARE_LOOKED_AT = 400, 0.04
+# Of these, so many are looked at once more, and ranked.
+MAX_RANKED = 50
 # A tile is as similar to a query as its best photos are on average: one alone may be so by chance.
 _NUM_BEST = 3
 # Of a large set, so many tiles teach vocabulary and projection.
 _MAX_TEACHERS = 256
-_BLOCK_ROWS = 2**18
+_BLOCK_ROWS, _BLOCK_PHOTOS = 2**18, 2**14
+_LEAST_SIDE = 1e-12  # of a query that nothing was seen in
 _NO_PIXELS = np.empty((0, 0, 3), np.uint8)
 
 
@@ -158,9 +162,7 @@ def coarse_index(described: Iterator[DescribedTile], model: CoarseModel) -> Coar
 def rank_tiles(
     map_set: MapSet, local: LocalFeatures, allowed: NDArray[np.bool_] | None = None
 ) -> tuple[TileScore, ...]:
-    """Rank tiles by how much their photos look like a query, best first.
-
-    Of a large set only those tiles are ranked that its centroids propose.
+    """Rank tiles by how much their photos look like a query, best first; 50 at most.
 
     Args:
         map_set: the set.
@@ -188,7 +190,20 @@ def ranked(
     coarse: CoarseIndex, query: NDArray[np.float32], allowed: NDArray[np.bool_] | None = None
 ) -> tuple[TileScore, ...]:
     """Rank tiles by a query's descriptor (D,); as ``rank_tiles``."""
-    tiles = _proposed(coarse, query, allowed)
+    tiles = _similar(coarse, query, _proposed(coarse, query, allowed))
+    sides = query @ coarse.model["planes"]
+    sides /= max(float(np.sqrt(np.mean(sides**2))), _LEAST_SIDE)
+    scores = np.array([_score(coarse, tile, sides) for tile in tiles.tolist()])
+    order = np.argsort(-scores, kind="stable")
+    return tuple(TileScore(int(tiles[i]), float(scores[i])) for i in order)
+
+
+def _similar(
+    coarse: CoarseIndex, query: NDArray[np.float32], tiles: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """The tiles whose codes differ least from that of a query, in the order of the set."""
+    if len(tiles) <= MAX_RANKED:
+        return tiles
     counts = coarse.offsets[tiles + 1] - coarse.offsets[tiles]
     ends = np.cumsum(counts)
     place = np.repeat(np.arange(len(tiles)), counts)
@@ -206,8 +221,29 @@ def ranked(
     # Two vectors lie on different sides of a random plane as often as their angle says.
     cosines = np.cos(np.pi * np.arange(length) / coarse.bits)
     scores = best @ cosines / np.minimum(counts, _NUM_BEST)
-    order = np.argsort(-scores, kind="stable")
-    return tuple(TileScore(int(tiles[i]), float(scores[i])) for i in order)
+    return np.sort(tiles[np.argpartition(-scores, MAX_RANKED)[:MAX_RANKED]])
+
+
+def _score(coarse: CoarseIndex, tile: int, sides: NDArray[np.float32]) -> float:
+    """The mean cosine of a query with the best photos of a tile.
+
+    Args:
+        coarse: the index.
+        tile: row of the tile.
+        sides: (bits,) how far from each plane the query's descriptor lies, and on which side, in
+            units of their root mean square.
+    """
+    start, stop = int(coarse.offsets[tile]), int(coarse.offsets[tile + 1])
+    best = np.empty(0, np.float32)
+    for block in range(start, stop, _BLOCK_PHOTOS):
+        codes = np.ascontiguousarray(coarse.codes[block : min(block + _BLOCK_PHOTOS, stop)], "<u8")
+        bits = np.unpackbits(codes.view(np.uint8), axis=1, bitorder="little")
+        # That a photo lies beyond a plane says more, the further beyond it the query lies: of unit
+        # vectors at an angle, the mean of sign times distance is their cosine times this.
+        signed = 2.0 * (bits.astype(np.float32) @ sides) - sides.sum()
+        cosines = math.sqrt(math.pi / 2) / coarse.bits * signed
+        best = np.sort(np.concatenate([best, cosines]))[-_NUM_BEST:]
+    return float(best.mean())
 
 
 def codes_of(rows: NDArray[np.float32], planes: NDArray[np.float32]) -> NDArray[np.uint64]:
