@@ -35,6 +35,7 @@ from mapping.georeference import (
 )
 from mapping.imported_points import read_imported_points
 from mapping.importers import IMPORTERS, ImportSummary, import_dataset, imported
+from mapping.merging.command import merge
 from mapping.options import (
     CLUSTER_PANEL,
     GLOBAL_DEFAULT,
@@ -623,6 +624,7 @@ def verify(
 
 app.command()(report)
 app.command()(prune)
+app.command()(merge)
 app.command("set")(set_maps)
 app.command()(split)
 app.command()(update)
