@@ -27,7 +27,14 @@ from visloc.archive.set_rules import (
     refuse_missing_tiles,
     refuse_other_kind,
 )
-from visloc.archive.sets import MapSet, SetOutline, open_set, read_any_outline, verify_any
+from visloc.archive.sets import (
+    SET_CODES,
+    MapSet,
+    SetOutline,
+    open_set,
+    read_any_outline,
+    verify_any,
+)
 from visloc.errors import (
     Conflict,
     Forbidden,
@@ -234,7 +241,7 @@ class MapStore:
         """
         with self._changing():
             folder = self.folder(f"{map_id}@{version}")
-            refuse_if_tile(map_id, version, self._in_use())
+            refuse_if_tile(map_id, version, self._sets_in_use())
             others = [name for name in self.versions(map_id) if name != version]
             if others and _current_or_none(self, map_id) == version:
                 raise version_in_use(map_id, version, others)
@@ -296,12 +303,13 @@ class MapStore:
                 return self._manifest(map_id, version)
         return None
 
-    def _in_use(self) -> Iterator[tuple[str, AnyManifest]]:
-        """What is in use; without what cannot be read, which is not in use either."""
+    def _sets_in_use(self) -> Iterator[tuple[str, AnyManifest]]:
+        """The sets in use; without those that cannot be read, which are not in use either."""
         for map_id in self.ids():
             with suppress(MapCorrupt, NotFound):
                 folder = self.folder(map_id)
-                yield f"{map_id}@{folder.name}", read_any_manifest(folder)
+                if (folder / SET_CODES).is_file():  # of thousands of maps, no manifest is read
+                    yield f"{map_id}@{folder.name}", read_any_manifest(folder)
 
     @contextmanager
     def _changing(self) -> Iterator[None]:
