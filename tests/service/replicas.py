@@ -84,7 +84,7 @@ def balanced(
                 ports=ports,
                 environment=environment,
                 cache_dir=work / f"cache-{address}",
-                drain_delay_s=2,
+                drain_delay_s=3,
             )
             replica.start()
             stack.callback(replica.stop)
