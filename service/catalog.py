@@ -306,6 +306,7 @@ class Catalog:
     async def _forget(self, ref: str, workers: Workers) -> None:
         """Close a version that another one took over from, after its last request."""
         await self._until_unused(ref, _FORGET_LIMIT_S)
+        self._sets.pop(ref, None)
         if not any(of.ref == ref for of in self._serving.values()):
             await workers.run_everywhere(worker.forget, ref)
 

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncGenerator, AsyncIterator, Iterator, Mapping, Sequence
+from collections.abc import (
+    AsyncGenerator,
+    AsyncIterator,
+    Coroutine,
+    Iterator,
+    Mapping,
+    Sequence,
+)
 from contextlib import aclosing, contextmanager
 from dataclasses import dataclass
 from time import time
+from typing import Any, TypeVar
 
 from service import worker
 from service.catalog import Catalog, ServedMap
@@ -33,6 +41,7 @@ from service.worker import MapFolder, WorkerSettings
 from service.workers import Workers
 from visloc.errors import (
     InvalidInput,
+    NotFound,
     Overloaded,
     Unavailable,
     VislocError,
@@ -41,6 +50,8 @@ from visloc.priors import NO_PRIORS, Priors
 from visloc.types import Localized
 
 logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +197,7 @@ class Engine:
                 if alone:
                     found.append(self.workers.run(worker.localize, job, alone, time()))
                 return max(
-                    await together(found),
+                    await _answers_of(found),
                     key=lambda one: (
                         isinstance(one.answer, Localized),
                         one.answer.evidence.num_inliers,
@@ -241,7 +252,7 @@ class Engine:
             if alone:
                 found.append(solve_rig(self.workers, job, alone))
             return max(
-                await together(found),
+                await _answers_of(found),
                 key=lambda one: (one.answer.pose is not None, one.answer.num_inliers),
             )
 
@@ -391,6 +402,29 @@ class Engine:
             raise stopping_error()
         if not self._started:
             raise Unavailable("server.starting", "the maps are being loaded; try again shortly")
+
+
+async def _answers_of(searches: Sequence[Coroutine[Any, Any, T]]) -> list[T]:
+    """Search maps and sets at once; a set of which the priors leave nothing does not count.
+
+    Raises:
+        NotFound: ``set.no_tile`` when nothing else is searched.
+    """
+
+    async def of(search: Coroutine[Any, Any, T]) -> T | NotFound:
+        try:
+            return await search
+        except NotFound as error:
+            if error.code != "set.no_tile":
+                raise
+            return error
+
+    found = await together(of(search) for search in searches)
+    answers = [each for each in found if not isinstance(each, NotFound)]
+    nothing = [each for each in found if isinstance(each, NotFound)]
+    if not answers:
+        raise nothing[0]
+    return answers
 
 
 def _parted(

@@ -6,6 +6,7 @@ as any map is, with what was read; what they say is put into the set's frame and
 
 from __future__ import annotations
 
+import asyncio
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, replace
@@ -74,10 +75,15 @@ class SetSearch:
         catalog: gives the tiles.
         workers: do the work.
         metrics: count the tiles that were searched.
+
+    Attributes:
+        place: held from when a photo is read until its tiles were searched.
     """
 
     def __init__(self, catalog: Catalog, workers: Workers, metrics: Metrics) -> None:
         self._catalog, self._workers, self._metrics = catalog, workers, metrics
+        # Photos that were read are much larger than those that wait.
+        self.place = asyncio.Semaphore(workers.count + 1)
 
     async def localize(self, job: LocalizeJob, of: MapFolder) -> Localization:
         """Localize a photo, or its features, in a set.
@@ -87,38 +93,43 @@ class SetSearch:
             NotFound: ``set.no_tile`` when the priors allow no tile.
             Unavailable: ``set.tile_unavailable``, ``server.worker_died``.
         """
+        submitted = time()
         outline = self._catalog.set_outline(of)
         allowed = allowed_tiles(outline, job.priors)
-        choice = await self.choose(of, [job.query], job.options, allowed)
-        (query,) = choice.queries
+        async with self.place:
+            choice = await self.choose(of, [job.query], job.options, allowed, submitted)
+            (query,) = choice.queries
 
-        async def ask(row: int, folder: MapFolder) -> Localization:
-            priors = self.priors_in(outline, outline.tiles[row], job.priors)
-            asked = replace(job, query=query, priors=priors)
-            return await self._workers.run(worker.localize, asked, (folder,), time())
+            async def ask(row: int, folder: MapFolder) -> Localization:
+                priors = self.priors_in(outline, outline.tiles[row], job.priors)
+                asked = replace(job, query=query, priors=priors)
+                return await self._workers.run(worker.localize, asked, (folder,), time())
 
-        _, found = await self.search(outline, choice, ask)
-        return found
+            _, found = await self.search(outline, choice, ask)
+            return found
 
     async def localize_rig(self, job: RigJob, of: MapFolder) -> InstantLocalization:
         """Localize the images of one instant together in a set; errors as of ``localize``."""
+        submitted = time()
         outline = self._catalog.set_outline(of)
         allowed = allowed_tiles(outline, job.priors)
-        choice = await self.choose(of, [image.query for image in job.images], job.options, allowed)
-        images = with_queries(job.images, choice.queries)
+        async with self.place:
+            queries = [image.query for image in job.images]
+            choice = await self.choose(of, queries, job.options, allowed, submitted)
+            images = with_queries(job.images, choice.queries)
 
-        async def ask(row: int, folder: MapFolder) -> InstantLocalization:
-            tile = outline.tiles[row]
-            asked = replace(
-                job,
-                images=images,
-                rig=rig_in(tile, job.rig),
-                priors=self.priors_in(outline, tile, job.priors),
-            )
-            return await solve_rig(self._workers, asked, (folder,))
+            async def ask(row: int, folder: MapFolder) -> InstantLocalization:
+                tile = outline.tiles[row]
+                asked = replace(
+                    job,
+                    images=images,
+                    rig=rig_in(tile, job.rig),
+                    priors=self.priors_in(outline, tile, job.priors),
+                )
+                return await solve_rig(self._workers, asked, (folder,))
 
-        _, found = await self.search(outline, choice, ask)
-        return found
+            _, found = await self.search(outline, choice, ask)
+            return found
 
     async def choose(
         self,
@@ -126,6 +137,7 @@ class SetSearch:
         queries: Sequence[Query],
         options: LocalizeOptions,
         allowed: NDArray[np.bool_],
+        submitted: float,
     ) -> Choice:
         """Read photos, and say which of the allowed tiles to search.
 
@@ -133,7 +145,7 @@ class SetSearch:
         """
         rows = np.flatnonzero(allowed)
         asked = allowed if len(rows) > 1 else None
-        chosen = await self.read(of, queries, options, asked)
+        chosen = await self.read(of, queries, options, asked, submitted)
         scores: dict[int, float] = defaultdict(float)
         for one in chosen:
             for each in one.scores:
@@ -152,11 +164,11 @@ class SetSearch:
         queries: Sequence[Query],
         options: LocalizeOptions,
         allowed: NDArray[np.bool_] | None,
+        submitted: float,
     ) -> list[Chosen]:
-        """Read photos, and rank tiles by each; None: do not rank any."""
-        now = time()
+        """Read photos, and rank tiles by each; arguments as of ``worker.choose_tiles``."""
         return await together(
-            self._workers.run(worker.choose_tiles, query, of, options, allowed, now)
+            self._workers.run(worker.choose_tiles, query, of, options, allowed, submitted)
             for query in queries
         )
 

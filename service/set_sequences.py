@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import AsyncGenerator, AsyncIterator, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
+from time import time
 
 from service import worker
 from service.catalog import Catalog
@@ -100,7 +101,9 @@ class SetSequence:
                     if before is not None:
                         check_order(before, instant.timestamp)
                 before = instant.timestamp
-                for answer in await self._add(index, instant):
+                async with self._search.place:
+                    answers = await self._add(index, instant)
+                for answer in answers:
                     yield answer
                 index += 1
             if index == 0:
@@ -125,7 +128,7 @@ class SetSequence:
                 return await self._begin(found)
             return [] if found is None else [found]
         queries = [image.query for image in instant.images]
-        read = await self._search.read(self._of, queries, self._start.options, None)
+        read = await self._search.read(self._of, queries, self._start.options, None, time())
         images = with_queries(instant.images, [one.query for one in read])
         instant = replace(instant, images=images)
         looked = await self._look(index, instant, leg)
@@ -162,7 +165,8 @@ class SetSequence:
             if not allowed.any():
                 return None
         queries = [image.query for image in instant.images]
-        choice = await self._search.choose(self._of, queries, self._start.options, allowed)
+        options = self._start.options
+        choice = await self._search.choose(self._of, queries, options, allowed, time())
         asked = replace(instant, images=with_queries(instant.images, choice.queries))
         looked: dict[int, _Looked] = {}
 
@@ -173,7 +177,7 @@ class SetSequence:
                 seen.leg.start.rig,
                 seen.instant.images,
                 instant.timestamp,
-                self._start.options,
+                options,
                 seen.priors,
                 ypr=self._start.ypr,
             )

@@ -14,9 +14,11 @@ import httpx
 import numpy as np
 import pytest
 
-from clients import Client, Instant, LocalizeResult, RigImage, RigSensor
+from clients import Client, Instant, LocalizeResult, Near, RigImage, RigSensor
 from clients import Features as SentFeatures
+from clients.cli import main
 from mapping.build import BuildSettings, build_map
+from mapping.georeference import given_place, publish_anchored
 from mapping.sample import write_sample
 from mapping.sets import publish_set
 from visloc.archive import MapStore
@@ -257,6 +259,17 @@ def test_what_shows_nothing_is_an_answer_and_what_is_no_photo_an_error(client: C
     assert caught.value.code.startswith("image.")
 
 
+def test_a_set_without_an_allowed_tile_leaves_the_answer_to_other_maps(
+    client: Client, query: Any
+) -> None:
+    here = Priors(position=PositionPrior(query.cam_from_world.center, 0.5))
+    found = client.localize(query.image, ["site", "room"], query.camera, priors=here)
+    assert (found.map.id, found.pose is None) == ("room", False)
+    with pytest.raises(NotFound) as caught:
+        client.localize(query.image, ["site", "twice"], query.camera, priors=here)
+    assert caught.value.code == "set.no_tile"
+
+
 @pytest.mark.parametrize(("asked", "moved"), [("site", SITE_FROM_ROOM), ("model", MODEL_FROM_ROOM)])
 def test_a_rig_is_localized_in_a_set(
     asked: str, moved: Similarity, client: Client, sample: Path
@@ -432,3 +445,65 @@ def test_a_packed_set_is_uploaded_and_put_into_use(
         used = client.use_version("site", version)
         assert (used.kind, used.current, used.num_tiles) == ("set", True, 2)
         assert client.localize(query.image, "site", query.camera).pose is not None
+
+
+def test_a_set_on_earth_is_searched_instead_of_its_tiles(
+    built_maps: Path, serve: Serve, query: Any, tmp_path: Path
+) -> None:
+    maps = Path(shutil.copytree(built_maps, tmp_path / "maps"))
+    store = MapStore(maps)
+    place = (45.2178, 5.8083, 310.0)
+    anchored = given_place(store.open("room"), place, 90.0, gravity=(0.0, 0.0, -1.0))
+    publish_anchored(store.open("room"), anchored, maps, force=False)
+    publish_set(store, "site", [("room", SITE_FROM_ROOM)], quiet)
+    near = Near(45.2178, 5.8083, 50.0)
+    with serve(maps) as doors, Client(doors.url) as client:
+        assert {info.id for info in client.maps(near)} == {"room", "site"}
+        own = client.localize(query.image, "room", query.camera)
+        found = client.localize(query.image, near, query.camera)
+        assert found.map.id == "site"
+        assert found.tile == f"room@{store.current_version('room')}"
+        # Wherever the frame of the set lies, the photo was taken at one place on Earth.
+        assert own.geopose is not None
+        assert found.geopose is not None
+        assert found.geopose.latitude == pytest.approx(own.geopose.latitude, abs=1e-9)
+        assert found.geopose.longitude == pytest.approx(own.geopose.longitude, abs=1e-9)
+        assert found.geopose.height == pytest.approx(own.geopose.height, abs=1e-4)
+        turn = np.abs(np.dot(found.geopose.quaternion_xyzw, own.geopose.quaternion_xyzw))
+        assert turn == pytest.approx(1.0)
+        sequence = client.localize_sequence(instants([query.image], query.camera), near)
+        assert [each.map.id for each in sequence] == ["site"]
+
+
+def test_the_command_asks_a_set_and_names_the_tile(
+    served: Any, site: Path, sample: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photo = next((sample / "query").rglob("*.jpg"))
+    server = ["--server", served.url]
+    tile = f"room@{MapStore(site).current_version('room')}"
+
+    assert run(["image", str(photo), "--map", "site", *server]) == 0
+    assert f"tile           {tile}" in capsys.readouterr().out
+    batch = tmp_path / "batch"
+    queries = str(sample / "query")
+    assert run(["batch", queries, "--map", "site", "--output", str(batch), *server]) == 0
+    lines = (batch / "results.jsonl").read_text().splitlines()
+    assert {json.loads(line)["tile"] for line in lines} == {tile}
+    report = tmp_path / "report.json"
+    assert run(["benchmark", queries, "--map", "site", "--report", str(report), *server]) == 0
+    assert json.loads(report.read_text())["localized"] == len(lines)
+    asked = ["--map", "site", "--axis", "top-k", "--values", "2,4", "--output", str(tmp_path)]
+    assert run(["compare", queries, *asked, *server]) == 0
+    assert run(["maps", "list", *server]) == 0
+    assert "a set of 2 maps" in capsys.readouterr().out
+    assert run(["maps", "show", "site", *server]) == 0
+    assert tile in capsys.readouterr().out
+
+
+def run(arguments: list[str]) -> int:
+    """Run ``localize`` and return what it exits with."""
+    try:
+        main(arguments)
+    except SystemExit as ended:
+        return int(ended.code or 0)
+    return 0
