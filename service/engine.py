@@ -7,7 +7,6 @@ import logging
 from collections.abc import (
     AsyncGenerator,
     AsyncIterator,
-    Coroutine,
     Iterator,
     Mapping,
     Sequence,
@@ -15,7 +14,6 @@ from collections.abc import (
 from contextlib import aclosing, contextmanager
 from dataclasses import dataclass
 from time import time
-from typing import Any, TypeVar
 
 from service import worker
 from service.catalog import Catalog, ServedMap
@@ -31,27 +29,23 @@ from service.jobs import (
 )
 from service.metrics import Metrics
 from service.scenes import Scenes
-from service.set_search import SetSearch
+from service.set_search import SetSearch, answers_of, check_no_tiles, parted
 from service.set_sequences import SetSequence
 from service.stores import Store
-from service.together import together
 from service.uploads import Uploads
 from service.wire import stopping_error
 from service.worker import MapFolder, WorkerSettings
 from service.workers import Workers
 from visloc.errors import (
     InvalidInput,
-    NotFound,
     Overloaded,
     Unavailable,
     VislocError,
 )
-from visloc.priors import NO_PRIORS, Priors
+from visloc.priors import NO_PRIORS
 from visloc.types import Localized
 
 logger = logging.getLogger(__name__)
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,12 +186,12 @@ class Engine:
         self._photos += 1
         try:
             async with self._catalog.using(job.maps, self.workers) as maps:
-                sets, alone = _parted(maps, job.priors)
+                sets, alone = parted(maps, job.priors)
                 found = [self._sets.localize(job, of) for of in sets]
                 if alone:
                     found.append(self.workers.run(worker.localize, job, alone, time()))
                 return max(
-                    await _answers_of(found),
+                    await answers_of(found),
                     key=lambda one: (
                         isinstance(one.answer, Localized),
                         one.answer.evidence.num_inliers,
@@ -247,12 +241,12 @@ class Engine:
         if not job.images:
             raise InvalidInput("rig.empty", "there is no image", field="images")
         async with self._catalog.using(job.maps, self.workers) as maps:
-            sets, alone = _parted(maps, job.priors)
+            sets, alone = parted(maps, job.priors)
             found = [self._sets.localize_rig(job, of) for of in sets]
             if alone:
                 found.append(solve_rig(self.workers, job, alone))
             return max(
-                await _answers_of(found),
+                await answers_of(found),
                 key=lambda one: (one.answer.pose is not None, one.answer.num_inliers),
             )
 
@@ -272,7 +266,7 @@ class Engine:
             VislocError: what the store raises.
         """
         async with self._catalog.using(start.maps, self.workers) as maps:
-            sets, alone = _parted(maps, start.priors)
+            sets, alone = parted(maps, start.priors)
             if sets and len(maps) > 1:
                 raise InvalidInput(
                     "sequence.set",
@@ -300,7 +294,7 @@ class Engine:
         state = await run(worker.open_sequence, start, maps)
         if isinstance(instants, Sequence):
             for instant in instants:
-                _check_no_tiles(maps, instant.priors or NO_PRIORS)
+                check_no_tiles(maps, instant.priors or NO_PRIORS)
             bare = [without_photos(instant) for instant in instants]
             state, _ = await run(worker.check_instants, state, maps, 0, bare)
         index = 0
@@ -308,7 +302,7 @@ class Engine:
             async for instant in _in_turn(instants):
                 bare = [without_photos(instant)]
                 state, (priors,) = await run(worker.check_instants, state, maps, index, bare)
-                _check_no_tiles(maps, priors)
+                check_no_tiles(maps, priors)
                 seen = await look(
                     self.workers, maps, start.rig, instant.images, start.options, priors
                 )
@@ -402,55 +396,6 @@ class Engine:
             raise stopping_error()
         if not self._started:
             raise Unavailable("server.starting", "the maps are being loaded; try again shortly")
-
-
-async def _answers_of(searches: Sequence[Coroutine[Any, Any, T]]) -> list[T]:
-    """Search maps and sets at once; a set of which the priors leave nothing does not count.
-
-    Raises:
-        NotFound: ``set.no_tile`` when nothing else is searched.
-    """
-
-    async def of(search: Coroutine[Any, Any, T]) -> T | NotFound:
-        try:
-            return await search
-        except NotFound as error:
-            if error.code != "set.no_tile":
-                raise
-            return error
-
-    found = await together(of(search) for search in searches)
-    answers = [each for each in found if not isinstance(each, NotFound)]
-    nothing = [each for each in found if isinstance(each, NotFound)]
-    if not answers:
-        raise nothing[0]
-    return answers
-
-
-def _parted(
-    maps: Sequence[MapFolder], priors: Priors
-) -> tuple[tuple[MapFolder, ...], tuple[MapFolder, ...]]:
-    """Part sets of maps from maps on their own.
-
-    Raises:
-        InvalidInput: ``priors.maps`` when it names tiles where there is none.
-    """
-    sets = tuple(of for of in maps if of.is_set)
-    alone = tuple(of for of in maps if not of.is_set)
-    if alone:
-        _check_no_tiles(alone, priors)
-    return sets, alone
-
-
-def _check_no_tiles(maps: Sequence[MapFolder], priors: Priors) -> None:
-    if priors.maps is not None:
-        raise InvalidInput(
-            "priors.maps",
-            "only a set of maps has tiles",
-            field="priors.maps",
-            expected="a set of maps, or none of this",
-            got=", ".join(of.ref for of in maps),
-        )
 
 
 def _in_turn(instants: AsyncIterator[Instant] | Sequence[Instant]) -> AsyncIterator[Instant]:

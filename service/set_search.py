@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import asyncio
 from collections import defaultdict
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from dataclasses import dataclass, replace
 from time import time
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,14 @@ from service.together import together
 from service.worker import Chosen, MapFolder
 from service.workers import Workers
 from visloc.archive import SetOutline, TileRecord
-from visloc.errors import Conflict, MapCorrupt, NotFound, Unavailable, VislocError
+from visloc.errors import (
+    Conflict,
+    InvalidInput,
+    MapCorrupt,
+    NotFound,
+    Unavailable,
+    VislocError,
+)
 from visloc.priors import Priors
 from visloc.sets.choosing import (
     Found,
@@ -48,6 +55,7 @@ from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
 from visloc.types import InstantAnswer, Localized, LocalizeOptions, NotLocalized, Refusal
 
 AnyLocalization = TypeVar("AnyLocalization", Localization, InstantLocalization)
+T = TypeVar("T")
 
 # Codes that begin so say that a map cannot be had.
 _OF_A_MAP = ("map.", "maps.")
@@ -238,6 +246,60 @@ class SetSearch:
                 return row, error
 
         return await together(of(row) for row in rows)
+
+
+async def answers_of(searches: Sequence[Coroutine[Any, Any, T]]) -> list[T]:
+    """Search maps and sets at once; a set of which the priors leave nothing does not count.
+
+    Raises:
+        NotFound: ``set.no_tile`` when nothing else is searched.
+    """
+
+    async def of(search: Coroutine[Any, Any, T]) -> T | NotFound:
+        try:
+            return await search
+        except NotFound as error:
+            if error.code != "set.no_tile":
+                raise
+            return error
+
+    found = await together(of(search) for search in searches)
+    answers = [each for each in found if not isinstance(each, NotFound)]
+    nothing = [each for each in found if isinstance(each, NotFound)]
+    if not answers:
+        raise nothing[0]
+    return answers
+
+
+def parted(
+    maps: Sequence[MapFolder], priors: Priors
+) -> tuple[tuple[MapFolder, ...], tuple[MapFolder, ...]]:
+    """Part sets of maps from maps on their own.
+
+    Raises:
+        InvalidInput: ``priors.maps`` when it names tiles where there is none.
+    """
+    sets = tuple(of for of in maps if of.is_set)
+    alone = tuple(of for of in maps if not of.is_set)
+    if alone:
+        check_no_tiles(alone, priors)
+    return sets, alone
+
+
+def check_no_tiles(maps: Sequence[MapFolder], priors: Priors) -> None:
+    """Refuse priors that name tiles for maps that have none.
+
+    Raises:
+        InvalidInput: ``priors.maps``.
+    """
+    if priors.maps is not None:
+        raise InvalidInput(
+            "priors.maps",
+            "only a set of maps has tiles",
+            field="priors.maps",
+            expected="a set of maps, or none of this",
+            got=", ".join(of.ref for of in maps),
+        )
 
 
 def in_set(found: AnyLocalization, outline: SetOutline, tile: TileRecord) -> AnyLocalization:
