@@ -33,6 +33,13 @@ from mapping.landmarks import MadeLandmarks
 from mapping.outputs import refuse_existing
 from mapping.pairing import PAIRINGS, write_pairs
 from mapping.photos import MappingPhoto, collect_photos
+from mapping.places import (
+    is_remote,
+    open_store,
+    opened_dataset,
+    scratch_folder,
+    storage_errors,
+)
 from mapping.previews import keep_photos
 from mapping.publishing import PAIRS, publish_content
 from mapping.rgbd import DepthSettings, landmarks_from_depth, refuse_without_depth
@@ -75,9 +82,11 @@ class BuildSettings:
     """What a build is made of.
 
     Attributes:
-        dataset: kapture folder.
+        dataset: kapture folder, or the URL of one (``mapping.places``).
         map_id: id of the map.
-        maps_dir: folder of maps.
+        maps_dir: folder of maps, or the URL of one.
+        cache_dir: for maps of a URL: folder of their copies here.
+        work_dir: folder or URL where finished work is kept; None: beside the maps.
         method: a name of ``METHODS``.
         local_features: a name of ``visloc.features.LOCAL_FEATURES``, or ``kapture:TYPE`` for
             features that the dataset brings along.
@@ -127,6 +136,8 @@ class BuildSettings:
     executor: str = EXECUTORS[0]
     ray_address: str = "auto"
     force: bool = False
+    work_dir: Path | None = None
+    cache_dir: Path = Path("maps-cache")
 
 
 def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None = None) -> Path:
@@ -141,7 +152,7 @@ def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None =
         costs: told what the stages cost.
 
     Returns:
-        The folder of the new version.
+        The folder of the new version; of maps of a URL, that of the copy here.
 
     Raises:
         Conflict: ``map.exists`` without ``force``; ``build.running``.
@@ -149,7 +160,7 @@ def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None =
         Unavailable: ``storage.failed`` when the disk is full or broken; what executors raise.
     """
     _check(settings)
-    store = MapStore(settings.maps_dir)
+    store = open_store(settings.maps_dir, settings.cache_dir)
     versions = store.versions(settings.map_id)
     # Versions of which none is current are what a build left that was killed while it published.
     if versions and settings.map_id in store.ids() and not settings.force:
@@ -161,23 +172,28 @@ def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None =
         )
     if not is_ready_made(settings.local_features):  # raises when it cannot
         open_extractor(settings.local_features, settings.weights_dir, settings.inference)
-    dataset = read_dataset(settings.dataset).with_pixels_from(settings.pixel_origin)
-    work_root = settings.maps_dir / ".work" / settings.map_id
+    scratch = scratch_folder(settings.maps_dir, settings.cache_dir, settings.map_id)
+    work = WorkFolder((settings.work_dir or settings.maps_dir / ".work") / settings.map_id)
     try:
-        with exclusive(work_root.with_name(f"{work_root.name}.lock")):
+        with (
+            opened_dataset(settings.dataset) as dataset,
+            exclusive(scratch.with_name(f"{scratch.name}.lock")),
+        ):
             with open_executor(
                 settings.executor, settings.workers, settings.ray_address
             ) as workers:
                 if costs is not None:
                     progress = costs.measured(progress, workers)
-                folder = _build(settings, dataset, store, work_root, workers, progress)
-            shutil.rmtree(work_root, ignore_errors=True)
-    except OSError as error:
+                dataset = dataset.with_pixels_from(settings.pixel_origin)
+                folder = _build(settings, dataset, store, work, scratch, workers, progress)
+            work.remove()
+            shutil.rmtree(scratch, ignore_errors=True)
+    except storage_errors() as error:
         raise Unavailable(
             "storage.failed",
-            f"reading or writing failed: {error.strerror or error}; "
+            f"reading or writing failed: {getattr(error, 'strerror', None) or error}; "
             "finished work is kept, the same command resumes",
-            field=str(error.filename or work_root),
+            field=str(getattr(error, "filename", None) or work.root),
         ) from error
     return folder
 
@@ -237,6 +253,17 @@ def _check(settings: BuildSettings) -> None:
             got=settings.method,
         )
     _check_names("--executor", (settings.executor,), EXECUTORS)
+    if is_remote(settings.dataset) and (
+        settings.method == "model"
+        or any(is_ready_made(n) for n in (settings.local_features, *settings.global_features))
+    ):
+        raise InvalidInput(
+            "build.dataset",
+            "features and points that a dataset brings along are not read from a URL",
+            field="dataset",
+            expected="a folder, for --method model and kapture:TYPE",
+            got=str(settings.dataset),
+        )
     names = settings.global_features
     if not names or "" in names or len(set(names)) < len(names):
         raise InvalidInput(
@@ -327,11 +354,11 @@ def _build(
     settings: BuildSettings,
     dataset: Dataset,
     store: MapStore,
-    work_root: Path,
+    work: WorkFolder,
+    scratch: Path,
     workers: Executor,
     progress: Progress,
 ) -> Path:
-    work = WorkFolder(work_root)
     features = local_features_source(
         work,
         settings.dataset,
@@ -387,7 +414,7 @@ def _build(
         settings, dataset, photos, features, global_features, made, (*dataset.notes, *notes)
     )
     kept = [photos[row] for row in made.photos] if settings.keep_photos else []
-    return _publish(settings, content, made, kept, store, work_root, workers, progress)
+    return _publish(settings, content, made, kept, store, work, scratch, workers, progress)
 
 
 def _refuse_early(
@@ -550,16 +577,17 @@ def _publish(
     made: MadeLandmarks,
     kept: Sequence[MappingPhoto],
     store: MapStore,
-    work_root: Path,
+    work: WorkFolder,
+    scratch: Path,
     workers: Executor,
     progress: Progress,
 ) -> Path:
-    incoming = work_root / "incoming"
+    incoming = scratch / "incoming"
     shutil.rmtree(incoming, ignore_errors=True)  # of a build that was killed here
     incoming.mkdir(parents=True)
     try:
         if kept:
-            keep_photos(WorkFolder(work_root), incoming, kept, workers, progress)
+            keep_photos(work, incoming, kept, workers, progress)
         progress("archive", 0, 1)
         if made.pairs is not None:
             write_pairs(incoming / PAIRS, *made.pairs)

@@ -239,7 +239,7 @@ def _read_raw(path: Path, camera: Camera) -> NDArray[np.float32]:
             expected=f"{expected} bytes, float32 of {camera.width} x {camera.height}",
             got=f"{size} bytes",
         )
-    values = np.fromfile(path, dtype="<f4").astype(np.float32, copy=False)
+    values = np.frombuffer(path.read_bytes(), dtype="<f4").astype(np.float32)
     return values.reshape(camera.height, camera.width)
 
 

@@ -21,7 +21,7 @@ class MappingPhoto:
     Attributes:
         record: its name, sensor and timestamp in the dataset.
         path: the file; it exists when ``sha256`` is not None.
-        sha256: of the file.
+        sha256: of the file; of one below a URL, what its storage says instead.
         camera: intrinsics.
         camera_known: whether they are the dataset's; else a guess to start from.
         cam_from_world: pose, when known.
@@ -101,12 +101,12 @@ def collect_photos(
                 MappingPhoto(
                     record,
                     path,
-                    _checksum(path) if with_files else None,
+                    _checksum(dataset, record) if with_files else None,
                     camera or _guessed_camera(dataset, record),
                     camera is not None,
                     pose,
                     depth,
-                    _checksum(dataset.path_of(depth.record)) if depth else None,
+                    _checksum(dataset, depth.record) if depth else None,
                 )
             )
         progress(done, len(dataset.images))
@@ -138,9 +138,10 @@ def _guessed_camera(dataset: Dataset, record: FileRecord) -> Camera:
     return Camera("SIMPLE_RADIAL", width, height, (focal, width / 2, height / 2, 0.0))
 
 
-def _checksum(path: Path) -> str:
+def _checksum(dataset: Dataset, record: FileRecord) -> str:
+    path = dataset.path_of(record)
     try:
-        return sha256_of(path)
+        return sha256_of(path) if dataset.files is None else dataset.files.identity(record.path)
     except OSError as error:
         raise DatasetError(
             "dataset.unreadable", f"cannot be read: {error.strerror}", field=str(path)

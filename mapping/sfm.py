@@ -236,7 +236,9 @@ class _ModelTask:
         def compute() -> Item:
             make = reconstruct if self.estimate_poses else triangulate
             given = [self._given(photo) for photo in self.photos]
-            model = make(given, self.rigs, self.matches, self.config, self.refine, self.work.root)
+            model = make(
+                given, self.rigs, self.matches, self.config, self.refine, self.work.scratch
+            )
             return _to_item(model)
 
         self.work.get(key, compute)

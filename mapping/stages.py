@@ -12,9 +12,12 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import io
 import json
 import os
 import platform
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.costs import wrote
+from mapping.places import is_remote, remove_folder
 from visloc.archive.npz import read_npz
 from visloc.errors import Conflict, Unavailable
 
@@ -48,9 +52,25 @@ def key_of(stage: str, revision: int, **inputs: object) -> str:
 
 @dataclass(frozen=True, slots=True)
 class WorkFolder:
-    """Finished items of a build, found again after an interruption."""
+    """Finished items of a build, found again after an interruption.
+
+    Attributes:
+        root: a folder, or a URL of object storage, where what is written appears whole.
+    """
 
     root: Path
+
+    @property
+    def scratch(self) -> Path:
+        """A folder of this machine for temporary files."""
+        return Path(tempfile.gettempdir()) if is_remote(self.root) else self.root
+
+    def remove(self) -> None:
+        """Remove all items."""
+        if is_remote(self.root):
+            remove_folder(self.root)
+        else:
+            shutil.rmtree(self.root, ignore_errors=True)
 
     def has(self, key: str) -> bool:
         """Tell whether an item is finished."""
@@ -60,10 +80,18 @@ class WorkFolder:
         """Read a finished item.
 
         Raises:
-            Unavailable: ``build.damaged_item``.
+            Unavailable: ``build.damaged_item``, ``build.missing_item``.
         """
         try:
             return self._load(key)
+        except FileNotFoundError as error:
+            raise Unavailable(
+                "build.missing_item",
+                "finished work is not there: it was removed, or this work folder is not that of "
+                "the machine that did it; the same command makes it again",
+                field=str(self._path(key)),
+                expected="one work folder for all machines, see --work-dir",
+            ) from error
         except ValueError as error:
             self._path(key).unlink(missing_ok=True)
             raise Unavailable(
@@ -80,6 +108,11 @@ class WorkFolder:
         except (FileNotFoundError, ValueError):
             item = compute()
         path = self._path(key)
+        if is_remote(path):
+            buffer = io.BytesIO()
+            np.savez(buffer, **item)  # type: ignore[arg-type]  # the stub knows no **arrays
+            wrote(path.write_bytes(buffer.getvalue()))
+            return item
         path.parent.mkdir(parents=True, exist_ok=True)
         # Machines may share the folder.
         unfinished = path.with_suffix(f".{platform.node()}.{os.getpid()}.tmp")
@@ -90,7 +123,8 @@ class WorkFolder:
         return item
 
     def _load(self, key: str) -> Item:
-        arrays = read_npz(self._path(key), _KINDS)
+        path = self._path(key)
+        arrays = read_npz(path.read_bytes() if is_remote(path) else path, _KINDS)
         # Copied, to be writable as what was computed is.
         return {name: array.copy() for name, array in arrays.items()}
 

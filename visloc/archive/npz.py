@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import math
 import tokenize
 import zipfile
@@ -17,14 +18,14 @@ _ENCRYPTED = 0x1  # bit of a zip entry's flags
 _EMPTY_BYTES = 22  # a zip archive of nothing
 
 
-def read_npz(path: Path, kinds: str = "biuf") -> dict[str, NDArray[Any]]:
+def read_npz(archive: Path | bytes, kinds: str = "biuf") -> dict[str, NDArray[Any]]:
     """Read the arrays of an archive without compression; they are read-only.
 
     No more memory is taken than the file is long, whatever its headers announce: entries that are
     compressed, and arrays whose shape is not that of their entry, are refused before they are read.
 
     Args:
-        path: the archive.
+        archive: its file, or what is in it.
         kinds: NumPy's letters of the types that are allowed: numbers and truth values.
 
     Raises:
@@ -32,12 +33,14 @@ def read_npz(path: Path, kinds: str = "biuf") -> dict[str, NDArray[Any]]:
         OSError: the file cannot be read.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            entries = archive.infolist()
-            _check_entries(entries, path.stat().st_size)
+        source = io.BytesIO(archive) if isinstance(archive, bytes) else archive
+        size = len(archive) if isinstance(archive, bytes) else archive.stat().st_size
+        with zipfile.ZipFile(source) as opened:
+            entries = opened.infolist()
+            _check_entries(entries, size)
             arrays = {}
             for entry in entries:
-                with archive.open(entry) as file:
+                with opened.open(entry) as file:
                     arrays[entry.filename.removesuffix(_SUFFIX)] = _read_array(file, entry, kinds)
             return arrays
     except (zipfile.BadZipFile, NotImplementedError, EOFError, OverflowError) as error:

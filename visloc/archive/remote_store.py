@@ -45,6 +45,7 @@ from visloc.archive.store import (
     MapStore,
     checked_name,
     none_in_use,
+    outdated,
     read_published_outline,
     refuse_renamed,
     version_exists,
@@ -230,7 +231,13 @@ class RemoteMapStore:
             return copy
 
     def publish(
-        self, incoming: Path, map_id: str, version: str, *, make_current: bool = True
+        self,
+        incoming: Path,
+        map_id: str,
+        version: str,
+        *,
+        make_current: bool = True,
+        based_on: str | None = None,
     ) -> Path:
         """Verify a map and write it to the storage; manifest last, then ``current``.
 
@@ -247,6 +254,8 @@ class RemoteMapStore:
             known = self._versions_now(map_id)
             if version in known.versions:
                 raise version_exists(map_id, version)
+            if based_on is not None and known.current != based_on:
+                raise outdated(map_id, based_on, known.current)
             manifest = read_any_manifest(incoming)
             refuse_other_kind(manifest, self._any_version(map_id, known))
             refuse_missing_tiles(manifest, self._manifest)

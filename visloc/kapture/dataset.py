@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Protocol
 
 from visloc.geometry import Camera, PixelOrigin, Pose
 
@@ -85,6 +86,26 @@ class GnssRecord:
     dop: float
 
 
+class RecordFiles(Protocol):
+    """Where files of records lie that are not below their dataset, by their names."""
+
+    def path_of(self, name: str) -> Path:
+        """Where a file should lie."""
+        ...
+
+    def has(self, name: str) -> bool:
+        """Whether it is there."""
+        ...
+
+    def identity(self, name: str) -> str:
+        """What changes when its content does."""
+        ...
+
+    def without_listing(self) -> RecordFiles:
+        """The same places, without knowing what is there."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Dataset:
     """What the ``sensors`` folder of a kapture dataset says.
@@ -99,6 +120,7 @@ class Dataset:
         depth_maps: sorted the same way.
         gnss: sorted by (timestamp, sensor_id).
         notes: what was tolerated in reading, one sentence each, with file and count.
+        files: where photos and depth maps lie, when not in ``sensors/records_data``.
     """
 
     root: Path
@@ -109,6 +131,7 @@ class Dataset:
     depth_maps: tuple[FileRecord, ...]
     gnss: tuple[GnssRecord, ...]
     notes: tuple[str, ...] = ()
+    files: RecordFiles | None = None
     _rigs_of_sensor: Mapping[str, list[str]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -139,11 +162,16 @@ class Dataset:
 
     def path_of(self, record: FileRecord) -> Path:
         """Return where the record's file should lie; it may be missing."""
+        if self.files is not None:
+            return self.files.path_of(record.path)
         return self.root / "sensors" / "records_data" / record.path
 
     def without_records(self) -> Dataset:
         """Return what it takes to find files: this dataset, light enough to be sent to others."""
-        return replace(self, trajectories={}, images=(), depth_maps=(), gnss=(), notes=())
+        files = None if self.files is None else self.files.without_listing()
+        return replace(
+            self, trajectories={}, images=(), depth_maps=(), gnss=(), notes=(), files=files
+        )
 
     def with_pixels_from(self, origin: PixelOrigin) -> Dataset:
         """Return this dataset in our convention, when its calibrations count from ``origin``."""
@@ -159,6 +187,8 @@ class Dataset:
 
     def has_file(self, record: FileRecord) -> bool:
         """Tell whether the record's file is there."""
+        if self.files is not None:
+            return self.files.has(record.path)
         # Path.is_file raises for names that are longer than a file's name can be.
         return os.path.isfile(self.path_of(record))  # noqa: PTH113
 

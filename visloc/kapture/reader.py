@@ -11,7 +11,14 @@ from collections.abc import Container, Mapping
 from pathlib import Path
 
 from visloc.geometry import CAMERA_MODELS, MAX_IMAGE_SIDE, Camera, Pose
-from visloc.kapture.dataset import UNKNOWN_CAMERA, Dataset, FileRecord, GnssRecord, Sensor
+from visloc.kapture.dataset import (
+    UNKNOWN_CAMERA,
+    Dataset,
+    FileRecord,
+    GnssRecord,
+    RecordFiles,
+    Sensor,
+)
 from visloc.kapture.rigs import unroll_rigs
 from visloc.kapture.table import Table
 from visloc.kapture.text import relative_path
@@ -19,10 +26,14 @@ from visloc.kapture.text import relative_path
 _NEWEST_VERSION = (1, 1)
 
 
-def read_dataset(root: Path) -> Dataset:
+def read_dataset(root: Path, files: RecordFiles | None = None) -> Dataset:
     """Read sensors, rigs, trajectories and the camera, depth and GNSS records of a dataset.
 
     Only ``sensors/sensors.txt`` must exist. What is tolerated is told in ``notes``.
+
+    Args:
+        root: the dataset.
+        files: where photos and depth maps lie, when not in its ``sensors/records_data``.
 
     Raises:
         DatasetError: codes ``kapture.*``, ``camera.*`` and ``pose.*``; the field is the file,
@@ -32,10 +43,10 @@ def read_dataset(root: Path) -> Dataset:
     sensors = _read_sensors(root, notes)
     rigs = _read_rigs(root, sensors, notes)
     trajectories = _read_trajectories(root, sensors.keys() | rigs.keys(), notes)
-    images = _read_files(root, "records_camera.txt", "camera", sensors, notes)
-    depth_maps = _read_files(root, "records_depth.txt", "depth", sensors, notes)
+    images = _read_files(root, "records_camera.txt", "camera", sensors, notes, files)
+    depth_maps = _read_files(root, "records_depth.txt", "depth", sensors, notes, files)
     gnss = _read_gnss(root, sensors, notes)
-    return Dataset(root, sensors, rigs, trajectories, images, depth_maps, gnss, tuple(notes))
+    return Dataset(root, sensors, rigs, trajectories, images, depth_maps, gnss, tuple(notes), files)
 
 
 def _read_sensors(root: Path, notes: list[str]) -> dict[str, Sensor]:
@@ -176,7 +187,12 @@ def _parse_pose(table: Table, fields: list[str]) -> Pose | None:
 
 
 def _read_files(
-    root: Path, name: str, kind: str, sensors: Mapping[str, Sensor], notes: list[str]
+    root: Path,
+    name: str,
+    kind: str,
+    sensors: Mapping[str, Sensor],
+    notes: list[str],
+    files: RecordFiles | None,
 ) -> tuple[FileRecord, ...]:
     table = Table(root, f"sensors/{name}", 3)
     if not table.exists():
@@ -209,7 +225,8 @@ def _read_files(
         paths.add(path)
         records[key] = FileRecord(*key, path)
         # Path.is_file would raise for a name that is too long.
-        if not os.path.isfile(data / path):  # noqa: PTH113
+        is_there = os.path.isfile(data / path) if files is None else files.has(path)  # noqa: PTH113
+        if not is_there:
             table.tolerate("files do not exist", path)
     notes += table.notes()
     return tuple(record for key in sorted(records) if (record := records[key]) is not None)
