@@ -68,6 +68,7 @@ from mapping.options import (
 )
 from mapping.packing import write_packed
 from mapping.pairing import PairSettings
+from mapping.places import open_store, place_of
 from mapping.progress import StageProgress
 from mapping.pruning.command import prune
 from mapping.report.command import report
@@ -108,9 +109,16 @@ _DEPTH_DEFAULTS, _SFM_DEFAULTS, _PAIR_DEFAULTS = DepthSettings(), SfmSettings(),
 
 @app.command()
 def build(
-    dataset: DatasetArgument,
+    dataset: Annotated[
+        str, typer.Argument(help="kapture folder (holds sensors/), or the URL of one.")
+    ],
     map_id: Annotated[str, typer.Option("--map", help="Id of the map.")],
-    maps_dir: MapsDirOption = Path("maps"),
+    maps_dir: Annotated[
+        str,
+        typer.Option(
+            "--maps-dir", envvar="VISLOC_MAPS_DIR", help="Folder of maps, or the URL of one."
+        ),
+    ] = "maps",
     method: Annotated[
         str,
         typer.Option(
@@ -170,6 +178,23 @@ def build(
             rich_help_panel=CLUSTER_PANEL,
         ),
     ] = "auto",
+    work_dir: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FOLDER|URL",
+            help="Where finished work is kept until the map is published, the same for all "
+            "machines; left out: .work in --maps-dir.",
+            rich_help_panel=CLUSTER_PANEL,
+        ),
+    ] = None,
+    cache_dir: Annotated[
+        Path,
+        typer.Option(
+            envvar="VISLOC_CACHE_DIR",
+            help="With a URL of maps: folder of the copy that stays here.",
+            rich_help_panel=CLUSTER_PANEL,
+        ),
+    ] = Path("maps-cache"),
     force: Annotated[
         bool, typer.Option("--force", help="Publish a new version of a map that exists.")
     ] = False,
@@ -236,10 +261,11 @@ def build(
         raise InvalidInput(
             "build.poses", "unknown", field="--poses", expected="given or estimate", got=poses
         )
+    maps = place_of(maps_dir, "--maps-dir")
     settings = BuildSettings(
-        dataset=dataset,
+        dataset=place_of(dataset, "dataset"),
         map_id=map_id,
-        maps_dir=maps_dir,
+        maps_dir=maps,
         method=method,
         local_features=local_features,
         global_features=_names(global_features),
@@ -262,7 +288,7 @@ def build(
             pairs_file=pairs_file,
             covisible_in=None
             if covisible_in is None
-            else open_map(map_folder(covisible_in, maps_dir)),
+            else open_map(_map_folder(covisible_in, maps, cache_dir)),
             mapper=mapper,
             refine=_names(refine),
             estimate_poses=poses == "estimate",
@@ -273,6 +299,8 @@ def build(
         workers=workers,
         executor=executor,
         ray_address=ray_address,
+        work_dir=None if work_dir is None else place_of(work_dir, "--work-dir"),
+        cache_dir=cache_dir,
         force=force,
     )
     _build(settings)
@@ -354,6 +382,10 @@ def calibrate_rig_command(
     write_calibration(calibration, target)
     print_rig(_out, calibration)
     _out.print(f"rig: {target}", highlight=False, soft_wrap=True)
+
+
+def _map_folder(ref: str, maps_dir: Path, cache_dir: Path) -> Path:
+    return Path(ref) if is_map_folder(ref) else open_store(maps_dir, cache_dir).folder(ref)
 
 
 def _build(settings: BuildSettings) -> None:
