@@ -31,23 +31,28 @@ def place_of(text: str, option: str) -> Path:
     """
     if "://" not in text:
         return Path(text)
+    if "::" in text or "@" in text:
+        raise _bad_url(option, "credentials, or a URL of several parts")
     try:
         from upath import UPath  # with the libraries of URLs, which are optional
 
-        if "::" in text or "@" in text:
-            raise ValueError("credentials and URLs of several parts (::) are not taken")
         # Other machines write there too.
         place = UPath(text, use_listings_cache=False)
         place.fs  # noqa: B018  raises where the library of this kind of URL is missing
     except (ImportError, ValueError) as error:
-        raise InvalidInput(
-            "build.url",
-            "the URL cannot be used",
-            field=option,
-            expected="a folder, or a URL such as s3://BUCKET/FOLDER, with visloc[cluster] installed",
-            got=str(error),
-        ) from error
+        raise _bad_url(option, str(error)) from error
     return cast("Path", place)
+
+
+def _bad_url(option: str, got: str) -> InvalidInput:
+    return InvalidInput(
+        "build.url",
+        "the URL cannot be used",
+        field=option,
+        expected="a folder, or a URL such as s3://BUCKET/FOLDER with visloc[cluster] installed; "
+        "credentials come from the environment",
+        got=got,
+    )
 
 
 def is_remote(place: Path) -> bool:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
+import fsspec
 import numpy as np
 import pytest
+from moto.server import ThreadedMotoServer
 from numpy.typing import NDArray
+from s3fs import S3FileSystem
 
 from mapping.build import BuildSettings, build_map
 from mapping.sample import write_sample
@@ -127,3 +130,23 @@ def rgbd_walk(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Map:
 def sfm_walk(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Map:
     """The walk as a map by matches with default settings; only to be read."""
     return _build_walk(walk / "mapping", tmp_path_factory.mktemp("sfm"))
+
+
+@pytest.fixture(scope="module")
+def bucket(walk: Path) -> Iterator[str]:
+    """The URL of a bucket that holds the walk's dataset in ``walk``."""
+    server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+        patch.setenv("AWS_ACCESS_KEY_ID", "AKIDEXAMPLE")
+        patch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
+        patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+        S3FileSystem.clear_instance_cache()  # of other servers
+        storage = fsspec.filesystem("s3", use_listings_cache=False)
+        storage.mkdir("cluster")
+        storage.put(f"{walk / 'mapping'}/", "cluster/walk/", recursive=True)
+        yield "s3://cluster"
+    S3FileSystem.clear_instance_cache()
+    server.stop()

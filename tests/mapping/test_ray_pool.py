@@ -19,6 +19,7 @@ from benchmarks.cluster import busy_workers
 from mapping import ray_pool
 from mapping.build import BuildSettings, build_map
 from mapping.executors import open_executor
+from mapping.places import place_of
 from mapping.ray_pool import RayPool
 from visloc.archive import Map, open_map
 from visloc.errors import InvalidInput, Unavailable
@@ -27,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Path]:
+def cluster(bucket: str) -> Iterator[Path]:  # noqa: ARG001  its workers know how to reach it
     """The folder of a cluster with two processors that ``auto`` finds."""
     # Short: the names of sockets are within it.
     folder = Path(tempfile.mkdtemp(prefix="ray", dir="/tmp"))
@@ -146,6 +147,7 @@ def test_a_machine_with_another_version_is_refused(
 @pytest.mark.parametrize("method", ["rgbd", "sfm"])
 def test_a_build_whose_workers_are_killed_makes_the_map_of_a_local_build(
     cluster: Path,
+    bucket: str,
     walk: Path,
     tmp_path: Path,
     request: pytest.FixtureRequest,
@@ -170,6 +172,7 @@ def test_a_build_whose_workers_are_killed_makes_the_map_of_a_local_build(
         max_keypoints=500,
         executor="ray",
         workers=2,
+        work_dir=place_of(f"{bucket}/ray", "--work-dir") if method == "sfm" else None,
     )
     built = open_map(build_map(settings, kill_one))
     assert len(killed) == (2 if method == "sfm" else 1)
