@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -145,8 +146,9 @@ def bucket(walk: Path) -> Iterator[str]:
         patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
         S3FileSystem.clear_instance_cache()  # of other servers
         storage = fsspec.filesystem("s3", use_listings_cache=False)
-        storage.mkdir("cluster")
-        storage.put(f"{walk / 'mapping'}/", "cluster/walk/", recursive=True)
-        yield "s3://cluster"
+        name = f"bucket-{secrets.token_hex(4)}"  # what is in a server outlives it in a process
+        storage.mkdir(name)
+        storage.put(f"{walk / 'mapping'}/", f"{name}/walk/", recursive=True)
+        yield f"s3://{name}"
     S3FileSystem.clear_instance_cache()
     server.stop()
