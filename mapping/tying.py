@@ -48,6 +48,8 @@ class Seen:
         pixels: (n, 2) float64, inliers of ``pose_there``.
         points: (n, 3) float64, what they see, in the other frame.
         pose_there: cam_from_there, as it was localized.
+        own_points: (n, 3) float64, the same points where depth puts them in the photo's own frame;
+            None where it does not.
     """
 
     pose_here: Pose
@@ -55,6 +57,7 @@ class Seen:
     pixels: NDArray[np.float64]
     points: NDArray[np.float64]
     pose_there: Pose
+    own_points: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,6 +110,11 @@ def tie(
             break
         chosen = [view for view, use in zip(views, agrees, strict=True) if use]
         similarity = _refined(chosen, similarity, rigid=rigid)
+        agrees = _agreeing(views, similarity, _AGREES)
+    chosen = [view for view, use in zip(views, agrees, strict=True) if use]
+    if chosen and all(view.seen.own_points is not None for view in chosen):
+        here, there = (np.concatenate(side) for side in zip(*map(_points, chosen), strict=True))
+        similarity = refined_on_points(similarity, here, there, rigid=rigid)
         agrees = _agreeing(views, similarity, _AGREES)
     tied = agrees[: len(photos)]
     if tied.sum() < max(MIN_PHOTOS, len(photos) // 2 + 1):
@@ -181,7 +189,10 @@ class _View:
     def thinned(self, count: int) -> _View:
         """Keep at most so many matches, evenly."""
         step = -(-len(self.seen.pixels) // count)
-        thin = replace(self.seen, pixels=self.seen.pixels[::step], points=self.seen.points[::step])
+        seen = self.seen
+        thin = replace(
+            seen, pixels=seen.pixels[::step], points=seen.points[::step], own_points=None
+        )
         return _View(thin, self.forward)
 
     def estimate(self) -> tuple[Pose, Pose]:
@@ -206,6 +217,13 @@ class _View:
     def max_error_px(self) -> float:
         """That of an inlier when it was localized."""
         return registration_for(LocalizeOptions(), [self.seen.camera]).max_error_px
+
+
+def _points(view: _View) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What a photo sees, in this frame and in the other, where depth tells."""
+    own, other = view.seen.own_points, view.seen.points
+    assert own is not None
+    return (own, other) if view.forward else (other, own)
 
 
 def _proposed(views: Sequence[_View], *, rigid: bool, seed: int) -> Similarity:

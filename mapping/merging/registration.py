@@ -56,8 +56,11 @@ def register(a: Map, b: Map, min_overlap: float, progress: Progress) -> Registra
     described = describe_together((a, b))
     progress("describing", 1, 1)
     rows_a, rows_b = np.split(described.descriptors, [len(a.images)])
-    seen, tried = _seen(b, a, rows_b, rows_a, lambda *done: progress("B in A", *done))
-    back, _ = _seen(a, b, rows_a, rows_b, lambda *done: progress("A in B", *done))
+    depth = all(opened.manifest.method.name == "rgbd" for opened in (a, b))
+    seen, tried = _seen(b, a, rows_b, rows_a, lambda *done: progress("B in A", *done), depth=depth)
+    back: dict[int, Seen] = {}
+    if len(seen) >= MIN_PHOTOS:  # else it is refused below
+        back, _ = _seen(a, b, rows_a, rows_b, lambda *done: progress("A in B", *done), depth=depth)
     rigid = a.manifest.world.metric and b.manifest.world.metric
     found = tie(list(seen.values()), list(back.values()), rigid=rigid)
     if isinstance(found, str):
@@ -85,9 +88,15 @@ def _seen(
     own_rows: NDArray[np.float32],
     rows: NDArray[np.float32],
     progress: Callable[[int, int], None],
+    *,
+    depth: bool,
 ) -> tuple[dict[int, Seen], int]:
-    """Localize photos of one map in another; those that are, by row, and how many were tried."""
+    """Localize photos of one map in another; those that are, by row, and how many were tried.
+
+    With ``depth`` both maps know where a landmark is as well as depth does.
+    """
     options, geometry = LocalizeOptions(), MapGeometry(target)
+    source_origin = np.array(source.manifest.world.origin)
     chosen = np.linspace(0, len(source.images) - 1, min(len(source.images), _MAX_TRIED))
     tried = np.unique(chosen.astype(np.int64)).tolist()
     found = {}
@@ -99,12 +108,14 @@ def _seen(
         if solved.answer.refusal is not None or solved.pose is None:
             continue
         inliers, local = solved.inliers[0], solved.pose.rig_from_world
+        own = source.observations(image)[0][matched.keypoints][inliers]
         row = source.image_poses[image]
         found[image] = Seen(
             pose_here=Pose.from_quaternion(row[:4], row[4:]),
             camera=source.cameras[source.images[image].camera],
             pixels=source.keypoints(image)[matched.keypoints][inliers].astype(np.float64),
             points=target.landmarks[matched.landmarks][inliers] + geometry.origin,
+            own_points=source.landmarks[own] + source_origin if depth else None,
             pose_there=Pose(local.rotation, local.translation - local.rotation @ geometry.origin),
         )
     progress(len(tried), len(tried))

@@ -100,6 +100,27 @@ def test_photos_that_go_back_count_too() -> None:
     )
 
 
+def test_points_that_depth_gave_in_both_frames_tell_more() -> None:
+    random = np.random.default_rng(12)
+    photos = [
+        replace(
+            seen,
+            own_points=SCALED.inverse().apply(seen.points)
+            + random.normal(scale=0.005, size=seen.points.shape),
+        )
+        for seen in seen_photos(SCALED, seed=12, count=5, noise_px=2.0)
+    ]
+    bare = [replace(seen, own_points=None) for seen in photos]
+    found, without = (tie(some, rigid=False) for some in (photos, bare))
+
+    assert isinstance(found, Tie)
+    assert isinstance(without, Tie)
+    distance, angle = error_of(found.there_from_here, SCALED, np.zeros(3))
+    assert distance < 0.003 < error_of(without.there_from_here, SCALED, np.zeros(3))[0]
+    assert angle < 0.02
+    assert found.tied.all()
+
+
 def test_photos_that_were_localized_elsewhere_do_not_count() -> None:
     good = seen_photos(THERE_FROM_HERE, seed=5)
     wrong = seen_photos(
