@@ -120,7 +120,8 @@ def of_held_out_photos(
     viewpoints = Viewpoints.of(before)
     geometries = MapGeometry(before), MapGeometry(after)
     chosen = np.linspace(0, len(photo_rows) - 1, min(len(photo_rows), _MAX_HELD_OUT)).astype(int)
-    count, errors = 0, ([], [])  # type: tuple[int, tuple[list[tuple[float, float]], ...]]
+    count = 0
+    errors: tuple[list[tuple[float, float]], ...] = ([], [])
     for done, image in enumerate(chosen.tolist()):
         progress(done, len(chosen))
         sets = left_out_sets(before, viewpoints, image)

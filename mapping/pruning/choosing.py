@@ -33,6 +33,8 @@ _COVERED_WITHIN = 0.4
 # With fewer in a photo, its neighbourhood is lost: a pose needs 30 inliers.
 _LEAST = 50
 _HEADER_BYTES = 128  # of an ``.npy``
+# Neither is needed to localize, nor true of a part of the photos.
+LEFT_OUT = ("pairs.txt", "imported_points.npz")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,10 +121,6 @@ def _shortened(size: int, share: float) -> int:
     return _HEADER_BYTES + math.ceil((size - _HEADER_BYTES) * share)
 
 
-# Neither is needed to localize, nor true of a part of the photos.
-LEFT_OUT = ("pairs.txt", "imported_points.npz")
-
-
 def num_landmarks(opened: Map, kept: Kept) -> int:
     """How many landmarks a map has with what is kept."""
     return len(np.unique(opened.observation_landmarks[kept.observations]))
@@ -166,11 +164,10 @@ def _turns(opened: Map) -> NDArray[np.int64]:
 def _ranks(group: NDArray[np.int64], *keys: NDArray[np.generic]) -> NDArray[np.int64]:
     """The place of each row in its group when rows are sorted by keys, the last one first."""
     order = np.lexsort((*keys, group))
-    found, starts = np.unique(group[order], return_index=True)
+    _, starts = np.unique(group[order], return_index=True)
     sizes = np.diff(np.append(starts, len(group)))
     ranks = np.empty(len(group), np.int64)
     ranks[order] = np.arange(len(group)) - np.repeat(starts, sizes)
-    del found
     return ranks
 
 
