@@ -135,3 +135,5 @@ def print_update(out: Console, updated: Updated) -> None:
         f"map {opened.ref}: {counts.images} photos, {counts.landmarks} landmarks, "
         f"{counts.observations} observations"
     )
+    for note in updated.notes:
+        say(f"note: {note}")

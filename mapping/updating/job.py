@@ -97,10 +97,17 @@ class UpdateRecord:
 
 @dataclass(frozen=True, slots=True)
 class Updated:
-    """The folder of the new version, and what its manifest says of the update."""
+    """What an update made.
+
+    Attributes:
+        folder: of the new version.
+        record: what its manifest says of the update.
+        notes: that the update added: what was left out, one sentence each.
+    """
 
     folder: Path
     record: UpdateRecord
+    notes: tuple[str, ...]
 
 
 def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
@@ -143,7 +150,8 @@ def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
             "finished work is kept, the same command resumes",
             field=str(error.filename or work_root),
         ) from error
-    return Updated(folder, record)
+    notes = tuple(note for note in content.notes if note not in opened.manifest.notes)
+    return Updated(folder, record, notes)
 
 
 def _method(settings: UpdateSettings, opened: Map) -> str:
@@ -186,13 +194,13 @@ class _Job:
             with_depth=by_depth,
             progress=self.progress,
         )
-        if by_depth:
-            refuse_without_depth(self.dataset, capture.photos)
         count = len(capture.photos)
         rows = evenly(range(count), count if settings.poses == "localize" else _TIED_BY)
         # What does not fit is refused before the long work begins.
         first = self._described(capture.take(evenly(rows, _TRIED_FIRST)))
         refuse_elsewhere(self.opened, self._localized(first))
+        if by_depth:
+            refuse_without_depth(self.dataset, capture.photos)
         capture = self._described(capture)
         tried = capture.take(rows)
         placed = self._localized(tried)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -19,7 +20,7 @@ from mapping.sample import write_sample
 from mapping.updating import UpdateSettings, update_map
 from mapping.updating.job import Updated
 from visloc.archive import Map, MapStore, open_map, verify_map
-from visloc.errors import Conflict, InvalidInput
+from visloc.errors import Conflict, VislocError
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose, Similarity
 from visloc.kapture import Dataset, read_dataset, write_dataset
@@ -101,10 +102,10 @@ def errors_of_poses(opened: Map, walk: Path, first: int = 0) -> NDArray[np.float
     return np.array(errors)
 
 
-def refused(dataset: Path, maps_dir: Path, **changes: object) -> Conflict | InvalidInput:
+def refused(dataset: Path, maps_dir: Path, **changes: object) -> VislocError:
     """Why an update is refused; nothing may have changed."""
     before = MapStore(maps_dir).versions("walk")
-    with pytest.raises((Conflict, InvalidInput)) as caught:
+    with pytest.raises(VislocError) as caught:
         update(dataset, maps_dir, **changes)
     assert MapStore(maps_dir).versions("walk") == before
     return caught.value
@@ -206,6 +207,17 @@ def test_photos_of_another_room_are_refused(poses: str, maps_dir: Path, other_ro
     assert "expected half of 4 photos" in str(error)
 
 
+def test_another_place_is_told_from_a_capture_of_this_one_that_lacks_depth(
+    captures: Path, maps_dir: Path, other_room: Path, tmp_path: Path
+) -> None:
+    for dataset, code in ((other_room, "update.elsewhere"), (captures / "second", "no_depth")):
+        bare = tmp_path / code
+        shutil.copytree(
+            dataset, bare, symlinks=True, ignore=shutil.ignore_patterns("records_depth.txt")
+        )
+        assert code in refused(bare, maps_dir, capture="other").code
+
+
 def test_poses_that_are_said_to_be_in_the_maps_frame_are_taken_as_they_are(
     captures: Path, maps_dir: Path, walk: Path
 ) -> None:
@@ -244,10 +256,18 @@ def test_photos_without_poses_are_placed_where_they_localize(
     shutil.copytree(
         captures / "second", bare, symlinks=True, ignore=shutil.ignore_patterns("trajectories.txt")
     )
+    photo = bare / "sensors" / "records_data"
+    photo.unlink()  # a link
+    shutil.copytree(walk / "mapping" / "sensors" / "records_data", photo)
+    cv2.imwrite(str(photo / "mapping/left/0002.jpg"), np.zeros((192, 256, 3), np.uint8))
+
     done = update(bare, maps_dir, poses="localize")
-    errors = errors_of_poses(open_map(done.folder), walk, 8)
-    assert np.median(errors[:, 0]) < 0.01
-    assert done.record.photos == done.record.localized
+    opened = open_map(done.folder)
+    assert np.median(errors_of_poses(opened, walk, 8)[:, 0]) < 0.01
+    assert done.record.photos == done.record.localized == 7
+    assert done.record.not_localized == {"no_keypoints": 1}
+    assert done.notes == ("1 of 8 photos found no place: mapping/left/0002.jpg",)
+    assert done.notes[0] in opened.manifest.notes
 
 
 def test_the_same_names_need_a_name_for_the_capture(
@@ -361,7 +381,9 @@ def test_the_command_says_how_many_photos_were_tied_and_how_well(
             cli.main()
         return int(left.value.code or 0), *capsys.readouterr()
 
-    status, out, err = run("walk", other_room, "--capture=other", "--maps-dir", maps_dir)
+    status, out, err = run(
+        *("walk", other_room, "--capture=other", "--maps-dir", maps_dir, "--workers=1")
+    )
     assert (status, out) == (1, "")
     assert err.count("error [update.elsewhere]") == 1
 
