@@ -1,7 +1,7 @@
 """What a city takes, worked out from what other commands measured (docs/scale.md).
 
-    python -m benchmarks.capacity MAP QUERY_DATASET --build build.txt --tiles tiles.json
-        [--performance docs/performance.md] [--features faster2d2]
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.capacity MAP QUERY_DATASET --build build.txt
+        --tiles tiles.json [--performance docs/performance.md] [--features faster2d2]
 
 MAP is the folder of a map, such as maps/ID, build.txt what ``mapping build`` printed when it made
 it, and QUERY_DATASET a kapture dataset with photos as users send them. tiles.json is what
@@ -49,6 +49,8 @@ class Costs:
         query_core_s: seconds of one core that a query in one map takes, in a busy service.
         tile_core_s: ... that matching and solving in one more tile takes.
         coarse_core_s: ... that ranking all tiles takes.
+        open_core_s: ... that opening a tile takes.
+        open_bytes: anonymous memory of an open tile.
         tiles_searched: by a query without a prior, on average.
         query_bytes: of a photo that is sent.
     """
@@ -63,6 +65,8 @@ class Costs:
     query_core_s: float
     tile_core_s: float
     coarse_core_s: float
+    open_core_s: float
+    open_bytes: float
     tiles_searched: float
     query_bytes: float
 
@@ -104,14 +108,16 @@ class Capacity:
         build_core_s: seconds of one core that all photos take.
         build_machines: to do that in a night.
         index_core_s: seconds of one core to describe all photos for the coarse index.
-        query_core_s: seconds of one core that a query without a prior takes.
-        replicas: machines whose cores answer the queries.
-        replica_bytes: memory of one, without any tile.
-        in_memory: share of all tiles that the rest of its memory holds.
-        on_disk: share of all tiles that its disk holds.
-        received_share: of the network of all replicas, for the photos of queries.
-        fetched_share: of the network of one replica, for tiles that its disk does not hold, when
-            queries are spread evenly over the city and over the replicas.
+        query_core_s: seconds of one core that a query without a prior takes, its tiles open.
+        opening_core_s: what opening its tiles adds when queries are spread evenly over the city, so
+            that each worker process has few of them open.
+        replicas: machines whose cores answer the queries, tiles open.
+        replicas_opening: ... when queries are spread evenly.
+        replica_bytes: memory of a replica without any tile.
+        open_share: of all tiles that one worker process has open when memory is full.
+        disk_share: of all tiles that a replica's disk holds.
+        fill_s: to copy these from object storage.
+        received_share: of a replica's network, for the photos of queries.
     """
 
     tile_bytes: float
@@ -120,12 +126,14 @@ class Capacity:
     build_machines: int
     index_core_s: float
     query_core_s: float
+    opening_core_s: float
     replicas: int
+    replicas_opening: int
     replica_bytes: float
-    in_memory: float
-    on_disk: float
+    open_share: float
+    disk_share: float
+    fill_s: float
     received_share: float
-    fetched_share: float
 
 
 def capacity(costs: Costs, city: City, machine: Machine) -> Capacity:
@@ -137,11 +145,14 @@ def capacity(costs: Costs, city: City, machine: Machine) -> Capacity:
     build_core_s = city.photos * sum(costs.build_core_s.values())
     more_tiles = costs.tiles_searched - 1
     query_core_s = costs.query_core_s + costs.coarse_core_s + more_tiles * costs.tile_core_s
-    replicas = math.ceil(city.queries_per_s * query_core_s / machine.cores)
     replica_bytes = machine.cores * costs.process_bytes + costs.coarse_resident_bytes
-    on_disk = min(machine.disk_bytes / tiles_bytes, 1.0)
-    queries = city.queries_per_s / replicas
-    fetched_bytes = queries * costs.tiles_searched * (1 - on_disk) * tile_bytes
+    room = max(machine.memory_bytes - replica_bytes, 0) / machine.cores
+    open_share = min(room / costs.open_bytes / city.tiles, 1.0)
+    opening_core_s = costs.tiles_searched * (1 - open_share) * costs.open_core_s
+    replicas = math.ceil(city.queries_per_s * query_core_s / machine.cores)
+    every = query_core_s + opening_core_s
+    disk_share = min(machine.disk_bytes / tiles_bytes, 1.0)
+    received = city.queries_per_s / replicas * costs.query_bytes
     return Capacity(
         tile_bytes=tile_bytes,
         coarse_bytes=city.photos * costs.coarse_bytes,
@@ -149,12 +160,14 @@ def capacity(costs: Costs, city: City, machine: Machine) -> Capacity:
         build_machines=math.ceil(build_core_s / (machine.cores * city.night_h * 3600)),
         index_core_s=city.photos * costs.index_core_s,
         query_core_s=query_core_s,
+        opening_core_s=opening_core_s,
         replicas=replicas,
+        replicas_opening=math.ceil(city.queries_per_s * every / machine.cores),
         replica_bytes=replica_bytes,
-        in_memory=min(max(machine.memory_bytes - replica_bytes, 0) / tiles_bytes, 1.0),
-        on_disk=on_disk,
-        received_share=queries * costs.query_bytes / machine.network_bytes_per_s,
-        fetched_share=fetched_bytes / machine.network_bytes_per_s,
+        open_share=open_share,
+        disk_share=disk_share,
+        fill_s=disk_share * tiles_bytes / machine.network_bytes_per_s,
+        received_share=received / machine.network_bytes_per_s,
     )
 
 
@@ -222,11 +235,13 @@ def measured(
     models = {name: size for name, size in sizes.items() if name.endswith(".model.npz")}
     dims = max(record.dim for record in opened.manifest.global_features)
     steps = ("matching", "pose")
-    started = time.process_time()
     word_dim = opened.manifest.local_features.descriptor_dim
-    describe(opened, generated_model(BITS, BITS, word_dim=word_dim))
+    model = generated_model(dims, BITS, word_dim=word_dim)
+    started = time.process_time()
+    describe(opened, model)
     described_s = time.process_time() - started
     searched = tiles["without a prior"]
+    large = "Maps at scale"
     return Costs(
         build_core_s=stage_costs(built)[1],
         index_core_s=described_s / len(opened.images),
@@ -234,11 +249,12 @@ def measured(
         model_bytes=sum(models.values()) / dims,
         coarse_bytes=tiles["disk_bytes"][-1] / tiles["photos"],
         coarse_resident_bytes=tiles["resident_bytes"][0],
-        process_bytes=1e6
-        * cell(performance, "Maps at scale", "100 000", "process after all queries"),
+        process_bytes=1e6 * cell(performance, large, "100 000", "process after all queries"),
         query_core_s=cores / cell(performance, chapter, "concurrency 8", "queries per second"),
         tile_core_s=cores * sum(cell(performance, chapter, step, "`default`") for step in steps),
         coarse_core_s=searched["all_ms"][0] / 1e3,
+        open_core_s=cell(performance, large, "1 000", "opens in s"),
+        open_bytes=1e6 * cell(performance, large, "1 000", "anonymous MB: map, open"),
         tiles_searched=searched["searched"],
         query_bytes=mean_size(queries),
     )
@@ -257,7 +273,7 @@ def table_of_costs(costs: Costs) -> str:
     return table(
         "measured, seconds of one core",
         {
-            **{f"{name}, per photo": value for name, value in stages.items()},
+            **{f"{name}, per photo": value for name, value in stages.items() if value != "0 ms"},
             "build in all, per photo": f"{sum(costs.build_core_s.values()):.2f} s",
             "coarse index, per photo": f"{1e3 * costs.index_core_s:.1f} ms",
             "map, per photo": f"{costs.photo_bytes / 1e3:.0f} kB",
@@ -268,6 +284,8 @@ def table_of_costs(costs: Costs) -> str:
             "a query in one map": f"{costs.query_core_s:.2f} s",
             "ranking all tiles": f"{costs.coarse_core_s:.3f} s",
             "matching and pose in one more tile": f"{costs.tile_core_s:.2f} s",
+            "opening a tile of 1000 photos": f"{costs.open_core_s:.2f} s",
+            "an open tile of 1000 photos, in memory": f"{costs.open_bytes / 1e6:.0f} MB",
             "tiles searched at once, mean": f"{costs.tiles_searched:.1f}",
             "a photo that is sent": f"{costs.query_bytes / 1e3:.0f} kB",
         },
@@ -276,6 +294,7 @@ def table_of_costs(costs: Costs) -> str:
 
 def table_of_capacity(found: Capacity, city: City) -> str:
     """Return what follows as a table in Markdown."""
+    all_core_s = found.query_core_s + found.opening_core_s
     return table(
         "a city",
         {
@@ -285,13 +304,15 @@ def table_of_capacity(found: Capacity, city: City) -> str:
             "build": f"{found.build_core_s / 3600:.0f} core hours",
             f"machines to build it in {city.night_h:g} h": f"{found.build_machines}",
             "coarse index, described by one process": f"{found.index_core_s / 3600:.1f} h",
-            "a query without a prior": f"{found.query_core_s:.2f} core seconds",
+            "a query without a prior, its tiles open": f"{found.query_core_s:.2f} core seconds",
             f"replicas for {city.queries_per_s:g} queries per second": f"{found.replicas}",
-            "memory of a replica, without tiles": f"{found.replica_bytes / 1e9:.1f} GB",
-            "share of the tiles in the rest of its memory": f"{100 * found.in_memory:.1f} %",
-            "share of the tiles on its disk": f"{100 * found.on_disk:.0f} %",
-            "network of a replica: photos that come in": f"{100 * found.received_share:.2f} %",
-            "network of a replica: tiles not on its disk": f"{100 * found.fetched_share:.0f} %",
+            "the same with its tiles to open": f"{all_core_s:.2f} core seconds",
+            f"replicas for that, {city.queries_per_s:g} per second": f"{found.replicas_opening}",
+            "memory of a replica, no tile open": f"{found.replica_bytes / 1e9:.1f} GB",
+            "tiles that a worker has open in the rest": f"{found.open_share * city.tiles:.0f}",
+            "share of the tiles on the disk of a replica": f"{100 * found.disk_share:.0f} %",
+            "to copy them there": f"{found.fill_s / 60:.0f} min",
+            "network of a replica, photos that come in": f"{100 * found.received_share:.1f} %",
         },
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from dataclasses import replace
 
 import pytest
@@ -23,6 +24,8 @@ COSTS = Costs(
     query_core_s=0.7,
     tile_core_s=0.2,
     coarse_core_s=0.1,
+    open_core_s=0.3,
+    open_bytes=100e6,
     tiles_searched=2.0,
     query_bytes=100e3,
 )
@@ -54,17 +57,29 @@ def test_a_query_pays_for_its_index_and_every_tile() -> None:
     assert found().replicas == 7  # 100 / 16
 
 
-def test_memory_and_disk_hold_a_share_of_the_tiles_and_the_network_brings_the_rest() -> None:
+def test_workers_that_cannot_hold_the_city_open_their_tiles_again() -> None:
+    some = found()
+    assert some.replica_bytes == 16 * 0.5e9 + 1e9
+    # 55 GB for 16 workers, 100 MB for each tile of 1000.
+    assert some.open_share == pytest.approx(55e9 / 16 / 100e6 / 1000)
+    assert some.opening_core_s == pytest.approx(2 * (1 - some.open_share) * 0.3)
+    assert some.replicas_opening == math.ceil(100 * (1.0 + some.opening_core_s) / 16) > 7
+    roomy = found(open_bytes=1.0)
+    assert (roomy.open_share, roomy.opening_core_s) == (1.0, 0.0)
+    assert roomy.replicas_opening == roomy.replicas
+    full = capacity(COSTS, CITY, replace(MACHINE, memory_bytes=1e9))
+    assert full.open_share == 0.0
+
+
+def test_disk_and_network_hold_and_bring_what_they_can() -> None:
     some = found()
     tiles_bytes = 1000 * some.tile_bytes
-    assert some.replica_bytes == 16 * 0.5e9 + 1e9
-    assert some.in_memory == pytest.approx((64e9 - 9e9) / tiles_bytes)
-    assert some.on_disk == 1.0
-    assert some.fetched_share == 0.0
+    assert some.disk_share == 1.0
+    assert some.fill_s == pytest.approx(tiles_bytes / 1e9)
     assert some.received_share == pytest.approx(100 / 7 * 100e3 / 1e9)
     small = capacity(COSTS, CITY, replace(MACHINE, disk_bytes=tiles_bytes / 4))
-    assert small.on_disk == pytest.approx(0.25)
-    assert small.fetched_share == pytest.approx(100 / 7 * 2 * 0.75 * some.tile_bytes / 1e9)
+    assert small.disk_share == pytest.approx(0.25)
+    assert small.fill_s == pytest.approx(tiles_bytes / 4 / 1e9)
 
 
 def test_costs_are_read_from_what_a_build_prints() -> None:

@@ -27,7 +27,10 @@ from visloc.types import LocalFeatures
 
 CoarseModel = Mapping[str, NDArray[np.float32]]
 
-BITS = 256
+# With 256, chance put more wrong tiles before the right one (docs/scale.md).
+BITS = 512
+# Of a descriptor; those that tell more than chance come first.
+_MAX_DIMS = 256
 # Rows that stand for a tile: the middles of what its photos look like.
 CENTROIDS = 4
 # Tiles whose photos are looked at: so many, or this share of a larger set.
@@ -103,7 +106,7 @@ def learn_of_words(
         descriptor.pool(_NO_PIXELS, _local(words_of(number)), model) for number in range(num_photos)
     ]
     projection = descriptor.learn_projection(np.array(pooled))
-    dim = min(projection["axes"].shape[1], bits)
+    dim = min(projection["axes"].shape[1], _MAX_DIMS)
     axes = np.ascontiguousarray(projection["axes"][:, :dim])
     return {
         **model,
@@ -214,8 +217,11 @@ def _similar(
     histogram = np.zeros((len(tiles), length), np.int64)
     for start in range(0, len(rows), _BLOCK_ROWS):
         some = slice(start, start + _BLOCK_ROWS)
-        differing = np.bitwise_count(coarse.codes[rows[some]] ^ code).sum(axis=1, dtype=np.int64)
-        cells = place[some] * length + differing
+        counted = np.bitwise_count(coarse.codes[rows[some]] ^ code)
+        cells = place[some] * length
+        # Column by column: NumPy sums short rows slowly.
+        for column in counted.T:
+            cells += column
         histogram += np.bincount(cells, minlength=histogram.size).reshape(histogram.shape)
     best = np.diff(np.minimum(np.cumsum(histogram, axis=1), _NUM_BEST), axis=1, prepend=0)
     # Two vectors lie on different sides of a random plane as often as their angle says.

@@ -15,6 +15,7 @@ from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.retrieval.rows import GlobalRows, in_8_bits
 from visloc.sets.coarse import (
+    BITS,
     DescribedTile,
     check_descriptor,
     coarse_index,
@@ -26,7 +27,7 @@ from visloc.sets.coarse import (
 )
 from visloc.types import LocalFeatures
 
-DIM, BITS = 64, 256
+DIM = 64
 
 
 def unit(rows: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -125,13 +126,13 @@ def test_tiles_join_in_their_order() -> None:
     random = np.random.default_rng(0)
     tiles = [
         DescribedTile(
-            random.integers(0, 2**63, (n, 4), np.uint64),
+            random.integers(0, 2**63, (n, BITS // 64), np.uint64),
             unit(random.normal(size=(4, DIM))),
         )
         for n in (3, 1, 5)
     ]
 
-    index = coarse_index(iter(tiles), {"planes": np.zeros((DIM, 256), np.float32)})
+    index = coarse_index(iter(tiles), {"planes": np.zeros((DIM, BITS), np.float32)})
 
     assert index.offsets.tolist() == [0, 3, 4, 9]
     np.testing.assert_array_equal(index.codes[3:4], tiles[1].codes)
@@ -152,7 +153,7 @@ def rooms(room: Map, outline: Callable[..., SetOutline]) -> MapSet:
     model = learn(lambda _: room, 1)
     random = np.random.default_rng(3)
     other = DescribedTile(
-        random.integers(0, 2**63, (9, 4), np.uint64),
+        random.integers(0, 2**63, (9, BITS // 64), np.uint64),
         unit(random.normal(size=(4, model["axes"].shape[1]))),
     )
     said = outline([((0, 0, 0), (1, 1, 1))] * 2)
