@@ -66,14 +66,14 @@ def main(
     folder = work / name_of(city)
     started = time.perf_counter()
     made = make_set(folder, city, model)
-    seconds = time.perf_counter() - started
+    typer.echo(f"made or found in {time.perf_counter() - started:.0f} s", err=True)
     asked = write_queries(folder / "queries.npz", city, queries)
     found = answers(made, asked)
     if out is not None:
         out.write_text(json.dumps(found, indent=1) + "\n")
     typer.echo(f"{tiles} tiles of {photos} photos, {queries} queries\n")
     typer.echo("| measure | value |\n|---|---|")
-    for name, value in (*rows_of(found), ("made in s", f"{seconds:.0f}")):
+    for name, value in rows_of(found):
         typer.echo(f"| {name} | {value} |")
     typer.echo("\n" + compared(city, model))
 
