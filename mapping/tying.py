@@ -34,6 +34,8 @@ _COARSE = 4.0
 # pixels. What was localized elsewhere is off by hundreds.
 _AGREES = 2.0
 _ROUNDS = 3
+# Of two frames with one unit, how much of another scale photos may tell: what a map may be off.
+_MAX_OTHER_UNIT = 0.02
 # After so many the weights of points change no more.
 _POINT_ROUNDS = 50
 
@@ -97,7 +99,8 @@ def tie(
 
     Returns:
         The tie; or why there is none, in words to follow "but": fewer than three photos, not more
-        than half of them agree, or they stand too close together to tell the scale.
+        than half of them agree, they stand too close together to tell the scale, or, rigidly
+        tied, they tell another one than 1.
     """
     if len(photos) < MIN_PHOTOS:
         return f"only {len(photos)} photos were localized, and {MIN_PHOTOS} are needed"
@@ -117,18 +120,34 @@ def tie(
         similarity = refined_on_points(similarity, here, there, rigid=rigid)
         agrees = _agreeing(views, similarity, _AGREES)
     tied = agrees[: len(photos)]
-    if tied.sum() < max(MIN_PHOTOS, len(photos) // 2 + 1):
-        return (
-            f"only {tied.sum()} of {len(photos)} localized photos agree on how the frames lie to "
-            f"each other, and more than half must, {MIN_PHOTOS} at least"
-        )
-    errors = [pose_error(similarity.move(seen.pose_here), seen.pose_there) for seen in photos]
-    distances, angles = np.array(errors).T
-    doubt = None if rigid else _scale_doubt(photos, tied, distances)
+    if (few := too_few(tied)) is not None:
+        return few
+    distances, angles = _errors(photos, similarity)
+    if rigid:
+        chosen = [view for view, use in zip(views, agrees, strict=True) if use]
+        free = _refined(chosen, similarity, rigid=False)
+        doubt = _other_unit(photos, tied, free)
+    else:
+        doubt = _scale_doubt(photos, tied, distances)
     if doubt is not None:
         return doubt
     medians = np.array([view.median_error(similarity) for view in views[: len(photos)]])
     return Tie(similarity, tied, medians, distances, angles, int(agrees[len(photos) :].sum()))
+
+
+def agreeing(photos: Sequence[Seen], there_from_here: Similarity) -> NDArray[np.bool_]:
+    """Tell which photos (n,) agree with a similarity, as they must to be tied."""
+    return _agreeing([_View(seen, forward=True) for seen in photos], there_from_here, _AGREES)
+
+
+def too_few(tied: NDArray[np.bool_]) -> str | None:
+    """Say why photos (n,) of which these agree are no tie, in words to follow "but"; or None."""
+    if tied.sum() >= max(MIN_PHOTOS, len(tied) // 2 + 1):
+        return None
+    return (
+        f"only {tied.sum()} of {len(tied)} localized photos agree on how the frames lie to "
+        f"each other, and more than half must, {MIN_PHOTOS} at least"
+    )
 
 
 def refined_on_points(
@@ -151,6 +170,8 @@ def refined_on_points(
         rigid: whether both frames have one unit.
     """
     similarity = start
+    if (here == here[0]).all():  # one point tells no turn
+        return start
     for _ in range(_POINT_ROUNDS):
         distances = np.linalg.norm(similarity.apply(here) - there, axis=1)
         unit = float(np.median(distances))
@@ -309,19 +330,43 @@ def _distance(views: Sequence[_View]) -> float:
     return float(np.median(far))
 
 
-def _scale_doubt(
+def _errors(photos: Sequence[Seen], similarity: Similarity) -> NDArray[np.float64]:
+    """(2, n) distances and angles between where photos were localized and where they are put."""
+    errors = [pose_error(similarity.move(seen.pose_here), seen.pose_there) for seen in photos]
+    return np.array(errors).T
+
+
+def _scale_error(
     photos: Sequence[Seen], tied: NDArray[np.bool_], distances: NDArray[np.float64]
-) -> str | None:
-    """Why the photos do not tell the scale, if they do not."""
+) -> float:
+    """Half of the 95 % interval of the scale that tied photos tell, as a part of it."""
     centers = np.array(
         [seen.pose_there.center for seen, use in zip(photos, tied, strict=True) if use]
     )
     squares = float(((centers - centers.mean(axis=0)) ** 2).sum())
     rms = float(np.sqrt((distances[tied] ** 2).mean()))
-    error = 2 * rms / np.sqrt(squares) if squares > 0 else np.inf
+    return float(2 * rms / np.sqrt(squares)) if squares > 0 else np.inf
+
+
+def _other_unit(photos: Sequence[Seen], tied: NDArray[np.bool_], free: Similarity) -> str | None:
+    """Why frames have not one unit, by the similarity that fits best; None when they may."""
+    allowed = max(_MAX_OTHER_UNIT, _scale_error(photos, tied, _errors(photos, free)[0]))
+    if abs(np.log(free.scale)) <= allowed:
+        return None
+    return (
+        f"a metre of theirs is {free.scale:.3g} metres there: both are said to be metric, and at "
+        f"least one is not to within {allowed:.0%}"
+    )
+
+
+def _scale_doubt(
+    photos: Sequence[Seen], tied: NDArray[np.bool_], distances: NDArray[np.float64]
+) -> str | None:
+    """Why the photos do not tell the scale, if they do not."""
+    error = _scale_error(photos, tied, distances)
     if error <= MAX_SCALE_ERROR:
         return None
     return (
-        f"the {len(centers)} photos that agree stand too close together to tell the scale: to "
+        f"the {tied.sum()} photos that agree stand too close together to tell the scale: to "
         f"{error:.0%}, and {MAX_SCALE_ERROR:.0%} are needed"
     )

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.photos import MappingPhoto
-from mapping.tying import Seen, refined_on_points, tie
+from mapping.tying import Seen, agreeing, refined_on_points, tie, too_few
 from mapping.updating.localizing import Placed
 from visloc.archive import Map
 from visloc.errors import Conflict
@@ -31,6 +31,13 @@ own frame of the world (m, 3)."""
 _MIN_PART = 0.5
 # Matches with depth that a tie is refined on; of fewer, projections tell more.
 _MIN_LIFTED = 100
+# How much longer or shorter than the map has them depth may say that things are away. What a depth
+# camera is off, and poses of photos, comes to 1 % at most on redkitchen.
+_MAX_DEPTH_OFF = 0.03
+_GOOD_DEPTH = (
+    f"depth within {_MAX_DEPTH_OFF:.0%} of what the map and the poses say (--depth-scale), or "
+    "--method sfm"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +107,8 @@ def place_capture(
         metric: whether a unit of the photos' own poses is a metre.
 
     Raises:
-        Conflict: ``update.elsewhere`` when too few are localized, or do not agree.
+        Conflict: ``update.elsewhere`` when too few are localized, or do not agree, or their depth
+            contradicts where they lie.
     """
     refuse_elsewhere(opened, placed)
     both = [(photo, one) for photo, one in zip(photos, placed, strict=True) if one.localized]
@@ -132,23 +140,46 @@ def place_capture(
         )
     similarity, agrees = found.there_from_here, found.tied.tolist()
     if lift is not None:
-        tied = [pair for pair, agree in zip(both, agrees, strict=True) if agree]
-        similarity = _refined_by_depth(similarity, tied, lift, rigid=rigid)
+        similarity = _refined_by_depth(similarity, both, agrees, lift, rigid=rigid)
+        tied = agreeing(seen, similarity)
+        if (few := too_few(tied)) is not None:
+            raise _elsewhere(f"{localized}; where depth puts them, {few}", _GOOD_DEPTH)
+        agrees = tied.tolist()
     own = [similarity.move(photo.pose) for photo, _ in both]
     return _placement(similarity, placed, both, own, agrees)
 
 
 def _refined_by_depth(
-    start: Similarity, tied: Sequence[tuple[MappingPhoto, Placed]], lift: Lift, *, rigid: bool
+    start: Similarity,
+    both: Sequence[tuple[MappingPhoto, Placed]],
+    agrees: Sequence[bool],
+    lift: Lift,
+    *,
+    rigid: bool,
 ) -> Similarity:
-    """Refine a tie on the matches whose place the depth of the new photos tells as well."""
-    here, there = [np.empty((0, 3))], [np.empty((0, 3))]
-    for photo, one in tied:
-        rows, points = lift(photo, one.pixels)
-        here.append(points)
-        there.append(one.points[rows])
+    """Refine a tie on the matches whose place the depth of the new photos tells as well.
+
+    Raises:
+        Conflict: ``update.elsewhere`` when depth has another unit than the tie.
+    """
+    here, there, factors = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty(0)]
+    for (photo, one), tied in zip(both, agrees, strict=True):
+        if tied:
+            rows, points = lift(photo, one.pixels)
+            here.append(points)
+            there.append(one.points[rows])
+            away = start.scale * np.linalg.norm(photo.pose.apply(points), axis=1)
+            factors.append(away / np.linalg.norm(one.cam_from_map.apply(there[-1]), axis=1))
     if sum(map(len, here)) < _MIN_LIFTED:
         return start
+    # Places alone would not show it: moving all photos back makes up for much of it.
+    factor = float(np.median(np.concatenate(factors)))
+    if abs(factor - 1) > _MAX_DEPTH_OFF:
+        raise _elsewhere(
+            f"by its depth, what the photos see is {factor:.3g} times as far away as in the map",
+            _GOOD_DEPTH,
+            f"{factor:.4g}",
+        )
     return refined_on_points(start, np.concatenate(here), np.concatenate(there), rigid=rigid)
 
 

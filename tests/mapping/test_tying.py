@@ -180,6 +180,19 @@ def test_photos_at_one_place_do_not_tell_the_scale_but_a_rigid_tie() -> None:
     assert isinstance(tie(together, rigid=True), Tie)
 
 
+@pytest.mark.parametrize(("scale", "tied"), [(1.01, True), (1.03, False), (0.95, False)])
+def test_metric_frames_of_different_metres_are_not_tied(scale: float, tied: bool) -> None:
+    found = tie(seen_photos(replace(THERE_FROM_HERE, scale=scale), seed=1), rigid=True)
+
+    assert isinstance(found, Tie) == tied, found
+    assert tied or f"is {scale:.3g} metres there" in str(found)
+
+
+def test_a_point_alone_does_not_turn_a_frame() -> None:
+    here = np.zeros((5, 3))
+    assert refined_on_points(SCALED, here, SCALED.apply(here) + 1.0, rigid=False) is SCALED
+
+
 @pytest.mark.parametrize(("truth", "rigid"), [(THERE_FROM_HERE, True), (SCALED, False)])
 def test_points_known_in_both_frames_tell_it_though_a_third_of_them_is_wrong(
     truth: Similarity, rigid: bool

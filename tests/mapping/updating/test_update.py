@@ -249,6 +249,21 @@ def test_a_trajectory_that_is_no_similarity_away_is_refused(
     assert refused(shaken, maps_dir).code == "update.elsewhere"
 
 
+@pytest.mark.parametrize("factor", [1.05, 5.0])
+def test_depth_of_another_unit_than_the_poses_is_refused(
+    captures: Path, maps_dir: Path, tmp_path: Path, factor: float
+) -> None:
+    root = Path(shutil.copytree(captures / "second", tmp_path / "longer"))
+    for depth in root.rglob("*.depth"):
+        depth.write_bytes((np.fromfile(depth, "<f4") * np.float32(factor)).tobytes())
+
+    error = refused(root, maps_dir)
+
+    assert error.code == "update.elsewhere"
+    assert "by its depth" in error.message
+    assert "--depth-scale" in str(error.expected)
+
+
 def test_photos_without_poses_are_placed_where_they_localize(
     captures: Path, maps_dir: Path, walk: Path, tmp_path: Path
 ) -> None:
