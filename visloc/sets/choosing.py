@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,8 +24,8 @@ MAX_SEARCHED = 5
 _CLOSE_SCORE = 0.8
 # An answer of so many inliers needs no other tile.
 CLEAR_INLIERS = 100
-# Of the most inliers: answers elsewhere with this share make the answer ambiguous; of answers
-# that agree and have this share, the most certain counts.
+# Of the most inliers: answers of this share must agree with each other, or the answer is
+# ambiguous; of those of this share, the most certain counts.
 _RIVAL_SHARE, _SIMILAR_SHARE = 0.5, 0.8
 # Answers agree that are no further apart than what both leave open (three standard deviations),
 # and how well tiles are tied to each other: a tenth of how far their photos see, five degrees.
@@ -133,9 +134,10 @@ def is_clear(answer: Answer | InstantAnswer) -> bool:
 def judge(outline: SetOutline, found: Sequence[Found]) -> int | Refusal:
     """Choose the answer of a set among those of its tiles.
 
-    Of answers with a pose, the one with the most inliers counts, or one that agrees with it, has
-    similarly many, and is more certain. Another place that explains half as much is reason to
-    refuse: guessing could put the device into the wrong building.
+    Of answers with a pose, the one with the most inliers counts, or one that has similarly many
+    and is more certain. Two places are reason to refuse, each of which explains half as much as
+    the best: guessing could put the device into the wrong building. All pairs are compared, since
+    an uncertain answer agrees with places that contradict each other.
 
     Args:
         outline: the set.
@@ -148,18 +150,12 @@ def judge(outline: SetOutline, found: Sequence[Found]) -> int | Refusal:
     localized = [row for row, one in enumerate(found) if _pose(one.answer) is not None]
     if not localized:
         return max(range(len(found)), key=lambda row: _progress(found[row].answer))
-    best = max(localized, key=lambda row: inliers_of(found[row].answer))
-    most = inliers_of(found[best].answer)
-    agreeing = [best]
-    for row in localized:
-        count = inliers_of(found[row].answer)
-        if row == best or count < _RIVAL_SHARE * most:
-            continue
-        if _agree(outline, found[best], found[row]):
-            agreeing.append(row)
-        else:
-            return _ambiguous(outline, found[best], found[row])
-    similar = [row for row in agreeing if inliers_of(found[row].answer) >= _SIMILAR_SHARE * most]
+    most = max(inliers_of(found[row].answer) for row in localized)
+    rivals = [row for row in localized if inliers_of(found[row].answer) >= _RIVAL_SHARE * most]
+    for a, b in itertools.combinations(rivals, 2):
+        if not _agree(outline, found[a], found[b]):
+            return _ambiguous(outline, found[a], found[b])
+    similar = [row for row in rivals if inliers_of(found[row].answer) >= _SIMILAR_SHARE * most]
     return min(similar, key=lambda row: _spread(found[row].answer))
 
 

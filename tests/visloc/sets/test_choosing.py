@@ -217,7 +217,9 @@ def test_two_places_that_explain_it_are_refused(
 
 
 def test_a_rival_of_few_inliers_is_no_reason_to_refuse(outline: MakeOutline) -> None:
-    assert judge(outline(HOUSES), [Found(2, localized(99, (100, 0, 0))), Found(0, localized(200))])
+    found = [Found(2, localized(99, (100, 0, 0))), Found(0, localized(200))]
+
+    assert judge(outline(HOUSES), found) == 1
 
 
 def test_the_same_position_the_other_way_round_is_another_place(outline: MakeOutline) -> None:
@@ -235,6 +237,23 @@ def test_how_well_tiles_are_tied_is_no_contradiction(outline: MakeOutline) -> No
     assert judge(outline(HOUSES), near) == 0
     assert isinstance(judge(outline(HOUSES), far), Refusal)
     assert judge(outline(HOUSES), unsure) == 0
+
+
+@pytest.mark.parametrize("best", [{"inliers": 100, "std": 0.3}, {"inliers": 170, "std": 2.0}])
+def test_places_that_only_an_uncertain_answer_agrees_with_are_refused(
+    outline: MakeOutline, best: dict[str, Any]
+) -> None:
+    apart = [
+        Found(1, localized(90, (1.1, 0, 0), std=0.01)),
+        Found(2, localized(89, (-1.1, 0, 0), std=0.02)),
+    ]
+    together = [Found(0, localized(**best)), *apart]
+
+    for found in (apart, together, together[::-1]):
+        answer = judge(outline(HOUSES), found)
+        assert isinstance(answer, Refusal)
+        assert answer.reason is Reason.AMBIGUOUS
+    assert judge(outline(HOUSES), together[:2]) == (1 if best["inliers"] == 100 else 0)
 
 
 def test_without_a_pose_the_answer_that_came_furthest_counts(outline: MakeOutline) -> None:
