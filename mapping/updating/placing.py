@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapping.photos import MappingPhoto
-from mapping.tying import Seen, agreeing, refined_on_points, tie, too_few
+from mapping.tying import MAX_DEPTH_OFF, Seen, agreeing, refined_by_depth, tie, too_few
 from mapping.updating.localizing import Placed
 from visloc.archive import Map
 from visloc.errors import Conflict
@@ -31,11 +31,8 @@ own frame of the world (m, 3)."""
 _MIN_PART = 0.5
 # Matches with depth that a tie is refined on; of fewer, projections tell more.
 _MIN_LIFTED = 100
-# How much longer or shorter than the map has them depth may say that things are away. What a depth
-# camera is off, and poses of photos, comes to 1 % at most on redkitchen.
-_MAX_DEPTH_OFF = 0.03
 _GOOD_DEPTH = (
-    f"depth within {_MAX_DEPTH_OFF:.0%} of what the map and the poses say (--depth-scale), or "
+    f"depth within {MAX_DEPTH_OFF:.0%} of what the map and the poses say (--depth-scale), or "
     "--method sfm"
 )
 
@@ -140,47 +137,27 @@ def place_capture(
         )
     similarity, agrees = found.there_from_here, found.tied.tolist()
     if lift is not None:
-        similarity = _refined_by_depth(similarity, both, agrees, lift, rigid=rigid)
-        tied = agreeing(seen, similarity)
-        if (few := too_few(tied)) is not None:
-            raise _elsewhere(f"{localized}; where depth puts them, {few}", _GOOD_DEPTH)
-        agrees = tied.tolist()
+        lifted = [
+            _lifted(one, photo, lift)
+            for one, (photo, _), agree in zip(seen, both, agrees, strict=True)
+            if agree
+        ]
+        if sum(len(one.points) for one in lifted) >= _MIN_LIFTED:
+            by_depth = refined_by_depth(lifted, similarity, rigid=rigid)
+            if isinstance(by_depth, str):
+                raise _elsewhere(f"{localized}, but {by_depth}", _GOOD_DEPTH)
+            similarity, tied = by_depth, agreeing(seen, by_depth)
+            if (few := too_few(tied)) is not None:
+                raise _elsewhere(f"{localized}, but with depth {few}", _GOOD_DEPTH)
+            agrees = tied.tolist()
     own = [similarity.move(photo.pose) for photo, _ in both]
     return _placement(similarity, placed, both, own, agrees)
 
 
-def _refined_by_depth(
-    start: Similarity,
-    both: Sequence[tuple[MappingPhoto, Placed]],
-    agrees: Sequence[bool],
-    lift: Lift,
-    *,
-    rigid: bool,
-) -> Similarity:
-    """Refine a tie on the matches whose place the depth of the new photos tells as well.
-
-    Raises:
-        Conflict: ``update.elsewhere`` when depth has another unit than the tie.
-    """
-    here, there, factors = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty(0)]
-    for (photo, one), tied in zip(both, agrees, strict=True):
-        if tied:
-            rows, points = lift(photo, one.pixels)
-            here.append(points)
-            there.append(one.points[rows])
-            away = start.scale * np.linalg.norm(photo.pose.apply(points), axis=1)
-            factors.append(away / np.linalg.norm(one.cam_from_map.apply(there[-1]), axis=1))
-    if sum(map(len, here)) < _MIN_LIFTED:
-        return start
-    # Places alone would not show it: moving all photos back makes up for much of it.
-    factor = float(np.median(np.concatenate(factors)))
-    if abs(factor - 1) > _MAX_DEPTH_OFF:
-        raise _elsewhere(
-            f"by its depth, what the photos see is {factor:.3g} times as far away as in the map",
-            _GOOD_DEPTH,
-            f"{factor:.4g}",
-        )
-    return refined_on_points(start, np.concatenate(here), np.concatenate(there), rigid=rigid)
+def _lifted(seen: Seen, photo: MappingPhoto, lift: Lift) -> Seen:
+    """A photo with those of its matches whose place its depth tells as well."""
+    rows, points = lift(photo, seen.pixels)
+    return replace(seen, pixels=seen.pixels[rows], points=seen.points[rows], own_points=points)
 
 
 def _placement(

@@ -121,6 +121,18 @@ def test_points_that_depth_gave_in_both_frames_tell_more() -> None:
     assert found.tied.all()
 
 
+@pytest.mark.parametrize(("factor", "tied"), [(1.01, True), (1.1, False), (0.9, False)])
+def test_depth_of_another_unit_than_the_poses_ties_nothing(factor: float, tied: bool) -> None:
+    def lifted(seen: Seen) -> Seen:
+        in_cam = seen.pose_here.apply(SCALED.inverse().apply(seen.points))
+        return replace(seen, own_points=seen.pose_here.inverse().apply(factor * in_cam))
+
+    found = tie([lifted(seen) for seen in seen_photos(SCALED, seed=13)], rigid=False)
+
+    assert isinstance(found, Tie) == tied, found
+    assert tied or f"{factor:.3g} times as far" in str(found)
+
+
 def test_photos_that_were_localized_elsewhere_do_not_count() -> None:
     good = seen_photos(THERE_FROM_HERE, seed=5)
     wrong = seen_photos(

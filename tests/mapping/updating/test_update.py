@@ -260,7 +260,7 @@ def test_depth_of_another_unit_than_the_poses_is_refused(
     error = refused(root, maps_dir)
 
     assert error.code == "update.elsewhere"
-    assert "by its depth" in error.message
+    assert "by depth, what they see is" in error.message
     assert "--depth-scale" in str(error.expected)
 
 
