@@ -27,6 +27,7 @@ from visloc.archive.packed import pack_map, unpack_map
 from visloc.archive.remote_store import RemoteMapStore
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound
 from visloc.geometry import Similarity
+from visloc.sets.coarse import BITS
 
 LARGE = 2**30
 SECOND = Similarity(1.0, np.eye(3), np.array([100.0, 0.0, 3.0]))
@@ -113,7 +114,7 @@ def test_a_set_is_open_with_its_index(store: MapStore) -> None:
     photos = len(store.open("hall").images)
     assert opened.coarse.offsets.tolist() == [0, photos, 2 * photos]
     assert isinstance(opened.coarse.codes, np.memmap)
-    assert opened.coarse.bits == 256
+    assert opened.coarse.bits == BITS
     # Both tiles are the same map.
     np.testing.assert_array_equal(opened.coarse.codes[:photos], opened.coarse.codes[photos:])
     assert verify_set(opened.path).ref == opened.ref
@@ -273,7 +274,7 @@ def keep(_manifest: dict[str, Any]) -> None:
         (lambda m: m.update(tiles=[]), "map.manifest"),
         (lambda m: m["counts"].update(images=3), "map.manifest"),
         (lambda m: m["coarse"].update(bits=100), "map.manifest"),
-        (lambda m: m["coarse"].update(bits=512), "map.array"),
+        (lambda m: m["coarse"].update(bits=BITS // 2), "map.array"),
         (lambda m: m["coarse"].update(dim=5), "map.array"),
         (lambda m: m["tiles"][0]["set_from_tile"].update(scale=0), "map.manifest"),
         (
