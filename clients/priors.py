@@ -39,6 +39,13 @@ def priors_as_json(priors: Priors) -> dict[str, Any]:
         position, radius = priors.position.position, priors.position.radius
         given["position"] = {"position": position.tolist(), "radius": radius}
     if priors.height is not None:
+        if priors.height.down is not None:
+            raise InvalidInput(
+                "priors.height",
+                "heights are measured along what the map, or the gravity prior, knows of down",
+                field="priors.height",
+                expected="no down",
+            )
         given["height"] = {"min": priors.height.min, "max": priors.height.max}
     if priors.pose is not None:
         given["pose"] = {

@@ -103,7 +103,8 @@ class Constraints:
                     got=" ".join(f"{x:.3f}" for x in gravity.world),
                 )
             down = gravity.world
-        if down is None and (gravity is not None or priors.height is not None):
+        band = priors.height
+        if down is None and (gravity is not None or (band is not None and band.down is None)):
             name = "gravity" if gravity is not None else "height"
             raise InvalidInput(
                 f"priors.{name}",
@@ -116,7 +117,9 @@ class Constraints:
             if gravity is None or down is None
             else KnownGravity(gravity.direction, down, gravity.std)
         )
-        self._up = None if down is None else -down
+        if band is not None and band.down is not None:
+            down = np.array(band.down)
+        self._up = None if down is None else -down  # that heights are measured along
         self._pose = None
         if priors.pose is not None:
             self._pose = with_origin(

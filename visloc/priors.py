@@ -64,10 +64,13 @@ class HeightBand:
     Attributes:
         min: in units of the world.
         max: greater than ``min``.
+        down: unit vector along which they are measured; None for what the map knows of down, or
+            the gravity prior. In a tile it is that of the set (``visloc.sets.frame``).
     """
 
     min: float
     max: float
+    down: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.min) and math.isfinite(self.max) and self.min < self.max):

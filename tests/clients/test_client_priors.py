@@ -10,7 +10,7 @@ import pytest
 from clients.cli import main
 from clients.priors import priors_as_json, priors_from_json, priors_from_text
 from visloc.errors import InvalidInput
-from visloc.priors import NO_PRIORS
+from visloc.priors import NO_PRIORS, HeightBand, Priors
 
 COVARIANCE = np.diag([1e-4] * 3 + [1e-2] * 3).ravel().tolist()
 ALL: dict[str, Any] = {
@@ -115,6 +115,12 @@ def test_what_cannot_be_a_prior_is_named(raw: object, code: str, field: str) -> 
         priors_from_json(raw)
     assert caught.value.code == code
     assert caught.value.field == field
+
+
+def test_heights_along_another_down_are_not_sent_as_if_they_were_not() -> None:
+    with pytest.raises(InvalidInput) as caught:
+        priors_as_json(Priors(height=HeightBand(0.0, 3.0, (0.0, 1.0, 0.0))))
+    assert caught.value.code == "priors.height"
 
 
 @pytest.mark.parametrize("text", ["{", "none.json", "", "\x00"])

@@ -33,7 +33,7 @@ from visloc.geometry import Pose, Similarity
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localizer import Localizer
-from visloc.priors import NO_PRIORS, PositionPrior, Priors
+from visloc.priors import NO_PRIORS, HeightBand, PositionPrior, Priors
 from visloc.sets.choosing import Found, allowed_tiles, judge, plan
 from visloc.sets.coarse import rank_tiles
 from visloc.sets.frame import answer_in_set, priors_in_tile
@@ -400,6 +400,26 @@ def test_maps_on_earth_lie_where_their_anchors_say(store: MapStore) -> None:
     assert outline.place.distance_to(45.01, 5.82) == 0
     assert outline.gravity is not None
     np.testing.assert_allclose(outline.gravity, [0, 0, -1], atol=1e-3)  # the Earth is round
+
+
+def test_a_set_knows_down_when_all_of_its_maps_do(store: MapStore) -> None:
+    content = replace(content_of(store.open("hall")), gravity=None)
+    here = Geodetic(latitude_deg=45.0, longitude_deg=5.8, altitude_m=300.0)
+    anchor = Anchor(kind="correspondences", images=4, geodetic=here)
+    publish_edited(store, replace(content, anchor=anchor), "anchored")
+    publish_edited(store, content, "blind")
+    same = Similarity.identity()
+    publish(store, "half", [("anchored", same), ("blind", same)])
+    publish(store, "both", [("anchored", same), ("hall", same)])
+
+    half, both = store.outline("half"), store.outline("both")
+    assert half.gravity is None
+    assert isinstance(half, SetOutline)
+    assert half.geodetic == here
+    with pytest.raises(InvalidInput, match="this set does not know"):
+        allowed_tiles(half, Priors(height=HeightBand(0.0, 3.0)))
+    assert both.gravity is not None
+    np.testing.assert_allclose(both.gravity, [0, 0, -1])
 
 
 def test_a_map_without_a_place_needs_a_pose(store: MapStore) -> None:

@@ -18,7 +18,7 @@ from visloc.archive.checks import (
     read_any_manifest,
     read_model,
 )
-from visloc.archive.places import GeoCircle, circle_of, down_of
+from visloc.archive.places import GeoCircle, circle_of
 from visloc.archive.reader import MapOutline, outline_of, verify_map
 from visloc.archive.schema import Extent, FingerprintRecord, Geodetic
 from visloc.archive.set_schema import (
@@ -69,10 +69,9 @@ class SetOutline:
     @property
     def gravity(self) -> NDArray[np.float64] | None:
         """(3,) unit vector that points down in the set's frame; None where that is not known."""
-        world = self.manifest.world
-        if world.gravity is not None:
-            return np.array(world.gravity)
-        return None if self.geodetic is None else down_of(self.geodetic)
+        # That one of its maps lies on Earth tells nothing of what the others know.
+        gravity = self.manifest.world.gravity
+        return None if gravity is None else np.array(gravity)
 
     @property
     def geodetic(self) -> Geodetic | None:

@@ -65,7 +65,8 @@ def learn(
     """Learn the model of an index on a seeded sample of the tiles' photos.
 
     Args:
-        open_tile: opens a tile of the set by its row.
+        open_tile: opens a tile of the set by its row; each is asked for a few times, and one is
+            open at a time.
         num_tiles: how many there are.
         bits: of a photo's code, a multiple of 64.
         seed: of the sample, the vocabulary and the planes.
@@ -74,14 +75,23 @@ def learn(
     teachers = np.sort(
         random.choice(num_tiles, min(num_tiles, _MAX_TEACHERS), replace=False)
     ).tolist()
-    opened = [open_tile(tile) for tile in teachers]
-    most = math.ceil(WHITENING_MAX_PHOTOS / len(opened))
-    photos = [
-        (tile, photo)
-        for tile in opened
-        for photo in np.unique(np.linspace(0, len(tile.images) - 1, most).astype(int)).tolist()
-    ]
-    return learn_of_words(lambda number: _words(*photos[number]), len(photos), bits, random)
+    most = math.ceil(WHITENING_MAX_PHOTOS / len(teachers))
+    photos = []
+    for tile in teachers:
+        last = len(open_tile(tile).images) - 1
+        some = np.unique(np.linspace(0, last, most).astype(int)).tolist()
+        photos += [(tile, photo) for photo in some]
+    # One at a time: a process may have a thousand files open, and a map has several.
+    opened: dict[int, Map] = {}
+
+    def words_of(number: int) -> NDArray[np.float32]:
+        tile, photo = photos[number]
+        if tile not in opened:
+            opened.clear()
+            opened[tile] = open_tile(tile)
+        return _words(opened[tile], photo)
+
+    return learn_of_words(words_of, len(photos), bits, random)
 
 
 def learn_of_words(

@@ -85,9 +85,11 @@ def priors_in_tile(
     if position is not None:
         position = PositionPrior(tile_from_set.apply(position.position), scale * position.radius)
     if height is not None and down is not None:
-        # Heights count from each frame's own (0, 0, 0).
+        # Heights count from each frame's own (0, 0, 0), but along the same down: by what a tile
+        # takes for it, far from its origin a floor would be another one.
         lift = float(down @ set_from_tile.translation)
-        height = HeightBand(scale * (height.min + lift), scale * (height.max + lift))
+        x, y, z = (tile_from_set.rotation @ down).tolist()
+        height = HeightBand(scale * (height.min + lift), scale * (height.max + lift), (x, y, z))
     if pose is not None:
         pose = PosePrior(*moved_pose(pose.device_from_world, pose.covariance, tile_from_set))
     if gravity is not None and gravity.world is not None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from visloc.archive import CoarseIndex, FingerprintRecord, Map, MapStore, SetOutline
+from visloc.archive import CoarseIndex, FingerprintRecord, Map, MapStore, SetOutline, open_map
 from visloc.archive.sets import MapSet
 from visloc.errors import Conflict
 from visloc.features import make_local_features
@@ -180,6 +180,24 @@ def test_a_photo_of_nothing_is_like_no_tile(rooms: MapSet) -> None:
     )
 
     assert all(abs(s.score) < 0.5 for s in rank_tiles(rooms, nothing))
+
+
+def test_many_tiles_teach_with_one_open_at_a_time(room: Map) -> None:
+    files = Path("/proc/self/fd")
+    before, most = len(list(files.iterdir())), 0
+
+    def open_tile(_: int) -> Map:
+        nonlocal most
+        opened = open_map(room.path)
+        most = max(most, len(list(files.iterdir())) - before)
+        return opened
+
+    alone = open_tile(0)
+    assert most > 0
+    of_one = 2 * most  # the one that is opened, and the one before it
+    del alone
+    learn(open_tile, 30)
+    assert most <= of_one
 
 
 def test_equal_seeds_learn_the_same(room: Map) -> None:

@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from visloc.constraints import Constraints
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose, Similarity
 from visloc.pose.centre import position_covariance
@@ -169,7 +171,27 @@ def test_down_of_the_set_serves_a_height_band() -> None:
         np.array([0.0, 0.0, -1.0]),
     )
 
-    assert moved.height == HeightBand(1.0, 4.0)
+    assert moved.height == HeightBand(1.0, 4.0, (0.0, 0.0, -1.0))
+
+
+def test_a_floor_far_from_the_origin_of_a_tilted_tile_is_the_floor_of_the_set(
+    place: Any, hall: Any
+) -> None:
+    """What a tile takes for down, 4 degrees off, is 7 higher at 100 from its origin."""
+    tilt = Rotation.from_rotvec([np.radians(4.0), 0, 0]).as_matrix()
+    set_from_tile = Similarity(1.0, tilt, np.array([0.0, 3.0, -1.0]))
+    floors = np.array([[0.0, 100.0, 2.0], [0.0, 100.0, 9.0]])
+    centers = set_from_tile.inverse().apply(floors)
+    down = np.array([0.0, 0.0, -1.0])
+    priors = priors_in_tile(Priors(height=HeightBand(1.0, 3.0)), set_from_tile, down)
+
+    for one in (replace(hall, origin=place.origin), place):  # the other knows no down at all
+        constraints = Constraints(one.geometry_of(centers), priors)
+        assert constraints.photo_weights is not None
+        assert constraints.photo_weights.tolist() == [1.0, 0.0]
+        right, wrong = (Pose(np.eye(3), -center) for center in centers)
+        assert constraints.contradiction(right, 1e-6 * np.eye(6)) is None
+        assert "its height is" in str(constraints.contradiction(wrong, 1e-6 * np.eye(6)))
 
 
 def test_a_height_band_without_any_down_is_refused() -> None:
