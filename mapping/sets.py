@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,18 +21,22 @@ from visloc.archive import (
     Map,
     MapStore,
     SetContent,
+    SetManifest,
     SetWorld,
     SimilarityRecord,
     TileRecord,
     write_set,
 )
 from visloc.archive.checks import read_any_manifest
-from visloc.archive.schema import Extent
+from visloc.archive.places import enu_of, origin_of
+from visloc.archive.schema import Extent, Geodetic
 from visloc.archive.set_rules import refuse_other_features
+from visloc.archive.set_schema import MAX_TILES
 from visloc.archive.sets import joined_extent
 from visloc.archive.store import checked_name, open_published
 from visloc.constraints import MapGeometry
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound
+from visloc.geodesy import ecef_from_geodetic, geodetic_from_enu
 from visloc.geometry import Similarity
 from visloc.sets.coarse import CoarseModel, DescribedTile, coarse_index, describe, learn
 
@@ -38,6 +44,9 @@ from visloc.sets.coarse import CoarseModel, DescribedTile, coarse_index, describ
 _MAX_SCALE_DIFFERENCE = 0.02
 # Down as two maps know it, turned into the frame of the set, differs by no more than this.
 _MAX_DOWN_DIFFERENCE = math.radians(5.0)
+# By their own anchors, maps lie no further from where the set has them than this. Satellites tell
+# a place among houses to 10 m or so.
+_MAX_PLACE_DIFFERENCE_M, _MAX_PLACE_SHARE = 20.0, 0.05
 _BLOCK_ROWS = 2**20
 
 Progress = Callable[[str, int, int], None]
@@ -89,15 +98,26 @@ def publish_set(
         The folder of the version; of the one in use when that is the same set already.
 
     Raises:
-        InvalidInput: ``map.is_set`` for a tile that is a set, ``set.tiles`` without any.
-        Conflict: ``set.features``, ``set.scale``, ``set.gravity``: maps that contradict each other;
-            and what ``MapStore.publish`` raises.
+        InvalidInput: ``map.is_set`` for a tile that is a set, ``set.tiles`` without any, or for one
+            that is named twice.
+        Conflict: ``set.features``, ``set.scale``, ``set.gravity``, ``set.anchor``: maps that
+            contradict each other; ``set.id_is_map``; and what ``MapStore.publish`` raises.
         NotFound: ``map.unknown``, ``map.version``.
     """
     checked_name(set_id, "set")
     if not tiles:
         raise InvalidInput("set.tiles", "no maps", field="MAP", expected="one or more")
+    if len(tiles) > MAX_TILES:
+        raise InvalidInput(
+            "set.tiles",
+            "too many maps",
+            field="MAP",
+            expected=f"at most {MAX_TILES}",
+            got=len(tiles),
+        )
+    refuse_map_of_this_name(store, set_id, "SET")
     folders = [store.folder(ref) for ref, _ in tiles]
+    _refuse_twice(folders)
     placed = []
     for number, (folder, (_, set_from_tile)) in enumerate(zip(folders, tiles, strict=True), 1):
         placed.append(_placed(open_published(folder), set_from_tile))
@@ -114,6 +134,34 @@ def publish_set(
         notes=tuple(notes),
     )
     return _publish_changed(store, set_id, content)
+
+
+def refuse_map_of_this_name(store: MapStore, set_id: str, field: str) -> None:
+    """Refuse the id of a map for a set, before the long part.
+
+    Raises:
+        Conflict: ``set.id_is_map``.
+    """
+    with suppress(NotFound, MapCorrupt):
+        if not isinstance(read_any_manifest(store.folder(set_id)), SetManifest):
+            raise Conflict(
+                "set.id_is_map",
+                "a map has this id already; give the set another one",
+                field=field,
+                got=set_id,
+            )
+
+
+def _refuse_twice(folders: Sequence[Path]) -> None:
+    for folder, count in Counter(folders).items():
+        if count > 1:
+            raise InvalidInput(
+                "set.tiles",
+                "a map is named twice; at a second place in the set it would be another map",
+                field="MAP",
+                expected="each version of a map once",
+                got=f"{folder.parent.name}@{folder.name}",
+            )
 
 
 def _publish_changed(store: MapStore, set_id: str, content: SetContent) -> Path:
@@ -175,6 +223,8 @@ def _box(points: NDArray[np.float64]) -> Extent:
 
 def _world(placed: Sequence[_Placed]) -> SetWorld:
     anchor = next((one.anchor for one in placed if one.anchor and one.anchor.geodetic), None)
+    if anchor is not None and anchor.geodetic is not None:
+        _refuse_other_place(placed, anchor.geodetic)
     down = _down(placed)
     return SetWorld.model_validate(
         {
@@ -184,6 +234,32 @@ def _world(placed: Sequence[_Placed]) -> SetWorld:
             "gravity": None if down is None else down.tolist(),
         }
     )
+
+
+def _refuse_other_place(placed: Sequence[_Placed], geodetic: Geodetic) -> None:
+    """Refuse maps whose own anchors put their photos elsewhere on Earth than that of the set."""
+    for one in placed:
+        own = None if one.anchor is None else one.anchor.geodetic
+        if own is None:
+            continue
+        box = one.record.photo_extent
+        corners = np.array(list(itertools.product(*zip(box.min, box.max, strict=True))))
+        there, here = (
+            ecef_from_geodetic(geodetic_from_enu(enu_of(corners, by), origin_of(by)))
+            for by in (own, geodetic)
+        )
+        away = float(np.linalg.norm(there - here, axis=1).max())
+        size = geodetic.scale * float(np.linalg.norm(np.subtract(box.max, box.min)))
+        if away > max(_MAX_PLACE_DIFFERENCE_M, _MAX_PLACE_SHARE * size):
+            raise Conflict(
+                "set.anchor",
+                f"by its own anchor, {one.record.ref} lies elsewhere on Earth than by the set's; "
+                "anchor it anew, or correct its pose",
+                field="--poses",
+                expected=f"at most {_MAX_PLACE_DIFFERENCE_M:g} m, or {_MAX_PLACE_SHARE:.0%} of its "
+                "extent, away",
+                got=f"{away:.4g} m",
+            )
 
 
 def _is_metric(placed: Sequence[_Placed], anchor: Anchor | None) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,11 +12,11 @@ from numpy.typing import NDArray
 
 from mapping.editing import content_of, selected
 from mapping.publishing import new_version, photo_files
-from mapping.sets import Progress, publish_set, same_content
-from visloc.archive import Map, MapContent, MapStore, SetManifest, write_map
+from mapping.sets import Progress, publish_set, refuse_map_of_this_name, same_content
+from visloc.archive import Map, MapContent, MapStore, write_map
 from visloc.archive.anchoring import link_or_copy
 from visloc.archive.checks import read_any_manifest
-from visloc.archive.schema import photo_file
+from visloc.archive.schema import ID_PATTERN, photo_file
 from visloc.archive.set_schema import MAX_TILES
 from visloc.archive.store import checked_name, open_published
 from visloc.constraints import MapGeometry
@@ -24,6 +25,8 @@ from visloc.geometry import Similarity
 
 # Fewer photos localize too little to be a map of their own.
 MIN_PHOTOS = 5
+_TILE_OF = "a tile of "  # in the notes of a tile, before the map
+_MAX_CELLS = 2**31  # along one side
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,11 +70,12 @@ def split_map(
 
     Raises:
         InvalidInput: ``split.tile``, ``split.overlap``; ``map.is_set`` for a set.
-        Conflict: ``set.id_is_map`` and what ``publish_set`` raises.
+        Conflict: ``set.id_is_map``; ``split.map_exists`` when a map that is none of these tiles has
+            the id of one; and what ``publish_set`` raises.
     """
     checked_name(set_id, "set")
     opened = open_published(store.folder(ref))
-    _refuse_map_of_this_name(store, set_id)
+    refuse_map_of_this_name(store, set_id, "--set")
     cuts = cut(opened, tile, overlap)
     if len(cuts) > MAX_TILES:
         raise InvalidInput(
@@ -81,13 +85,14 @@ def split_map(
             expected=f"a side that makes at most {MAX_TILES} tiles",
             got=f"{len(cuts)} tiles",
         )
+    _refuse_other_maps(store, opened.manifest.id, set_id, cuts)
     content, pictures, tiles = content_of(opened), photo_files(opened), []
     for number, one in enumerate(cuts, 1):
         part = selected(content, images=one.photos)
-        part = replace(part, notes=(*part.notes, f"a tile of {opened.ref}"))
+        part = replace(part, notes=(*part.notes, f"{_TILE_OF}{opened.ref}"))
         some = [pictures[row] for row in np.flatnonzero(one.photos)] if pictures else []
-        tile_id = f"{set_id}-{one.cell[0]}-{one.cell[1]}"
-        tiles.append((_publish_tile(store, tile_id, part, some), Similarity.identity()))
+        published = _publish_tile(store, _tile_id(set_id, one), part, some)
+        tiles.append((published, Similarity.identity()))
         progress("cutting", number, len(cuts))
     notes = [f"cut from {opened.ref}"]
     if opened.gravity is None:
@@ -123,14 +128,18 @@ def cut(opened: Map, tile: float, overlap: float) -> tuple[Cut, ...]:
         )
     centers = MapGeometry(opened).centers @ _across(opened.gravity).T
     centers -= centers.min(axis=0)
+    if centers.max() > _MAX_CELLS * tile:
+        raise _too_small(tile)
     cells, cell_of = np.unique((centers // tile).astype(np.int64), axis=0, return_inverse=True)
     cell_of = cell_of.ravel()
     # A map of photos that see nothing could not be.
     counts = np.bincount(cell_of, weights=np.diff(opened.observation_offsets) > 0)
     middles = np.array([centers[cell_of == cell].mean(axis=0) for cell in range(len(cells))])
     large = np.flatnonzero(counts >= MIN_PHOTOS)
+    if len(large) == 0 and len(cells) > 1:
+        raise _too_small(tile)
     if len(large) == 0:
-        large = np.array([int(counts.argmax())])
+        large = np.array([0])
     owner = np.array(
         [
             cell if cell in large else large[_nearest(middles[cell], middles[large])]
@@ -147,6 +156,16 @@ def cut(opened: Map, tile: float, overlap: float) -> tuple[Cut, ...]:
         i, j = cells[cell].tolist()
         cuts.append(Cut((i, j), own))
     return tuple(cuts)
+
+
+def _too_small(tile: float) -> InvalidInput:
+    return InvalidInput(
+        "split.tile",
+        "the tiles are too small",
+        field="--tile",
+        expected=f"a side with which one cell at least has {MIN_PHOTOS} photos",
+        got=tile,
+    )
 
 
 def _across(down: NDArray[np.float64] | None) -> NDArray[np.float64]:
@@ -181,13 +200,29 @@ def _publish_tile(store: MapStore, tile_id: str, content: MapContent, pictures: 
     return f"{tile_id}@{version}"
 
 
-def _refuse_map_of_this_name(store: MapStore, set_id: str) -> None:
-    """Before the long part."""
-    with suppress(NotFound, MapCorrupt):
-        if not isinstance(read_any_manifest(store.folder(set_id)), SetManifest):
-            raise Conflict(
-                "set.id_is_map",
-                "a map has this id already; give the set another one",
+def _tile_id(set_id: str, one: Cut) -> str:
+    return f"{set_id}-{one.cell[0]}-{one.cell[1]}"
+
+
+def _refuse_other_maps(store: MapStore, map_id: str, set_id: str, cuts: Sequence[Cut]) -> None:
+    """Before the long part: tiles must not take over maps that others made."""
+    for one in cuts:
+        tile_id = _tile_id(set_id, one)
+        if not ID_PATTERN.fullmatch(tile_id):
+            raise InvalidInput(
+                "map.id",
+                "with this id of the set, those of its tiles would be no map names",
                 field="--set",
-                got=set_id,
+                expected="an id short enough for -<i>-<j> to follow, 64 letters in all",
+                got=tile_id,
             )
+        with suppress(NotFound):
+            notes = read_any_manifest(store.folder(tile_id)).notes
+            if not any(note.startswith(f"{_TILE_OF}{map_id}@") for note in notes):
+                raise Conflict(
+                    "split.map_exists",
+                    f"a map that is no tile of {map_id} has the id of a tile; give the set another "
+                    "id, or remove that map",
+                    field="--set",
+                    got=tile_id,
+                )

@@ -175,6 +175,8 @@ def test_a_map_of_one_cell_is_one_tile(hall: Map) -> None:
     [
         (0.0, 0.0, "split.tile"),
         (math.nan, 0.0, "split.tile"),
+        (1e-9, 0.0, "split.tile"),
+        (1e-300, 0.0, "split.tile"),
         (2.0, -1.0, "split.overlap"),
         (2.0, 3.0, "split.overlap"),
     ],
@@ -206,10 +208,33 @@ def test_an_interrupted_split_goes_on(store: MapStore) -> None:
 
 
 def test_the_id_of_a_map_is_refused_before_the_long_part(store: MapStore) -> None:
+    before = store.ids()
     with pytest.raises(Conflict) as caught:
         split_map(store, "hall", "hall", quiet, tile=2.0, overlap=0.4)
     assert caught.value.code == "set.id_is_map"
-    assert store.ids() == MapStore(store.root).ids()
+    said: list[str] = []
+    with pytest.raises(Conflict) as caught:
+        publish_set(
+            store,
+            "hall",
+            [("halls-0-0", Similarity.identity())],
+            lambda stage, *_: said.append(stage),
+        )
+    assert caught.value.code == "set.id_is_map"
+    with pytest.raises(InvalidInput) as wrong:
+        split_map(store, "hall", "h" * 62, quiet, tile=2.0, overlap=0.4)
+    assert (wrong.value.code, wrong.value.field) == ("map.id", "--set")
+    assert said == []
+    assert store.ids() == before
+
+
+def test_a_map_of_others_is_not_taken_over_as_a_tile(store: MapStore) -> None:
+    version = moved_map(store, "hall", "depot-0-0", Similarity.identity())
+
+    with pytest.raises(Conflict) as caught:
+        split_map(store, "hall", "depot", quiet, tile=50.0, overlap=1.0)
+    assert (caught.value.code, caught.value.got) == ("split.map_exists", "depot-0-0")
+    assert store.open("depot-0-0").ref == version
 
 
 # Localizing in a set
@@ -402,6 +427,19 @@ def test_maps_on_earth_lie_where_their_anchors_say(store: MapStore) -> None:
     np.testing.assert_allclose(outline.gravity, [0, 0, -1], atol=1e-3)  # the Earth is round
 
 
+def test_anchors_that_contradict_where_maps_lie_are_refused(store: MapStore) -> None:
+    here = Geodetic(latitude_deg=45.0, longitude_deg=5.8, altitude_m=300.0)
+    anchored(store, "here", here)
+    anchored(store, "near", here.model_copy(update={"longitude_deg": 5.8001}))  # 8 m
+    anchored(store, "far", here.model_copy(update={"longitude_deg": 5.801}))  # 80 m
+    same = Similarity.identity()
+
+    publish(store, "earth", [("here", same), ("near", same)])
+    with pytest.raises(Conflict, match="far@") as caught:
+        publish(store, "earth", [("here", same), ("far", same)])
+    assert caught.value.code == "set.anchor"
+
+
 def test_a_set_knows_down_when_all_of_its_maps_do(store: MapStore) -> None:
     content = replace(content_of(store.open("hall")), gravity=None)
     here = Geodetic(latitude_deg=45.0, longitude_deg=5.8, altitude_m=300.0)
@@ -439,6 +477,10 @@ def test_maps_that_contradict_each_other_are_refused(store: MapStore) -> None:
     with pytest.raises(Conflict, match="metres of") as caught:
         publish(store, "pair", [("hall", flat), (copy, larger)])
     assert caught.value.code == "set.scale"
+    for twice in (["hall", "hall"], ["hall", f"hall@{store.current_version('hall')}"]):
+        with pytest.raises(InvalidInput, match="named twice") as wrong:
+            publish(store, "pair", [(ref, flat) for ref in twice])
+        assert wrong.value.code == "set.tiles"
     with pytest.raises(InvalidInput) as wrong:
         publish(store, "pair", [])
     assert wrong.value.code == "set.tiles"

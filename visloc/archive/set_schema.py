@@ -25,12 +25,15 @@ SET_FORMAT = "visloc-set"
 SET_MAJOR, SET_MINOR = 1, 0
 # The manifest lists them; with so many it has about 12 MB.
 MAX_TILES = 10_000
+# What a query takes is proportional to it.
+MAX_BITS = 1024
 
 
 class SimilarityRecord(Record):
     """``visloc.geometry.Similarity`` as JSON: ``x_set = scale R x_tile + translation``."""
 
-    scale: Annotated[float, Field(gt=0)] = 1.0
+    # Beyond that, squares and inverses of it are no numbers any more.
+    scale: Annotated[float, Field(ge=1e-9, le=1e9)] = 1.0
     rotation_wxyz: UnitQuaternion = (1.0, 0.0, 0.0, 0.0)
     translation: Vector = (0.0, 0.0, 0.0)
 
@@ -96,7 +99,7 @@ class CoarseRecord(Record):
 
     fingerprint: FingerprintRecord
     dim: Annotated[int, Field(ge=1)]
-    bits: Annotated[int, Field(ge=64, multiple_of=64)]
+    bits: Annotated[int, Field(ge=64, le=MAX_BITS, multiple_of=64)]
     centroids: Annotated[int, Field(ge=1, le=64)]
 
 
@@ -147,9 +150,20 @@ class SetManifest(Record):
         return self
 
     @model_validator(mode="after")
+    def _names_each_tile_once(self) -> SetManifest:
+        if len({tile.ref for tile in self.tiles}) < len(self.tiles):
+            raise ValueError("a tile is named twice")
+        return self
+
+    @model_validator(mode="after")
     def _boxes_are_boxes(self) -> SetManifest:
+        low, high = np.array(self.world.extent.min), np.array(self.world.extent.max)
+        if not (low <= high).all():
+            raise ValueError("the extent of the set ends before it begins")
         for tile in self.tiles:
             for box in (tile.extent, tile.photo_extent):
                 if not (np.array(box.min) <= np.array(box.max)).all():
                     raise ValueError(f"a box of {tile.ref} ends before it begins")
+            if not ((low <= tile.extent.min).all() and (tile.extent.max <= high).all()):
+                raise ValueError(f"{tile.ref} reaches out of the extent of the set")
         return self

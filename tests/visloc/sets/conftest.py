@@ -25,7 +25,7 @@ def _outline(
     tiles = [
         {
             "map": names[row] if names else f"tile-{row}",
-            "version": "v1",
+            "version": f"v{1 + names[:row].count(names[row])}" if names else "v1",
             "content_hash": HASH,
             "set_from_tile": {},
             "extent": {"min": low, "max": high},
