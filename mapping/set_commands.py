@@ -156,7 +156,7 @@ def verify_tiles(out: Console, opened: MapSet, maps_dir: Path | None) -> None:
         store = MapStore(maps_dir)
         refuse_missing_tiles(
             opened.manifest,
-            lambda map_id, version: read_any_manifest(store.folder(f"{map_id}@{version}")),
+            lambda refs: (read_any_manifest(store.folder("@".join(ref))) for ref in refs),
         )
         out.print(f"{opened.manifest.counts.tiles} tiles: as the set names them", soft_wrap=True)
 

@@ -16,7 +16,7 @@ import math
 import os
 import tempfile
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -36,9 +36,10 @@ from visloc.archive.set_rules import (
     refuse_if_tile,
     refuse_missing_tiles,
     refuse_other_kind,
+    unreadable_set,
 )
 from visloc.archive.set_schema import SetManifest
-from visloc.archive.sets import SetOutline, read_any_outline
+from visloc.archive.sets import SET_CODES, SetOutline, read_any_outline
 from visloc.archive.store import (
     CURRENT,
     FULL,
@@ -53,7 +54,6 @@ from visloc.archive.store import (
 )
 from visloc.errors import (
     Conflict,
-    InvalidInput,
     MapCorrupt,
     NotFound,
     StorageFull,
@@ -74,6 +74,7 @@ CONNECT_TIMEOUT_S, READ_TIMEOUT_S = 3, 10
 NEVER = -math.inf
 _INDEX_FILE = ".index.json"
 _MAX_MANIFEST_BYTES = 16 * 2**20
+_AT_ONCE = 256  # manifests that are asked for together
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,7 +259,7 @@ class RemoteMapStore:
                 raise outdated(map_id, based_on, known.current)
             manifest = read_any_manifest(incoming)
             refuse_other_kind(manifest, self._any_version(map_id, known))
-            refuse_missing_tiles(manifest, self._manifest)
+            refuse_missing_tiles(manifest, self._manifests)
             with suppress(NotFound):  # the copy of one that was removed by another server
                 self._copies.remove(map_id, version)
             self._make_room(_size_of(incoming))
@@ -288,7 +289,7 @@ class RemoteMapStore:
         with self._changing:
             known = self._versions_now(checked_name(map_id, "map"))
             self._refuse_unknown(map_id, version)
-            refuse_missing_tiles(self._manifest(map_id, version), self._manifest)
+            refuse_missing_tiles(self._manifest(map_id, version), self._manifests)
             self._write_current(map_id, version)
             self._keep_changed(map_id, known.versions, version)
 
@@ -305,7 +306,8 @@ class RemoteMapStore:
             others = [name for name in known.versions if name != version]
             if others and known.current == version:
                 raise version_in_use(map_id, version, others)
-            refuse_if_tile(map_id, version, self._in_use())
+            if not self._is_set(map_id, version):  # a set is no tile
+                refuse_if_tile(map_id, version, self._in_use())
             place = self._place(map_id, version)
             with self._asking():
                 if not others and known.current is not None:
@@ -463,21 +465,47 @@ class RemoteMapStore:
 
     # Manifests
 
-    def _manifest(self, map_id: str, version: str) -> AnyManifest:
-        """The manifest of a version, from its copy or from the storage.
+    # Rules go by what the storage has, never by copies: one may be damaged, or of another version
+    # that had the same name.
+
+    def _contents(self, refs: Sequence[tuple[str, str]]) -> Iterator[bytes | None]:
+        """The files ``manifest.json`` of versions, in their order; None where there is none.
+
+        Raises:
+            Unavailable: ``maps.storage_away``.
+        """
+        for start in range(0, len(refs), _AT_ONCE):
+            places = [f"{self._place(*ref)}/{MANIFEST}" for ref in refs[start : start + _AT_ONCE]]
+            with self._asking():
+                found = self._fs.cat(places, on_error="return")
+                for place in places:
+                    if not isinstance(found[place], bytes | FileNotFoundError):
+                        raise found[place]
+            for place in places:
+                yield found[place] if isinstance(found[place], bytes) else None
+
+    def _manifests(self, refs: Sequence[tuple[str, str]]) -> Iterator[AnyManifest]:
+        """The manifests of versions, in their order.
 
         Raises:
             NotFound: ``map.unknown`` or ``map.version``.
-            MapCorrupt: when it is damaged.
+            MapCorrupt: when one is damaged.
             Unavailable: ``maps.storage_away``.
         """
-        self._refuse_unknown(map_id, version)
-        copy = self._copies.root / map_id / version
-        if copy.is_dir():
-            return read_any_manifest(copy)
+        for ref, content in zip(refs, self._contents(refs), strict=True):
+            self._refuse_unknown(*ref)
+            yield self._parsed(*ref, content)
+
+    def _parsed(self, map_id: str, version: str, content: bytes | None) -> AnyManifest:
+        if content is None:
+            raise self._damaged(map_id, version, MANIFEST, "is missing")
         with tempfile.TemporaryDirectory() as folder:
-            self._fetch_small(map_id, version, MANIFEST, Path(folder))
+            (Path(folder) / MANIFEST).write_bytes(content)
             return read_any_manifest(Path(folder))
+
+    def _manifest(self, map_id: str, version: str) -> AnyManifest:
+        """As ``_manifests``, of one."""
+        return next(self._manifests([(map_id, version)]))
 
     def _any_version(self, map_id: str, known: _Versions) -> AnyManifest | None:
         """The manifest of any version of a map or set; None when none can be read."""
@@ -487,11 +515,31 @@ class RemoteMapStore:
         return None
 
     def _in_use(self) -> Iterator[tuple[str, AnyManifest]]:
-        """What is in use; without what cannot be read, which is not in use either."""
+        """What is in use; of an id whose ``current`` is damaged, all of its versions.
+
+        Raises:
+            Conflict: ``map.in_set`` for a set that cannot be read.
+        """
+        refs = []
         for map_id, known in self._known().items():
             if known.current is not None:
-                with suppress(MapCorrupt, NotFound, InvalidInput):
-                    yield f"{map_id}@{known.current}", self._manifest(map_id, known.current)
+                is_name = ID_PATTERN.fullmatch(known.current)
+                versions = (known.current,) if is_name else known.versions
+                refs += [(map_id, version) for version in versions]
+        for (map_id, version), content in zip(refs, self._contents(refs), strict=True):
+            ref = f"{map_id}@{version}"
+            if content is None:  # another server has just removed it
+                continue
+            try:
+                yield ref, self._parsed(map_id, version, content)
+            except MapCorrupt as error:
+                if self._is_set(map_id, version):
+                    raise unreadable_set(ref, error) from error
+
+    def _is_set(self, map_id: str, version: str) -> bool:
+        """Whether a version is a set, by its files."""
+        with self._asking():
+            return bool(self._fs.exists(f"{self._place(map_id, version)}/{SET_CODES}"))
 
     def _fetch_small(self, map_id: str, version: str, name: str, folder: Path) -> None:
         place = f"{self._place(map_id, version)}/{name}"

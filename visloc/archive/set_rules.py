@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from visloc.archive.schema import FingerprintRecord, Manifest
 from visloc.archive.set_schema import SetManifest
-from visloc.errors import Conflict, NotFound
+from visloc.errors import Conflict, MapCorrupt, NotFound
 
 AnyManifest = Manifest | SetManifest
-# Of a map id and a version; raises NotFound for what is not in the store.
-ReadManifest = Callable[[str, str], AnyManifest]
+# Of map ids and versions, in their order; raises NotFound for what is not in the store.
+ReadManifests = Callable[[Sequence[tuple[str, str]]], Iterator[AnyManifest]]
 
 
 def refuse_other_kind(incoming: AnyManifest, published: AnyManifest | None) -> None:
@@ -38,7 +38,7 @@ def refuse_other_kind(incoming: AnyManifest, published: AnyManifest | None) -> N
     )
 
 
-def refuse_missing_tiles(incoming: AnyManifest, read_manifest: ReadManifest) -> None:
+def refuse_missing_tiles(incoming: AnyManifest, read_manifests: ReadManifests) -> None:
     """Refuse a set unless each of its tiles is in the store, with the content that it names.
 
     Raises:
@@ -48,9 +48,10 @@ def refuse_missing_tiles(incoming: AnyManifest, read_manifest: ReadManifest) -> 
     """
     if not isinstance(incoming, SetManifest):
         return
+    manifests = read_manifests([(tile.map, tile.version) for tile in incoming.tiles])
     for tile in incoming.tiles:
         try:
-            found = read_manifest(tile.map, tile.version)
+            found = next(manifests)
         except NotFound as error:
             raise NotFound(
                 "set.tile",
@@ -108,3 +109,15 @@ def refuse_if_tile(map_id: str, version: str, current: Iterable[tuple[str, AnyMa
                 expected=f"a version that {ref} does not name",
                 got=f"{map_id}@{version}",
             )
+
+
+def unreadable_set(ref: str, error: MapCorrupt) -> Conflict:
+    """``map.in_set``: nobody can tell whether a set in use names a version."""
+    return Conflict(
+        "map.in_set",
+        f"{ref} is a set in use that cannot be read, so that nobody knows its tiles; publish it "
+        "anew, or remove it first",
+        field="map",
+        expected="sets that can be read",
+        got=f"{error.message}: {error.field}",
+    )

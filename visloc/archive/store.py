@@ -26,6 +26,7 @@ from visloc.archive.set_rules import (
     refuse_if_tile,
     refuse_missing_tiles,
     refuse_other_kind,
+    unreadable_set,
 )
 from visloc.archive.sets import (
     SET_CODES,
@@ -198,7 +199,7 @@ class MapStore:
         with self._changing():
             if keeps_rules:
                 refuse_other_kind(manifest, self._any_version(map_id))
-                refuse_missing_tiles(manifest, self._manifest)
+                refuse_missing_tiles(manifest, self._manifests)
             target.parent.mkdir(parents=True, exist_ok=True)
             if target.exists():
                 raise version_exists(map_id, version)
@@ -225,7 +226,7 @@ class MapStore:
         """
         with self._changing():
             parent = self.folder(f"{map_id}@{version}").parent
-            refuse_missing_tiles(read_any_manifest(parent / version), self._manifest)
+            refuse_missing_tiles(read_any_manifest(parent / version), self._manifests)
             _prepare_current(parent, version).replace(parent / CURRENT)
             _sync_folder(parent)
 
@@ -241,10 +242,11 @@ class MapStore:
         """
         with self._changing():
             folder = self.folder(f"{map_id}@{version}")
-            refuse_if_tile(map_id, version, self._sets_in_use())
             others = [name for name in self.versions(map_id) if name != version]
             if others and _current_or_none(self, map_id) == version:
                 raise version_in_use(map_id, version, others)
+            if not (folder / SET_CODES).is_file():  # a set is no tile
+                refuse_if_tile(map_id, version, self._sets_in_use())
             leaving = folder if others else folder.parent
             # Beside where it was, as a full disk may have no room for another folder.
             removed = leaving.with_name(f"{REMOVED}{secrets.token_hex(8)}")
@@ -296,6 +298,10 @@ class MapStore:
     def _manifest(self, map_id: str, version: str) -> AnyManifest:
         return read_any_manifest(self.folder(f"{map_id}@{version}"))
 
+    def _manifests(self, refs: Sequence[tuple[str, str]]) -> Iterator[AnyManifest]:
+        for ref in refs:
+            yield self._manifest(*ref)
+
     def _any_version(self, map_id: str) -> AnyManifest | None:
         """The manifest of any version of a map or set; None when none can be read."""
         for version in self.versions(map_id):
@@ -304,12 +310,25 @@ class MapStore:
         return None
 
     def _sets_in_use(self) -> Iterator[tuple[str, AnyManifest]]:
-        """The sets in use; without those that cannot be read, which are not in use either."""
+        """The sets in use; of an id whose ``current`` is damaged, all of its versions.
+
+        Raises:
+            Conflict: ``map.in_set`` for one that cannot be read.
+        """
         for map_id in self.ids():
-            with suppress(MapCorrupt, NotFound):
-                folder = self.folder(map_id)
+            try:
+                versions = [self.current_version(map_id)]
+            except NotFound:
+                continue
+            except MapCorrupt:
+                versions = self.versions(map_id)
+            for version in versions:
+                folder, ref = self.root / map_id / version, f"{map_id}@{version}"
                 if (folder / SET_CODES).is_file():  # of thousands of maps, no manifest is read
-                    yield f"{map_id}@{folder.name}", read_any_manifest(folder)
+                    try:
+                        yield ref, read_any_manifest(folder)
+                    except MapCorrupt as error:
+                        raise unreadable_set(ref, error) from error
 
     @contextmanager
     def _changing(self) -> Iterator[None]:

@@ -245,6 +245,67 @@ def test_a_url_keeps_the_same_rules(incoming: Callable[..., Path], tmp_path: Pat
     other.remove("hall", "v1")
 
 
+def bucket_of(tmp_path: Path) -> tuple[Path, Callable[[str], RemoteMapStore]]:
+    """An empty storage, and what opens it with a folder of copies of this name."""
+    bucket = tmp_path / "bucket"
+    bucket.mkdir()
+    return bucket, lambda cache: RemoteMapStore(f"file://{bucket}", tmp_path / cache, LARGE)
+
+
+def push(store: RemoteMapStore, made: Path, map_id: str, version: str) -> None:
+    with store.incoming() as folder:
+        store.publish(Path(shutil.copytree(made, folder / "map")), map_id, version)
+
+
+def test_a_damaged_copy_of_a_set_does_not_free_its_tiles(store: MapStore, tmp_path: Path) -> None:
+    bucket, remote = bucket_of(tmp_path)
+    server = remote("cache")
+    for map_id in ("hall", "attic", "house"):
+        folder = store.folder(map_id)
+        push(server, folder, map_id, folder.name)
+    (copy,) = (tmp_path / "cache").glob("*/house/*/manifest.json")
+    copy.write_bytes(copy.read_bytes()[:-30])
+
+    with pytest.raises(Conflict, match="tile of a set in use"):
+        server.remove("hall", "v1")
+
+    (damaged,) = bucket.glob("house/*/manifest.json")
+    damaged.write_bytes(damaged.read_bytes()[:-30])
+    with pytest.raises(Conflict, match=r"house@.* cannot be read") as caught:
+        server.remove("hall", "v1")
+    assert caught.value.code == "map.in_set"
+    assert (bucket / "hall" / "v1" / "manifest.json").is_file()
+    server.remove("house", damaged.parent.name)
+    server.remove("hall", "v1")
+
+
+def test_a_set_is_not_taken_for_the_tile_that_a_copy_was(
+    store: MapStore, incoming: Callable[..., Path], tmp_path: Path
+) -> None:
+    _, remote = bucket_of(tmp_path)
+    server, other = remote("cache"), remote("cache of another")
+    for map_id in ("hall", "attic"):
+        push(server, store.folder(map_id), map_id, "v1")
+    other.remove("hall", "v1")
+    push(other, incoming("hall", "hall", "v1", notes=["another hall"]), "hall", "v1")
+
+    house = store.folder("house")
+    with pytest.raises(Conflict, match="another one in this store") as caught:
+        push(remote("cache"), house, "house", house.name)  # that server, started again
+    assert caught.value.code == "set.tile"
+
+
+def test_a_set_that_cannot_be_read_frees_no_tile(store: MapStore) -> None:
+    house = store.folder("house")
+    (house / "manifest.json").write_text("{")
+
+    with pytest.raises(Conflict, match=r"house@.* cannot be read") as caught:
+        store.remove("hall", "v1")
+    assert caught.value.code == "map.in_set"
+    store.remove("house", house.name)
+    store.remove("hall", "v1")
+
+
 # Damage
 
 
