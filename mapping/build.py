@@ -35,10 +35,12 @@ from mapping.pairing import PAIRINGS, write_pairs
 from mapping.photos import MappingPhoto, collect_photos
 from mapping.places import (
     is_remote,
+    lies_in,
     open_store,
     opened_dataset,
     scratch_folder,
     storage_errors,
+    work_place,
 )
 from mapping.previews import keep_photos
 from mapping.publishing import PAIRS, publish_content
@@ -86,7 +88,8 @@ class BuildSettings:
         map_id: id of the map.
         maps_dir: folder of maps, or the URL of one.
         cache_dir: for maps of a URL: folder of their copies here.
-        work_dir: folder or URL where finished work is kept; None: beside the maps.
+        work_dir: folder or URL in which finished work is kept, in a folder of its own; None:
+            beside the maps.
         method: a name of ``METHODS``.
         local_features: a name of ``visloc.features.LOCAL_FEATURES``, or ``kapture:TYPE`` for
             features that the dataset brings along.
@@ -173,12 +176,14 @@ def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None =
     if not is_ready_made(settings.local_features):  # raises when it cannot
         open_extractor(settings.local_features, settings.weights_dir, settings.inference)
     scratch = scratch_folder(settings.maps_dir, settings.cache_dir, settings.map_id)
-    work = WorkFolder((settings.work_dir or settings.maps_dir / ".work") / settings.map_id)
+    work = WorkFolder(work_place(settings.work_dir or settings.maps_dir, settings.map_id))
     try:
         with (
             opened_dataset(settings.dataset) as dataset,
             exclusive(scratch.with_name(f"{scratch.name}.lock")),
         ):
+            if settings.work_dir is not None:
+                work.claim()
             with open_executor(
                 settings.executor, settings.workers, settings.ray_address
             ) as workers:
@@ -253,6 +258,8 @@ def _check(settings: BuildSettings) -> None:
             got=settings.method,
         )
     _check_names("--executor", (settings.executor,), EXECUTORS)
+    if settings.work_dir is not None:
+        _refuse_mixed_places(settings, settings.work_dir)
     if is_remote(settings.dataset) and (
         settings.method == "model"
         or any(is_ready_made(n) for n in (settings.local_features, *settings.global_features))
@@ -336,6 +343,28 @@ def _check(settings: BuildSettings) -> None:
             expected="nothing, or intrinsics, with --poses estimate",
             got=",".join(sfm.refine),
         )
+
+
+def _refuse_mixed_places(settings: BuildSettings, work_dir: Path) -> None:
+    """Refuse a folder for finished work that is among other things, or holds them.
+
+    It is removed when the map is published.
+    """
+    root = work_place(work_dir, settings.map_id)
+    for option, place in (
+        ("DATASET", settings.dataset),
+        ("--maps-dir", settings.maps_dir),
+        ("--cache-dir", settings.cache_dir),
+    ):
+        if lies_in(root, place) or lies_in(place, root):
+            raise InvalidInput(
+                "build.work_dir",
+                f"finished work would be kept in {root}, which is in {option} or holds it, and is "
+                "removed when the map is published",
+                field="--work-dir",
+                expected=f"a folder apart from {option}, or without the option",
+                got=str(work_dir),
+            )
 
 
 def _check_names(option: str, names: Sequence[str], known: Sequence[str]) -> None:

@@ -183,7 +183,7 @@ def build(
         typer.Option(
             metavar="FOLDER|URL",
             help="Where finished work is kept until the map is published, the same for all "
-            "machines; left out: .work in --maps-dir.",
+            "machines, in .work/MAP of it; left out: --maps-dir.",
             rich_help_panel=CLUSTER_PANEL,
         ),
     ] = None,

@@ -29,6 +29,7 @@ def place_of(text: str, option: str) -> Path:
     Raises:
         InvalidInput: ``build.url`` for one that cannot be used.
     """
+    text = text.removeprefix("file://")
     if "://" not in text:
         return Path(text)
     if "::" in text or "@" in text:
@@ -80,6 +81,20 @@ def open_store(maps_dir: Path, cache_dir: Path) -> MapStore:
     from visloc.archive.remote_store import RemoteMapStore  # its libraries are optional
 
     return cast("MapStore", RemoteMapStore(str(maps_dir), cache_dir, sys.maxsize))
+
+
+def lies_in(place: Path, other: Path) -> bool:
+    """Tell whether a place is in another, or is the same."""
+    if is_remote(place) != is_remote(other):
+        return False
+    if is_remote(place):
+        return f"{place}/".replace("//", "/").startswith(f"{other}/".replace("//", "/"))
+    return place.resolve().is_relative_to(other.resolve())
+
+
+def work_place(place: Path, map_id: str) -> Path:
+    """Return where a place keeps finished work of a map: in a folder that is only for that."""
+    return place / ".work" / map_id
 
 
 def scratch_folder(maps_dir: Path, cache_dir: Path, map_id: str) -> Path:

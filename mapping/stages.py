@@ -30,8 +30,11 @@ from numpy.typing import NDArray
 from mapping.costs import wrote
 from mapping.places import is_remote, remove_folder
 from visloc.archive.npz import read_npz
-from visloc.errors import Conflict, Unavailable
+from visloc.errors import Conflict, InvalidInput, Unavailable
 
+# Tells that a folder is one of finished work, which may be removed.
+_MARKER = "visloc-work.txt"
+_MARKER_TEXT = b"Finished work of a build. It is removed when the map is published.\n"
 # NumPy's letters of what items hold: numbers, truth values, text.
 _KINDS = "biufU"
 
@@ -65,8 +68,30 @@ class WorkFolder:
         """A folder of this machine for temporary files."""
         return Path(tempfile.gettempdir()) if is_remote(self.root) else self.root
 
+    def claim(self) -> None:
+        """Mark the folder as one of finished work, so that it may be removed.
+
+        Raises:
+            InvalidInput: ``build.work_dir`` for a folder of somebody else's files.
+        """
+        marker = self.root / _MARKER
+        if marker.is_file():
+            return
+        if self.root.exists() and any(self.root.iterdir()):
+            raise InvalidInput(
+                "build.work_dir",
+                "the folder for finished work has files that no build made; it would be removed "
+                "with them when the map is published. Choose another one, or move them away",
+                field="--work-dir",
+                expected=f"a folder that is not there yet, or is empty, or has {_MARKER}",
+                got=str(self.root),
+            )
+        if not is_remote(self.root):
+            self.root.mkdir(parents=True, exist_ok=True)
+        marker.write_bytes(_MARKER_TEXT)
+
     def remove(self) -> None:
-        """Remove all items."""
+        """Remove the folder with all that is in it."""
         if is_remote(self.root):
             remove_folder(self.root)
         else:

@@ -139,8 +139,76 @@ def test_items_of_a_url_are_read_again_and_damaged_ones_made_again(
     work.remove()
 
 
+def test_a_url_with_files_of_others_is_not_taken_for_finished_work(
+    bucket: str, tmp_path: Path
+) -> None:
+    place = place_of(f"{bucket}/{tmp_path.name}/work", "--work-dir")
+    (place / "photos" / "mine.jpg").write_bytes(b"mine")
+    with pytest.raises(InvalidInput) as caught:
+        WorkFolder(place).claim()
+    assert caught.value.code == "build.work_dir"
+    WorkFolder(place / "new").claim()
+    WorkFolder(place / "new").claim()
+    WorkFolder(place / "new").remove()
+    found = {name for name in objects_of(bucket) if name.startswith(tmp_path.name)}
+    assert found == {f"{tmp_path.name}/work/photos/mine.jpg"}
+
+
+def test_a_build_removes_only_what_it_made(walk_copy: Path, tmp_path: Path) -> None:
+    (walk_copy / "notes.txt").write_text("mine")
+    before = sorted(walk_copy.rglob("*"))
+    settings = BuildSettings(
+        walk_copy,
+        map_id=walk_copy.name,  # so that finished work might take the dataset's place
+        maps_dir=tmp_path / "maps",
+        local_features="sift",
+        global_features=("localvlad",),
+        max_keypoints=100,
+        work_dir=walk_copy.parent,
+    )
+    work = walk_copy.parent / ".work" / walk_copy.name
+    kept: list[Path] = []
+
+    def watch(stage: str, done: int, _total: int) -> None:
+        if (stage, done) == ("archive", 0):
+            kept.extend(work.glob("lifted/*.npz"))
+
+    built = build_map(settings, watch)
+    assert len(kept) == 16
+    assert not work.exists()
+    assert sorted(walk_copy.rglob("*")) == before
+    assert open_map(built).manifest.id == walk_copy.name
+
+
+@pytest.mark.parametrize(
+    ("work_dir", "maps_dir"),
+    [
+        ("maps", "maps"),
+        ("maps/walk", "maps"),
+        ("dataset", "maps"),
+        ("dataset/sensors", "maps"),
+        ("work", "work/.work/walk/maps"),
+        ("s3://bucket/maps", "s3://bucket/maps"),
+        ("s3://bucket", "s3://bucket/.work/walk/maps"),
+    ],
+)
+def test_finished_work_is_not_kept_among_other_things(
+    walk_copy: Path, tmp_path: Path, work_dir: str, maps_dir: str
+) -> None:
+    places = [
+        place_of(text if "://" in text else str(tmp_path / text), "--work-dir")
+        for text in (work_dir, maps_dir)
+    ]
+    settings = BuildSettings(walk_copy, "walk", places[1], work_dir=places[0])
+    with pytest.raises(InvalidInput) as caught:
+        build_map(settings, quiet)
+    assert (caught.value.code, caught.value.field) == ("build.work_dir", "--work-dir")
+    assert {path.name for path in tmp_path.iterdir()} == {"dataset"}
+
+
 def test_folders_are_paths() -> None:
     assert place_of("some/folder", "dataset") == Path("some/folder")
+    assert place_of("file:///some/folder", "dataset") == Path("/some/folder")
     assert not is_remote(place_of("/some", "dataset"))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mapping.stages import WorkFolder, exclusive, key_of
-from visloc.errors import Conflict, Unavailable
+from visloc.errors import Conflict, InvalidInput, Unavailable
 
 
 def test_a_finished_item_is_not_computed_again(tmp_path: Path) -> None:
@@ -124,6 +124,25 @@ def test_a_failing_computation_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError):
         work.get(key_of("stage", 1), fail)
     assert list(tmp_path.rglob("*")) == []
+
+
+def test_only_a_folder_of_its_own_is_taken_for_finished_work(tmp_path: Path) -> None:
+    work = WorkFolder(tmp_path / "new" / "room")
+    work.claim()
+    work.get(key_of("stage", 1), lambda: {"a": np.zeros(1)})
+    work.claim()  # of a build that was interrupted
+    work.remove()
+    assert not work.root.exists()
+    work.root.mkdir()
+    work.claim()  # it was empty
+
+
+def test_a_folder_with_files_of_others_is_refused_and_stays(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InvalidInput, match="no build made") as caught:
+        WorkFolder(tmp_path).claim()
+    assert (caught.value.code, caught.value.field) == ("build.work_dir", "--work-dir")
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
 def _hold(lock: Path, ready: object, leave: object) -> None:
