@@ -31,8 +31,9 @@ _NAMED = 3
 def content_of(opened: Map) -> MapContent:
     """Return a map as content. Written again, it is byte for byte the same.
 
-    Large arrays stay mapped from its files, which must stay as long as the content is used. What
-    lies beside the arrays (``mapping.publishing.photo_files``, ``files_beside``) is not part of it.
+    Large arrays stay mapped from its files, but for keypoints, which become float32: the files must
+    stay as long as the content is used. What lies beside the arrays
+    (``mapping.publishing.photo_files``, ``files_beside``) is not part of it.
     """
     manifest = opened.manifest
     local, scale = manifest.local_features, manifest.local_features.descriptor_scale
@@ -294,7 +295,8 @@ def _joined_cameras(
         camera_of[name] = _free_name(name, camera, cameras)
         cameras[camera_of[name]] = camera
     for name, members in b.rigs.items():
-        renamed = {camera_of[key]: row for key, row in members.items()}
+        # A rig may have sensors that are no cameras.
+        renamed = {camera_of.get(key, key): row for key, row in members.items()}
         rigs[_free_name(name, renamed, rigs)] = renamed
     return cameras, rigs, camera_of
 

@@ -109,5 +109,10 @@ def _parsed(fields: Sequence[str], where: str) -> Similarity:
         raise InvalidInput(
             "set.poses", "not a pose", field=where, expected=_LINE, got=" ".join(fields)
         )
-    pose = Pose.from_quaternion(numbers[:4], numbers[4:7])
+    try:
+        pose = Pose.from_quaternion(numbers[:4], numbers[4:7])
+    except InvalidInput as error:
+        raise InvalidInput(
+            error.code, error.message, field=where, expected=error.expected, got=error.got
+        ) from error
     return Similarity(scale, pose.rotation, pose.translation)

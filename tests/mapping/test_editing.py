@@ -185,7 +185,7 @@ def test_cameras_of_one_name_that_differ_are_two(built: Map) -> None:
     content = content_of(built)
     first = np.arange(8) < 5
     name, *_ = content.cameras
-    rig = dict.fromkeys(content.cameras, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    rig = dict.fromkeys((*content.cameras, "lidar"), (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     a = replace(selected(content, first), rigs={"rig": rig})
     other = Camera("SIMPLE_PINHOLE", 256, 192, (200.0, 128.0, 96.0))
     b = replace(selected(content, ~first), cameras={**a.cameras, name: other}, rigs={"rig": rig})

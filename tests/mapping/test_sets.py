@@ -373,6 +373,7 @@ def test_poses_that_do_not_fit_are_refused(tmp_path: Path, text: str, code: str)
     with pytest.raises(InvalidInput) as caught:
         read_poses(tmp_path / "poses.txt", ["a", "b"])
     assert caught.value.code == code
+    assert "poses.txt" in str(caught.value.field)
 
 
 def anchored(store: MapStore, map_id: str, geodetic: Geodetic) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import CoarseIndex, FingerprintRecord, Map, MapSet
+from visloc.errors import MapCorrupt
 from visloc.features import GlobalDescriptor, make_global_descriptor
 from visloc.features.vlad import KMEANS_MAX_WORDS, learn_words
 from visloc.features.whitening import WHITENING_MAX_PHOTOS, unit_rows
@@ -184,8 +185,18 @@ def rank_tiles(
 
     Raises:
         Conflict: ``map.features`` when the index was made with another revision of the descriptor.
+        MapCorrupt: ``map.array`` when its vocabulary is of other local features.
     """
     check_descriptor(map_set)
+    dim, expected = local.descriptors.shape[1], map_set.coarse.model["vocabulary"].shape[1]
+    if dim != expected:
+        raise MapCorrupt(
+            "map.array",
+            f"the coarse model of {map_set.ref} is not of its local features; make the set anew",
+            field="vocabulary",
+            expected=f"{dim} columns",
+            got=f"{expected} columns",
+        )
     query = _descriptor().describe(_NO_PIXELS, local, map_set.coarse.model)
     return ranked(map_set.coarse, query, allowed)
 

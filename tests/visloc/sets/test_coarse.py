@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from visloc.archive import CoarseIndex, FingerprintRecord, Map, MapStore, SetOutline, open_map
 from visloc.archive.sets import MapSet
-from visloc.errors import Conflict
+from visloc.errors import Conflict, MapCorrupt
 from visloc.features import make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
@@ -207,6 +207,18 @@ def test_equal_seeds_learn_the_same(room: Map) -> None:
     for name, array in once.items():
         np.testing.assert_array_equal(array, again[name])
     assert once["planes"].shape == (once["axes"].shape[1], BITS)
+
+
+def test_a_vocabulary_of_other_features_is_named(rooms: MapSet) -> None:
+    other = LocalFeatures(
+        np.zeros((5, 2), np.float32),
+        np.ones((5, 64), np.float32) / 8,
+        np.zeros(5, np.float32),
+        np.zeros(5, np.float32),
+    )
+
+    with pytest.raises(MapCorrupt, match="not of its local features"):
+        rank_tiles(rooms, other)
 
 
 def test_the_index_of_another_revision_is_refused(rooms: MapSet) -> None:
