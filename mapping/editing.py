@@ -160,10 +160,14 @@ def moved(content: MapContent, new_from_old: Similarity, *, metric: bool) -> Map
         Similarity(new_from_old.scale, new_from_old.rotation, np.zeros(3)),
     )
     poses = (Pose.from_quaternion(row[:4], row[4:]) for row in content.image_poses)
+    settings, voxel_size = content.settings, content.settings.get("voxel_size")
+    if isinstance(voxel_size, int | float):  # of landmarks by depth; captures that join keep it
+        settings = {**settings, "voxel_size": new_from_old.scale * voxel_size}
     gravity = None if content.gravity is None else turn.rotation @ np.array(content.gravity)
     return replace(
         content,
         metric=metric,
+        settings=settings,
         rigs={
             rig: {
                 key: (*row[:4], *(new_from_old.scale * np.array(row[4:])).tolist())

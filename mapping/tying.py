@@ -160,6 +160,14 @@ def agreeing(photos: Sequence[Seen], there_from_here: Similarity) -> NDArray[np.
     return _agreeing([_View(seen, forward=True) for seen in photos], there_from_here, _AGREES)
 
 
+def contradicting(photos: Sequence[Seen], there_from_here: Similarity) -> NDArray[np.bool_]:
+    """Tell which photos (n,) cannot have been where a similarity puts them.
+
+    Some that agree with it badly do not contradict it: poses of photos are not exact.
+    """
+    return ~_agreeing([_View(seen, forward=True) for seen in photos], there_from_here, _COARSE)
+
+
 def too_few(tied: NDArray[np.bool_]) -> str | None:
     """Say why photos (n,) of which these agree are no tie, in words to follow "but"; or None."""
     if tied.sum() >= max(MIN_PHOTOS, len(tied) // 2 + 1):

@@ -22,6 +22,7 @@ from mapping.features import (
 )
 from mapping.photos import MappingPhoto, collect_photos
 from mapping.stages import WorkFolder
+from mapping.updating.localizing import Placed
 from mapping.updating.settings import UpdateSettings
 from visloc.archive import Map
 from visloc.archive.schema import photo_file
@@ -187,6 +188,18 @@ def describe_capture(
                 progress,
             )
     return replace(capture, described=found)
+
+
+def where_localized(capture: Capture, placed: Sequence[Placed]) -> tuple[Capture, list[str]]:
+    """Return the photos that were localized, with these poses, and the names of the others."""
+    rows = [row for row, one in enumerate(placed) if one.localized]
+    found = capture.take(rows)
+    photos = [
+        replace(photo, cam_from_world=placed[row].cam_from_map)
+        for photo, row in zip(found.photos, rows, strict=True)
+    ]
+    pairs = zip(capture.names, placed, strict=True)
+    return replace(found, photos=photos), [name for name, one in pairs if not one.localized]
 
 
 def some(names: Sequence[str]) -> str:

@@ -33,22 +33,32 @@ from mapping.updating.capture import (
     describe_capture,
     open_map_features,
     some,
+    where_localized,
 )
-from mapping.updating.joining import landmarks_in_same_voxel, part_of_map
+from mapping.updating.joining import landmarks_in_same_voxel, part_of_map, scaled_rigs
 from mapping.updating.localizing import Placed, localize_photos
 from mapping.updating.placing import (
     Placement,
+    beside,
+    contradicted,
     evenly,
     place_capture,
     refuse_elsewhere,
 )
-from mapping.updating.settings import METHODS, UpdateSettings, check_settings
+from mapping.updating.settings import (
+    UpdateSettings,
+    check_settings,
+    method_for,
+    refuse_few,
+    refuse_strange_settings,
+)
 from mapping.workers import Workers
 from visloc.archive import Map, MapContent, MapStore, open_map
 from visloc.archive.schema import photo_file
 from visloc.archive.store import outdated
-from visloc.errors import InvalidInput, Unavailable
-from visloc.geometry import Pose, Similarity
+from visloc.errors import Unavailable
+from visloc.evaluation import pose_error
+from visloc.geometry import Similarity
 from visloc.kapture import Dataset, read_dataset
 
 # Photos that are localized before the long work begins, to refuse what does not fit.
@@ -119,7 +129,7 @@ def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
     Raises:
         Conflict: ``update.elsewhere`` for a capture that does not fit the map; ``update.photos``
             when the map has photos of these names; ``map.outdated`` when another version is
-            current; ``map.features``; ``build.running``.
+            current; ``map.features``; ``update.settings``; ``build.running``.
         DatasetError, WeightsError, InvalidInput: with the file or the setting that is wrong.
         Unavailable: ``storage.failed`` when the disk is full or broken.
     """
@@ -127,7 +137,8 @@ def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
     store = MapStore(settings.maps_dir)
     opened = open_map(map_folder(settings.map_ref, settings.maps_dir))
     map_id, version = opened.manifest.id, opened.manifest.version
-    method = _method(settings, opened)
+    method = method_for(settings, opened)
+    refuse_strange_settings(opened)
     dataset = read_dataset(settings.dataset).with_pixels_from(settings.pixel_origin)
     work_root = settings.maps_dir / ".work" / map_id
     work = WorkFolder(work_root)
@@ -138,7 +149,7 @@ def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
                 raise outdated(map_id, version, current)
             with Workers(settings.workers) as workers:
                 job = _Job(settings, opened, dataset, features, method, work, workers, progress)
-                content, pictures, record = job.run()
+                content, pictures, record, notes = job.run()
             progress("archive", 0, 1)
             folder = publish_edited(store, content, map_id, photos=pictures, based_on=version)
             progress("archive", 1, 1)
@@ -150,24 +161,7 @@ def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
             "finished work is kept, the same command resumes",
             field=str(error.filename or work_root),
         ) from error
-    notes = tuple(note for note in content.notes if note not in opened.manifest.notes)
     return Updated(folder, record, notes)
-
-
-def _method(settings: UpdateSettings, opened: Map) -> str:
-    """How landmarks are made: as asked, else as those of the map; refuse what has no unit."""
-    made_by = opened.manifest.method.name
-    method = settings.method or (made_by if made_by in METHODS else "sfm")
-    if method == "rgbd" and settings.poses != "tie" and not opened.manifest.world.metric:
-        raise InvalidInput(
-            "update.unit",
-            "how long a metre of the depth maps is in the map's unit tells only a trajectory of "
-            "the capture's own",
-            field="--poses",
-            expected="tie, or --method sfm, or a metric map",
-            got=settings.poses,
-        )
-    return method
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,8 +177,8 @@ class _Job:
     workers: Executor
     progress: Progress
 
-    def run(self) -> tuple[MapContent, list[Path], UpdateRecord]:
-        """Return the updated map, its small pictures if it keeps such, and the update's record."""
+    def run(self) -> tuple[MapContent, list[Path], UpdateRecord, tuple[str, ...]]:
+        """Return the updated map, its small pictures if it keeps such, the record, and notes."""
         settings, by_depth = self.settings, self.method == "rgbd"
         capture, notes = collect_capture(
             settings,
@@ -195,6 +189,8 @@ class _Job:
             progress=self.progress,
         )
         count = len(capture.photos)
+        if not by_depth:
+            refuse_few(count)
         rows = evenly(range(count), count if settings.poses == "localize" else _TIED_BY)
         # What does not fit is refused before the long work begins.
         first = self._described(capture.take(evenly(rows, _TRIED_FIRST)))
@@ -213,10 +209,54 @@ class _Job:
             metric=settings.metric,
         )
         if settings.poses == "localize":
-            capture, absent = _where_localized(tried, placed)
+            capture, absent = where_localized(tried, placed)
             if absent:
                 notes.append(f"{len(absent)} of {count} photos found no place: {some(absent)}")
+        else:
+            known = dict(zip(rows, placed, strict=True))
+            capture, left_out = self._without_contradicted(
+                capture, known, placement.map_from_dataset
+            )
+            notes += left_out
         return self._joined(capture, placement, notes)
+
+    def _without_contradicted(
+        self, capture: Capture, placed: dict[int, Placed], map_from_dataset: Similarity
+    ) -> tuple[Capture, list[str]]:
+        """The photos whose poses the map does not contradict, and notes on the others.
+
+        Who stands beside a contradicted photo is tried as well, and goes when the map cannot tell.
+        """
+        count = len(capture.photos)
+
+        def localized() -> list[int]:
+            return [row for row, one in placed.items() if one.localized]
+
+        wrong = contradicted(capture.photos, placed, map_from_dataset)
+        if not wrong:
+            return capture, []
+        more = [row for row in beside(wrong, localized(), count) if row not in placed]
+        placed = {**placed, **dict(zip(more, self._localized(capture.take(more)), strict=True))}
+        wrong = contradicted(capture.photos, placed, map_from_dataset)
+        doubtful = beside(wrong, localized(), count)
+        off = [
+            pose_error(map_from_dataset.move(capture.photos[row].pose), placed[row].cam_from_map)
+            for row in wrong
+        ]
+        distance, angle = np.median(off, axis=0)
+        unit = "m" if self.opened.manifest.world.metric else "units"
+        notes = [
+            f"{len(wrong)} of {count} photos left out, since the map localizes them {distance:.3g} "
+            f"{unit}, {angle:.3g} degrees from their own poses, in the median: "
+            f"{some([capture.names[row] for row in wrong])}"
+        ]
+        if doubtful:
+            notes.append(
+                f"{len(doubtful)} of {count} photos left out, since they are beside such, and not "
+                f"localized: {some([capture.names[row] for row in doubtful])}"
+            )
+        gone = {*wrong, *doubtful}
+        return capture.take([row for row in range(count) if row not in gone]), notes
 
     def _lifted(
         self, photo: MappingPhoto, pixels: NDArray[np.float64]
@@ -252,11 +292,17 @@ class _Job:
 
     def _joined(
         self, capture: Capture, placement: Placement, notes: Sequence[str]
-    ) -> tuple[MapContent, list[Path], UpdateRecord]:
+    ) -> tuple[MapContent, list[Path], UpdateRecord, tuple[str, ...]]:
         """Make landmarks of the photos, and join them to the map."""
+        if self.method == "sfm":
+            refuse_few(len(capture.photos))
         content = content_of(self.opened)
         map_from_dataset = placement.map_from_dataset
-        dataset = _scaled_rigs(self.dataset, map_from_dataset.scale)
+        if self.settings.poses == "localize" and not (self.settings.metric and content.metric):
+            # Photos that are placed one by one do not tell how long a rig is in the map's unit.
+            dataset = replace(self.dataset, rigs={})
+        else:
+            dataset = scaled_rigs(self.dataset, map_from_dataset.scale)
         made, same = self._landmarks(content, dataset, capture, map_from_dataset)
         placed = [capture.photos[row] for row in made.photos]
         if content.landmarks.colors is not None and made.landmarks.colors is None:
@@ -274,6 +320,8 @@ class _Job:
             made,
             notes,
         )
+        # Those of two captures are two, though they say the same.
+        part = replace(part, notes=tuple(f"{self._name}: {note}" for note in part.notes))
         pictures = photo_files(self.opened)
         if pictures:
             folder = self.work.root / "small_photos"
@@ -284,7 +332,12 @@ class _Job:
         before = content.settings.get("updates", [])
         assert isinstance(before, list)
         settings = {**content.settings, "updates": [*before, asdict(record)]}
-        return replace(whole, settings=settings), pictures, record
+        return replace(whole, settings=settings), pictures, record, tuple(part.notes)
+
+    @property
+    def _name(self) -> str:
+        """What the capture is called."""
+        return self.settings.capture or self.settings.dataset.resolve().name
 
     def _landmarks(
         self,
@@ -336,7 +389,7 @@ class _Job:
     def _record(self, placement: Placement, before: MapContent, after: MapContent) -> UpdateRecord:
         settings, old, new = self.settings, before.landmarks, after.landmarks
         return UpdateRecord(
-            capture=settings.capture or settings.dataset.resolve().name,
+            capture=self._name,
             poses=settings.poses,
             method=self.method,
             photos=len(after.images) - len(before.images),
@@ -351,29 +404,3 @@ class _Job:
             orientation_deg=placement.orientation_deg,
             scale=placement.map_from_dataset.scale,
         )
-
-
-def _where_localized(capture: Capture, placed: Sequence[Placed]) -> tuple[Capture, list[str]]:
-    """The photos that were localized, with these poses, and the names of the others."""
-    rows = [row for row, one in enumerate(placed) if one.localized]
-    found = capture.take(rows)
-    photos = [
-        replace(photo, cam_from_world=placed[row].cam_from_map)
-        for photo, row in zip(found.photos, rows, strict=True)
-    ]
-    pairs = zip(capture.names, placed, strict=True)
-    return replace(found, photos=photos), [name for name, one in pairs if not one.localized]
-
-
-def _scaled_rigs(dataset: Dataset, scale: float) -> Dataset:
-    """The dataset with its rigs in another unit."""
-    return replace(
-        dataset,
-        rigs={
-            rig: {
-                sensor: pose and Pose(pose.rotation, pose.translation * scale)
-                for sensor, pose in members.items()
-            }
-            for rig, members in dataset.rigs.items()
-        },
-    )

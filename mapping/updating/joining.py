@@ -13,6 +13,7 @@ from mapping.landmarks import MadeLandmarks
 from mapping.photos import MappingPhoto
 from mapping.sfm import known_rigs
 from visloc.archive import ImageRecord, Landmarks, MapContent, pose_row
+from visloc.geometry import Pose
 from visloc.kapture import Dataset
 
 
@@ -67,6 +68,20 @@ def part_of_map(
             replace(one, descriptors=described[one.fingerprint.name][made.photos])
             for one in content.global_features
         ),
+    )
+
+
+def scaled_rigs(dataset: Dataset, scale: float) -> Dataset:
+    """Return the dataset with its rigs in another unit."""
+    return replace(
+        dataset,
+        rigs={
+            rig: {
+                sensor: pose and Pose(pose.rotation, pose.translation * scale)
+                for sensor, pose in members.items()
+            }
+            for rig, members in dataset.rigs.items()
+        },
     )
 
 

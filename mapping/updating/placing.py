@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from bisect import bisect
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -11,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.photos import MappingPhoto
-from mapping.tying import MAX_DEPTH_OFF, Seen, agreeing, refined_by_depth, tie, too_few
+from mapping.tying import (
+    MAX_DEPTH_OFF,
+    Seen,
+    agreeing,
+    contradicting,
+    refined_by_depth,
+    tie,
+    too_few,
+)
 from mapping.updating.localizing import Placed
 from visloc.archive import Map
 from visloc.errors import Conflict
@@ -118,17 +127,14 @@ def place_capture(
     if poses == "given":
         own = [photo.pose for photo, _ in both]
         agrees = [_fits(photo, one) for photo, one in both]
-        if sum(agrees) < _MIN_PART * len(both):
+        if sum(agrees) <= len(both) / 2:  # as a tie needs more than half
             raise _elsewhere(
                 f"{localized}, but only {sum(agrees)} where --poses given has them",
                 "poses in the map's frame, or --poses tie",
             )
         return _placement(Similarity.identity(), placed, both, own, agrees)
     rigid = metric and opened.manifest.world.metric
-    seen = [
-        Seen(photo.pose, photo.camera, one.pixels, one.points, one.cam_from_map)
-        for photo, one in both
-    ]
+    seen = [_seen(photo, one) for photo, one in both]
     found = tie(seen, rigid=rigid)
     if isinstance(found, str):
         raise _elsewhere(
@@ -142,7 +148,14 @@ def place_capture(
             for one, (photo, _), agree in zip(seen, both, agrees, strict=True)
             if agree
         ]
-        if sum(len(one.points) for one in lifted) >= _MIN_LIFTED:
+        count = sum(len(one.points) for one in lifted)
+        if count < _MIN_LIFTED and not metric:
+            raise _elsewhere(
+                f"{localized}, but only {count} points that they see have depth, which do not tell "
+                "whether its unit is that of the poses",
+                f"{_MIN_LIFTED} points with depth, or --method sfm",
+            )
+        if count >= _MIN_LIFTED:
             by_depth = refined_by_depth(lifted, similarity, rigid=rigid)
             if isinstance(by_depth, str):
                 raise _elsewhere(f"{localized}, but {by_depth}", _GOOD_DEPTH)
@@ -152,6 +165,36 @@ def place_capture(
             agrees = tied.tolist()
     own = [similarity.move(photo.pose) for photo, _ in both]
     return _placement(similarity, placed, both, own, agrees)
+
+
+def contradicted(
+    photos: Sequence[MappingPhoto], placed: Mapping[int, Placed], map_from_dataset: Similarity
+) -> list[int]:
+    """Rows of the photos that were localized where their own pose, moved, cannot be."""
+    rows = [row for row, one in placed.items() if one.localized]
+    wrong = contradicting([_seen(photos[row], placed[row]) for row in rows], map_from_dataset)
+    return sorted(row for row, is_wrong in zip(rows, wrong, strict=True) if is_wrong)
+
+
+def beside(wrong: Collection[int], localized: Collection[int], count: int) -> list[int]:
+    """Rows of photos that are not localized and of whose neighbours that are one is wrong.
+
+    Args:
+        wrong: rows of photos that the map contradicts.
+        localized: rows of all that are localized, these among them.
+        count: of all photos, which are in the order in which they were taken.
+    """
+    known = sorted(localized)
+    found = []
+    for row in sorted(set(range(count)).difference(known)):
+        at = bisect(known, row)
+        if not set(known[max(at - 1, 0) : at + 1]).isdisjoint(wrong):
+            found.append(row)
+    return found
+
+
+def _seen(photo: MappingPhoto, one: Placed) -> Seen:
+    return Seen(photo.pose, photo.camera, one.pixels, one.points, one.cam_from_map)
 
 
 def _lifted(seen: Seen, photo: MappingPhoto, lift: Lift) -> Seen:

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mapping.rgbd import DepthSettings
+from visloc.archive import Map
 from visloc.archive.schema import ID_PATTERN
-from visloc.errors import InvalidInput
+from visloc.errors import Conflict, InvalidInput
 from visloc.geometry import PixelOrigin
 from visloc.types import Inference
 
@@ -88,4 +89,67 @@ def check_settings(settings: UpdateSettings) -> None:
             field="--depth-scale",
             expected="metres, more than 0",
             got=settings.depth_scale,
+        )
+
+
+def method_for(settings: UpdateSettings, opened: Map) -> str:
+    """Return how landmarks are made: as asked, else as those of the map.
+
+    Raises:
+        InvalidInput: ``update.unit`` when depth has no unit in the map.
+    """
+    made_by = opened.manifest.method.name
+    method = settings.method or (made_by if made_by in METHODS else "sfm")
+    if method == "rgbd" and settings.poses != "tie" and not opened.manifest.world.metric:
+        raise InvalidInput(
+            "update.unit",
+            "how long a metre of the depth maps is in the map's unit tells only a trajectory of "
+            "the capture's own",
+            field="--poses",
+            expected="tie, or --method sfm, or a metric map",
+            got=settings.poses,
+        )
+    return method
+
+
+def refuse_strange_settings(opened: Map) -> None:
+    """Refuse a map whose settings, which may be of any software, are not what an update reads.
+
+    Raises:
+        Conflict: ``update.settings``.
+    """
+    settings = opened.manifest.method.settings
+    voxel_size = settings.get("voxel_size", DepthSettings().voxel_size)
+    is_length = (
+        isinstance(voxel_size, int | float)
+        and not isinstance(voxel_size, bool)
+        and 0 < voxel_size < float("inf")
+    )
+    for name, known, expected in (
+        ("updates", isinstance(settings.get("updates", []), list), "a list of updates"),
+        ("voxel_size", is_length, "a length, more than 0"),
+    ):
+        if not known:
+            raise Conflict(
+                "update.settings",
+                f"the settings of map {opened.ref} have a strange {name}",
+                field=name,
+                expected=expected,
+                got=str(settings[name]),
+            )
+
+
+def refuse_few(count: int) -> None:
+    """Refuse to match fewer photos with each other than two.
+
+    Raises:
+        InvalidInput: ``update.photos_few``.
+    """
+    if count < 2:
+        raise InvalidInput(
+            "update.photos_few",
+            "new photos are matched with each other",
+            field="--method",
+            expected="two photos or more, or --method rgbd",
+            got=f"{count} to be matched",
         )

@@ -16,9 +16,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from mapping import cli
+from mapping.editing import content_of
+from mapping.publishing import publish_edited
 from mapping.sample import write_sample
 from mapping.updating import UpdateSettings, update_map
 from mapping.updating.job import Updated
+from mapping.updating.placing import beside
 from visloc.archive import Map, MapStore, open_map, verify_map
 from visloc.errors import Conflict, VislocError
 from visloc.evaluation import pose_error
@@ -249,6 +252,120 @@ def test_a_trajectory_that_is_no_similarity_away_is_refused(
     assert refused(shaken, maps_dir).code == "update.elsewhere"
 
 
+def write_drifted(source: Path, root: Path, num_instants: int) -> Path:
+    """A capture whose first instants are a metre from where they were."""
+    dataset = read_dataset(source)
+    shutil.copytree(source, root, symlinks=True, ignore=shutil.ignore_patterns("*.txt"))
+    wrong = sorted({image.timestamp for image in dataset.images})[:num_instants]
+    poses = {
+        (time, device): Pose(pose.rotation, pose.translation + np.array([time in wrong, 0, 0]))
+        for (time, device), pose in dataset.trajectories.items()
+    }
+    write_dataset(replace(dataset, root=root, trajectories=poses))
+    return root
+
+
+@pytest.mark.parametrize(("poses", "name"), [("tie", "second"), ("given", "in_frame")])
+def test_photos_that_the_map_contradicts_are_left_out(
+    poses: str, name: str, captures: Path, maps_dir: Path, tmp_path: Path, walk: Path
+) -> None:
+    half = write_drifted(captures / name, tmp_path / "half", 2)
+    assert refused(half, maps_dir, poses=poses).code == "update.elsewhere"
+
+    drifted = write_drifted(captures / name, tmp_path / "drifted", 1)
+    done = update(drifted, maps_dir, poses=poses)
+    opened = open_map(done.folder)
+    assert errors_of_poses(opened, walk, 8)[:, 0].max() < 0.01
+    assert done.record.tied == done.record.photos == 6
+    (note,) = done.notes
+    assert re.fullmatch(
+        r"drifted: 2 of 8 photos left out, since the map localizes them (1|1\.0\d|0\.99\d) m, "
+        r"0\.\d+ degrees from their own poses, in the median: "
+        r"mapping/left/0002\.jpg, mapping/right/0002\.jpg",
+        note,
+    ), note
+    assert note in opened.manifest.notes
+
+
+def test_photos_beside_contradicted_ones_are_tried_too(
+    captures: Path, maps_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, walk: Path
+) -> None:
+    # Of eight, rows 0, 2, 5 and 7 are tried first; the last two, of one instant, lie elsewhere.
+    monkeypatch.setattr("mapping.updating.job._TIED_BY", 4)
+    dataset, drifted = read_dataset(captures / "second"), tmp_path / "drifted"
+    shutil.copytree(captures / "second", drifted, symlinks=True)
+    for path in (drifted / "sensors").glob("*.txt"):
+        path.unlink()
+    last = max(image.timestamp for image in dataset.images)
+    poses = {
+        key: Pose(pose.rotation, pose.translation + np.array([key[0] == last, 0, 0]))
+        for key, pose in dataset.trajectories.items()
+    }
+    write_dataset(replace(dataset, root=drifted, trajectories=poses))
+    done = update(drifted, maps_dir)
+    assert errors_of_poses(open_map(done.folder), walk, 8)[:, 0].max() < 0.02
+    assert (done.record.tried, done.record.tied, done.record.photos) == (4, 3, 6)
+
+
+def test_whom_a_contradicted_photo_makes_doubtful() -> None:
+    # 2 and 3 have a wrong neighbour, 7 none; 8 and 9 have one on their only side.
+    assert beside({1}, {0, 1, 4, 6}, 8) == [2, 3]
+    assert beside({7}, {0, 7}, 10) == [1, 2, 3, 4, 5, 6, 8, 9]
+    assert beside(set(), {0, 7}, 10) == []
+
+
+def test_depth_in_metres_does_not_join_poses_of_another_unit(
+    captures: Path, maps_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    error = refused(captures / "scaled", maps_dir, metric=False)
+    assert error.code == "update.elsewhere"
+    assert "by depth, what they see is" in error.message
+
+    monkeypatch.setattr("mapping.updating.placing._MIN_LIFTED", 10**9)
+    error = refused(captures / "scaled", maps_dir, metric=False)
+    assert "do not tell whether its unit" in error.message
+
+
+def test_rigs_of_another_unit_than_the_map_do_not_join_with_localized_photos(
+    captures: Path, tmp_path: Path, build_walk: Callable[..., Map]
+) -> None:
+    before = build_walk(captures / "scaled", tmp_path, metric=False)
+    done = update(captures / "first", tmp_path, poses="localize")
+    opened = open_map(done.folder)
+    assert len(opened.images) == 16
+    assert content_of(opened).rigs == content_of(before).rigs
+
+
+def test_a_single_photo_has_nothing_to_be_matched_with(
+    captures: Path, maps_dir: Path, tmp_path: Path
+) -> None:
+    dataset = read_dataset(captures / "second")
+    root = Path(shutil.copytree(captures / "second", tmp_path / "single", symlinks=True))
+    for path in (root / "sensors").glob("*.txt"):
+        path.unlink()
+    write_dataset(replace(dataset, root=root, images=dataset.images[:1]))
+    error = refused(root, maps_dir, poses="localize", method="sfm")
+    assert error.code == "update.photos_few"
+    assert "--method rgbd" in str(error.expected)
+
+
+@pytest.mark.parametrize("changes", [{"updates": {}}, {"voxel_size": 0}, {"voxel_size": True}])
+def test_strange_settings_of_the_map_are_refused_before_the_work(
+    changes: dict[str, object], captures: Path, maps_dir: Path
+) -> None:
+    store = MapStore(maps_dir)
+    content = content_of(store.open("walk"))
+    publish_edited(store, replace(content, settings={**content.settings, **changes}), "strange")
+    told: list[str] = []
+    with pytest.raises(Conflict) as caught:
+        update_map(
+            UpdateSettings(captures / "second", "strange", maps_dir),
+            lambda stage, _done, _total: told.append(stage),
+        )
+    assert caught.value.code == "update.settings"
+    assert told == []
+
+
 @pytest.mark.parametrize("factor", [1.05, 5.0])
 def test_depth_of_another_unit_than_the_poses_is_refused(
     captures: Path, maps_dir: Path, tmp_path: Path, factor: float
@@ -281,7 +398,7 @@ def test_photos_without_poses_are_placed_where_they_localize(
     assert np.median(errors_of_poses(opened, walk, 8)[:, 0]) < 0.01
     assert done.record.photos == done.record.localized == 7
     assert done.record.not_localized == {"no_keypoints": 1}
-    assert done.notes == ("1 of 8 photos found no place: mapping/left/0002.jpg",)
+    assert done.notes == ("bare: 1 of 8 photos found no place: mapping/left/0002.jpg",)
     assert done.notes[0] in opened.manifest.notes
 
 
