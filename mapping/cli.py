@@ -576,8 +576,10 @@ def export(
     maps_dir: MapsDirOption = Path("maps"),
 ) -> None:
     """Write a map for other tools: a COLMAP model, a kapture dataset, or a PLY point cloud."""
-    export_map(open_map(map_folder(map_ref, maps_dir)), output, format_name)
+    notes = export_map(open_map(map_folder(map_ref, maps_dir)), output, format_name)
     _out.print(f"{format_name}: {output}", soft_wrap=True)
+    for note in notes:
+        _out.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
 
 
 @app.command()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from mapping.imported_points import ImportedPoints, read_imported_points
 from mapping.landmarks import Observations, View, reprojection_errors
 from mapping.outputs import complete_output
-from visloc.archive import Map
+from visloc.archive import ImageRecord, Map
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose
 from visloc.kapture import (
@@ -35,7 +36,7 @@ _NO_ERROR = -1.0  # COLMAP's word for a point whose error is not known
 _IMPORTED = "imported"  # type of the keypoints of the reconstruction that a map came from
 
 
-def export_map(opened: Map, output: Path, format_name: str) -> None:
+def export_map(opened: Map, output: Path, format_name: str) -> tuple[str, ...]:
     """Write a map for other tools; nothing is left if it fails.
 
     Coordinates are those of the world, with the map's origin added, and names of photos are those
@@ -50,6 +51,9 @@ def export_map(opened: Map, output: Path, format_name: str) -> None:
         format_name: a key of ``EXPORTERS``: ``colmap`` is a binary model of one rig per camera;
             ``kapture`` a kapture 1.1 dataset with keypoints, descriptors as the map has them in 8
             bits, points and global descriptors; ``ply`` points in binary, double precision.
+
+    Returns:
+        Notes on what is not as in the map, one sentence each.
 
     Raises:
         InvalidInput: ``export.unknown_format``.
@@ -66,7 +70,7 @@ def export_map(opened: Map, output: Path, format_name: str) -> None:
             got=format_name,
         )
     with complete_output(output, "export.exists") as partial:
-        export(opened, partial)
+        return export(opened, partial)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +133,7 @@ def _mean_errors(opened: Map, imported: ImportedPoints) -> NDArray[np.float32]:
     return mean.astype(np.float32)
 
 
-def _export_colmap(opened: Map, output: Path) -> None:
+def _export_colmap(opened: Map, output: Path) -> tuple[str, ...]:
     exported = _model(opened)
     model = pycolmap.Reconstruction()
     camera_ids = {name: number for number, name in enumerate(opened.cameras, 1)}
@@ -158,12 +162,17 @@ def _export_colmap(opened: Map, output: Path) -> None:
         model.points3D[point_id].error = float(errors[index])
     output.mkdir()
     model.write_binary(output)
+    return ()
 
 
-def _export_kapture(opened: Map, output: Path) -> None:
+def _export_kapture(opened: Map, output: Path) -> tuple[str, ...]:
     exported = _model(opened)
     poses = [Pose.from_quaternion(row[:4], row[4:]) for row in opened.image_poses]
-    records = [FileRecord(i.timestamp, i.camera, i.name) for i in opened.images]
+    timestamps = _timestamps(opened.images)
+    records = [
+        FileRecord(timestamp, image.camera, image.name)
+        for timestamp, image in zip(timestamps, opened.images, strict=True)
+    ]
     write_dataset(
         Dataset(
             root=output,
@@ -203,9 +212,36 @@ def _export_kapture(opened: Map, output: Path) -> None:
             observations=exported.observations,
         ),
     )
+    later = sum(
+        timestamp != image.timestamp
+        for timestamp, image in zip(timestamps, opened.images, strict=True)
+    )
+    if not later:
+        return ()
+    return (
+        f"{later} of {len(timestamps)} photos have a later timestamp than in the map, which has "
+        "several of one camera at one time",
+    )
 
 
-def _export_ply(opened: Map, output: Path) -> None:
+def _timestamps(images: Sequence[ImageRecord]) -> list[int]:
+    """When photos were taken, so that a camera takes one at a time, as kapture has it.
+
+    Captures whose clocks began anew come one after the other: the second photo of a camera and time
+    is later by more than all photos span, the third by twice that. Photos of a rig stay together.
+    """
+    times = [image.timestamp for image in images]
+    span = max(times) - min(times) + 1
+    seen: Counter[tuple[int, str]] = Counter()
+    found = []
+    for image in images:
+        key = image.timestamp, image.camera
+        found.append(image.timestamp + seen[key] * span)
+        seen[key] += 1
+    return found
+
+
+def _export_ply(opened: Map, output: Path) -> tuple[str, ...]:
     exported = _model(opened)
     # pycolmap writes single precision, which is half a metre at the coordinates of a city.
     columns = [(axis, "<f8") for axis in "xyz"]
@@ -228,9 +264,10 @@ def _export_ply(opened: Map, output: Path) -> None:
         "end_header\n",
     ]
     output.write_bytes("\n".join(header).encode("ascii") + vertices.tobytes())
+    return ()
 
 
-EXPORTERS: Mapping[str, Callable[[Map, Path], None]] = {
+EXPORTERS: Mapping[str, Callable[[Map, Path], tuple[str, ...]]] = {
     "colmap": _export_colmap,
     "kapture": _export_kapture,
     "ply": _export_ply,

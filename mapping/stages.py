@@ -167,7 +167,7 @@ def exclusive(lock: Path) -> Iterator[None]:
         Conflict: ``build.running``.
     """
     lock.parent.mkdir(parents=True, exist_ok=True)
-    with lock.open("w") as file:
+    with lock.open("a") as file:  # whatever it is, it stays as it is
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -163,7 +163,8 @@ def agreeing(photos: Sequence[Seen], there_from_here: Similarity) -> NDArray[np.
 def contradicting(photos: Sequence[Seen], there_from_here: Similarity) -> NDArray[np.bool_]:
     """Tell which photos (n,) cannot have been where a similarity puts them.
 
-    Some that agree with it badly do not contradict it: poses of photos are not exact.
+    Some that agree with it badly do not contradict it: poses of photos are not exact. Those of
+    redkitchen come to 2.4 times the error of an inlier.
     """
     return ~_agreeing([_View(seen, forward=True) for seen in photos], there_from_here, _COARSE)
 

@@ -14,6 +14,7 @@ from mapping.publishing import photo_files, publish_edited
 from mapping.sets import publish_set
 from mapping.stages import exclusive
 from visloc.archive import GlobalFeatures, Map, MapContent, MapStore
+from visloc.archive.schema import ID_PATTERN
 from visloc.errors import Conflict, InvalidInput
 from visloc.geometry import Similarity
 from visloc.retrieval.fusion import EQUAL_GHARM
@@ -65,9 +66,11 @@ def merge_maps(
     Raises:
         Conflict: ``merge.overlap``, ``merge.features``, ``merge.photos``; ``map.exists``;
             ``build.running``.
+        InvalidInput: ``map.id``, ``merge.same``, ``merge.min_overlap``.
     """
-    with exclusive(store.root / ".work" / f"{map_id}.lock"):
-        a, b = _opened(store, a_ref, b_ref, map_id, min_overlap)
+    _refuse_name(store, map_id)
+    a, b = _opened(store, a_ref, b_ref, min_overlap)
+    with exclusive(_lock_of(store, map_id)):
         first, second = content_of(a), content_of(b)
         refuse_other_features(first, second)
         joined(_alike(first), _alike(second))  # refuses early
@@ -75,6 +78,7 @@ def merge_maps(
         progress("archive", 0, 1)
         second = moved(second, found.tie.there_from_here, metric=first.metric)
         content, pictures, notes = _joined(a, b, first, second, found)
+        _refuse_name(store, map_id)  # one may have been uploaded meanwhile
         folder = publish_edited(store, content, map_id, photos=pictures)
         progress("archive", 1, 1)
         return Merged(folder, a, b, found, notes)
@@ -94,18 +98,44 @@ def join_as_set(
     Arguments and errors as of ``merge_maps``, but that photos of one name are no matter; and what
     ``publish_set`` raises.
     """
-    a, b = _opened(store, a_ref, b_ref, set_id, min_overlap)
-    refuse_other_features(content_of(a), content_of(b))
-    found = register(a, b, min_overlap, progress)
-    tiles = [(a.ref, Similarity.identity()), (b.ref, found.tie.there_from_here)]
-    note = _note(b, found)
-    folder = publish_set(store, set_id, tiles, progress, notes=(note,))
-    return Merged(folder, a, b, found, ())
+    _refuse_name(store, set_id)
+    a, b = _opened(store, a_ref, b_ref, min_overlap)
+    with exclusive(_lock_of(store, set_id)):
+        refuse_other_features(content_of(a), content_of(b))
+        found = register(a, b, min_overlap, progress)
+        _refuse_name(store, set_id)  # one may have been made meanwhile
+        tiles = [(a.ref, Similarity.identity()), (b.ref, found.tie.there_from_here)]
+        note = _note(b, found)
+        folder = publish_set(store, set_id, tiles, progress, notes=(note,))
+        return Merged(folder, a, b, found, ())
 
 
-def _opened(
-    store: MapStore, a_ref: str, b_ref: str, new_id: str, min_overlap: float
-) -> tuple[Map, Map]:
+def _refuse_name(store: MapStore, new_id: str) -> None:
+    """Refuse what is no name, or that of a map or a set that there is.
+
+    Raises:
+        InvalidInput: ``map.id``.
+        Conflict: ``map.exists``.
+    """
+    if not ID_PATTERN.fullmatch(new_id):
+        raise InvalidInput(
+            "map.id",
+            "not a name of a map",
+            field="--map",
+            expected="up to 64 letters, digits, '.', '_', '-', beginning with a letter or digit",
+            got=new_id,
+        )
+    if new_id in store.ids():
+        raise Conflict(
+            "map.exists", "there is a map or a set of this name", field="--map", got=new_id
+        )
+
+
+def _lock_of(store: MapStore, new_id: str) -> Path:
+    return store.root / ".work" / f"{new_id}.lock"
+
+
+def _opened(store: MapStore, a_ref: str, b_ref: str, min_overlap: float) -> tuple[Map, Map]:
     if not 0 < min_overlap <= 1:
         raise InvalidInput(
             "merge.min_overlap",
@@ -113,10 +143,6 @@ def _opened(
             field="--min-overlap",
             expected="more than 0, at most 1",
             got=min_overlap,
-        )
-    if new_id in store.ids():
-        raise Conflict(
-            "map.exists", "there is a map or a set of this name", field="--map", got=new_id
         )
     a, b = store.open(a_ref), store.open(b_ref)
     if a.ref == b.ref:

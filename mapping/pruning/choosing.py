@@ -65,17 +65,17 @@ def choose(opened: Map, fits: Callable[[Kept], bool], *, whole_landmarks: bool) 
         What stays; None where the least that a map needs does not fit, which ``least`` tells.
     """
     turn = _turns(opened)
+    num, most = len(opened.images), int(turn.max()) + 1
+    order, num_needed = np.arange(num), num
 
     def kept(num_photos: int, per_photo: int) -> Kept:
         images = np.zeros(len(order), np.bool_)
         images[order[:num_photos]] = True
         return _kept(opened, turn, images, per_photo, whole_landmarks=whole_landmarks)
 
-    order, num_needed = _photos_by_need(opened)
-    num = len(order)
-    if not fits(kept(num, min(_ENOUGH, int(turn.max()) + 1))):
+    if not fits(kept(num, min(_ENOUGH, most))):
+        order, num_needed = _photos_by_need(opened)  # slow in large maps
         num = _most(num_needed, num, lambda count: fits(kept(count, _ENOUGH)))
-    most = int(turn.max()) + 1
     found = kept(num, _most(min(_LEAST, most), most, lambda count: fits(kept(num, count))))
     return found if fits(found) else None
 

@@ -29,7 +29,7 @@ _err = Console(stderr=True)
 
 
 def prune(
-    map_id: Annotated[str, typer.Argument(metavar="MAP", help="Id of the map.")],
+    map_id: Annotated[str, typer.Argument(metavar="MAP", help="Id of the map, or id@version.")],
     max_bytes: Annotated[
         str | None,
         typer.Option(help="Most that the map may take, such as 200MB, or 50% of what it takes."),
@@ -77,7 +77,7 @@ def prune(
 
         pruned = prune_map(
             store,
-            opened.manifest.id,
+            opened.ref,  # a part of its size means nothing of another version
             max_bytes=None if max_bytes is None else parse_size(max_bytes, opened.size_bytes),
             max_landmarks=max_landmarks,
             measure=measure,

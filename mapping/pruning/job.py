@@ -12,6 +12,7 @@ from mapping.pruning.choosing import LEFT_OUT, Kept, choose, least, num_landmark
 from mapping.publishing import link_photos, photo_files, write_content
 from mapping.stages import exclusive
 from visloc.archive import Map, MapContent, MapStore, open_map
+from visloc.archive.store import outdated
 from visloc.errors import Conflict, InvalidInput
 
 Measure = Callable[[Map, Map], tuple[Accuracy, Accuracy]]
@@ -34,7 +35,7 @@ class Pruned:
 
 def prune_map(
     store: MapStore,
-    map_id: str,
+    map_ref: str,
     *,
     max_bytes: int | None = None,
     max_landmarks: int | None = None,
@@ -45,7 +46,7 @@ def prune_map(
 
     Args:
         store: with the map.
-        map_id: its version in use is taken.
+        map_ref: ``id``, or ``id@version`` of the version in use.
         max_bytes: most that its files take, manifest aside; or None.
         max_landmarks: most landmarks; or None.
         measure: compares the accuracy of both versions; None: by photos of the map.
@@ -55,8 +56,11 @@ def prune_map(
         InvalidInput: ``prune.too_small`` with the least that is possible.
         Conflict: ``prune.small_already``; ``map.outdated``; ``build.running``.
     """
+    before = store.open(map_ref)
+    map_id, named = before.manifest.id, before.manifest.version
     with exclusive(store.root / ".work" / f"{map_id}.lock"):
-        before = store.open(map_id)
+        if (current := store.current_version(map_id)) != named:
+            raise outdated(map_id, named, current)
         progress("choosing", 0, 1)
         kept = keep_within(before, max_bytes, max_landmarks)
         progress("choosing", 1, 1)
@@ -79,7 +83,7 @@ def prune_map(
                 if measure is None
                 else measure(before, after)
             )
-            folder = store.publish(incoming, map_id, version, based_on=before.manifest.version)
+            folder = store.publish(incoming, map_id, version, based_on=named)
         return Pruned(before, open_map(folder), accuracy)
 
 

@@ -132,6 +132,9 @@ def test_a_moved_map_sees_the_same_from_elsewhere(built: Map, tmp_path: Path) ->
         atol=1e-4,
     )
     assert not there.manifest.world.metric
+    assert there.manifest.method.settings["voxel_size"] == pytest.approx(
+        ELSEWHERE.scale * built.manifest.method.settings["voxel_size"]
+    )
     assert built.gravity is not None
     assert there.gravity is not None
     np.testing.assert_allclose(there.gravity, TURN @ built.gravity, atol=1e-9)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mapping.build import BuildSettings, build_map
+from mapping.editing import content_of
 from mapping.export import EXPORTERS, export_map
 from mapping.importers import import_dataset
 from visloc.archive import (
@@ -134,6 +136,41 @@ def test_pycolmap_reads_the_same_cameras_poses_and_points(opened: Map, tmp_path:
     assert np.array_equal([point.color for point in points], opened.colors)
     assert [point.error for point in points] == [0.5, 0.25, 1, 2, -1, -1]
     assert [point.track.length() for point in points] == [2, 1, 1, 3, 0, 0]
+
+
+def test_photos_of_one_camera_and_time_are_told_apart_in_kapture(
+    opened: Map, tmp_path: Path
+) -> None:
+    content = content_of(opened)
+    same = ImageRecord("left/again.jpg", "left", content.images[0].timestamp)
+    images = (*content.images[:2], same)
+    (tmp_path / "twice").mkdir()
+    write_map(
+        tmp_path / "twice",
+        replace(content, images=images),
+        map_id="room",
+        version="v2",
+        created="2026-01-02T03:04:05+00:00",
+    )
+    twice = open_map(tmp_path / "twice")
+
+    notes = export_map(twice, tmp_path / "dataset", "kapture")
+
+    dataset = read_dataset(tmp_path / "dataset")
+    poses = {record.path: dataset.pose(record) for record in dataset.images}
+    assert poses.keys() == {image.name for image in images}
+    for image, row in zip(images, opened.image_poses, strict=True):
+        pose = poses[image.name]
+        assert pose is not None
+        assert pose.translation.tolist() == row[4:].tolist()
+    times = {record.path: record.timestamp for record in dataset.images}
+    assert [times[image.name] for image in images[:2]] == [i.timestamp for i in images[:2]]
+    assert times[same.name] > max(image.timestamp for image in images)
+    assert notes == (
+        "1 of 3 photos have a later timestamp than in the map, which has several of one camera at "
+        "one time",
+    )
+    assert export_map(opened, tmp_path / "once", "kapture") == ()
 
 
 def test_our_reader_reads_the_same_dataset(opened: Map, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from mapping.editing import content_of, moved, selected
 from mapping.merging import join_as_set, merge_maps
 from mapping.publishing import publish_edited
 from mapping.sample import write_sample
+from mapping.stages import exclusive
 from visloc.archive import Map, MapStore, SetOutline
 from visloc.errors import Conflict, InvalidInput
 from visloc.geometry import Pose, Similarity, rotation_angle
@@ -194,6 +195,41 @@ def test_descriptors_with_models_of_their_own_are_learned_anew_or_left_out(
     lengths = np.linalg.norm(result.global_descriptors["localvlad"][:], axis=1)
     np.testing.assert_allclose(lengths, 1.0, atol=1e-3)
     assert list(merged.global_descriptors) == ["localvlad"]
+
+
+@pytest.mark.parametrize("join", [merge_maps, join_as_set])
+def test_the_name_is_checked_before_anything_is_done(
+    join: Callable[..., object], halves: MapStore
+) -> None:
+    victim = halves.root.parent / "victim.lock"
+    victim.write_text("precious")
+    told: list[str] = []
+    for name in ("../../victim", "bad name!"):
+        with pytest.raises(InvalidInput) as error:
+            join(halves, "a", "b", name, lambda stage, _done, _total: told.append(stage))
+        assert (error.value.code, error.value.field) == ("map.id", "--map")
+    assert told == []
+    assert victim.read_text() == "precious"
+    assert not (halves.root / ".work" / "bad name!.lock").exists()
+
+
+@pytest.mark.parametrize("join", [merge_maps, join_as_set])
+def test_a_name_that_was_taken_meanwhile_is_not_replaced(
+    join: Callable[..., object], halves: MapStore
+) -> None:
+    name = f"taken-{join.__name__}"
+
+    def take(_stage: str, _done: int, _total: int) -> None:
+        with pytest.raises(Conflict) as running, exclusive(halves.root / ".work" / f"{name}.lock"):
+            pass
+        assert running.value.code == "build.running"
+        if name not in halves.ids():
+            publish_edited(halves, content_of(halves.open("a")), name)
+
+    with pytest.raises(Conflict) as error:
+        join(halves, "a", "b", name, take)
+    assert error.value.code == "map.exists"
+    assert len(halves.versions(name)) == 1
 
 
 def test_a_set_of_both_leaves_them_as_they_are(halves: MapStore) -> None:

@@ -153,6 +153,29 @@ def test_a_version_that_came_meanwhile_is_not_replaced(store: MapStore) -> None:
     assert len(store.versions("room")) == 2
 
 
+def test_an_old_version_by_name_is_not_mistaken_for_the_one_in_use(store: MapStore) -> None:
+    old = store.current_version("room")
+    pruned = prune_map(
+        store, "room", max_landmarks=len(store.open("room").landmarks) - 1, progress=quiet
+    )
+    told: list[str] = []
+    with pytest.raises(Conflict) as error:
+        prune_map(
+            store,
+            f"room@{old}",
+            max_landmarks=10,
+            progress=lambda stage, _done, _total: told.append(stage),
+        )
+    assert error.value.code == "map.outdated"
+    assert told == []
+    result = CliRunner().invoke(
+        app, ["prune", f"room@{old}", "--max-bytes", "90%", "--maps-dir", str(store.root)]
+    )
+    assert isinstance(result.exception, Conflict)
+    assert result.exception.code == "map.outdated"
+    assert store.current_version("room") == pruned.after.manifest.version
+
+
 def test_the_command_measures_with_queries(store: MapStore, sample: Path) -> None:
     arguments = ["prune", "room", "--maps-dir", str(store.root), "--queries"]
     result = CliRunner().invoke(
