@@ -17,11 +17,13 @@ from typing import Any
 from service import worker
 from service.jobs import Near, Where
 from service.stores import Store
+from service.together import together
 from service.worker import MapFolder
 from service.workers import Workers
 from visloc.archive import MapOutline, SetOutline, read_any_outline
 from visloc.archive.store import version_in_use
 from visloc.errors import InvalidInput, MapCorrupt, NotFound, Unavailable, VislocError
+from visloc.sets.choosing import tiles_near
 
 logger = logging.getLogger(__name__)
 
@@ -158,6 +160,30 @@ class Catalog:
         finally:
             for of in taken:
                 self._give_back(of.ref)
+
+    async def away(self, refs: Sequence[str]) -> tuple[str, ...]:
+        """Say which versions are to be fetched before they can be used."""
+
+        def away(ref: str) -> bool:
+            try:
+                return self._store.at_hand(ref) is None
+            except VislocError:
+                return False  # using it says what is wrong
+
+        return tuple([ref for ref in refs if await asyncio.to_thread(away, ref)])
+
+    async def fetch(self, refs: Sequence[str]) -> dict[str, VislocError]:
+        """Bring versions to this machine; say of which that failed."""
+
+        async def fetched(ref: str) -> VislocError | None:
+            try:
+                await self._folder(ref)
+            except VislocError as error:
+                return error
+            return None
+
+        errors = await together(fetched(ref) for ref in refs)
+        return {ref: error for ref, error in zip(refs, errors, strict=True) if error is not None}
 
     @asynccontextmanager
     async def reading(self, ref: str) -> AsyncIterator[MapFolder]:
@@ -473,4 +499,8 @@ def _without_tiles(maps: Sequence[ServedMap]) -> list[ServedMap]:
 
 def _reaches(outline: MapOutline | SetOutline, near: Near) -> bool:
     place = outline.place
-    return place is not None and place.distance_to(near.latitude, near.longitude) <= near.radius
+    if place is None or place.distance_to(near.latitude, near.longitude) > near.radius:
+        return False
+    if isinstance(outline, SetOutline):  # between its tiles, there is none of it
+        return bool(tiles_near(outline, near.latitude, near.longitude, near.radius).any())
+    return True

@@ -170,6 +170,11 @@ class Engine:
         return self._photos
 
     @property
+    def waiting(self) -> int:
+        """Photos that wait for a worker process, or to be read for a set of maps."""
+        return self.workers.waiting + self._sets.waiting
+
+    @property
     def batches(self) -> int:
         """Rigs and sequences that are served."""
         return self._batches

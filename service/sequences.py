@@ -12,7 +12,7 @@ from visloc.priors import Priors
 from visloc.sequence import SeenInstant, SequenceSolver, check_max_gap
 from visloc.solving import SeenImage
 from visloc.trajectory import TimeUnit, guess_time_unit
-from visloc.types import InstantAnswer
+from visloc.types import InstantAnswer, RigPose
 
 
 class SequenceRun:
@@ -103,9 +103,10 @@ class SequenceRun:
         return self._released() if len(self.targets) == 1 else []
 
     @property
-    def localized(self) -> bool:
-        """Whether its own images localize the newest instant."""
-        return any(solver.measured for solver in self._solvers)
+    def pose(self) -> RigPose | None:
+        """What its own images measured of the newest instant; None when they do not localize it."""
+        best = max(self._solvers, key=lambda solver: solver.measured)
+        return best.newest
 
     def finish(self) -> list[InstantAnswer]:
         """Return the answers that waited for instants which will not come.

@@ -159,7 +159,7 @@ class Server:
         return ServiceState(
             status.ready,
             draining=engine.draining,
-            photos_waiting=workers.waiting,
+            photos_waiting=engine.waiting,
             max_queue=settings.max_queue,
             photos_running=workers.running,
             batches_running=engine.batches,

@@ -24,13 +24,16 @@ from service.jobs import (
     InstantLocalization,
     Localization,
     LocalizeJob,
+    Near,
     Query,
     Rig,
     RigJob,
+    Where,
 )
 from service.metrics import Metrics
+from service.set_photos import Places, SetPhotos
 from service.together import together
-from service.worker import Chosen, MapFolder
+from service.worker import MapFolder
 from service.workers import Workers
 from visloc.archive import SetOutline, TileRecord
 from visloc.errors import (
@@ -50,6 +53,7 @@ from visloc.sets.choosing import (
     is_clear,
     judge,
     plan,
+    tiles_near,
 )
 from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
 from visloc.types import InstantAnswer, Localized, LocalizeOptions, NotLocalized, Refusal
@@ -68,12 +72,12 @@ class Choice:
     Attributes:
         first: rows of the tiles to search.
         rest: those to search when none of the first has a clear answer.
-        queries: the photos, read where they could be.
+        blind: whether the photos say nothing of where that is.
     """
 
     first: tuple[int, ...]
     rest: tuple[int, ...]
-    queries: tuple[Query, ...]
+    blind: bool = False
 
 
 class SetSearch:
@@ -83,15 +87,31 @@ class SetSearch:
         catalog: gives the tiles.
         workers: do the work.
         metrics: count the tiles that were searched.
-
-    Attributes:
-        place: held from when a photo is read until its tiles were searched.
     """
 
     def __init__(self, catalog: Catalog, workers: Workers, metrics: Metrics) -> None:
         self._catalog, self._workers, self._metrics = catalog, workers, metrics
-        # Photos that were read are much larger than those that wait.
-        self.place = asyncio.Semaphore(workers.count + 1)
+        self._places = Places(workers.count + 1)
+
+    @property
+    def waiting(self) -> int:
+        """Photos that nobody has read yet."""
+        return self._places.waiting
+
+    def reading(
+        self, of: MapFolder, queries: Sequence[Query], options: LocalizeOptions
+    ) -> SetPhotos:
+        """Make room for photos, within a block ``async with``."""
+        return SetPhotos(self._places, self._workers, of, queries, options)
+
+    async def within(self, outline: SetOutline, where: Where) -> NDArray[np.bool_] | None:
+        """Tell which tiles (T,) are asked for; None for all."""
+        if not isinstance(where, Near):
+            return None
+        # Of ten thousand tiles, it takes a moment.
+        return await asyncio.to_thread(
+            tiles_near, outline, where.latitude, where.longitude, where.radius
+        )
 
     async def localize(self, job: LocalizeJob, of: MapFolder) -> Localization:
         """Localize a photo, or its features, in a set.
@@ -101,84 +121,55 @@ class SetSearch:
             NotFound: ``set.no_tile`` when the priors allow no tile.
             Unavailable: ``set.tile_unavailable``, ``server.worker_died``.
         """
-        submitted = time()
         outline = self._catalog.set_outline(of)
-        allowed = allowed_tiles(outline, job.priors)
-        async with self.place:
-            choice = await self.choose(of, [job.query], job.options, allowed, submitted)
-            (query,) = choice.queries
+        allowed = allowed_tiles(outline, job.priors, await self.within(outline, job.maps))
 
-            async def ask(row: int, folder: MapFolder) -> Localization:
-                priors = self.priors_in(outline, outline.tiles[row], job.priors)
-                asked = replace(job, query=query, priors=priors)
-                return await self._workers.run(worker.localize, asked, (folder,), time())
+        async def ask(row: int, folder: MapFolder, queries: Sequence[Query]) -> Localization:
+            priors = self.priors_in(outline, outline.tiles[row], job.priors)
+            asked = replace(job, query=queries[0], priors=priors)
+            return await self._workers.run(worker.localize, asked, (folder,), time())
 
-            _, found = await self.search(outline, choice, ask)
+        async with self.reading(of, [job.query], job.options) as photos:
+            choice = await self.choose(photos, allowed)
+            _, found = await self.search(outline, choice, photos, ask)
             return found
 
     async def localize_rig(self, job: RigJob, of: MapFolder) -> InstantLocalization:
         """Localize the images of one instant together in a set; errors as of ``localize``."""
-        submitted = time()
         outline = self._catalog.set_outline(of)
-        allowed = allowed_tiles(outline, job.priors)
-        async with self.place:
-            queries = [image.query for image in job.images]
-            choice = await self.choose(of, queries, job.options, allowed, submitted)
-            images = with_queries(job.images, choice.queries)
+        allowed = allowed_tiles(outline, job.priors, await self.within(outline, job.maps))
 
-            async def ask(row: int, folder: MapFolder) -> InstantLocalization:
-                tile = outline.tiles[row]
-                asked = replace(
-                    job,
-                    images=images,
-                    rig=rig_in(tile, job.rig),
-                    priors=self.priors_in(outline, tile, job.priors),
-                )
-                return await solve_rig(self._workers, asked, (folder,))
+        async def ask(row: int, folder: MapFolder, queries: Sequence[Query]) -> InstantLocalization:
+            tile = outline.tiles[row]
+            asked = replace(
+                job,
+                images=with_queries(job.images, queries),
+                rig=rig_in(tile, job.rig),
+                priors=self.priors_in(outline, tile, job.priors),
+            )
+            return await solve_rig(self._workers, asked, (folder,))
 
-            _, found = await self.search(outline, choice, ask)
+        queries = [image.query for image in job.images]
+        async with self.reading(of, queries, job.options) as photos:
+            choice = await self.choose(photos, allowed)
+            _, found = await self.search(outline, choice, photos, ask)
             return found
 
-    async def choose(
-        self,
-        of: MapFolder,
-        queries: Sequence[Query],
-        options: LocalizeOptions,
-        allowed: NDArray[np.bool_],
-        submitted: float,
-    ) -> Choice:
+    async def choose(self, photos: SetPhotos, allowed: NDArray[np.bool_]) -> Choice:
         """Read photos, and say which of the allowed tiles to search.
 
         Photos of one instant count together: by the sum of what they say of a tile.
         """
         rows = np.flatnonzero(allowed)
-        asked = allowed if len(rows) > 1 else None
-        chosen = await self.read(of, queries, options, asked, submitted)
         scores: dict[int, float] = defaultdict(float)
-        for one in chosen:
-            for each in one.scores:
+        for ranked in await photos.rank(allowed if len(rows) > 1 else None):
+            for each in ranked:
                 scores[each.tile] += each.score
         best_first = sorted(scores, key=lambda tile: -scores[tile])
+        if best_first:
+            return Choice(*plan([TileScore(tile, scores[tile]) for tile in best_first]))
         # What shows nothing is told so by any tile.
-        ranked = [TileScore(tile, scores[tile]) for tile in best_first] or [
-            TileScore(int(rows[0]), 0.0)
-        ]
-        first, rest = plan(ranked)
-        return Choice(first, rest, tuple(one.query for one in chosen))
-
-    async def read(
-        self,
-        of: MapFolder,
-        queries: Sequence[Query],
-        options: LocalizeOptions,
-        allowed: NDArray[np.bool_] | None,
-        submitted: float,
-    ) -> list[Chosen]:
-        """Read photos, and rank tiles by each; arguments as of ``worker.choose_tiles``."""
-        return await together(
-            self._workers.run(worker.choose_tiles, query, of, options, allowed, submitted)
-            for query in queries
-        )
+        return Choice((int(rows[0]),), (), blind=len(rows) > 1 or not photos.seen)
 
     def priors_in(self, outline: SetOutline, tile: TileRecord, priors: Priors) -> Priors:
         """Say what priors of the set's frame mean in that of a tile."""
@@ -188,13 +179,18 @@ class SetSearch:
         self,
         outline: SetOutline,
         choice: Choice,
-        ask: Callable[[int, MapFolder], Awaitable[AnyLocalization]],
+        photos: SetPhotos,
+        ask: Callable[[int, MapFolder, Sequence[Query]], Awaitable[AnyLocalization]],
     ) -> tuple[int, AnyLocalization]:
         """Search tiles, and judge what they say.
+
+        A tile that cannot be asked what is asked, say for a rig that it does not know, does not
+        count as long as others answer.
 
         Args:
             outline: of the set.
             choice: where to look.
+            photos: what to look for.
             ask: searches one tile, given by its row, in its own frame.
 
         Returns:
@@ -203,49 +199,69 @@ class SetSearch:
         Raises:
             Unavailable: ``set.tile_unavailable`` for a tile that cannot be opened, unless another
                 one has a clear answer.
-            VislocError: what ``ask`` raises.
+            VislocError: what ``ask`` raises of every tile.
         """
         found: list[tuple[int, AnyLocalization]] = []
         missing: list[tuple[TileRecord, VislocError]] = []
+        unfit: list[VislocError] = []
         for rows in (choice.first, choice.rest):
             if any(is_clear(each.answer) for _, each in found):
                 break
-            for row, each in await self._asked(outline, rows, ask):
-                if isinstance(each, VislocError):
+            for row, each in await self._asked(outline, rows, photos, ask):
+                if not isinstance(each, VislocError):
+                    found.append((row, each))
+                elif _says_tile_is_away(each):
                     missing.append((outline.tiles[row], each))
                 else:
-                    found.append((row, each))
+                    unfit.append(each)
         self._metrics.observe_tiles(len(found))
         if missing and not any(is_clear(each.answer) for _, each in found):
-            tile, error = missing[0]
-            raise Unavailable(
-                "set.tile_unavailable",
-                f"a tile of the set that may show this cannot be opened: {error.message}",
-                field="map",
-                expected=tile.ref,
-                got=error.code,
-            ) from error
+            raise tile_unavailable(*missing[0])
+        if not found:
+            raise unfit[0]
         return _judged(outline, found)
 
     async def _asked(
         self,
         outline: SetOutline,
         rows: Sequence[int],
-        ask: Callable[[int, MapFolder], Awaitable[AnyLocalization]],
+        photos: SetPhotos,
+        ask: Callable[[int, MapFolder, Sequence[Query]], Awaitable[AnyLocalization]],
     ) -> list[tuple[int, AnyLocalization | VislocError]]:
-        """Search tiles at once; of one that cannot be had, say why."""
+        """Search tiles at once; of one that cannot be asked, say why."""
+        away = await self._catalog.away([outline.tiles[row].ref for row in rows])
+        failed = await photos.aside(self._catalog.fetch(away)) if away else {}
 
         async def of(row: int) -> tuple[int, AnyLocalization | VislocError]:
             tile = outline.tiles[row]
+            if tile.ref in failed:
+                return row, failed[tile.ref]
             try:
                 async with self._catalog.using((tile.ref,), self._workers) as (folder,):
-                    return row, in_set(await ask(row, folder), outline, tile)
-            except (NotFound, MapCorrupt, Conflict, Unavailable) as error:
-                if not error.code.startswith(_OF_A_MAP):
+                    return row, in_set(await ask(row, folder, photos.queries), outline, tile)
+            except (InvalidInput, NotFound) as error:
+                return row, error
+            except (MapCorrupt, Conflict, Unavailable) as error:
+                if not _says_tile_is_away(error):
                     raise
                 return row, error
 
         return await together(of(row) for row in rows)
+
+
+def tile_unavailable(tile: TileRecord, error: VislocError) -> Unavailable:
+    """``set.tile_unavailable``."""
+    return Unavailable(
+        "set.tile_unavailable",
+        f"a tile of the set that may show this cannot be opened: {error.message}",
+        field="map",
+        expected=tile.ref,
+        got=error.code,
+    )
+
+
+def _says_tile_is_away(error: VislocError) -> bool:
+    return error.code.startswith(_OF_A_MAP)
 
 
 async def answers_of(searches: Sequence[Coroutine[Any, Any, T]]) -> list[T]:

@@ -6,23 +6,45 @@ Instants of two legs know nothing of each other: gaps are filled within a leg.
 
 from __future__ import annotations
 
+import math
 from collections.abc import AsyncGenerator, AsyncIterator, Sequence
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, aclosing
 from dataclasses import dataclass, replace
-from time import time
+
+import numpy as np
+from numpy.typing import NDArray
 
 from service import worker
 from service.catalog import Catalog
 from service.incoming import inside
 from service.instant_tasks import look, without_photos
-from service.jobs import Instant, InstantLocalization, RigJob, SequenceStart, check_order
-from service.set_search import SetSearch, in_set, rig_in, with_queries
+from service.jobs import (
+    Instant,
+    InstantLocalization,
+    Query,
+    RigJob,
+    SequenceStart,
+    check_order,
+)
+from service.set_photos import SetPhotos
+from service.set_search import (
+    Choice,
+    SetSearch,
+    in_set,
+    rig_in,
+    tile_unavailable,
+    with_queries,
+)
 from service.worker import MapFolder, Seen
 from service.workers import Workers
 from visloc.archive import SetOutline
-from visloc.errors import InvalidInput, NotFound, VislocError
+from visloc.errors import InvalidInput, NotFound, Unavailable, VislocError
 from visloc.priors import Priors
-from visloc.sets.choosing import allowed_tiles
+from visloc.sets.choosing import allowed_tiles, is_clear, nearest_tile
+from visloc.sets.frame import moved_pose
+from visloc.sets.handover import Track
+from visloc.trajectory import guess_time_unit
+from visloc.types import RigPose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +103,9 @@ class SetSequence:
         self._search, self._catalog, self._workers = search, catalog, workers
         self._start, self._of = start, of
         self._outline: SetOutline = catalog.set_outline(of)
+        self._within: NDArray[np.bool_] | None = None
         self._leg: _Leg | None = None
+        self._track: Track | None = None
         self._held = AsyncExitStack()  # keeps the tile of the leg
 
     async def answers(
@@ -91,9 +115,9 @@ class SetSequence:
 
         Raises:
             InvalidInput: as ``Engine.localize_sequence``.
-            NotFound: ``set.no_tile``.
             Unavailable: as ``SetSearch.search``.
         """
+        self._within = await self._search.within(self._outline, self._start.maps)
         index, before = 0, None
         try:
             async for instant in instants:
@@ -101,10 +125,9 @@ class SetSequence:
                     if before is not None:
                         check_order(before, instant.timestamp)
                 before = instant.timestamp
-                async with self._search.place:
-                    answers = await self._add(index, instant)
-                for answer in answers:
-                    yield answer
+                async with aclosing(self._add(index, instant)) as added:
+                    async for answer in added:
+                        yield answer
                 index += 1
             if index == 0:
                 raise InvalidInput("sequence.empty", "there is no instant", field="instants")
@@ -119,72 +142,141 @@ class SetSequence:
         finally:
             await self._held.aclose()
 
-    async def _add(self, index: int, instant: Instant) -> list[InstantLocalization]:
-        """Take one more instant; return the answers that are final now."""
-        leg = self._leg
-        if leg is None:
-            found = await self._elsewhere(index, instant)
-            if isinstance(found, _Looked):
-                return await self._begin(found)
-            return [] if found is None else [found]
+    async def _add(self, index: int, instant: Instant) -> AsyncGenerator[InstantLocalization]:
+        """Take one more instant; give the answers that are final now."""
+        if self._track is not None:
+            self._track = self._track.moved(instant.odometry)
         queries = [image.query for image in instant.images]
-        read = await self._search.read(self._of, queries, self._start.options, None, time())
-        images = with_queries(instant.images, [one.query for one in read])
-        instant = replace(instant, images=images)
-        looked = await self._look(index, instant, leg)
-        added = await self._added(looked)
-        if not added.localized:
-            found = await self._elsewhere(index, instant)
-            if isinstance(found, _Looked):
-                return [*await self._finish(), *await self._begin(found)]
-        self._leg = replace(leg, state=added.state)
-        return self._in_set(leg, added.answers)
+        leg = self._leg
+        async with self._search.reading(self._of, queries, self._start.options) as photos:
+            if leg is None:
+                begins = await self._anywhere(index, instant, photos)
+            else:
+                await photos.rank(None)
+                images = with_queries(instant.images, photos.queries)
+                looked = await self._look(index, replace(instant, images=images), leg)
+                added = await self._added(looked)
+                begins = None
+                if added.pose is None:
+                    begins = await self._elsewhere(index, instant, photos, leg)
+        if isinstance(begins, InstantLocalization):
+            yield begins
+        elif begins is not None:
+            for answer in await self._finish():
+                yield answer
+            for answer in await self._begin(begins):
+                yield answer
+        elif leg is not None:
+            self._leg = replace(leg, state=added.state)
+            if added.pose is not None:
+                self._follow(leg, instant, added.pose)
+            for answer in self._in_set(leg, added.answers):
+                yield answer
 
-    async def _elsewhere(
-        self, index: int, instant: Instant
-    ) -> _Looked | InstantLocalization | None:
-        """Search an instant in the tiles but that of the leg.
-
-        Returns:
-            It, looked at in a tile that localizes it; else why none does; None when no other tile
-            is allowed.
-
-        Raises:
-            NotFound: ``set.no_tile`` unless there is a leg.
-        """
+    async def _anywhere(
+        self, index: int, instant: Instant, photos: SetPhotos
+    ) -> _Looked | InstantLocalization:
+        """Search the first instant of a leg: looked at in a tile that localizes it, or why not."""
         priors = self._start.priors if instant.priors is None else instant.priors
         with inside(f"instants[{index}]"):
             try:
-                allowed = allowed_tiles(self._outline, priors)
+                allowed = allowed_tiles(self._outline, priors, self._within)
             except NotFound:
-                if self._leg is None:
-                    raise
+                # As in a map: a device may come from outside.
+                allowed = np.zeros(len(self._outline.tiles), np.bool_)
+                allowed[nearest_tile(self._outline, priors, self._within)] = True
+        choice = await self._search.choose(photos, allowed)
+        looked, found = await self._searched(index, instant, photos, choice)
+        return found if found.answer.pose is None else looked
+
+    async def _elsewhere(
+        self, index: int, instant: Instant, photos: SetPhotos, leg: _Leg
+    ) -> _Looked | None:
+        """Search an instant in the tiles but that of the leg, which does not localize it.
+
+        Returns:
+            It, looked at in a tile that begins a new leg with it; None when it stays in the leg:
+            no other tile may be where the device is, or says so clearly enough.
+        """
+        track, priors = self._track, instant.priors or self._start.priors
+        seconds = self._seconds_since(track, instant)
+        if seconds > self._start.max_gap_s:
+            track = None  # nothing is known of it any more
+        with inside(f"instants[{index}]"):
+            try:
+                allowed = allowed_tiles(self._outline, priors, self._within)
+                if track is not None and track.knows_motion:
+                    area = Priors(position=track.area(self._outline))
+                    allowed = allowed_tiles(self._outline, area, allowed)
+            except NotFound:
                 return None
-        if self._leg is not None:
-            allowed[self._leg.row] = False
-            if not allowed.any():
-                return None
-        queries = [image.query for image in instant.images]
-        options = self._start.options
-        choice = await self._search.choose(self._of, queries, options, allowed, time())
-        asked = replace(instant, images=with_queries(instant.images, choice.queries))
+        allowed[leg.row] = False
+        if not photos.seen or not allowed.any():
+            return None
+        choice = await self._search.choose(photos, allowed)
+        if choice.blind:
+            return None
+        try:
+            looked, found = await self._searched(index, instant, photos, choice)
+        except Unavailable as error:
+            if error.code != "set.tile_unavailable":
+                raise
+            return None
+        pose = found.answer.pose
+        if pose is None:
+            return None
+        if track is None or (is_clear(found.answer) and not track.knows_motion):
+            return looked
+        reach = float(self._outline.reaches[[leg.row, looked.leg.row]].max())
+        if track.allows(pose.rig_from_world, pose.covariance, seconds, reach):
+            return looked
+        return None
+
+    async def _searched(
+        self, index: int, instant: Instant, photos: SetPhotos, choice: Choice
+    ) -> tuple[_Looked, InstantLocalization]:
+        """Search an instant in tiles: looked at in one, and what the set says of it."""
         looked: dict[int, _Looked] = {}
 
-        async def ask(row: int, folder: MapFolder) -> InstantLocalization:
+        async def ask(row: int, folder: MapFolder, queries: Sequence[Query]) -> InstantLocalization:
+            asked = replace(instant, images=with_queries(instant.images, queries))
             seen = looked[row] = await self._look(index, asked, await self._leg_in(row, folder))
             job = RigJob(
                 self._start.maps,
                 seen.leg.start.rig,
                 seen.instant.images,
                 instant.timestamp,
-                options,
+                self._start.options,
                 seen.priors,
                 ypr=self._start.ypr,
             )
             return await self._workers.run(worker.solve_rig, job, (folder,), seen.seen)
 
-        row, found = await self._search.search(self._outline, choice, ask)
-        return found if found.answer.pose is None else looked[row]
+        row, found = await self._search.search(self._outline, choice, photos, ask)
+        return looked[row], found
+
+    def _seconds_since(self, track: Track | None, instant: Instant) -> float:
+        """Time since the device was last measured; endless when it never was."""
+        if track is None:
+            return math.inf
+        unit = self._start.time_unit or guess_time_unit([track.timestamp])
+        assert unit is not None  # the leg has begun
+        return (instant.timestamp - track.timestamp) * unit.seconds
+
+    def _follow(self, leg: _Leg, instant: Instant, measured: RigPose) -> None:
+        """Note where the device was measured, unless that contradicts how it moved."""
+        tile = self._outline.tiles[leg.row]
+        moved = tile.set_from_tile.similarity
+        pose, covariance = moved_pose(measured.rig_from_world, measured.covariance, moved)
+        track, seconds = self._track, self._seconds_since(self._track, instant)
+        if track is not None and track.knows_motion and seconds <= self._start.max_gap_s:
+            reach = float(self._outline.reaches[leg.row])
+            if not track.allows(pose, covariance, seconds, reach):
+                return
+        metre = 1.0 if self._outline.manifest.world.metric else None
+        if instant.odometry is not None:
+            metre = moved.scale  # of a metric map, else it would have been refused
+        self._track = Track.begun(instant.timestamp, pose, covariance, metre, instant.odometry)
 
     async def _leg_in(self, row: int, folder: MapFolder) -> _Leg:
         """Begin a leg that has no instant yet."""
@@ -221,13 +313,23 @@ class SetSequence:
         )
 
     async def _begin(self, looked: _Looked) -> list[InstantLocalization]:
-        """Begin a leg with an instant; the tile stays until the leg ends."""
+        """Begin a leg with an instant; the tile stays until the leg ends.
+
+        Raises:
+            Unavailable: ``set.tile_unavailable`` when the tile is gone again.
+        """
         tile = self._outline.tiles[looked.leg.row]
         using = self._catalog.using((tile.ref,), self._workers)
-        (folder,) = await self._held.enter_async_context(using)
+        try:
+            (folder,) = await self._held.enter_async_context(using)
+        except NotFound as error:
+            raise tile_unavailable(tile, error) from error
         leg = replace(looked.leg, folder=folder)
         added = await self._added(replace(looked, leg=leg))
         self._leg = replace(leg, state=added.state)
+        self._track = None
+        if added.pose is not None:
+            self._follow(leg, looked.instant, added.pose)
         return self._in_set(leg, added.answers)
 
     async def _finish(self) -> list[InstantLocalization]:

@@ -308,7 +308,7 @@ class Vision:
         found = run.add(instant, _by_map(seen, len(maps)), priors)
         answers = [run.localization(answer) for answer in found]
         kept = tuple(target.localizer.map.ref for target in run.targets)
-        return Added(_dumped(run), kept, answers, run.localized)
+        return Added(_dumped(run), kept, answers, run.pose)
 
     def finish_sequence(self, state: bytes, maps: Sequence[MapFolder]) -> list[InstantLocalization]:
         """As ``worker.finish_sequence``."""

@@ -35,7 +35,7 @@ from service.logs import configure_logging
 from visloc.errors import VislocError
 from visloc.priors import Priors
 from visloc.sets.choosing import TileScore
-from visloc.types import Inference, LocalizeOptions
+from visloc.types import Inference, LocalizeOptions, RigPose
 
 if TYPE_CHECKING:
     from service.vision import Vision
@@ -256,13 +256,13 @@ class Added(NamedTuple):
         state: the sequence after it.
         maps: references of those that are still searched.
         answers: those that are final.
-        localized: whether the instant's own images localize it.
+        pose: what the instant's own images measured; None when they do not localize it.
     """
 
     state: bytes
     maps: tuple[str, ...]
     answers: list[InstantLocalization]
-    localized: bool
+    pose: RigPose | None
 
 
 # A sequence lives in the main process, as bytes that only worker processes read: which of them

@@ -5,8 +5,6 @@ Geodetic positions are latitude (deg), longitude (deg) and height above the elli
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -68,9 +66,15 @@ def ground_distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     The arc of a sphere over the chord of the ellipsoid: exact to a millionth within 50 km, to a
     few thousandths anywhere.
     """
-    points = ecef_from_geodetic(np.array([[a[0], a[1], 0.0], [b[0], b[1], 0.0]]))
-    half = float(np.linalg.norm(points[1] - points[0])) / (2 * _MEAN_RADIUS_M)
-    return 2 * _MEAN_RADIUS_M * math.asin(min(half, 1.0))
+    return float(ground_distances(a[None], b)[0])
+
+
+def ground_distances(positions: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """As ``ground_distance``, from each of some positions (n, 3) to one (3,): (n,) metres."""
+    ground = np.array([1.0, 1.0, 0.0])
+    points = ecef_from_geodetic(positions * ground) - ecef_from_geodetic((b * ground)[None])
+    half = np.linalg.norm(points, axis=1) / (2 * _MEAN_RADIUS_M)
+    return np.asarray(2 * _MEAN_RADIUS_M * np.arcsin(np.minimum(half, 1.0)))
 
 
 def enu_from_ecef(origin: NDArray[np.float64]) -> NDArray[np.float64]:

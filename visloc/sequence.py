@@ -42,7 +42,7 @@ from visloc.trajectory import (
     covariance_from_center,
     fill_sequence,
 )
-from visloc.types import InstantAnswer, LocalizeOptions, Reason, Refusal
+from visloc.types import InstantAnswer, LocalizeOptions, Reason, Refusal, RigPose
 
 # At most so many instants wait, and as many answered ones are remembered, however long the gap
 # may be: what is further away in a fast sequence adds little and costs time.
@@ -123,6 +123,11 @@ class SequenceSolver:
         """Inliers of the newest instant if its own images localize it, else 0."""
         newest = self._entries[-1].solved.pose if self._entries else None
         return 0 if newest is None else newest.num_inliers
+
+    @property
+    def newest(self) -> RigPose | None:
+        """What its own images measured of the newest instant; None when they do not localize it."""
+        return self._entries[-1].solved.answer.pose if self._entries else None
 
     def add(self, seen: SeenInstant) -> list[InstantAnswer]:
         """Take one more instant; return the answers that are final now.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from visloc.archive.schema import Geodetic, World
 from visloc.archive.set_schema import SetWorld
-from visloc.geodesy import enu_from_geodetic, geodetic_from_enu, ground_distance
+from visloc.geodesy import ecef_from_geodetic, geodetic_from_enu, ground_distance
 from visloc.geometry import Pose
 
 
@@ -60,11 +60,30 @@ def circle_of(world: World | SetWorld) -> GeoCircle | None:
     geodetic = None if world.anchor is None else world.anchor.geodetic
     if geodetic is None:
         return None
-    sides = zip(world.extent.min, world.extent.max, strict=True)
-    corners = np.array(list(itertools.product(*sides)))
-    local = enu_of(np.vstack([corners.mean(axis=0), corners]), geodetic)
+    box = np.array([[world.extent.min, world.extent.max]])
+    return GeoCircle(*circles_of(box, geodetic)[0].tolist())
+
+
+def circles_of(boxes: NDArray[np.float64], geodetic: Geodetic) -> NDArray[np.float64]:
+    """Return circles on Earth that hold boxes of a world, each about the middle of its box.
+
+    Args:
+        boxes: (n, 2, 3) smallest and largest coordinates.
+        geodetic: where the world lies.
+
+    Returns:
+        (n, 3) latitude, longitude (deg) and radius (m).
+    """
+    which = np.array(list(itertools.product((0, 1), repeat=3)))
+    corners = boxes[:, which, np.arange(3)]
+    points = np.concatenate([boxes.mean(axis=1, keepdims=True), corners], axis=1)
+    local = enu_of(points.reshape(-1, 3), geodetic)
     positions = geodetic_from_enu(local, origin_of(geodetic))
-    # Across, in the plane at the middle: east and north of it.
-    across = enu_from_geodetic(positions[1:], positions[0])[:, :2]
-    radius = float(np.linalg.norm(across, axis=1).max())
-    return GeoCircle(float(positions[0, 0]), float(positions[0, 1]), radius)
+    middles = positions.reshape(points.shape)[:, 0]
+    away = ecef_from_geodetic(positions).reshape(points.shape)
+    away = away[:, 1:] - away[:, :1]
+    # Across, in the plane at each middle: what is not up or down.
+    up = ecef_from_geodetic(middles + np.array([0.0, 0.0, 1.0])) - ecef_from_geodetic(middles)
+    across = away - (away @ up[:, :, None]) * up[:, None]
+    radii = np.linalg.norm(across, axis=2).max(axis=1)
+    return np.column_stack([middles[:, :2], radii])

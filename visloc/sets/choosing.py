@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import SetOutline
+from visloc.archive.places import circles_of
 from visloc.errors import InvalidInput, NotFound
+from visloc.geodesy import ground_distances
 from visloc.geometry import Pose, rotation_angle
 from visloc.pose.centre import largest_std, position_covariance
 from visloc.priors import HEIGHT_REACH, POSE_PRIOR_STDS, REACH, Priors
@@ -29,8 +31,8 @@ CLEAR_INLIERS = 100
 _RIVAL_SHARE, _SIMILAR_SHARE = 0.5, 0.8
 # Answers agree that are no further apart than what both leave open (three standard deviations),
 # and how well tiles are tied to each other: a tenth of how far their photos see, five degrees.
-_STDS = 3.0
-_REACH_SHARE, _ANGLE = 0.1, math.radians(5.0)
+STDS = 3.0
+TIE_REACH_SHARE, TIE_ANGLE = 0.1, math.radians(5.0)
 _NAMED = 5
 
 
@@ -60,7 +62,31 @@ class Found:
     answer: Answer | InstantAnswer
 
 
-def allowed_tiles(outline: SetOutline, priors: Priors) -> NDArray[np.bool_]:
+def tiles_near(
+    outline: SetOutline, latitude: float, longitude: float, radius: float
+) -> NDArray[np.bool_]:
+    """Tell which tiles reach into a circle on Earth.
+
+    Args:
+        outline: the set.
+        latitude: of the circle's middle, degrees.
+        longitude: likewise.
+        radius: metres.
+
+    Returns:
+        (T,) all False for a set that is not tied to the Earth.
+    """
+    if outline.geodetic is None:
+        return np.zeros(len(outline.tiles), np.bool_)
+    boxes = np.array([(tile.extent.min, tile.extent.max) for tile in outline.tiles])
+    circles = circles_of(boxes, outline.geodetic)
+    away = ground_distances(circles, np.array([latitude, longitude, 0.0]))
+    return np.asarray(away <= radius + circles[:, 2])
+
+
+def allowed_tiles(
+    outline: SetOutline, priors: Priors, within: NDArray[np.bool_] | None = None
+) -> NDArray[np.bool_]:
     """Tell which tiles the priors allow.
 
     A tile is allowed when a photo of it may show what the device sees. As in one map, photos
@@ -71,6 +97,7 @@ def allowed_tiles(outline: SetOutline, priors: Priors) -> NDArray[np.bool_]:
     Args:
         outline: the set.
         priors: in its frame.
+        within: (T,) the tiles that are asked for; None for all.
 
     Returns:
         (T,) one at least is True.
@@ -81,7 +108,7 @@ def allowed_tiles(outline: SetOutline, priors: Priors) -> NDArray[np.bool_]:
         NotFound: ``set.no_tile``.
     """
     low, high = outline.photo_boxes[:, 0], outline.photo_boxes[:, 1]
-    allowed = np.ones(len(low), np.bool_)
+    allowed = np.ones(len(low), np.bool_) if within is None else within.copy()
     if priors.maps is not None:
         allowed &= _named(outline, priors.maps)
     spheres = []
@@ -108,6 +135,38 @@ def allowed_tiles(outline: SetOutline, priors: Priors) -> NDArray[np.bool_]:
             got=outline.ref,
         )
     return allowed
+
+
+def nearest_tile(
+    outline: SetOutline, priors: Priors, within: NDArray[np.bool_] | None = None
+) -> int:
+    """Return the tile that says best that it has no photo where the priors allow the device.
+
+    Of the tiles that are asked for, that whose photos are nearest to where the device may be; the
+    first where only a height says so.
+
+    Args:
+        outline: the set.
+        priors: in its frame, of which ``allowed_tiles`` leaves nothing.
+        within: (T,) the tiles that are asked for; None for all.
+
+    Returns:
+        Its row.
+
+    Raises:
+        NotFound: ``set.no_tile`` when none that is asked for is named.
+    """
+    asked = allowed_tiles(outline, Priors(maps=priors.maps), within)
+    center = None
+    if priors.position is not None:
+        center = priors.position.position
+    elif priors.pose is not None:
+        center = priors.pose.device_from_world.center
+    if center is None:
+        return int(np.flatnonzero(asked)[0])
+    low, high = outline.photo_boxes[:, 0], outline.photo_boxes[:, 1]
+    away = np.linalg.norm(center - np.clip(center, low, high), axis=1)
+    return int(np.where(asked, away, np.inf).argmin())
 
 
 def plan(scores: Sequence[TileScore]) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -160,10 +219,16 @@ def judge(outline: SetOutline, found: Sequence[Found]) -> int | Refusal:
 
 
 def _named(outline: SetOutline, names: Sequence[str]) -> NDArray[np.bool_]:
-    known = np.array([(tile.map, tile.ref) for tile in outline.tiles])
+    asked, known = set(names), set[str]()
+    named = np.zeros(len(outline.tiles), np.bool_)
+    for row, tile in enumerate(outline.tiles):
+        found = asked & {tile.map, tile.ref}
+        if found:
+            known |= found
+            named[row] = True
     for name in names:
         if name not in known:
-            some = ", ".join(dict.fromkeys(known[:_NAMED, 0].tolist()))
+            some = ", ".join(dict.fromkeys(tile.map for tile in outline.tiles[:_NAMED]))
             raise InvalidInput(
                 "priors.maps",
                 f"not a tile of {outline.ref}",
@@ -171,7 +236,7 @@ def _named(outline: SetOutline, names: Sequence[str]) -> NDArray[np.bool_]:
                 expected=f"id or id@version of its tiles, such as {some}",
                 got=name,
             )
-    return np.asarray(np.isin(known, list(names)).any(axis=1))
+    return named
 
 
 def _pose(answer: Answer | InstantAnswer) -> tuple[Pose, NDArray[np.float64]] | None:
@@ -207,13 +272,13 @@ def _agree(outline: SetOutline, a: Found, b: Found) -> bool:
     known_a, known_b = _pose(a.answer), _pose(b.answer)
     if known_a is None or known_b is None:
         return False
-    floor = _REACH_SHARE * float(outline.reaches[[a.tile, b.tile]].max())
+    floor = TIE_REACH_SHARE * float(outline.reaches[[a.tile, b.tile]].max())
     (pose_a, covariance_a), (pose_b, covariance_b) = known_a, known_b
     away = float(np.linalg.norm(pose_a.center - pose_b.center))
     turned = rotation_angle(pose_a.rotation @ pose_b.rotation.T)
     turn_std = math.sqrt(covariance_a[:3, :3].trace() + covariance_b[:3, :3].trace())
     move_std = math.hypot(largest_std(*known_a), largest_std(*known_b))
-    return away <= floor + _STDS * move_std and turned <= _ANGLE + _STDS * turn_std
+    return away <= floor + STDS * move_std and turned <= TIE_ANGLE + STDS * turn_std
 
 
 def _ambiguous(outline: SetOutline, a: Found, b: Found) -> Refusal:
