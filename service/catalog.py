@@ -16,14 +16,15 @@ from typing import Any
 
 from service import worker
 from service.jobs import Near, Where
+from service.listing import Listing
 from service.stores import Store
 from service.together import together
 from service.worker import MapFolder
 from service.workers import Workers
-from visloc.archive import MapOutline, SetOutline, read_any_outline
+from visloc.archive import SetOutline, read_any_outline
+from visloc.archive.set_rules import refuse_if_tile
 from visloc.archive.store import version_in_use
-from visloc.errors import InvalidInput, MapCorrupt, NotFound, Unavailable, VislocError
-from visloc.sets.choosing import tiles_near
+from visloc.errors import MapCorrupt, NotFound, Unavailable, VislocError
 
 logger = logging.getLogger(__name__)
 
@@ -31,34 +32,12 @@ logger = logging.getLogger(__name__)
 RETRY_AFTER_S = 10.0
 # How often the store is asked what has become current, besides by requests.
 FOLLOW_S = 1.0
-# Most maps that one request may search.
-MAX_MAPS = 16
 # How often it is looked whether the last request of a version has ended, and how long at most
 # before it is closed all the same.
 _UNUSED_POLL_S = 0.05
 _FORGET_LIMIT_S = 600.0
 # Maps that are fetched at once.
 _MAX_FETCHES = 4
-# Descriptions of so many versions stay in memory; their arrays stay on disk.
-_MAX_DESCRIBED = 1000
-# Tiles of sets that are opened at the start; others are when they are asked for. A set may have
-# thousands.
-_MAX_TILES_AT_START = 100
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ServedMap:
-    """A version of a map.
-
-    Attributes:
-        outline: what it, or a set of maps, says about itself.
-        current: whether it is the one in use.
-        versions: all published ones of the map, oldest first, and which is in use.
-    """
-
-    outline: MapOutline | SetOutline
-    current: bool
-    versions: tuple[tuple[str, bool], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,9 +72,9 @@ class Catalog:
         self._fetchers = ThreadPoolExecutor(_MAX_FETCHES, thread_name_prefix="fetch")
         self._fetching: dict[str, asyncio.Future[Path]] = {}  # by id@version
         self._serving: dict[str, MapFolder] = {}  # by map id
+        self.listing = Listing(store, self._serving)
         self._refused: dict[str, _Refused] = {}  # by map id
         self._taking_over: dict[str, asyncio.Task[None]] = {}  # by map id
-        self._described: dict[str, MapOutline | SetOutline] = {}  # by id@version
         self._sets: dict[str, SetOutline | None] = {}  # by id@version; None: it is a map
         self._users: Counter[str] = Counter()  # requests under way, by id@version
         self._leaving: set[str] = set()  # id@version of what is being deleted
@@ -117,7 +96,7 @@ class Catalog:
         Sets come first, and their tiles last, the first ones only. One that is broken does not
         keep back the others.
         """
-        for map_id in await asyncio.to_thread(self._opened_at_start):
+        for map_id in await asyncio.to_thread(self.listing.opened_at_start):
             if sum(workers.loaded.values()) >= max_bytes:
                 logger.info("max_loaded_bytes is full: other maps are opened when they are asked")
                 break
@@ -151,7 +130,10 @@ class Catalog:
             NotFound: ``map.unknown``, ``map.version``, ``map.none_near``.
             VislocError: what the store and ``worker.load`` raise.
         """
-        refs = await self._ids_near(where) if isinstance(where, Near) else where
+        if isinstance(where, Near):
+            refs = await asyncio.to_thread(self.listing.searched_near, where)
+        else:
+            refs = where
         taken: list[MapFolder] = []
         try:
             for ref in refs:
@@ -225,13 +207,15 @@ class Catalog:
 
         Raises:
             NotFound: ``map.unknown``, ``map.version``.
-            Conflict: ``map.version_in_use``.
+            Conflict: ``map.version_in_use``, ``map.in_set``.
         """
         ref = f"{map_id}@{version}"
         # One that answers while the current one cannot be opened is in use too.
         others = set(await asyncio.to_thread(self._store.versions, map_id)) - {version}
         if others and any(of.ref == ref for of in self._serving.values()):
             raise version_in_use(map_id, version, sorted(others))
+        # Before anyone is turned away from it.
+        await asyncio.to_thread(self._refuse_if_tile, map_id, version)
         self._leaving.add(ref)
         try:
             await self._until_unused(ref, limit_s)
@@ -240,7 +224,7 @@ class Catalog:
             await asyncio.to_thread(self._store.remove, map_id, version)
         finally:
             self._leaving.discard(ref)
-        self._described.pop(ref, None)
+        self.listing.forget(ref)
         self._sets.pop(ref, None)
         if map_id in self._serving and not others:
             del self._serving[map_id]
@@ -251,49 +235,6 @@ class Catalog:
         outline = self._sets[of.ref]
         assert outline is not None  # the caller has looked
         return outline
-
-    async def describe(self, ref: str) -> ServedMap:
-        """Describe ``id``, in the version that is served, or ``id@version``.
-
-        Raises:
-            VislocError: what the store raises.
-        """
-        return await asyncio.to_thread(self._describe, ref)
-
-    async def list(self, near: Near | None) -> Sequence[ServedMap]:
-        """Describe all maps that can be opened, or those that reach into a circle, by id."""
-
-        def described() -> list[ServedMap]:
-            found = []
-            for map_id in self._store.ids():
-                try:
-                    served = self._describe(map_id)
-                except VislocError as error:
-                    logger.warning("map %s is not listed: %s", map_id, error)
-                    continue
-                if near is None or _reaches(served.outline, near):
-                    found.append(served)
-            return found
-
-        return await asyncio.to_thread(described)
-
-    def _opened_at_start(self) -> tuple[str, ...]:
-        """Say which maps to open at the start, and in which order; in a thread."""
-        sets, maps, tiles = [], [], set[str]()
-        for map_id in self._store.ids():
-            try:
-                outline = self._describe(map_id).outline
-            except VislocError:
-                maps.append(map_id)  # opening it says what is wrong
-                continue
-            if isinstance(outline, SetOutline):
-                sets.append(map_id)
-                tiles.update(tile.map for tile in outline.tiles)
-            else:
-                maps.append(map_id)
-        alone = [map_id for map_id in maps if map_id not in tiles]
-        in_sets = [map_id for map_id in maps if map_id in tiles]
-        return (*sets, *alone, *in_sets[:_MAX_TILES_AT_START])
 
     async def _take(self, ref: str, workers: Workers) -> MapFolder:
         """Return a map, which stays until it is given back."""
@@ -333,30 +274,20 @@ class Catalog:
         """Close a version that another one took over from, after its last request."""
         await self._until_unused(ref, _FORGET_LIMIT_S)
         self._sets.pop(ref, None)
-        if not any(of.ref == ref for of in self._serving.values()):
+        if not any(of.ref == ref for of in self._serving.values()) and not self._sets_with(ref):
             await workers.run_everywhere(worker.forget, ref)
 
-    async def _ids_near(self, near: Near) -> tuple[str, ...]:
-        # A set is searched instead of its tiles.
-        listed = _without_tiles(await self.list(near))
-        found = [served.outline.manifest.id for served in listed]
-        if not found:
-            raise NotFound(
-                "map.none_near",
-                "no map that is tied to the Earth reaches into this circle",
-                field="near",
-                expected="a place that a map covers: GET /maps?near=latitude,longitude,radius",
-                got=f"{near.latitude:g}, {near.longitude:g}, {near.radius:g} m",
-            )
-        if len(found) > MAX_MAPS:
-            raise InvalidInput(
-                "request.map",
-                "too many maps reach into this circle",
-                field="near.radius",
-                expected=f"a circle that at most {MAX_MAPS} maps reach into",
-                got=f"{len(found)} maps",
-            )
-        return tuple(found)
+    def _sets_with(self, ref: str) -> list[SetOutline]:
+        """The sets that are served and name a version."""
+        sets = [self._sets.get(of.ref) for of in tuple(self._serving.values())]
+        return [of for of in sets if of and any(ref == tile.ref for tile in of.tiles)]
+
+    def _refuse_if_tile(self, map_id: str, version: str) -> None:
+        """Refuse to delete a tile of a set that is served and in use; in a thread."""
+        for of in self._sets_with(f"{map_id}@{version}"):
+            with suppress(NotFound):  # the set was deleted a moment ago
+                if self._store.current_version(of.manifest.id) == of.manifest.version:
+                    refuse_if_tile(map_id, version, [(of.ref, of.manifest)])
 
     async def _resolve(self, ref: str, workers: Workers) -> MapFolder:
         """Return what ``id`` stands for: what is current, or the version before it."""
@@ -463,44 +394,6 @@ class Catalog:
         self._background.add(task)  # the loop itself keeps only a weak reference
         task.add_done_callback(self._background.discard)
 
-    def _describe(self, ref: str) -> ServedMap:
-        """Describe a map; in a thread."""
-        map_id, at, version = ref.partition("@")
-        try:
-            current = self._store.current_version(map_id)
-        except (NotFound, MapCorrupt):
-            current = ""
-        if not at:
-            served = self._serving.get(map_id)
-            version = current if served is None else served.ref.partition("@")[2]
-            if not current:
-                self._store.current_version(map_id)  # raises what is wrong
-        wanted = f"{map_id}@{version}"
-        versions = self._store.versions(map_id)
-        outline = self._described.get(wanted) if version in versions else None
-        if outline is None:
-            outline = self._store.outline(wanted)
-            while len(self._described) >= _MAX_DESCRIBED:
-                self._described.pop(next(iter(self._described)), None)
-            self._described[wanted] = outline
-        return ServedMap(outline, version == current, tuple((v, v == current) for v in versions))
-
 
 def _gone_meanwhile(map_id: str) -> NotFound:
     return NotFound("map.unknown", "the map was deleted a moment ago", field="map", got=map_id)
-
-
-def _without_tiles(maps: Sequence[ServedMap]) -> list[ServedMap]:
-    """Return maps without those that are tiles of a set among them."""
-    outlines = [served.outline for served in maps]
-    tiles = {tile.map for of in outlines if isinstance(of, SetOutline) for tile in of.tiles}
-    return [served for served in maps if served.outline.manifest.id not in tiles]
-
-
-def _reaches(outline: MapOutline | SetOutline, near: Near) -> bool:
-    place = outline.place
-    if place is None or place.distance_to(near.latitude, near.longitude) > near.radius:
-        return False
-    if isinstance(outline, SetOutline):  # between its tiles, there is none of it
-        return bool(tiles_near(outline, near.latitude, near.longitude, near.radius).any())
-    return True

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from time import time
 
 from service import worker
-from service.catalog import Catalog, ServedMap
+from service.catalog import Catalog
 from service.instant_tasks import look, solve_rig, without_photos
 from service.jobs import (
     Instant,
@@ -27,10 +27,11 @@ from service.jobs import (
     RigJob,
     SequenceStart,
 )
+from service.listing import ServedMap
 from service.metrics import Metrics
 from service.scenes import Scenes
 from service.set_search import SetSearch, answers_of, check_no_tiles, parted
-from service.set_sequences import SetSequence
+from service.set_sequences import SetSequence, check_all_in_order
 from service.stores import Store
 from service.uploads import Uploads
 from service.wire import stopping_error
@@ -282,6 +283,8 @@ class Engine:
                 )
             if sets:
                 sequence = SetSequence(self._sets, self._catalog, self.workers, start, sets[0])
+                if isinstance(instants, Sequence):
+                    check_all_in_order(instants)
                 found = sequence.answers(_in_turn(instants))
             else:
                 found = self._answers(start, instants, alone)
@@ -332,7 +335,7 @@ class Engine:
         Args:
             near: only those that reach into this circle.
         """
-        return await self._catalog.list(near)
+        return await asyncio.to_thread(self._catalog.listing.all, near)
 
     async def map(self, ref: str) -> ServedMap:
         """One map: ``id``, or ``id@version``.
@@ -340,7 +343,7 @@ class Engine:
         Raises:
             VislocError: what the store raises.
         """
-        return await self._catalog.describe(ref)
+        return await asyncio.to_thread(self._catalog.listing.describe, ref)
 
     async def upload(self, map_id: str, version: str, chunks: AsyncIterator[bytes]) -> ServedMap:
         """Publish a packed map, verified byte by byte; it is not put into use.

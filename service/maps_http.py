@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from contextlib import aclosing
 from typing import Annotated, Any
 
@@ -56,7 +57,7 @@ def add_map_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) -> N
     @app.get("/maps/{ref}", response_model=MapInfo, responses=problems(404, 422, 500))
     async def get_map(ref: str) -> Response:
         """Describe one map: `id`, or `id@version`."""
-        return json_response(MapInfo.from_served(await engine.map(ref)))
+        return json_response(await asyncio.to_thread(MapInfo.from_served, await engine.map(ref)))
 
     @app.post(
         "/maps/{map_id}/current",
@@ -78,7 +79,8 @@ def add_map_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) -> N
     @app.get(path, response_model=MapInfo, responses=problems(404, 422, 500))
     async def get_version(map_id: str, version: str) -> Response:
         """Describe one version, published but not necessarily in use."""
-        return json_response(MapInfo.from_served(await engine.map(f"{map_id}@{version}")))
+        served = await engine.map(f"{map_id}@{version}")
+        return json_response(await asyncio.to_thread(MapInfo.from_served, served))
 
     @app.put(
         path,

@@ -10,6 +10,7 @@ import math
 from collections.abc import AsyncGenerator, AsyncIterator, Sequence
 from contextlib import AsyncExitStack, aclosing
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +80,17 @@ class _Looked:
     instant: Instant
     seen: list[Seen]
     priors: Priors
+
+
+def check_all_in_order(instants: Sequence[Instant]) -> None:
+    """Refuse instants that are not in the order of time, before any is worked on.
+
+    Raises:
+        InvalidInput: ``sequence.timestamps``.
+    """
+    for index, (before, instant) in enumerate(pairwise(instants), start=1):
+        with inside(f"instants[{index}]"):
+            check_order(before.timestamp, instant.timestamp)
 
 
 class SetSequence:

@@ -16,7 +16,7 @@ from visloc.archive.store import checked_name
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, TooLarge
 
 # Uploads that are written or verified at once.
-_MAX_UPLOADS = 4
+MAX_UPLOADS = 4
 # What is taken from an upload before it is written to disk.
 _WRITE_BYTES = 4 * 2**20
 
@@ -35,7 +35,7 @@ class Uploads:
     def __init__(self, store: Store, max_bytes: int) -> None:
         self._store, self._max_bytes = store, max_bytes
         # Verifying gigabytes takes minutes, in which all else that needs a thread goes on.
-        self._threads = ThreadPoolExecutor(_MAX_UPLOADS, thread_name_prefix="upload")
+        self._threads = ThreadPoolExecutor(MAX_UPLOADS, thread_name_prefix="upload")
         self._running: set[str] = set()
 
     async def publish(self, map_id: str, version: str, chunks: AsyncIterator[bytes]) -> None:

@@ -12,7 +12,7 @@ from service.incoming import IncomingMessage
 from visloc.types import Fusion
 
 if TYPE_CHECKING:
-    from service.catalog import ServedMap
+    from service.listing import ServedMap
 
 
 class Extent(BaseModel):

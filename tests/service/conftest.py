@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import shutil
 import threading
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -89,3 +90,37 @@ def doors(built_maps: Path) -> Iterator[Doors]:
 def serve() -> Callable[..., AbstractContextManager[Doors]]:
     """``with serve(maps_dir, **settings) as doors``: a service of the test's own."""
     return serving
+
+
+@pytest.fixture(scope="session")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of another room than the sample's."""
+    from tests.service.map_sets import write_study
+
+    folder = tmp_path_factory.mktemp("study")
+    write_study(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def site(built_maps: Path, study: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Maps ``room``, ``study`` and ``copy``, and sets of them; only to be read."""
+    from tests.service.map_sets import write_site
+
+    maps = Path(shutil.copytree(built_maps, tmp_path_factory.mktemp("site") / "maps"))
+    write_site(study, maps)
+    return maps
+
+
+@pytest.fixture
+def site_copy(site: Path, tmp_path: Path) -> Path:
+    """The same, to be changed."""
+    return Path(shutil.copytree(site, tmp_path / "maps"))
+
+
+@pytest.fixture(scope="session")
+def in_study(study: Path) -> list[Any]:
+    """Photos of the other room with their cameras and poses."""
+    from tests.service.map_sets import photos_of
+
+    return photos_of(study)

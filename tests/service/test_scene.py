@@ -19,8 +19,8 @@ import pytest
 from starlette.responses import Response
 
 import service.scenes
-from service.catalog import ServedMap
 from service.key_file import Scope, edited_keys, new_key
+from service.listing import ServedMap
 from service.scene_http import _of_version
 from service.scenes import Scenes, _Kept
 from service.schemas import MapImages

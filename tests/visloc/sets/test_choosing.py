@@ -1,18 +1,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from visloc.archive import SetOutline
+from visloc.archive import Anchor, Geodetic, SetOutline
 from visloc.errors import InvalidInput, NotFound
+from visloc.geodesy import geodetic_from_enu
 from visloc.geometry import Camera, Pose
 from visloc.pose.centre import position_covariance
 from visloc.priors import NO_PRIORS, GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
-from visloc.sets.choosing import Found, allowed_tiles, is_clear, judge, plan
+from visloc.sets.choosing import (
+    Found,
+    allowed_tiles,
+    is_clear,
+    judge,
+    nearest_tile,
+    plan,
+    tiles_near,
+)
 from visloc.sets.coarse import TileScore
 from visloc.trajectory import PoseSource
 from visloc.types import (
@@ -82,6 +92,57 @@ def of_rig(inliers: int, center: Any = (0, 0, 0)) -> InstantAnswer:
 
 
 # Which tiles
+
+
+def test_tiles_near_are_those_whose_boxes_reach_into_a_circle(outline: MakeOutline) -> None:
+    houses = outline(HOUSES)
+    assert not tiles_near(houses, 48.0, 8.0, 1e6).any()  # it lies nowhere on Earth
+    # A frame of half metres, turned by 90 degrees: its x points north, its y west.
+    turn = np.sqrt(0.5)
+    geodetic = Geodetic(
+        latitude_deg=48.0,
+        longitude_deg=8.0,
+        altitude_m=400.0,
+        rotation_wxyz=(turn, 0.0, 0.0, turn),
+        translation=(0.0, 0.0, 0.0),
+        scale=0.5,
+    )
+    world = houses.manifest.world.model_copy(
+        update={"anchor": Anchor(kind="correspondences", images=3, rms=None, geodetic=geodetic)}
+    )
+    anchored = replace(houses, manifest=houses.manifest.model_copy(update={"world": world}))
+    # Circles about the boxes have a radius of 2.5 m times the root of 2.
+    for east, north, radius, expected in (
+        (-2.5, 2.5, 0.1, [True, True, False]),
+        (-2.5, 52.5, 0.1, [False, False, True]),
+        (-2.5, 27.5, 21.0, [False, False, False]),
+        (-2.5, 27.5, 22.0, [True, True, True]),
+    ):
+        origin = np.array([48.0, 8.0, 400.0])
+        ((latitude, longitude, _),) = geodetic_from_enu(np.array([[east, north, 0.0]]), origin)
+        found = tiles_near(anchored, latitude, longitude, radius)
+        assert found.tolist() == expected
+
+
+def test_tiles_that_are_asked_for_are_narrowed_further(outline: MakeOutline) -> None:
+    houses = outline(HOUSES, names=("low", "high", "away"))
+    there = Priors(position=PositionPrior(np.array([5.0, 5, 1.5]), 1.0))
+    within = np.array([False, True, True])
+    assert allowed_tiles(houses, there, within).tolist() == [False, True, False]
+    with pytest.raises(NotFound):
+        allowed_tiles(houses, there, np.array([False, False, True]))
+    assert within.tolist() == [False, True, True]
+
+
+def test_the_nearest_tile_is_one_that_is_asked_for(outline: MakeOutline) -> None:
+    houses = outline(HOUSES, names=("low", "high", "away"))
+    far = PositionPrior(np.array([300.0, 0, 0]), 1.0)
+    assert nearest_tile(houses, Priors(position=far)) == 2
+    assert nearest_tile(houses, Priors(position=far, maps=("low", "high"))) in (0, 1)
+    assert nearest_tile(houses, Priors(position=far), np.array([False, True, False])) == 1
+    assert nearest_tile(houses, Priors(height=HeightBand(50.0, 51.0))) == 0
+    with pytest.raises(NotFound):
+        nearest_tile(houses, Priors(position=far, maps=("away",)), np.array([True, True, False]))
 
 
 def test_without_priors_all_tiles_are_allowed(outline: MakeOutline) -> None:

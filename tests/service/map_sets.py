@@ -1,0 +1,89 @@
+"""What tests of sets of maps share: two rooms, and where they lie in their sets."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clients import Instant, RigImage
+from mapping.build import BuildSettings, build_map
+from mapping.sample import write_sample
+from mapping.sets import publish_set
+from visloc.archive import MapStore
+from visloc.geometry import Similarity
+from visloc.kapture import read_dataset
+
+START = 1_700_000_000_000  # milliseconds
+
+
+def turned(degrees: float, scale: float, *translation: float) -> Similarity:
+    """About the world's z axis."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+    return Similarity(scale, rotation, np.array(translation))
+
+
+# Where the two rooms lie in the set.
+SITE_FROM_ROOM = turned(30, 1.0, 100.0, -20.0, 3.0)
+SITE_FROM_STUDY = turned(-75, 1.0, -50.0, 40.0, 6.0)
+# The same room in a set of another unit.
+MODEL_FROM_ROOM = turned(90, 0.1, 1.0, 2.0, 3.0)
+
+
+def quiet(_stage: str, _done: int, _total: int) -> None:
+    pass
+
+
+def copy_map(maps: Path, of: str, map_id: str, version: str) -> None:
+    """Publish the current version of a map under another name, not made current."""
+    target = maps / map_id / version
+    shutil.copytree(MapStore(maps).folder(of), target)
+    manifest = json.loads((target / "manifest.json").read_text()) | {
+        "id": map_id,
+        "version": version,
+    }
+    (target / "manifest.json").write_text(json.dumps(manifest))
+
+
+def instants(photos: list[bytes], camera: Any) -> list[Instant]:
+    return [
+        Instant(START + 100 * i, (RigImage("camera", photo, camera),))
+        for i, photo in enumerate(photos)
+    ]
+
+
+def write_study(folder: Path) -> None:
+    """Write a dataset of another room: of the same shape, but other pictures, and another rig."""
+    write_sample(folder, images=8, size=(256, 192), seed=1)
+    for path in folder.rglob("sensors/*.txt"):
+        path.write_text(re.sub(r"\brig,", "cart,", path.read_text()))
+
+
+def write_site(study: Path, maps: Path) -> None:
+    """Add ``study`` and ``copy``, which is the room again, and sets of them to ``room``."""
+    build_map(BuildSettings(study / "mapping", "study", maps, local_features="sift"), quiet)
+    copy_map(maps, "room", "copy", "v1")
+    (maps / "copy" / "current").write_text("v1")
+    store = MapStore(maps)
+    rooms = [("room", SITE_FROM_ROOM), ("study", SITE_FROM_STUDY)]
+    publish_set(store, "site", rooms, quiet)
+    publish_set(store, "twice", [("room", SITE_FROM_ROOM), ("copy", SITE_FROM_STUDY)], quiet)
+    publish_set(store, "model", [("room", MODEL_FROM_ROOM)], quiet)
+
+
+def photos_of(study: Path) -> list[Any]:
+    """Photos of a dataset's queries with their cameras and poses."""
+    dataset = read_dataset(study / "query")
+    return [
+        (
+            dataset.path_of(record).read_bytes(),
+            dataset.sensors[record.sensor_id].camera,
+            dataset.pose(record),
+        )
+        for record in dataset.images
+    ]

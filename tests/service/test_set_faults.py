@@ -1,0 +1,346 @@
+"""Sets of maps when something is away, slow, far off or wrong, with real worker processes."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import shutil
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from pathlib import Path
+from time import sleep
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from clients import Client, Instant, Near, Odometry, RigImage
+from mapping.georeference import given_place, publish_anchored
+from mapping.sets import publish_set
+from service.jobs import Near as Circle
+from service.listing import Listing
+from service.metrics import ServiceState
+from service.set_sequences import SetSequence
+from tests.service.map_sets import (
+    SITE_FROM_ROOM,
+    SITE_FROM_STUDY,
+    START,
+    copy_map,
+    instants,
+    quiet,
+)
+from visloc.archive import MapOutline, MapStore, SetOutline
+from visloc.archive.remote_store import RemoteMapStore
+from visloc.errors import Conflict, NotFound, Unavailable, VislocError
+from visloc.geometry import Pose
+from visloc.kapture import read_dataset
+from visloc.priors import PositionPrior, Priors
+
+Serve = Callable[..., AbstractContextManager[Any]]
+
+
+@pytest.fixture(scope="module")
+def served(site: Path, serve: Serve) -> Iterator[Any]:
+    with serve(site, workers=2) as doors:
+        yield doors
+
+
+@pytest.fixture(scope="module")
+def client(served: Any) -> Iterator[Client]:
+    with Client(served.url) as client:
+        yield client
+
+
+def told(client: Client, sent: list[Instant], asked: Any) -> list[tuple[str, str]]:
+    """Status and tile of each answer; the code of the error that ended it, if any."""
+    found = []
+    try:
+        for each in client.localize_sequence(sent, asked):
+            found.append((each.status, (each.tile or "").partition("@")[0]))
+    except VislocError as error:
+        found.append(("error", error.code))
+    return found
+
+
+def state_of(doors: Any) -> ServiceState:
+    async def state() -> ServiceState:
+        return doors.server.state()
+
+    loop = doors.server.engine._following.get_loop()
+    return asyncio.run_coroutine_threadsafe(state(), loop).result(60)
+
+
+def busy(state: ServiceState) -> int:
+    return state.photos_waiting + state.photos_running
+
+
+def wait_until(holds: Callable[[], bool]) -> None:
+    while not holds():
+        sleep(0.005)
+
+
+def test_near_searches_the_tiles_that_reach_into_the_circle(
+    site: Path, serve: Serve, query: Any, in_study: list[Any], tmp_path: Path
+) -> None:
+    maps = tmp_path / "maps"
+    for name in ("room", "study"):
+        shutil.copytree(site / name, maps / name)
+    store = MapStore(maps)
+    place = (45.2178, 5.8083, 310.0)
+    anchored = given_place(store.open("room"), place, 90.0, gravity=(0.0, 0.0, -1.0))
+    publish_anchored(store.open("room"), anchored, maps, force=False)
+    rooms = [("room", SITE_FROM_ROOM), ("study", SITE_FROM_STUDY)]
+    publish_set(store, "site", rooms, quiet)
+    with serve(maps) as doors, Client(doors.url) as client:
+        there = client.localize(in_study[0][0], "site", in_study[0][1]).geopose
+        assert there is not None
+        about_room = Near(45.2178, 5.8083, 5.0)
+        about_study = Near(there.latitude, there.longitude, 5.0)
+        both = client.map("site").place
+        assert both is not None
+
+        assert client.localize(query.image, about_room, query.camera).pose is not None
+        for photo, near, tile in (
+            (query.image, about_study, "study"),
+            (in_study[0][0], about_room, "room"),
+        ):
+            found = client.localize(photo, near, query.camera)
+            assert (found.map.id, found.pose) == ("site", None)
+            assert (found.tile or "").startswith(f"{tile}@")
+            sent = instants([photo], query.camera)
+            assert told(client, sent, near) == [("not_localized", tile)]
+        everywhere = Near(both.latitude, both.longitude, both.radius)
+        assert client.localize(in_study[0][0], everywhere, query.camera).pose is not None
+        # The circle about both holds it, yet it lies between them.
+        between = Near(both.latitude, both.longitude, 5.0)
+        assert [info.id for info in client.maps(between)] == []
+        with pytest.raises(NotFound) as nothing:
+            client.localize(query.image, between, query.camera)
+        assert nothing.value.code == "map.none_near"
+
+
+def test_a_sequence_changes_tiles_only_where_its_odometry_has_it(
+    client: Client, queries: list[Any], in_study: list[Any]
+) -> None:
+    here, there = queries[0].image, in_study[0][0]
+    # In the frame of the set, from one room to the other; both are metric.
+    room = SITE_FROM_ROOM.move(queries[0].cam_from_world)
+    study = SITE_FROM_STUDY.move(in_study[0][2])
+    still = Pose.identity()
+    for moved, expected in (
+        (still, ["room", "room", "room"]),
+        (study @ room.inverse(), ["room", "study", "room"]),
+    ):
+        poses = [still, moved, still]
+        sent = [
+            Instant(
+                START + 100 * i,
+                (RigImage("camera", photo, queries[0].camera),),
+                odometry=Odometry(pose),
+            )
+            for i, (photo, pose) in enumerate(zip([here, there, here], poses, strict=True))
+        ]
+        assert [tile for _, tile in told(client, sent, "site")] == expected
+
+
+def test_an_instant_that_shows_nothing_stays_in_its_leg(
+    site_copy: Path, serve: Serve, queries: list[Any]
+) -> None:
+    camera = queries[0].camera
+    _, blank = cv2.imencode(".png", np.zeros((64, 64), np.uint8))
+    (site_copy / "study").rename(site_copy / "away")
+    with serve(site_copy) as doors, Client(doors.url) as client:
+        for nothing in (b"no photo", blank.tobytes()):
+            sent = instants([queries[0].image, nothing, queries[1].image], camera)
+            assert [status for status, _ in told(client, sent, "room")] == [
+                "localized",
+                "filled",
+                "localized",
+            ]
+            assert told(client, sent, "site") == [
+                ("localized", "room"),
+                ("filled", "room"),
+                ("localized", "room"),
+            ]
+
+
+def test_a_tile_that_is_away_does_not_end_a_leg_elsewhere(
+    site_copy: Path, serve: Serve, queries: list[Any], in_study: list[Any]
+) -> None:
+    (site_copy / "study").rename(site_copy / "away")
+    photos = [queries[0].image, in_study[0][0], queries[1].image]
+    with serve(site_copy) as doors, Client(doors.url) as client:
+        found = told(client, instants(photos, queries[0].camera), "site")
+    assert found == [("localized", "room"), ("filled", "room"), ("localized", "room")]
+
+
+def test_answers_of_a_leg_outlive_an_error_of_the_next(
+    client: Client,
+    query: Any,
+    in_study: list[Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    begin, begun = SetSequence._begin, list[Any]()
+
+    async def second_fails(self: SetSequence, looked: Any) -> Any:
+        begun.append(looked)
+        if len(begun) == 2:
+            raise Unavailable("server.worker_died", "died")
+        return await begin(self, looked)
+
+    monkeypatch.setattr(SetSequence, "_begin", second_fails)
+    photos = [query.image, b"no photo", b"no photo", in_study[0][0]]
+    found = told(client, instants(photos, query.camera), "site")
+    assert [tile for _, tile in found[:3]] == ["room"] * 3
+    assert found[3] == ("error", "server.worker_died")
+
+
+def test_a_sequence_may_begin_outside_the_set(client: Client, query: Any) -> None:
+    outside = Priors(position=PositionPrior(np.array([900.0, 0, 0]), 1.0))
+    sent = [
+        Instant(
+            START + 100 * i,
+            (RigImage("camera", query.image, query.camera),),
+            priors=outside if i == 0 else None,
+        )
+        for i in range(2)
+    ]
+    first, second = client.localize_sequence(sent, "site")
+    assert first.refusal is not None
+    assert (first.status, first.refusal.reason) == ("not_localized", "no_photo_near")
+    assert second.status == "localized"
+
+
+def test_a_tile_that_does_not_know_a_rig_leaves_it_to_others(client: Client, sample: Path) -> None:
+    dataset = read_dataset(sample / "query")
+    first = [r for r in dataset.images if r.timestamp == dataset.images[0].timestamp]
+    images = [RigImage(r.sensor_id, dataset.path_of(r).read_bytes()) for r in first]
+    assert client.localize_rig(images, "site", "rig").pose is not None
+    # What the photos show does not know it.
+    found = client.localize_rig(images, "site", "cart")
+    assert found.pose is None
+    assert (found.tile or "").startswith("study@")
+    with pytest.raises(NotFound) as unknown:
+        client.localize_rig(images, "site", "bus")
+    assert unknown.value.code == "rig.unknown"
+
+
+def test_a_tile_in_use_stays_in_service_when_its_deletion_is_refused(
+    served: Any, client: Client, site: Path, in_study: list[Any]
+) -> None:
+    engine = served.server.engine
+    version = MapStore(site).current_version("study")
+    held, done = threading.Event(), threading.Event()
+
+    async def hold() -> None:
+        async with engine._catalog.using((f"study@{version}",), engine.workers):
+            held.set()
+            await asyncio.to_thread(done.wait)
+
+    asyncio.run_coroutine_threadsafe(hold(), engine._following.get_loop())
+    assert held.wait(60)
+    image, camera, _ = in_study[0]
+    try:
+        with ThreadPoolExecutor(1) as pool:
+            deletion = pool.submit(client.delete_version, "study", version)
+            while not deletion.done():
+                assert client.localize(image, "site", camera).pose is not None
+    finally:
+        done.set()
+    refused = deletion.exception()
+    assert isinstance(refused, Conflict)
+    assert refused.code == "map.in_set"
+
+
+def test_photos_that_wait_for_a_set_are_counted(site: Path, serve: Serve, query: Any) -> None:
+    sent = 8
+    with serve(site, workers=1) as doors:
+
+        def ask() -> bool:
+            with Client(doors.url) as client:
+                return client.localize(query.image, "site", query.camera).pose is not None
+
+        (process,) = doors.server.engine.workers.pids
+        with ThreadPoolExecutor(sent) as pool:
+            os.kill(process, signal.SIGSTOP)
+            try:
+                answers = [pool.submit(ask) for _ in range(sent)]
+                most = 0
+                while most < sent and not all(answer.done() for answer in answers):
+                    most = max(most, busy(state_of(doors)))
+            finally:
+                os.kill(process, signal.SIGCONT)
+            assert most == sent
+            assert all(answer.result() for answer in answers)
+        assert state_of(doors).photos_waiting == 0
+
+
+def test_a_tile_that_is_being_fetched_holds_up_no_other_set(
+    site: Path,
+    serve: Serve,
+    query: Any,
+    in_study: list[Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fetch, asked, arrives = RemoteMapStore.folder, threading.Event(), threading.Event()
+
+    def slow(self: RemoteMapStore, ref: str) -> Path:
+        if ref.startswith("study@"):
+            asked.set()
+            assert arrives.wait(60)
+        return fetch(self, ref)
+
+    monkeypatch.setattr(RemoteMapStore, "folder", slow)
+    settings = {"cache_dir": tmp_path / "cache", "max_loaded_bytes": 1}
+    image, camera, _ = in_study[0]
+    with serve(f"file://{site}", workers=1, **settings) as doors:
+
+        def ask() -> Any:
+            with Client(doors.url) as client:
+                return client.localize(image, "site", camera).tile
+
+        with ThreadPoolExecutor(4) as pool, Client(doors.url) as client:
+            # More than there is room for in memory.
+            answers = [pool.submit(ask) for _ in range(4)]
+            assert asked.wait(60)
+            wait_until(lambda: doors.server.engine.photos == 4 and not busy(state_of(doors)))
+            here = Priors(maps=("room",))
+            assert client.localize(query.image, "site", query.camera, priors=here).pose is not None
+            assert not any(answer.done() for answer in answers)
+            arrives.set()
+            assert all(answer.result().startswith("study@") for answer in answers)
+
+
+def test_a_version_that_a_set_names_stays_open_when_another_takes_over(
+    site_copy: Path, serve: Serve, query: Any
+) -> None:
+    before = f"room@{MapStore(site_copy).current_version('room')}"
+    copy_map(site_copy, "room", "room", "v2")
+    with serve(site_copy) as doors, Client(doors.url) as client:
+        engine = doors.server.engine
+        client.use_version("room", "v2")
+        wait_until(lambda: not engine._catalog._background)
+        assert {before, "room@v2"} <= engine.workers.loaded.keys()
+        assert client.localize(query.image, "site", query.camera).tile == before
+
+
+def test_tiles_of_sets_are_not_read_to_find_what_is_near(site: Path) -> None:
+    read = list[str]()
+
+    class Counting(MapStore):
+        def outline(self, ref: str) -> MapOutline | SetOutline:
+            read.append(ref.partition("@")[0])
+            return super().outline(ref)
+
+    listing = Listing(Counting(site), {})
+    assert listing.opened_at_start() == ("model", "site", "twice", "copy", "room", "study")
+    read.clear()
+    listing._described.clear()
+    with pytest.raises(NotFound):
+        listing.searched_near(Circle(45.0, 5.0, 10.0))
+    assert sorted(read) == ["model", "site", "twice"]
