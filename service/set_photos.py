@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 
 class Places:
-    """Room for photos that were read, which are much larger than those that wait.
+    """Room for photos that were read, which take much more memory than those that wait.
 
     Args:
         count: requests whose photos may be in memory at once.
