@@ -54,6 +54,7 @@ from mapping.sfm import (
 )
 from mapping.stages import WorkFolder, exclusive
 from mapping.triangulation import MAPPER_CONFIGS, REFINABLE
+from mapping.workers import one_thread_here
 from visloc.archive import (
     Anchor,
     FingerprintRecord,
@@ -65,6 +66,7 @@ from visloc.archive import (
 )
 from visloc.errors import Conflict, InvalidInput, Unavailable
 from visloc.features import DEFAULT_GLOBAL_FEATURES, DEFAULT_LOCAL_FEATURES
+from visloc.features.inference import choose_inference
 from visloc.features.readymade import is_ready_made, ready_made_type
 from visloc.geometry import PixelOrigin, Pose
 from visloc.kapture import Dataset, open_features, read_dataset
@@ -162,6 +164,9 @@ def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None =
         DatasetError, WeightsError, InvalidInput: with the file or the setting that is wrong.
         Unavailable: ``storage.failed`` when the disk is full or broken; what executors raise.
     """
+    if settings.executor != "local" and settings.inference is Inference.AUTO:
+        # What suits this machine; each of a cluster would choose for itself.
+        settings = replace(settings, inference=choose_inference(settings.inference))
     _check(settings)
     store = open_store(settings.maps_dir, settings.cache_dir)
     versions = store.versions(settings.map_id)
@@ -190,7 +195,8 @@ def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None =
                 if costs is not None:
                     progress = costs.measured(progress, workers)
                 dataset = dataset.with_pixels_from(settings.pixel_origin)
-                folder = _build(settings, dataset, store, work, scratch, workers, progress)
+                with one_thread_here():  # so that processors do not change what comes out
+                    folder = _build(settings, dataset, store, work, scratch, workers, progress)
             work.remove()
             shutil.rmtree(scratch, ignore_errors=True)
     except storage_errors() as error:

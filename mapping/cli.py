@@ -173,8 +173,8 @@ def build(
         str,
         typer.Option(
             metavar="ADDRESS",
-            help="Of the cluster: HOST:PORT, ray://HOST:PORT, auto for the one that this machine "
-            "is part of, or local for one of this machine that ends with the build.",
+            help="Of the cluster: HOST:PORT, ray://HOST:PORT, auto for the one of RAY_ADDRESS or "
+            "of this machine, or local for one of this machine that ends with the build.",
             rich_help_panel=CLUSTER_PANEL,
         ),
     ] = "auto",

@@ -15,11 +15,14 @@ T = TypeVar("T")
 
 EXECUTORS = ("local", "ray")
 # Ray reads these when it is loaded. Nothing is reported to anyone; no worker is shown other GPUs
-# than its machine has; an address where nothing listens is an error within a minute, not thirteen.
+# than its machine has; an address where nothing listens is an error within a minute, not thirteen;
+# a batch for which there is not enough memory is tried as often as one whose worker died, not for
+# ever.
 _RAY_SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_NUM_REDIS_GET_RETRIES": "1",
+    "RAY_task_oom_retries": "3",
 }
 
 

@@ -17,7 +17,7 @@ from mapping.executors import Executor
 from mapping.photos import MappingPhoto
 from mapping.stages import Item, WorkFolder, key_of
 from visloc.archive import FingerprintRecord, GlobalFeatures, Map
-from visloc.errors import DatasetError, InvalidInput
+from visloc.errors import DatasetError, InvalidInput, Unavailable
 from visloc.features import (
     GlobalDescriptor,
     LocalFeatureExtractor,
@@ -153,6 +153,7 @@ class ExtractedFeatures:
                 got=f"{pixels.width} x {pixels.height}",
             )
         extractor = open_extractor(self.name, self.weights_dir, self.inference)
+        _refuse_other_computing(self.name, self.computed_with, extractor.computed_with)
         return asdict(extractor.extract(pixels.rgb, max_keypoints=self.max_keypoints))
 
 
@@ -484,7 +485,9 @@ class _DescribeTask:
 
     @property
     def _descriptor(self) -> GlobalDescriptor:
-        return open_descriptor(self.name, self.weights_dir, self.inference)
+        descriptor = open_descriptor(self.name, self.weights_dir, self.inference)
+        _refuse_other_computing(self.name, self.computed_with, descriptor.computed_with)
+        return descriptor
 
     def _inputs(self, photo: MappingPhoto) -> Mapping[str, object]:
         return {
@@ -497,6 +500,20 @@ class _DescribeTask:
     def _read(self, photo: MappingPhoto) -> tuple[NDArray[np.uint8], LocalFeatures]:
         rgb = read_photo_file(photo.path).rgb if self.needs_image else _NO_PIXELS
         return rgb, self.features.read(photo) if self.needs_local_features else _NO_FEATURES
+
+
+def _refuse_other_computing(name: str, expected: str | None, here: str | None) -> None:
+    """Refuse what would not be what the command itself computes, whose name all items have."""
+    if here != expected:
+        raise Unavailable(
+            "build.other_computing",
+            f"a machine of the cluster computes {name} in another way than the one that builds; "
+            "their results would be mixed in one map. Choose a way that all have, or machines "
+            "that are alike",
+            field="--inference",
+            expected=expected,
+            got=here,
+        )
 
 
 @cache

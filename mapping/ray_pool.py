@@ -23,7 +23,8 @@ T = TypeVar("T")
 
 # An address of its own: a cluster of this machine that ends with the build.
 LOCAL = "local"
-# How often Ray does a batch again whose worker or machine died.
+# How often Ray does a batch again whose worker or machine died; of those that ended for want of
+# memory it keeps a count of its own, see ``executors``.
 _RETRIES = 3
 # Tasks and items are small: results do not travel through it.
 _OBJECT_STORE_BYTES = 256 * 2**20
@@ -62,7 +63,7 @@ class RayPool:
                 "the Ray cluster cannot be used",
                 field="--ray-address",
                 expected="local, auto, HOST:PORT or ray://HOST:PORT of a running cluster",
-                got=f"{address}: {str(error).splitlines()[0]}",
+                got=f"{address}: {_reason(error)}",
             ) from error
         self._count = count
         self._spent = Spent()
@@ -116,6 +117,13 @@ class RayPool:
             for one in running:
                 ray.cancel(one, force=True)  # results appear whole or not at all
             raise
+
+
+def _reason(error: BaseException) -> str:
+    """What went wrong first, in a line: Ray quotes the traceback of another process."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return str(error).strip().splitlines()[-1]
 
 
 def _do_batch(version: str, task: Callable[[T], object], items: Sequence[T]) -> tuple[int, Spent]:

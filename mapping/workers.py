@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import TypeVar
 
 import cv2
+from threadpoolctl import threadpool_limits
 
 from mapping.costs import Spent, spent_here
 from visloc.errors import Unavailable
@@ -84,7 +85,7 @@ class Workers:
         """
         progress(0, len(items))
         if self._pool is None or len(items) == 1:
-            with _one_thread_here():
+            with one_thread_here():
                 for done, item in enumerate(items, 1):
                     task(item)
                     progress(done, len(items))
@@ -156,8 +157,8 @@ def _interrupted_later() -> Iterator[None]:
 
 
 @contextmanager
-def _one_thread_here() -> Iterator[None]:
-    """Compute as a worker does: networks differ in the last bits with the number of threads."""
+def one_thread_here() -> Iterator[None]:
+    """Compute as a worker does: results differ in the last bits with the number of threads."""
     # A network that torch computes was made before, with torch. Without one it would take seconds
     # to load for nothing; matching may load it later.
     torch = sys.modules.get("torch")
@@ -166,7 +167,8 @@ def _one_thread_here() -> Iterator[None]:
     if torch:
         torch.set_num_threads(1)
     try:
-        yield
+        with threadpool_limits(1, user_api="blas"):  # of NumPy and SciPy
+            yield
     finally:
         cv2.setNumThreads(before[0])
         if torch:

@@ -14,11 +14,14 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
+import mapping.build
 import mapping.publishing
 from mapping.build import BuildSettings, build_map
 from mapping.rgbd import DepthSettings
 from mapping.stages import exclusive
+from mapping.workers import Workers
 from visloc.archive import Map, MapStore, verify_map, write_map
 from visloc.errors import (
     Conflict,
@@ -30,12 +33,13 @@ from visloc.errors import (
 )
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
+from visloc.features.inference import choose_inference
 from visloc.features.sift import SiftExtractor
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localizer import Localizer
-from visloc.types import Localized, LocalizeOptions
+from visloc.types import Inference, Localized, LocalizeOptions
 
 Damage = Callable[[Path], None]
 
@@ -402,6 +406,39 @@ def test_a_second_build_of_the_same_map_is_refused(sample: Path, maps_dir: Path)
     ):
         build(sample / "mapping", maps_dir)
     assert caught.value.code == "build.running"
+
+
+def test_one_thread_computes_however_many_processors_there_are(
+    sample: Path, tmp_path: Path
+) -> None:
+    threads = set()
+
+    def look(stage: str, _done: int, _total: int) -> None:
+        if stage in ("localvlad", "archive"):
+            threads.update(pool["num_threads"] for pool in blas.info())
+
+    blas = ThreadpoolController().select(user_api="blas")
+    with threadpool_limits(2, user_api="blas"):
+        build_map(settings_for(sample / "mapping", tmp_path, max_keypoints=50), look)
+        assert {pool["num_threads"] for pool in blas.info()} == {2}
+    assert threads == {1}
+
+
+def test_a_build_on_a_cluster_computes_as_suits_the_machine_that_begins_it(
+    sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Inference] = []
+
+    def note_source(*_: object, inference: Inference, **__: object) -> None:
+        asked.append(inference)
+        raise Stopped
+
+    monkeypatch.setattr(mapping.build, "open_executor", lambda *_: Workers(1))
+    monkeypatch.setattr(mapping.build, "local_features_source", note_source)
+    for executor in ("local", "ray"):
+        with pytest.raises(Stopped):
+            build_map(settings_for(sample / "mapping", tmp_path, executor=executor), quiet)
+    assert asked == [Inference.AUTO, choose_inference(Inference.AUTO)]
 
 
 def test_a_full_disk_is_named_and_the_same_build_resumes(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mapping.features import (
     ExtractedFeatures,
+    _DescribeTask,
     describe_photos,
     describe_with_model,
     open_descriptor,
@@ -24,6 +25,7 @@ from mapping.photos import MappingPhoto, collect_photos
 from mapping.stages import WorkFolder
 from mapping.workers import Workers
 from visloc.archive import GlobalFeatures, Map
+from visloc.errors import Unavailable
 from visloc.features import GLOBAL_FEATURES, ImageDescriptor
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
@@ -197,3 +199,24 @@ def test_photos_of_later_are_described_by_the_model_of_the_map(
     # These are the map's own photos: stored in 8 bits, and so is the model.
     rows = rgbd_walk.global_descriptors["localvlad"][:5]
     assert (found * rows).sum(axis=1).min() > 0.999
+
+
+def test_a_machine_that_computes_in_another_way_is_refused(
+    work: WorkFolder, photos: list[MappingPhoto]
+) -> None:
+    on_gpu = replace(sift(work), computed_with="torch 2.13.0 on H200")
+    with pytest.raises(Unavailable) as caught:
+        on_gpu.prepare(photos[0])
+    error = caught.value
+    assert (error.code, error.field) == ("build.other_computing", "--inference")
+    assert (error.expected, error.got) == (on_gpu.computed_with, sift(work).computed_with)
+    assert not work.has(on_gpu.key(photos[0]))
+
+
+def test_a_machine_that_describes_in_another_way_is_refused(
+    work: WorkFolder, photos: list[MappingPhoto]
+) -> None:
+    task = _DescribeTask.of(work, sift(work), "localvlad", None, Inference.TORCH)
+    with pytest.raises(Unavailable) as caught:
+        replace(task, computed_with="torch 2.13.0 on H200").find_words(photos[0])
+    assert caught.value.code == "build.other_computing"
