@@ -44,7 +44,8 @@ class Costs:
         model_bytes: of a map, per dimension of its global descriptors; they have as many as it has
             photos, or ``WHITENING_MAX_DIMS``.
         coarse_bytes: of the coarse index on disk, per photo.
-        coarse_resident_bytes: memory of a process that has ranked all tiles, files included.
+        coarse_process_bytes: anonymous memory that the set takes in each process.
+        coarse_file_bytes: pages of its files that ranking all tiles reads; processes share them.
         process_bytes: anonymous memory of a process after queries of a large map.
         query_core_s: seconds of one core that a query in one map takes, in a busy service.
         tile_core_s: ... that matching and solving in one more tile takes.
@@ -60,7 +61,8 @@ class Costs:
     photo_bytes: float
     model_bytes: float
     coarse_bytes: float
-    coarse_resident_bytes: float
+    coarse_process_bytes: float
+    coarse_file_bytes: float
     process_bytes: float
     query_core_s: float
     tile_core_s: float
@@ -114,7 +116,9 @@ class Capacity:
         replicas: machines whose cores answer the queries, tiles open.
         replicas_opening: ... when queries are spread evenly.
         replica_bytes: memory of a replica without any tile.
-        open_share: of all tiles that one worker process has open when memory is full.
+        open_share: of all tiles that one worker process has open when memory is full; pages of
+            their files are not counted, and come from the disk again where there is no room.
+        open_file_bytes: of the files of these tiles, of all worker processes.
         disk_share: of all tiles that a replica's disk holds.
         fill_s: to copy these from object storage.
         received_share: of a replica's network, for the photos of queries.
@@ -131,6 +135,7 @@ class Capacity:
     replicas_opening: int
     replica_bytes: float
     open_share: float
+    open_file_bytes: float
     disk_share: float
     fill_s: float
     received_share: float
@@ -145,7 +150,8 @@ def capacity(costs: Costs, city: City, machine: Machine) -> Capacity:
     build_core_s = city.photos * sum(costs.build_core_s.values())
     more_tiles = costs.tiles_searched - 1
     query_core_s = costs.query_core_s + costs.coarse_core_s + more_tiles * costs.tile_core_s
-    replica_bytes = machine.cores * costs.process_bytes + costs.coarse_resident_bytes
+    process_bytes = costs.process_bytes + costs.coarse_process_bytes
+    replica_bytes = machine.cores * process_bytes + costs.coarse_file_bytes
     room = max(machine.memory_bytes - replica_bytes, 0) / machine.cores
     open_share = min(room / costs.open_bytes / city.tiles, 1.0)
     opening_core_s = costs.tiles_searched * (1 - open_share) * costs.open_core_s
@@ -165,6 +171,7 @@ def capacity(costs: Costs, city: City, machine: Machine) -> Capacity:
         replicas_opening=math.ceil(city.queries_per_s * every / machine.cores),
         replica_bytes=replica_bytes,
         open_share=open_share,
+        open_file_bytes=min(machine.cores * open_share, 1.0) * tiles_bytes,
         disk_share=disk_share,
         fill_s=disk_share * tiles_bytes / machine.network_bytes_per_s,
         received_share=received / machine.network_bytes_per_s,
@@ -248,7 +255,8 @@ def measured(
         photo_bytes=(sum(sizes.values()) - sum(models.values())) / len(opened.images),
         model_bytes=sum(models.values()) / dims,
         coarse_bytes=tiles["disk_bytes"][-1] / tiles["photos"],
-        coarse_resident_bytes=tiles["resident_bytes"][0],
+        coarse_process_bytes=tiles["anonymous_bytes"][0],
+        coarse_file_bytes=tiles["resident_bytes"][0] - tiles["anonymous_bytes"][1],
         process_bytes=1e6 * cell(performance, large, "100 000", "process after all queries"),
         query_core_s=cores / cell(performance, chapter, "concurrency 8", "queries per second"),
         tile_core_s=cores * sum(cell(performance, chapter, step, "`default`") for step in steps),
@@ -280,7 +288,8 @@ def table_of_costs(costs: Costs) -> str:
             "models of a map, per photo, to 1024 photos": f"{costs.model_bytes / 1e3:.0f} kB",
             "coarse index on disk, per photo": f"{costs.coarse_bytes:.0f} bytes",
             "a worker process, without pages of files": f"{costs.process_bytes / 1e9:.2f} GB",
-            "a process with the coarse index": f"{costs.coarse_resident_bytes / 1e9:.1f} GB",
+            "the coarse index, in each process": f"{costs.coarse_process_bytes / 1e9:.2f} GB",
+            "the coarse index, pages of files": f"{costs.coarse_file_bytes / 1e9:.2f} GB",
             "a query in one map": f"{costs.query_core_s:.2f} s",
             "ranking all tiles": f"{costs.coarse_core_s:.3f} s",
             "matching and pose in one more tile": f"{costs.tile_core_s:.2f} s",
@@ -310,6 +319,7 @@ def table_of_capacity(found: Capacity, city: City) -> str:
             f"replicas for that, {city.queries_per_s:g} per second": f"{found.replicas_opening}",
             "memory of a replica, no tile open": f"{found.replica_bytes / 1e9:.1f} GB",
             "tiles that a worker has open in the rest": f"{found.open_share * city.tiles:.0f}",
+            "files of these tiles, of all workers": f"{found.open_file_bytes / 1e9:.0f} GB",
             "share of the tiles on the disk of a replica": f"{100 * found.disk_share:.0f} %",
             "to copy them there": f"{found.fill_s / 60:.0f} min",
             "network of a replica, photos that come in": f"{100 * found.received_share:.1f} %",

@@ -19,7 +19,8 @@ COSTS = Costs(
     photo_bytes=300e3,
     model_bytes=20e3,
     coarse_bytes=40.0,
-    coarse_resident_bytes=1e9,
+    coarse_process_bytes=0.25e9,
+    coarse_file_bytes=1e9,
     process_bytes=0.5e9,
     query_core_s=0.7,
     tile_core_s=0.2,
@@ -59,13 +60,15 @@ def test_a_query_pays_for_its_index_and_every_tile() -> None:
 
 def test_workers_that_cannot_hold_the_city_open_their_tiles_again() -> None:
     some = found()
-    assert some.replica_bytes == 16 * 0.5e9 + 1e9
-    # 55 GB for 16 workers, 100 MB for each tile of 1000.
-    assert some.open_share == pytest.approx(55e9 / 16 / 100e6 / 1000)
+    assert some.replica_bytes == 16 * (0.5e9 + 0.25e9) + 1e9
+    # 51 GB for 16 workers, 100 MB for each tile of 1000.
+    assert some.open_share == pytest.approx(51e9 / 16 / 100e6 / 1000)
+    assert some.open_file_bytes == pytest.approx(51e9 / 100e6 * some.tile_bytes)
     assert some.opening_core_s == pytest.approx(2 * (1 - some.open_share) * 0.3)
     assert some.replicas_opening == math.ceil(100 * (1.0 + some.opening_core_s) / 16) > 7
     roomy = found(open_bytes=1.0)
     assert (roomy.open_share, roomy.opening_core_s) == (1.0, 0.0)
+    assert roomy.open_file_bytes == 1000 * roomy.tile_bytes  # workers share them
     assert roomy.replicas_opening == roomy.replicas
     full = capacity(COSTS, CITY, replace(MACHINE, memory_bytes=1e9))
     assert full.open_share == 0.0
