@@ -1,4 +1,4 @@
-"""Several things at once: when one fails, nobody waits for the others."""
+"""Several things at once: when one fails, the others are given up."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ async def together(work: Iterable[Coroutine[Any, Any, T]]) -> list[T]:
     """Do all at once and return what they return, in order.
 
     Raises:
-        Exception: what the first of them raises that fails; the others are given up.
+        Exception: what the first of them raises that fails; the others are given up, and hold
+            nothing any more.
     """
     tasks = [asyncio.ensure_future(each) for each in work]
     try:
@@ -21,3 +22,4 @@ async def together(work: Iterable[Coroutine[Any, Any, T]]) -> list[T]:
     finally:
         for task in tasks:
             task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
