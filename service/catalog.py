@@ -76,14 +76,15 @@ class Catalog:
         self._refused: dict[str, _Refused] = {}  # by map id
         self._taking_over: dict[str, asyncio.Task[None]] = {}  # by map id
         self._sets: dict[str, SetOutline | None] = {}  # by id@version; None: it is a map
+        self._known: dict[str, MapFolder] = {}  # by id@version, what was asked for and may be open
         self._users: Counter[str] = Counter()  # requests under way, by id@version
         self._leaving: set[str] = set()  # id@version of what is being deleted
         self._background: set[asyncio.Task[None]] = set()
 
     @property
-    def serving(self) -> tuple[MapFolder, ...]:
-        """What is served, without being asked for by version."""
-        return tuple(self._serving.values())
+    def known(self) -> tuple[MapFolder, ...]:
+        """What may be open: what is served, and versions that were asked for, as sets do."""
+        return tuple(self._known.values())
 
     @property
     def not_loaded(self) -> Mapping[str, VislocError]:
@@ -226,6 +227,7 @@ class Catalog:
             self._leaving.discard(ref)
         self.listing.forget(ref)
         self._sets.pop(ref, None)
+        self._known.pop(ref, None)
         if map_id in self._serving and not others:
             del self._serving[map_id]
         await workers.run_everywhere(worker.forget, ref)
@@ -275,6 +277,7 @@ class Catalog:
         await self._until_unused(ref, _FORGET_LIMIT_S)
         self._sets.pop(ref, None)
         if not any(of.ref == ref for of in self._serving.values()) and not self._sets_with(ref):
+            self._known.pop(ref, None)
             await workers.run_everywhere(worker.forget, ref)
 
     def _sets_with(self, ref: str) -> list[SetOutline]:
@@ -368,7 +371,8 @@ class Catalog:
         if ref not in self._sets:
             outline = await asyncio.to_thread(read_any_outline, folder)
             self._sets[ref] = outline if isinstance(outline, SetOutline) else None
-        return MapFolder(ref, folder, self._sets[ref] is not None)
+        self._known[ref] = MapFolder(ref, folder, self._sets[ref] is not None)
+        return self._known[ref]
 
     async def _folder(self, ref: str) -> Path:
         """Return where a version lies on this machine, fetched once for all who wait for it."""

@@ -106,7 +106,7 @@ class Engine:
             workers,
             settings,
             limit_s=limit_s,
-            warm=lambda: self._catalog.serving,
+            warm=lambda: self._catalog.known,
             on_death=metrics.observe_worker_death,
         )
         self._sets = SetSearch(self._catalog, self.workers, metrics)

@@ -61,7 +61,7 @@ class Workers:
         count: processes.
         settings: what each of them needs to know.
         limit_s: longest time that one task may take; a process that exceeds it is replaced.
-        warm: the maps in service; a new process opens those that the one before had open.
+        warm: the maps that may be open; a new process opens those that the one before had open.
         on_death: called for every process that died.
     """
 

@@ -328,6 +328,13 @@ def test_a_version_that_a_set_names_stays_open_when_another_takes_over(
         assert {before, "room@v2"} <= engine.workers.loaded.keys()
         assert client.localize(query.image, "site", query.camera).tile == before
 
+        # Also in a process that takes the place of another.
+        (process,) = engine.workers.pids
+        os.kill(process, signal.SIGKILL)
+        wait_until(lambda: engine.workers.pids not in ((process,), (0,), ()))
+        client.localize(query.image, "room", query.camera)  # when it is ready
+        assert {before, "room@v2"} <= engine.workers.loaded.keys()
+
 
 def test_tiles_of_sets_are_not_read_to_find_what_is_near(site: Path) -> None:
     read = list[str]()
