@@ -1,6 +1,6 @@
 import { afterEach, beforeEach, describe, expect, test, vi } from "vitest";
 import { ownError, ServiceError, type MapImages, type MapInfo, type Service } from "../src/api";
-import { loadMap, movedBlock } from "../src/page/map_loading";
+import { loadMap, movedBlock, shownTiles } from "../src/page/map_loading";
 import { parsePoints } from "../src/points";
 import { patiently } from "../src/page/patience";
 import type { Viewer } from "../src/viewer/types";
@@ -164,4 +164,12 @@ describe("a set", () => {
     const at = [0, 1, 2].map((axis) => row.getFloat32(4 * axis, true) + block.origin[axis]!);
     [10, 3, 1].forEach((value, axis) => expect(at[axis]).toBeCloseTo(value));
   });
+});
+
+test("a set of more maps than are shown says how many are", () => {
+  const setOf = (count: number): MapInfo =>
+    ({ ...MAP, kind: "set", tiles: new Array(count).fill({}) }) as MapInfo;
+  expect(shownTiles(setOf(10_000))).toMatch(/^The first 200 of 10.000 maps are shown\.$/);
+  expect(shownTiles(setOf(200))).toBe("");
+  expect(shownTiles({ ...MAP, kind: "map", tiles: [] } as MapInfo)).toBe("");
 });

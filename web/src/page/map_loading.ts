@@ -11,6 +11,7 @@ import {
 import { add, apply, product, rotationMatrix, scale, worldUp } from "../geometry";
 import { MAX_POINTS, parsePoints, ROW_BYTES, streamPoints } from "../points";
 import type { PointBlock, Viewer } from "../viewer/types";
+import { counted, countText } from "../words";
 
 const IMAGES_PAGE = 5000;
 /** More frusta would hide the landmarks. */
@@ -79,6 +80,13 @@ async function allImages(service: Service, ref: string, signal: AbortSignal): Pr
     Object.assign(all.cameras, next.cameras);
   }
   return all;
+}
+
+/** Says of a set with more maps than are shown how many are; of others, nothing. */
+export function shownTiles(map: MapInfo): string {
+  const count = map.kind === "set" ? map.tiles.length : 0;
+  if (count <= MAX_TILES) return "";
+  return `The first ${countText(MAX_TILES)} of ${counted(count, "map")} are shown.`;
 }
 
 /** Show the tiles of a set in its frame: the first ones of a large set, and an even sample of each. */

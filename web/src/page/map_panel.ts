@@ -5,7 +5,7 @@ import { lengthText } from "../geometry";
 import { MAX_POINTS } from "../points";
 import { PALETTES, SEEN_BY_MOST } from "../viewer/themes";
 import type { PointBlock, PointColours, Theme, Viewer } from "../viewer/types";
-import { MAX_IMAGES } from "./map_loading";
+import { MAX_IMAGES, shownTiles } from "./map_loading";
 import { bytesText, counted, countText, instantText } from "../words";
 
 export interface MapPanel {
@@ -92,6 +92,7 @@ export function createMapPanel(host: HTMLElement, viewer: Viewer, theme: Theme):
         element("h2", {}, map.id),
         element("p", {}, "Drop or paste a photo anywhere to see where it was taken."),
         mapFacts(map),
+        element("p", { class: "quiet small", hidden: shownTiles(map) === "" }, shownTiles(map)),
         element(
           "p",
           { class: "quiet small" },
