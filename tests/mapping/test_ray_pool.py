@@ -206,7 +206,7 @@ def test_a_build_whose_workers_are_killed_makes_the_map_of_a_local_build(
         executor="ray",
         ray_address=cluster,
         workers=2,
-        work_dir=place_of(f"{bucket}/ray", "--work-dir") if method == "sfm" else None,
+        work_dir=place_of(f"{bucket}/ray", "--work-dir") if method == "rgbd" else None,
     )
     monkeypatch.setattr(RayPool, "run", run_with_kills)
     built = open_map(build_map(settings, kill_one))
