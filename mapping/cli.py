@@ -44,6 +44,8 @@ from mapping.options import (
     BuildLocalFeaturesOption,
     CovisibleInOption,
     DatasetArgument,
+    DepthScaleOption,
+    DepthSensorOption,
     FarOption,
     FeaturesDirOption,
     FusionOption,
@@ -204,16 +206,8 @@ def build(
             help="Points of one such cell become one landmark, metres.", rich_help_panel=RGBD_PANEL
         ),
     ] = _DEPTH_DEFAULTS.voxel_size,
-    depth_sensor: Annotated[
-        str | None,
-        typer.Option(
-            help="Depth sensor to use, when several go with a photo.", rich_help_panel=RGBD_PANEL
-        ),
-    ] = None,
-    depth_scale: Annotated[
-        float,
-        typer.Option(help="Metres per unit of 16-bit PNG depth.", rich_help_panel=RGBD_PANEL),
-    ] = _DEPTH_DEFAULTS.depth_scale,
+    depth_sensor: DepthSensorOption = None,
+    depth_scale: DepthScaleOption = _DEPTH_DEFAULTS.depth_scale,
     pairs: PairsOption = _SFM_DEFAULTS.pairs[0],
     top_k: TopKOption = _PAIR_DEFAULTS.top_k,
     max_distance: MaxDistanceOption = _PAIR_DEFAULTS.max_distance,

@@ -16,6 +16,15 @@ from visloc.types import Fusion, Inference
 GLOBAL_DEFAULT = ",".join(DEFAULT_GLOBAL_FEATURES)
 RGBD_PANEL, SFM_PANEL, CLUSTER_PANEL = "Method rgbd", "Method sfm", "On a cluster"
 
+DepthSensorOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Depth sensor to use, when several go with a photo.", rich_help_panel=RGBD_PANEL
+    ),
+]
+DepthScaleOption = Annotated[
+    float, typer.Option(help="Metres per unit of 16-bit PNG depth.", rich_help_panel=RGBD_PANEL)
+]
 MapsDirOption = Annotated[
     Path, typer.Option("--maps-dir", envvar="VISLOC_MAPS_DIR", help="Folder of maps.")
 ]

@@ -9,8 +9,9 @@ import typer
 from rich.console import Console
 
 from mapping.options import (
-    RGBD_PANEL,
     DatasetArgument,
+    DepthScaleOption,
+    DepthSensorOption,
     FeaturesDirOption,
     InferenceOption,
     MapArgument,
@@ -27,6 +28,8 @@ from mapping.workers import DEFAULT_WORKERS
 from visloc.archive import open_map
 from visloc.geometry import PixelOrigin
 from visloc.types import Inference
+
+_DEPTH_SCALE = DepthSettings().depth_scale
 
 _out = Console()
 _err = Console(stderr=True)
@@ -60,7 +63,8 @@ def update(
         bool,
         typer.Option(
             "--metric/--not-metric",
-            help="Whether a unit of the dataset's poses is a metre; if not, the tie finds it.",
+            help="Whether a unit of the dataset's poses is a metre; if not, the tie finds "
+            "it, and depth must have the same unit.",
         ),
     ] = True,
     features_dir: FeaturesDirOption = None,
@@ -68,16 +72,8 @@ def update(
     weights_dir: WeightsDirOption = None,
     inference: InferenceOption = Inference.AUTO,
     workers: WorkersOption = DEFAULT_WORKERS,
-    depth_sensor: Annotated[
-        str | None,
-        typer.Option(
-            help="Depth sensor to use, when several go with a photo.", rich_help_panel=RGBD_PANEL
-        ),
-    ] = None,
-    depth_scale: Annotated[
-        float,
-        typer.Option(help="Metres per unit of 16-bit PNG depth.", rich_help_panel=RGBD_PANEL),
-    ] = DepthSettings().depth_scale,
+    depth_sensor: DepthSensorOption = None,
+    depth_scale: DepthScaleOption = _DEPTH_SCALE,
 ) -> None:
     """Add a new capture to a map, without building it again.
 

@@ -105,6 +105,20 @@ def test_photos_go_before_each_keeps_too_few(built: Map) -> None:
     assert less is None
 
 
+def test_photos_are_put_in_order_only_when_some_must_go(
+    built: Map, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limit = built.size_bytes * 9 // 10
+    expected = choose(built, lambda part: size_with(built, part) <= limit, whole_landmarks=False)
+    monkeypatch.setattr("mapping.pruning.choosing._photos_by_need", None)  # slow in large maps
+    kept = choose(built, lambda part: size_with(built, part) <= limit, whole_landmarks=False)
+
+    assert kept is not None
+    assert expected is not None
+    assert kept.images.all()
+    np.testing.assert_array_equal(kept.observations, expected.observations)
+
+
 def test_landmarks_may_be_counted_instead_of_bytes(store: MapStore) -> None:
     before = store.open("room")
     count = len(before.landmarks) * 8 // 10

@@ -467,6 +467,13 @@ def test_stopped_before_the_end_it_finds_its_work_again_and_makes_the_same_map(
     assert len(MapStore(maps_dir).versions("walk")) == 2
 
 
+def test_two_processes_make_the_same_map(
+    captures: Path, maps_dir: Path, updated: tuple[Map, Updated]
+) -> None:
+    done = update(captures / "second", maps_dir, workers=2)
+    assert open_map(done.folder).manifest.content_hash == updated[0].manifest.content_hash
+
+
 def test_another_version_that_came_into_use_is_not_lost(captures: Path, maps_dir: Path) -> None:
     store = MapStore(maps_dir)
     old = store.current_version("walk")
