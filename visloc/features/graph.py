@@ -157,6 +157,8 @@ class Graph:
             "INFERENCE_PRECISION_HINT": "f32",  # bfloat16 otherwise, where the processor has it
             "PERFORMANCE_HINT": "LATENCY",
             "NUM_STREAMS": 1,
+            # Each process would bind its threads to the first cores, and all would share these.
+            "ENABLE_CPU_PINNING": False,
         }
         if threads is not None:
             settings["INFERENCE_NUM_THREADS"] = threads

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import os
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
 from threading import Event
 
 import numpy as np
@@ -61,3 +64,19 @@ def test_an_error_within_ends_the_turn(doubling: Graph) -> None:
     with pytest.raises(ValueError, match="ours"), doubling.computed(_image(8, 1)):
         raise ValueError("ours")
     np.testing.assert_array_equal(doubling(_image(8, 1))[0], _image(8, 2))
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two processors")
+def test_no_thread_is_bound_to_a_processor_that_other_processes_choose_too(
+    doubling: Graph,
+) -> None:
+    allowed, seen = os.sched_getaffinity(0), []
+    with ThreadPoolExecutor(1) as pool:
+        computing = pool.submit(lambda: [doubling(_image(2048, 1)) for _ in range(20)])
+        while not computing.done():
+            for thread in Path("/proc/self/task").iterdir():
+                with suppress(ProcessLookupError):
+                    seen.append(os.sched_getaffinity(int(thread.name)))
+        computing.result()
+    assert seen
+    assert {frozenset(each) for each in seen} == {frozenset(allowed)}
