@@ -88,9 +88,22 @@ class Tie:
     num_back: int
 
 
+@dataclass(frozen=True, slots=True)
+class NoTie:
+    """Why there is no tie.
+
+    Attributes:
+        why: in words to follow "but".
+        unit: whether the photos agree, and the units of the frames, or of depth, do not.
+    """
+
+    why: str
+    unit: bool = False
+
+
 def tie(
     photos: Sequence[Seen], back: Sequence[Seen] = (), *, rigid: bool, seed: int = 0
-) -> Tie | str:
+) -> Tie | NoTie:
     """Find the similarity that photos of one frame, localized in another, agree on.
 
     Args:
@@ -101,12 +114,12 @@ def tie(
         seed: equal seeds give equal ties.
 
     Returns:
-        The tie; or why there is none, in words to follow "but": fewer than three photos, not more
+        The tie; or why there is none: fewer than three photos, not more
         than half of them agree, they stand too close together to tell the scale, rigidly tied
         they tell another one than 1, or depth has another unit than the poses.
     """
     if len(photos) < MIN_PHOTOS:
-        return f"only {len(photos)} photos were localized, and {MIN_PHOTOS} are needed"
+        return NoTie(f"only {len(photos)} photos were localized, and {MIN_PHOTOS} are needed")
     views = [_View(seen, forward=True) for seen in photos]
     views += [_View(seen, forward=False) for seen in back]
     similarity = _proposed(views, rigid=rigid, seed=seed)
@@ -117,16 +130,17 @@ def tie(
         chosen = [view for view, use in zip(views, agrees, strict=True) if use]
         similarity = _refined(chosen, similarity, rigid=rigid)
         agrees = _agreeing(views, similarity, _AGREES)
+    if (few := too_few(agrees[: len(photos)])) is not None:
+        return NoTie(few)
     chosen = [view for view, use in zip(views, agrees, strict=True) if use]
-    if chosen and all(view.seen.own_points is not None for view in chosen):
-        by_depth = _refined_by_depth(chosen, similarity, rigid=rigid)
-        if isinstance(by_depth, str):
-            return by_depth
-        similarity = by_depth
+    if all(view.seen.own_points is not None for view in chosen):
+        if (other_depth := _other_depth(chosen, similarity)) is not None:
+            return NoTie(other_depth, unit=True)
+        similarity = _refined_by_depth(chosen, similarity, rigid=rigid)
         agrees = _agreeing(views, similarity, _AGREES)
     tied = agrees[: len(photos)]
     if (few := too_few(tied)) is not None:
-        return few
+        return NoTie(few)
     distances, angles = _errors(photos, similarity)
     if rigid:
         chosen = [view for view, use in zip(views, agrees, strict=True) if use]
@@ -135,12 +149,22 @@ def tie(
     else:
         doubt = _scale_doubt(photos, tied, distances)
     if doubt is not None:
-        return doubt
+        return NoTie(doubt, unit=rigid)
     medians = np.array([view.median_error(similarity) for view in views[: len(photos)]])
     return Tie(similarity, tied, medians, distances, angles, int(agrees[len(photos) :].sum()))
 
 
-def refined_by_depth(photos: Sequence[Seen], start: Similarity, *, rigid: bool) -> Similarity | str:
+def other_depth(photos: Sequence[Seen], there_from_here: Similarity) -> str | None:
+    """Say that depth has another unit than a similarity, in words to follow "but"; or None.
+
+    Args:
+        photos: those that agree with it, with ``own_points``, one at least.
+        there_from_here: the similarity.
+    """
+    return _other_depth([_View(seen, forward=True) for seen in photos], there_from_here)
+
+
+def refined_by_depth(photos: Sequence[Seen], start: Similarity, *, rigid: bool) -> Similarity:
     """Refine the similarity of tied photos on what they see, where depth puts it.
 
     Args:
@@ -149,10 +173,9 @@ def refined_by_depth(photos: Sequence[Seen], start: Similarity, *, rigid: bool) 
         rigid: whether both frames have one unit.
 
     Returns:
-        What must be judged again (``agreeing``); or, when depth has another unit than the poses,
-        words to follow "but".
+        What must be judged again (``agreeing``).
     """
-    return _refined_by_depth([_View(seen, True) for seen in photos], start, rigid=rigid)
+    return _refined_by_depth([_View(seen, forward=True) for seen in photos], start, rigid=rigid)
 
 
 def agreeing(photos: Sequence[Seen], there_from_here: Similarity) -> NDArray[np.bool_]:
@@ -278,16 +301,18 @@ class _View:
         return registration_for(LocalizeOptions(), [self.seen.camera]).max_error_px
 
 
-def _refined_by_depth(
-    views: Sequence[_View], start: Similarity, *, rigid: bool
-) -> Similarity | str:
+def _other_depth(views: Sequence[_View], similarity: Similarity) -> str | None:
     # Places alone would not show another unit: moving all photos back makes up for much of it.
-    factor = float(np.median(np.concatenate([view.depth_factors(start) for view in views])))
-    if abs(factor - 1) > MAX_DEPTH_OFF:
-        return (
-            f"by depth, what they see is {factor:.3g} times as far from them here as there, and "
-            f"at most {MAX_DEPTH_OFF:.0%} may come of errors"
-        )
+    factor = float(np.median(np.concatenate([view.depth_factors(similarity) for view in views])))
+    if abs(factor - 1) <= MAX_DEPTH_OFF:
+        return None
+    return (
+        f"by depth, what they see is {factor:.3g} times as far from them here as there, and "
+        f"at most {MAX_DEPTH_OFF:.0%} may come of errors"
+    )
+
+
+def _refined_by_depth(views: Sequence[_View], start: Similarity, *, rigid: bool) -> Similarity:
     here, there = (np.concatenate(side) for side in zip(*map(_points, views), strict=True))
     return refined_on_points(start, here, there, rigid=rigid)
 

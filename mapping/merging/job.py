@@ -64,8 +64,8 @@ def merge_maps(
         min_overlap: least part of the photos of B that must be tied to A.
 
     Raises:
-        Conflict: ``merge.overlap``, ``merge.features``, ``merge.photos``; ``map.exists``;
-            ``build.running``.
+        Conflict: ``merge.overlap``, ``merge.unit``, ``merge.features``, ``merge.photos``;
+            ``map.exists``; ``build.running``.
         InvalidInput: ``map.id``, ``merge.same``, ``merge.min_overlap``.
     """
     _refuse_name(store, map_id)

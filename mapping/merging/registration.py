@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapping.merging.describing import describe_together
 from mapping.stored_queries import match_stored, solve_stored
-from mapping.tying import MIN_PHOTOS, Seen, Tie, tie
+from mapping.tying import MIN_PHOTOS, NoTie, Seen, Tie, tie
 from visloc.archive import GlobalFeatures, Map
 from visloc.constraints import MapGeometry
 from visloc.errors import Conflict
@@ -50,7 +50,8 @@ def register(a: Map, b: Map, min_overlap: float, progress: Progress) -> Registra
         progress: told the stage, how much is done, and how much there is.
 
     Raises:
-        Conflict: ``merge.overlap`` when too few photos are, or they disagree.
+        Conflict: ``merge.overlap`` when too few photos are, or they disagree; ``merge.unit`` when
+            they agree, and units of the maps, or depth, do not.
     """
     progress("describing", 0, 1)
     described = describe_together((a, b))
@@ -63,8 +64,16 @@ def register(a: Map, b: Map, min_overlap: float, progress: Progress) -> Registra
         back, _ = _seen(a, b, rows_a, rows_b, lambda *done: progress("A in B", *done), depth=depth)
     rigid = a.manifest.world.metric and b.manifest.world.metric
     found = tie(list(seen.values()), list(back.values()), rigid=rigid)
-    if isinstance(found, str):
-        raise _no_overlap(a, b, tried, found)
+    if isinstance(found, NoTie) and found.unit:
+        raise Conflict(
+            "merge.unit",
+            f"{tried} photos of {b.ref} were looked for in {a.ref}, but {found.why}",
+            field="MAP",
+            expected="maps whose units and depth agree; build one of them anew (--not-metric, "
+            "--depth-scale)",
+        )
+    if isinstance(found, NoTie):
+        raise _no_overlap(a, b, tried, found.why)
     needed = max(MIN_PHOTOS, int(np.ceil(min_overlap * tried)))
     if found.tied.sum() < needed:
         raise _no_overlap(

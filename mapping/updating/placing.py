@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from mapping.photos import MappingPhoto
 from mapping.tying import (
     MAX_DEPTH_OFF,
+    NoTie,
     Seen,
     agreeing,
     contradicting,
+    other_depth,
     refined_by_depth,
     tie,
     too_few,
@@ -40,6 +42,8 @@ own frame of the world (m, 3)."""
 _MIN_PART = 0.5
 # Matches with depth that a tie is refined on; of fewer, projections tell more.
 _MIN_LIFTED = 100
+# Photos whose depth is compared with the map, evenly chosen.
+_LIFTED_BY = 16
 _GOOD_DEPTH = (
     f"depth within {MAX_DEPTH_OFF:.0%} of what the map and the poses say (--depth-scale), or "
     "--method sfm"
@@ -108,8 +112,8 @@ def place_capture(
         photos: those that were tried; with poses of their own but for ``localize``.
         placed: where they were localized.
         poses: a name of ``mapping.updating.settings.POSES``.
-        lift: gives pixels their place by the depth of their photo, for a better tie; None without
-            depth.
+        lift: gives pixels their place by the depth of their photo, which is compared with the map
+            and makes a tie better; None without depth.
         metric: whether a unit of the photos' own poses is a metre.
 
     Raises:
@@ -118,12 +122,15 @@ def place_capture(
     """
     refuse_elsewhere(opened, placed)
     both = [(photo, one) for photo, one in zip(photos, placed, strict=True) if one.localized]
-    if poses == "localize":
-        own = [one.cam_from_map for _, one in both]
-        return _placement(Similarity.identity(), placed, both, own, [True] * len(both))
     localized = (
         f"{len(both)} of {len(photos)} photos that were tried are localized in map {opened.ref}"
     )
+    if poses == "localize":
+        both = [(replace(photo, cam_from_world=one.cam_from_map), one) for photo, one in both]
+        agrees = [True] * len(both)
+        _refuse_other_depth(localized, both, agrees, lift)
+        own = [one.cam_from_map for _, one in both]
+        return _placement(Similarity.identity(), placed, both, own, agrees)
     if poses == "given":
         own = [photo.pose for photo, _ in both]
         agrees = [_fits(photo, one) for photo, one in both]
@@ -132,22 +139,21 @@ def place_capture(
                 f"{localized}, but only {sum(agrees)} where --poses given has them",
                 "poses in the map's frame, or --poses tie",
             )
+        _refuse_other_depth(localized, both, agrees, lift)
         return _placement(Similarity.identity(), placed, both, own, agrees)
     rigid = metric and opened.manifest.world.metric
     seen = [_seen(photo, one) for photo, one in both]
     found = tie(seen, rigid=rigid)
-    if isinstance(found, str):
+    if isinstance(found, NoTie):
         raise _elsewhere(
-            f"{localized}, but {found}",
-            "poses that agree with where the photos are localized, or --poses localize",
+            f"{localized}, but {found.why}",
+            "poses in metres, as those of the map, or --not-metric"
+            if found.unit
+            else "poses that agree with where the photos are localized, or --poses localize",
         )
     similarity, agrees = found.there_from_here, found.tied.tolist()
     if lift is not None:
-        lifted = [
-            _lifted(one, photo, lift)
-            for one, (photo, _), agree in zip(seen, both, agrees, strict=True)
-            if agree
-        ]
+        lifted = _all_lifted(both, agrees, lift)
         count = sum(len(one.points) for one in lifted)
         if count < _MIN_LIFTED and not metric:
             raise _elsewhere(
@@ -155,11 +161,10 @@ def place_capture(
                 "whether its unit is that of the poses",
                 f"{_MIN_LIFTED} points with depth, or --method sfm",
             )
+        _refuse_depth(localized, lifted, similarity)
         if count >= _MIN_LIFTED:
-            by_depth = refined_by_depth(lifted, similarity, rigid=rigid)
-            if isinstance(by_depth, str):
-                raise _elsewhere(f"{localized}, but {by_depth}", _GOOD_DEPTH)
-            similarity, tied = by_depth, agreeing(seen, by_depth)
+            similarity = refined_by_depth(lifted, similarity, rigid=rigid)
+            tied = agreeing(seen, similarity)
             if (few := too_few(tied)) is not None:
                 raise _elsewhere(f"{localized}, but with depth {few}", _GOOD_DEPTH)
             agrees = tied.tolist()
@@ -191,6 +196,32 @@ def beside(wrong: Collection[int], localized: Collection[int], count: int) -> li
         if not set(known[max(at - 1, 0) : at + 1]).isdisjoint(wrong):
             found.append(row)
     return found
+
+
+def _refuse_other_depth(
+    localized: str,
+    both: Sequence[tuple[MappingPhoto, Placed]],
+    agrees: Sequence[bool],
+    lift: Lift | None,
+) -> None:
+    """Refuse depth that contradicts the map, where poses are in its frame."""
+    if lift is not None:
+        _refuse_depth(localized, _all_lifted(both, agrees, lift), Similarity.identity())
+
+
+def _refuse_depth(localized: str, lifted: Sequence[Seen], map_from_dataset: Similarity) -> None:
+    if any(len(one.points) for one in lifted):
+        other = other_depth(lifted, map_from_dataset)
+        if other is not None:
+            raise _elsewhere(f"{localized}, but {other}", _GOOD_DEPTH)
+
+
+def _all_lifted(
+    both: Sequence[tuple[MappingPhoto, Placed]], agrees: Sequence[bool], lift: Lift
+) -> list[Seen]:
+    """Photos that agree, with those of their matches whose place their depth tells as well."""
+    agreed = [pair for pair, agree in zip(both, agrees, strict=True) if agree]
+    return [_lifted(_seen(*pair), pair[0], lift) for pair in evenly(agreed, _LIFTED_BY)]
 
 
 def _seen(photo: MappingPhoto, one: Placed) -> Seen:

@@ -135,6 +135,19 @@ def test_another_building_is_refused(halves: MapStore, tmp_path: Path) -> None:
     assert "wrong" not in halves.ids()
 
 
+def test_maps_of_different_metres_are_refused(halves: MapStore) -> None:
+    longer = Similarity(1.2, np.eye(3), np.zeros(3))
+    publish_edited(halves, moved(content_of(halves.open("b")), longer, metric=True), "longer")
+
+    with pytest.raises(Conflict) as error:
+        merge_maps(halves, "a", "longer", "wrong", quiet)
+
+    assert error.value.code == "merge.unit"
+    assert "is 1.2 times as far" in error.value.message
+    assert "not show the same place" not in error.value.message
+    assert "wrong" not in halves.ids()
+
+
 def test_too_little_overlap_is_refused(halves: MapStore) -> None:
     a = content_of(halves.open("a"))
     blind = np.arange(len(a.images)) < 3  # of the others, nothing but their names is left

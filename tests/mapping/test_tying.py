@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mapping.tying import Seen, Tie, refined_on_points, tie
+from mapping.tying import NoTie, Seen, Tie, refined_on_points, tie
 from visloc.geometry import Camera, Pose, Similarity, rotation_angle
 from visloc.pose.colmap import project
 
@@ -131,6 +131,7 @@ def test_depth_of_another_unit_than_the_poses_ties_nothing(factor: float, tied: 
 
     assert isinstance(found, Tie) == tied, found
     assert tied or f"{factor:.3g} times as far" in str(found)
+    assert isinstance(found, Tie) or found.unit
 
 
 def test_photos_that_were_localized_elsewhere_do_not_count() -> None:
@@ -164,8 +165,9 @@ def test_photos_of_another_building_agree_on_nothing() -> None:
 
     found = tie(elsewhere, rigid=True)
 
-    assert isinstance(found, str)
-    assert "of 8 localized photos agree" in found
+    assert isinstance(found, NoTie)
+    assert not found.unit
+    assert "of 8 localized photos agree" in found.why
 
 
 def test_two_photos_are_too_few() -> None:

@@ -366,15 +366,31 @@ def test_strange_settings_of_the_map_are_refused_before_the_work(
     assert told == []
 
 
-@pytest.mark.parametrize("factor", [1.05, 5.0])
+@pytest.mark.parametrize(
+    ("poses", "dataset", "factor", "enough"),
+    [
+        ("tie", "second", 1.05, 100),
+        ("tie", "second", 5.0, 10**9),
+        ("given", "in_frame", 5.0, 100),
+        ("localize", "second", 5.0, 100),
+    ],
+)
 def test_depth_of_another_unit_than_the_poses_is_refused(
-    captures: Path, maps_dir: Path, tmp_path: Path, factor: float
+    captures: Path,
+    maps_dir: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    poses: str,
+    dataset: str,
+    factor: float,
+    enough: int,
 ) -> None:
-    root = Path(shutil.copytree(captures / "second", tmp_path / "longer"))
+    monkeypatch.setattr("mapping.updating.placing._MIN_LIFTED", enough)
+    root = Path(shutil.copytree(captures / dataset, tmp_path / "longer"))
     for depth in root.rglob("*.depth"):
         depth.write_bytes((np.fromfile(depth, "<f4") * np.float32(factor)).tobytes())
 
-    error = refused(root, maps_dir)
+    error = refused(root, maps_dir, poses=poses)
 
     assert error.code == "update.elsewhere"
     assert "by depth, what they see is" in error.message
