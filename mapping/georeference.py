@@ -26,6 +26,7 @@ from mapping.anchor import (
 from mapping.publishing import new_version
 from mapping.stages import exclusive
 from visloc.archive import Anchor, Geodetic, Map, MapStore, down_of, write_anchored
+from visloc.archive.store import outdated
 from visloc.errors import Conflict, DatasetError, InvalidInput
 from visloc.geodesy import enu_from_geodetic
 from visloc.geometry import Pose, Similarity
@@ -257,8 +258,8 @@ def publish_anchored(opened: Map, found: Georeference, maps_dir: Path, *, force:
     """Publish a map with its place on Earth as a new version, and make it current.
 
     Raises:
-        Conflict: ``map.anchored`` without ``force``, when it has a place already;
-            ``build.running``.
+        Conflict: ``map.anchored`` without ``force``, when it has a place already; ``map.outdated``
+            when another version is in use; ``build.running``.
     """
     if opened.geodetic is not None and not force:
         raise Conflict(
@@ -267,15 +268,17 @@ def publish_anchored(opened: Map, found: Georeference, maps_dir: Path, *, force:
             "--force publishes a new version and keeps the old one",
             field="MAP",
         )
-    map_id = opened.manifest.id
+    map_id, based_on = opened.manifest.id, opened.manifest.version
     store = MapStore(maps_dir)
     with (
         exclusive(maps_dir / ".work" / f"{map_id}.lock"),
         store.incoming() as incoming,
     ):
+        if (current := store.current_version(map_id)) != based_on:
+            raise outdated(map_id, based_on, current)
         version, created = new_version()
         version = write_anchored(opened, incoming, found.anchor, version=version, created=created)
-        return store.publish(incoming, map_id, version)
+        return store.publish(incoming, map_id, version, based_on=based_on)
 
 
 def _centers(opened: Map) -> NDArray[np.float64]:

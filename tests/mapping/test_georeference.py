@@ -282,6 +282,11 @@ def test_an_anchored_map_is_a_new_version_of_the_same_files(room: Map, maps_dir:
     with pytest.raises(Conflict) as caught:
         publish_anchored(opened, found, maps_dir, force=False)
     assert caught.value.code == "map.anchored"
+    # The one before is not in use any more: what came since would be lost.
+    with pytest.raises(Conflict) as caught:
+        publish_anchored(room, found, maps_dir, force=True)
+    assert caught.value.code == "map.outdated"
+    assert MapStore(maps_dir).current_version("room") == opened.manifest.version
     again = given_place(opened, (45.3, 5.7, 0.0), 0.0)
     publish_anchored(opened, again, maps_dir, force=True)
     assert len(MapStore(maps_dir).versions("room")) == 3
