@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from visloc.archive import Geodetic, MapStore
 from visloc.archive.places import origin_of
+from visloc.archive.set_schema import MAX_SCALE, MIN_SCALE
 from visloc.errors import InvalidInput
 from visloc.geodesy import ecef_from_geodetic, enu_from_ecef
 from visloc.geometry import Pose, Similarity
@@ -105,7 +104,7 @@ def _parsed(fields: Sequence[str], where: str) -> Similarity:
     except ValueError:
         numbers = []
     scale = numbers[7] if len(numbers) == 8 else 1.0
-    if len(numbers) not in (7, 8) or not (np.isfinite(scale) and scale > 0):
+    if len(numbers) not in (7, 8) or not MIN_SCALE <= scale <= MAX_SCALE:
         raise InvalidInput(
             "set.poses", "not a pose", field=where, expected=_LINE, got=" ".join(fields)
         )

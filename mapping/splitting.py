@@ -87,11 +87,12 @@ def split_map(
         )
     _refuse_other_maps(store, opened.manifest.id, set_id, cuts)
     content, pictures, tiles = content_of(opened), photo_files(opened), []
+    source = f"{_TILE_OF}{opened.ref}"
     for number, one in enumerate(cuts, 1):
         part = selected(content, images=one.photos)
-        part = replace(part, notes=(*part.notes, f"{_TILE_OF}{opened.ref}"))
+        part = replace(part, notes=(*part.notes, source))
         some = [pictures[row] for row in np.flatnonzero(one.photos)] if pictures else []
-        published = _publish_tile(store, _tile_id(set_id, one), part, some)
+        published = _publish_tile(store, _tile_id(set_id, one), part, some, source)
         tiles.append((published, Similarity.identity()))
         progress("cutting", number, len(cuts))
     notes = [f"cut from {opened.ref}"]
@@ -182,8 +183,15 @@ def _nearest(point: NDArray[np.float64], others: NDArray[np.float64]) -> int:
     return int(np.linalg.norm(others - point, axis=1).argmin())
 
 
-def _publish_tile(store: MapStore, tile_id: str, content: MapContent, pictures: list[Path]) -> str:
-    """Publish a tile unless a version of it is the same already; return ``id@version``."""
+def _publish_tile(
+    store: MapStore, tile_id: str, content: MapContent, pictures: list[Path], source: str
+) -> str:
+    """Publish a tile unless a version of it is the same already; return ``id@version``.
+
+    A version in use of the same version of the map stays so: it may have been made from the tile
+    since, as by an update.
+    """
+    stays = _is_in_use(store, tile_id, source)
     prefix, created = new_version()
     with store.incoming() as incoming:
         for row, picture in enumerate(pictures):
@@ -194,10 +202,18 @@ def _publish_tile(store: MapStore, tile_id: str, content: MapContent, pictures: 
         for known in store.versions(tile_id):
             with suppress(MapCorrupt):
                 if same_content(store.root / tile_id / known, incoming):
-                    store.set_current(tile_id, known)
+                    if not stays:
+                        store.set_current(tile_id, known)
                     return f"{tile_id}@{known}"
-        store.publish(incoming, tile_id, version)
+        store.publish(incoming, tile_id, version, make_current=not stays)
     return f"{tile_id}@{version}"
+
+
+def _is_in_use(store: MapStore, tile_id: str, source: str) -> bool:
+    """Whether a version of a tile is in use that was cut from this version of a map."""
+    with suppress(NotFound, MapCorrupt):
+        return source in read_any_manifest(store.folder(tile_id)).notes
+    return False
 
 
 def _tile_id(set_id: str, one: Cut) -> str:

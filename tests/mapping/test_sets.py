@@ -206,6 +206,18 @@ def test_an_interrupted_split_goes_on(store: MapStore) -> None:
     folder = store.folder("halls")
     assert split_map(store, "hall", "halls", quiet, tile=2.0, overlap=0.4) == folder
 
+    # A tile that was updated since stays so, whether what was cut is still there or not.
+    updated = content_of(store.open(first.map))
+    publish_edited(store, replace(updated, notes=(*updated.notes, "updated")), first.map)
+    in_use = store.current_version(first.map)
+    assert split_map(store, "hall", "halls", quiet, tile=2.0, overlap=0.4) == folder
+    assert store.current_version(first.map) == in_use
+    store.remove("halls", folder.name)
+    store.remove(first.map, first.version)
+    split_map(store, "hall", "halls", quiet, tile=2.0, overlap=0.4)
+    assert store.current_version(first.map) == in_use
+    assert len(store.versions(first.map)) == 2
+
 
 def test_the_id_of_a_map_is_refused_before_the_long_part(store: MapStore) -> None:
     before = store.ids()
@@ -360,6 +372,8 @@ def test_poses_are_read_from_a_file(tmp_path: Path) -> None:
         ("a 1 0 0 0 0 0 0", "set.poses"),  # b has none
         ("a 1 0 0 0 0 0 0\nb 1 0 0 0 0 0", "set.poses"),
         ("a 1 0 0 0 0 0 0\nb 1 0 0 0 0 0 0 0", "set.poses"),
+        ("a 1 0 0 0 0 0 0\nb 1 0 0 0 0 0 0 1e-10", "set.poses"),
+        ("a 1 0 0 0 0 0 0\nb 1 0 0 0 0 0 0 1e10", "set.poses"),
         ("a 1 0 0 0 0 0 0\nb 1 0 0 0 0 0 x", "set.poses"),
         ("a 1 0 0 0 0 0 0\na 1 0 0 0 0 0 0", "set.poses"),
         ("a 1 0 0 0 0 0 0\nc 1 0 0 0 0 0 0", "set.poses"),

@@ -25,6 +25,8 @@ SET_FORMAT = "visloc-set"
 SET_MAJOR, SET_MINOR = 1, 0
 # The manifest lists them; with so many it has about 12 MB.
 MAX_TILES = 10_000
+# Of where a tile lies. Beyond that, squares and inverses of it are no numbers any more.
+MIN_SCALE, MAX_SCALE = 1e-9, 1e9
 # What a query takes is proportional to it.
 MAX_BITS = 1024
 
@@ -32,8 +34,7 @@ MAX_BITS = 1024
 class SimilarityRecord(Record):
     """``visloc.geometry.Similarity`` as JSON: ``x_set = scale R x_tile + translation``."""
 
-    # Beyond that, squares and inverses of it are no numbers any more.
-    scale: Annotated[float, Field(ge=1e-9, le=1e9)] = 1.0
+    scale: Annotated[float, Field(ge=MIN_SCALE, le=MAX_SCALE)] = 1.0
     rotation_wxyz: UnitQuaternion = (1.0, 0.0, 0.0, 0.0)
     translation: Vector = (0.0, 0.0, 0.0)
 
