@@ -16,7 +16,7 @@ import math
 import os
 import tempfile
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -39,12 +39,14 @@ from visloc.archive.set_rules import (
     unreadable_set,
 )
 from visloc.archive.set_schema import SetManifest
-from visloc.archive.sets import SET_CODES, SetOutline, read_any_outline
+from visloc.archive.sets import SetOutline, read_any_outline
 from visloc.archive.store import (
     CURRENT,
     FULL,
     MapStore,
     checked_name,
+    looks_like_map,
+    may_be_tile,
     none_in_use,
     outdated,
     read_published_outline,
@@ -306,8 +308,9 @@ class RemoteMapStore:
             others = [name for name in known.versions if name != version]
             if others and known.current == version:
                 raise version_in_use(map_id, version, others)
-            if not self._is_set(map_id, version):  # a set is no tile
-                refuse_if_tile(map_id, version, self._in_use())
+            has = self._has_file(map_id, version)
+            if may_be_tile(lambda: self._manifest(map_id, version), has):
+                refuse_if_tile(map_id, version, self._in_use((map_id, version)))
             place = self._place(map_id, version)
             with self._asking():
                 if not others and known.current is not None:
@@ -514,8 +517,8 @@ class RemoteMapStore:
                 return self._manifest(map_id, version)
         return None
 
-    def _in_use(self) -> Iterator[tuple[str, AnyManifest]]:
-        """What is in use; of an id whose ``current`` is damaged, all of its versions.
+    def _in_use(self, leaving: tuple[str, str]) -> Iterator[tuple[str, AnyManifest]]:
+        """What is in use but for ``leaving``; of an id whose ``current`` is damaged, all versions.
 
         Raises:
             Conflict: ``map.in_set`` for a set that cannot be read.
@@ -526,6 +529,7 @@ class RemoteMapStore:
                 is_name = ID_PATTERN.fullmatch(known.current)
                 versions = (known.current,) if is_name else known.versions
                 refs += [(map_id, version) for version in versions]
+        refs = [ref for ref in refs if ref != leaving]
         for (map_id, version), content in zip(refs, self._contents(refs), strict=True):
             ref = f"{map_id}@{version}"
             if content is None:  # another server has just removed it
@@ -533,13 +537,17 @@ class RemoteMapStore:
             try:
                 yield ref, self._parsed(map_id, version, content)
             except MapCorrupt as error:
-                if self._is_set(map_id, version):
+                if not looks_like_map(self._has_file(map_id, version)):
                     raise unreadable_set(ref, error) from error
 
-    def _is_set(self, map_id: str, version: str) -> bool:
-        """Whether a version is a set, by its files."""
-        with self._asking():
-            return bool(self._fs.exists(f"{self._place(map_id, version)}/{SET_CODES}"))
+    def _has_file(self, map_id: str, version: str) -> Callable[[str], bool]:
+        """What tells whether a version in the storage has a file."""
+
+        def has(name: str) -> bool:
+            with self._asking():
+                return bool(self._fs.exists(f"{self._place(map_id, version)}/{name}"))
+
+        return has
 
     def _fetch_small(self, map_id: str, version: str, name: str, folder: Path) -> None:
         place = f"{self._place(map_id, version)}/{name}"

@@ -14,7 +14,7 @@ import fcntl
 import os
 import secrets
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
@@ -28,6 +28,7 @@ from visloc.archive.set_rules import (
     refuse_other_kind,
     unreadable_set,
 )
+from visloc.archive.set_schema import SetManifest
 from visloc.archive.sets import (
     SET_CODES,
     MapSet,
@@ -47,6 +48,8 @@ from visloc.errors import (
 
 CURRENT = "current"
 INCOMING, REMOVED = ".incoming", ".removed-"
+# Every map has it, and no set.
+IMAGE_POSES = "image_poses.npy"
 FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -245,8 +248,8 @@ class MapStore:
             others = [name for name in self.versions(map_id) if name != version]
             if others and _current_or_none(self, map_id) == version:
                 raise version_in_use(map_id, version, others)
-            if not (folder / SET_CODES).is_file():  # a set is no tile
-                refuse_if_tile(map_id, version, self._sets_in_use())
+            if may_be_tile(lambda: read_any_manifest(folder), has_file(folder)):
+                refuse_if_tile(map_id, version, self._sets_in_use(folder))
             leaving = folder if others else folder.parent
             # Beside where it was, as a full disk may have no room for another folder.
             removed = leaving.with_name(f"{REMOVED}{secrets.token_hex(8)}")
@@ -309,8 +312,10 @@ class MapStore:
                 return self._manifest(map_id, version)
         return None
 
-    def _sets_in_use(self) -> Iterator[tuple[str, AnyManifest]]:
-        """The sets in use; of an id whose ``current`` is damaged, all of its versions.
+    def _sets_in_use(self, leaving: Path) -> Iterator[tuple[str, AnyManifest]]:
+        """The sets in use but for ``leaving``; of an id whose ``current`` is damaged, all versions.
+
+        A map may be among them.
 
         Raises:
             Conflict: ``map.in_set`` for one that cannot be read.
@@ -324,11 +329,14 @@ class MapStore:
                 versions = self.versions(map_id)
             for version in versions:
                 folder, ref = self.root / map_id / version, f"{map_id}@{version}"
-                if (folder / SET_CODES).is_file():  # of thousands of maps, no manifest is read
-                    try:
-                        yield ref, read_any_manifest(folder)
-                    except MapCorrupt as error:
-                        raise unreadable_set(ref, error) from error
+                if folder == leaving or not folder.is_dir():
+                    continue
+                if looks_like_map(has_file(folder)):  # of thousands, no manifest is read
+                    continue
+                try:
+                    yield ref, read_any_manifest(folder)
+                except MapCorrupt as error:
+                    raise unreadable_set(ref, error) from error
 
     @contextmanager
     def _changing(self) -> Iterator[None]:
@@ -337,6 +345,29 @@ class MapStore:
             with (self.root / ".lock").open("w") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 yield
+
+
+def looks_like_map(has: Callable[[str], bool]) -> bool:
+    """Tell by its files that a version is a map and no set; a file that is lost makes no map."""
+    return has(IMAGE_POSES) and not has(SET_CODES)
+
+
+def may_be_tile(read: Callable[[], AnyManifest], has: Callable[[str], bool]) -> bool:
+    """Tell whether sets may name a version: whether it is no set.
+
+    Args:
+        read: its manifest; raises MapCorrupt when that is damaged, and its files tell.
+        has: whether it has a file.
+    """
+    try:
+        return not isinstance(read(), SetManifest)
+    except MapCorrupt:
+        return has(IMAGE_POSES) or not has(SET_CODES)
+
+
+def has_file(folder: Path) -> Callable[[str], bool]:
+    """Return what tells whether a folder has a file."""
+    return lambda name: (folder / name).is_file()
 
 
 def open_published(folder: Path) -> Map:

@@ -306,6 +306,36 @@ def test_a_set_that_cannot_be_read_frees_no_tile(store: MapStore) -> None:
     store.remove("hall", "v1")
 
 
+def test_what_is_a_set_its_manifest_says(store: MapStore, tmp_path: Path) -> None:
+    _, remote = bucket_of(tmp_path)
+    server = remote("cache")
+    # A map with a file of a set, and a set that lost it.
+    hall, house = store.folder("hall"), store.folder("house")
+    (hall / "coarse").mkdir()
+    shutil.copy(house / "coarse/codes.npy", hall / "coarse/codes.npy")
+    manifest = json.loads((hall / "manifest.json").read_text())
+    manifest["files"]["coarse/codes.npy"] = json.loads((house / "manifest.json").read_text())[
+        "files"
+    ]["coarse/codes.npy"]
+    renamed(hall, "hall", "v1", files=manifest["files"])
+    hashed = json.loads((hall / "manifest.json").read_text())["content_hash"]
+    tiles = json.loads((house / "manifest.json").read_text())["tiles"]
+    tiles[0]["content_hash"] = hashed
+    renamed(house, "house", house.name, tiles=tiles)
+    for map_id in ("hall", "attic", "house"):
+        push(server, store.folder(map_id), map_id, store.folder(map_id).name)
+
+    for one, folder in ((store, house), (server, tmp_path / "bucket" / "house" / house.name)):
+        for lost in (False, True):
+            if lost:
+                (folder / "coarse/codes.npy").unlink()
+            for tile in ("hall", "attic"):
+                with pytest.raises(Conflict, match="tile of a set in use"):
+                    one.remove(tile, "v1")
+        one.remove("house", house.name)
+        one.remove("attic", "v1")
+
+
 # Damage
 
 
