@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from service.jobs import (
     ONLY_SENSOR,
     ImageJob,
@@ -22,8 +24,8 @@ from visloc.geometry import Pose
 from visloc.images import Photo
 from visloc.localizer import FeatureCache, Localizer
 from visloc.priors import Priors
-from visloc.solving import Look, SeenImage
-from visloc.types import InstantAnswer, LocalizeOptions, QueryFeatures
+from visloc.solving import Look, Matches, SeenImage
+from visloc.types import InstantAnswer, LocalizeOptions, QueryFeatures, Reason, Refusal
 
 _MAX_LISTED = 500  # characters of names from outside
 # Codes that begin so say what is wrong with all images: that is wrong with the request.
@@ -218,5 +220,26 @@ def _look(
         if error.code.startswith(_OF_ALL_IMAGES):
             raise
         return SeenImage(image.sensor, sensor.cam_from_rig, None, error)
+    if look.refusal is None and not _is_named(target, priors):
+        look = _nothing_here(look)
     evidence = replace(look.evidence, seconds=summed(seconds, look.evidence.seconds))
     return SeenImage(image.sensor, sensor.cam_from_rig, replace(look, evidence=evidence))
+
+
+def _is_named(target: Target, priors: Priors) -> bool:
+    """Whether the device may be in a map, of a set whose tiles the priors name."""
+    opened = target.localizer.map
+    return priors.maps is None or not {opened.manifest.id, opened.ref}.isdisjoint(priors.maps)
+
+
+def _nothing_here(look: Look) -> Look:
+    """What an image shows of a tile that the priors exclude."""
+    return Look(
+        replace(look.evidence, num_correspondences=0, retrieved=()),
+        Matches.none(),
+        np.empty(0, np.int64),
+        Matches.none(),
+        Refusal(
+            "retrieval", Reason.NO_PHOTO_NEAR, "the priors name other tiles, which do not show this"
+        ),
+    )

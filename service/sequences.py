@@ -9,7 +9,7 @@ from service.instants import Target, check_images, check_options, check_priors
 from service.jobs import Instant, InstantLocalization, SequenceStart, check_order
 from visloc.errors import InvalidInput, TooLarge
 from visloc.priors import Priors
-from visloc.sequence import SeenInstant, SequenceSolver, check_max_gap
+from visloc.sequence import SeenInstant, SequenceSolver, check_max_gap, check_odometry
 from visloc.solving import SeenImage
 from visloc.trajectory import TimeUnit, guess_time_unit
 from visloc.types import InstantAnswer, RigPose
@@ -69,6 +69,7 @@ class SequenceRun:
             for target in self.targets:
                 rig = None if self._start.rig is None else target.rig
                 check_images(instant.images, rig, self._max_images, "images")
+                check_odometry(instant.odometry, metric=_is_metric(target))
             if instant.priors is None:
                 return self._start.priors
             check_priors(self.targets, instant.priors)
@@ -85,8 +86,7 @@ class SequenceRun:
             priors: what ``check`` returned.
 
         Raises:
-            InvalidInput: ``sequence.time_unit`` when the first timestamp does not tell the unit,
-                ``sequence.odometry`` for a map that is not metric.
+            InvalidInput: ``sequence.time_unit`` when the first timestamp does not tell the unit.
         """
         if not self._solvers:
             unit = self._start.time_unit or _guessed_unit(instant.timestamp)
@@ -129,11 +129,15 @@ class SequenceRun:
     def _solver(self, target: Target, unit: TimeUnit) -> SequenceSolver:
         return SequenceSolver(
             target.localizer.geometry,
-            metric=target.localizer.map.manifest.world.metric,
+            metric=_is_metric(target),
             options=self._start.options,
             time_unit=unit,
             max_gap_s=self._start.max_gap_s,
         )
+
+
+def _is_metric(target: Target) -> bool:
+    return target.localizer.map.manifest.world.metric
 
 
 def _guessed_unit(timestamp: int) -> TimeUnit:

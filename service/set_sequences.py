@@ -130,6 +130,7 @@ class SetSequence:
             Unavailable: as ``SetSearch.search``.
         """
         self._within = await self._search.within(self._outline, self._start.maps)
+        self._check_names(self._start.priors)
         index, before = 0, None
         try:
             async for instant in instants:
@@ -158,6 +159,9 @@ class SetSequence:
         """Take one more instant; give the answers that are final now."""
         if self._track is not None:
             self._track = self._track.moved(instant.odometry)
+        if instant.priors is not None:
+            with inside(f"instants[{index}]"):
+                self._check_names(instant.priors)
         queries = [image.query for image in instant.images]
         leg = self._leg
         async with self._search.reading(self._of, queries, self._start.options) as photos:
@@ -184,6 +188,16 @@ class SetSequence:
                 self._follow(leg, instant, added.pose)
             for answer in self._in_set(leg, added.answers):
                 yield answer
+
+    def _check_names(self, priors: Priors) -> None:
+        """Refuse names of tiles that the set does not have, also while a leg goes on."""
+        if priors.maps is not None:
+            allowed_tiles(self._outline, Priors(maps=priors.maps))
+
+    def _priors_in(self, row: int, priors: Priors) -> Priors:
+        """Say what priors mean in a tile, which may be none of those that they name."""
+        found = self._search.priors_in(self._outline, self._outline.tiles[row], priors)
+        return replace(found, maps=priors.maps)
 
     async def _anywhere(
         self, index: int, instant: Instant, photos: SetPhotos
@@ -230,6 +244,8 @@ class SetSequence:
             return None
         try:
             looked, found = await self._searched(index, instant, photos, choice)
+        except (InvalidInput, NotFound):
+            return None  # the leg's tile takes what they do not, say a rig that only it knows
         except Unavailable as error:
             if error.code != "set.tile_unavailable":
                 raise
@@ -293,7 +309,7 @@ class SetSequence:
     async def _leg_in(self, row: int, folder: MapFolder) -> _Leg:
         """Begin a leg that has no instant yet."""
         tile = self._outline.tiles[row]
-        priors = self._search.priors_in(self._outline, tile, self._start.priors)
+        priors = self._priors_in(row, self._start.priors)
         start = replace(self._start, rig=rig_in(tile, self._start.rig), priors=priors)
         state = await self._workers.run(worker.open_sequence, start, (folder,))
         return _Leg(row, folder, start, state)
@@ -302,9 +318,7 @@ class SetSequence:
         """Look at the images of an instant in the tile of a leg."""
         bare = without_photos(instant)
         if bare.priors is not None:
-            tile = self._outline.tiles[leg.row]
-            priors = self._search.priors_in(self._outline, tile, bare.priors)
-            bare = replace(bare, priors=priors)
+            bare = replace(bare, priors=self._priors_in(leg.row, bare.priors))
         maps = (leg.folder,)
         state, known = await self._workers.run(
             worker.check_instants, leg.state, maps, index, [bare]

@@ -136,13 +136,7 @@ class SequenceSolver:
             InvalidInput: ``sequence.odometry`` for a map that is not metric; ``priors.*`` that
                 mean nothing in the map.
         """
-        if seen.odometry is not None and not self._metric:
-            raise InvalidInput(
-                "sequence.odometry",
-                "odometry is in metres, and this map's world has another unit",
-                field="odometry",
-                expected="a metric map, or a sequence without odometry",
-            )
+        check_odometry(seen.odometry, metric=self._metric)
         if self._first_timestamp is None:
             self._first_timestamp = seen.timestamp
         ticks = seen.timestamp - self._first_timestamp
@@ -351,6 +345,25 @@ def check_max_gap(max_gap_s: float) -> None:
             field="max_gap_s",
             expected=f"0 to {MAX_GAP_S:g} seconds",
             got=max_gap_s,
+        )
+
+
+def check_odometry(odometry: Odometry | None, *, metric: bool) -> None:
+    """Refuse odometry that cannot be compared with a map.
+
+    Args:
+        odometry: of an instant; None when there is none.
+        metric: whether one unit of the map's world is a metre.
+
+    Raises:
+        InvalidInput: ``sequence.odometry``.
+    """
+    if odometry is not None and not metric:
+        raise InvalidInput(
+            "sequence.odometry",
+            "odometry is in metres, and this map's world has another unit",
+            field="odometry",
+            expected="a metric map, or a sequence without odometry",
         )
 
 

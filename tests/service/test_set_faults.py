@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from time import sleep
 from typing import Any
@@ -227,6 +228,34 @@ def test_a_tile_that_does_not_know_a_rig_leaves_it_to_others(client: Client, sam
     with pytest.raises(NotFound) as unknown:
         client.localize_rig(images, "site", "bus")
     assert unknown.value.code == "rig.unknown"
+
+
+def test_a_tile_that_does_not_know_the_rig_ends_no_leg(
+    client: Client, sample: Path, in_study: list[Any]
+) -> None:
+    dataset = read_dataset(sample / "query")
+    first = [r for r in dataset.images if r.timestamp == dataset.images[0].timestamp]
+    here = tuple(RigImage(r.sensor_id, dataset.path_of(r).read_bytes()) for r in first)
+    there = (RigImage(first[0].sensor_id, in_study[0][0]),)
+    sent = [Instant(START + 100 * i, images) for i, images in enumerate([here, there, here])]
+    found = list(client.localize_sequence(sent, "site", rig="rig"))
+    assert [each.status for each in found] == ["localized", "filled", "localized"]
+
+
+def test_an_instant_may_name_tiles_while_a_leg_goes_on(
+    client: Client, query: Any, in_study: list[Any]
+) -> None:
+    def sent(photo: bytes, *names: str) -> list[Instant]:
+        plain = instants([query.image, photo, query.image], query.camera)
+        return [plain[0], replace(plain[1], priors=Priors(maps=names)), plain[2]]
+
+    found = told(client, sent(query.image, "study"), "site")
+    assert found == [("localized", "room"), ("filled", "room"), ("localized", "room")]
+    assert told(client, sent(query.image, "room"), "site") == [("localized", "room")] * 3
+    found = told(client, sent(in_study[0][0], "study"), "site")
+    assert found == [("localized", "room"), ("localized", "study"), ("localized", "room")]
+    found = told(client, sent(query.image, "attic"), "site")
+    assert found == [("localized", "room"), ("error", "priors.maps")]
 
 
 def test_a_tile_in_use_stays_in_service_when_its_deletion_is_refused(
