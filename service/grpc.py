@@ -120,8 +120,13 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
         """List the maps that can be opened, in the version that is served."""
         async with self._envelope("ListMaps", request_id(None), context):
             served = await self._engine.maps(near_of(request))
-            maps = [MapInfo.from_served(each, in_list=True) for each in served]
-            return message_of(ListMapsResponse(maps=maps), pb2.ListMapsResponse())
+
+            def answer() -> pb2.ListMapsResponse:
+                maps = [MapInfo.from_served(each, in_list=True) for each in served]
+                return message_of(ListMapsResponse(maps=maps), pb2.ListMapsResponse())
+
+            # Of ten thousand maps, it takes a moment.
+            return await asyncio.to_thread(answer)
 
     async def GetMap(  # noqa: N802
         self, request: pb2.GetMapRequest, context: Context

@@ -51,8 +51,13 @@ def add_map_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) -> N
         """List the maps that can be opened, in the version that is served; sets of maps too."""
         circle = None if near is None else near_from_text(near).to_core()
         listed = await engine.maps(circle)
-        maps = [MapInfo.from_served(served, in_list=True) for served in listed]
-        return json_response(ListMapsResponse(maps=maps))
+
+        def answer() -> Response:
+            maps = [MapInfo.from_served(served, in_list=True) for served in listed]
+            return json_response(ListMapsResponse(maps=maps))
+
+        # Of ten thousand maps, it takes a moment.
+        return await asyncio.to_thread(answer)
 
     @app.get("/maps/{ref}", response_model=MapInfo, responses=problems(404, 422, 500))
     async def get_map(ref: str) -> Response:
