@@ -97,14 +97,18 @@ class Catalog:
         Sets come first, and their tiles last, the first ones only. One that is broken does not
         keep back the others.
         """
-        for map_id in await asyncio.to_thread(self.listing.opened_at_start):
+        for ref in await asyncio.to_thread(self.listing.opened_at_start):
             if sum(workers.loaded.values()) >= max_bytes:
                 logger.info("max_loaded_bytes is full: other maps are opened when they are asked")
                 break
             try:
-                await self._resolve(map_id, workers)
+                if "@" in ref:
+                    of = await self._open(ref, workers)
+                    self._in_background(workers.run_everywhere(worker.load, of))
+                else:
+                    await self._resolve(ref, workers)
             except VislocError as error:
-                logger.error("map %s is not loaded: %s", map_id, error)  # noqa: TRY400
+                logger.error("map %s is not loaded: %s", ref, error)  # noqa: TRY400
         if self._background:
             await asyncio.wait(self._background)  # in every process, not only in the first
 
@@ -188,8 +192,7 @@ class Catalog:
         Raises:
             VislocError: as ``using``; then nothing has changed.
         """
-        of = await self._at_hand(f"{map_id}@{version}")
-        await workers.run(worker.load, of)
+        of = await self._open(f"{map_id}@{version}", workers)
         await asyncio.to_thread(self._store.set_current, map_id, version)
         self._serve(map_id, of, workers)
 
@@ -226,11 +229,9 @@ class Catalog:
         finally:
             self._leaving.discard(ref)
         self.listing.forget(ref)
-        self._sets.pop(ref, None)
-        self._known.pop(ref, None)
         if map_id in self._serving and not others:
             del self._serving[map_id]
-        await workers.run_everywhere(worker.forget, ref)
+        await self._close(ref, workers)
 
     def set_outline(self, of: MapFolder) -> SetOutline:
         """Return what a set says about itself that ``using`` gave."""
@@ -275,10 +276,18 @@ class Catalog:
     async def _forget(self, ref: str, workers: Workers) -> None:
         """Close a version that another one took over from, after its last request."""
         await self._until_unused(ref, _FORGET_LIMIT_S)
-        self._sets.pop(ref, None)
-        if not any(of.ref == ref for of in self._serving.values()) and not self._sets_with(ref):
-            self._known.pop(ref, None)
-            await workers.run_everywhere(worker.forget, ref)
+        if any(of.ref == ref for of in self._serving.values()) or self._sets_with(ref):
+            return
+        await self._close(ref, workers)
+
+    async def _close(self, ref: str, workers: Workers) -> None:
+        """Close a version; of a set, later the tiles too that no other set names."""
+        outline = self._sets.pop(ref, None)
+        self._known.pop(ref, None)
+        for tile in () if outline is None else outline.tiles:
+            if tile.ref in self._known:
+                self._in_background(self._forget(tile.ref, workers))
+        await workers.run_everywhere(worker.forget, ref)
 
     def _sets_with(self, ref: str) -> list[SetOutline]:
         """The sets that are served and name a version."""
@@ -332,8 +341,7 @@ class Catalog:
 
     async def _take_over(self, map_id: str, current: str, workers: Workers) -> None:
         try:
-            of = await self._at_hand(current)
-            await workers.run(worker.load, of)
+            of = await self._open(current, workers)
         except VislocError as error:
             self._refuse(map_id, current, error)
         else:
@@ -363,6 +371,12 @@ class Catalog:
         before = self._serving.pop(map_id, None)
         if before is not None:
             self._in_background(self._forget(before.ref, workers))
+
+    async def _open(self, ref: str, workers: Workers) -> MapFolder:
+        """Open a version in one of the processes, and warm it up."""
+        of = await self._at_hand(ref)
+        await workers.run(worker.load, of)
+        return of
 
     async def _at_hand(self, ref: str) -> MapFolder:
         """Return a version on this machine's disk, and whether it is a set."""

@@ -109,7 +109,7 @@ class Listing:
             NotFound: ``map.none_near``.
             InvalidInput: ``request.map`` when there are too many.
         """
-        sets, alone, _ = self._sets_and_others()
+        sets, alone = self._sets_and_others()
         found = [of.manifest.id for of in sets if _reaches(of, near)]
         for map_id in alone:
             with suppress(VislocError):  # what cannot be read is nowhere
@@ -134,19 +134,24 @@ class Listing:
         return tuple(sorted(found))
 
     def opened_at_start(self) -> tuple[str, ...]:
-        """Say which maps to open at the start, and in which order."""
-        sets, alone, tiles = self._sets_and_others()
+        """Say what to open at the start, and in which order.
+
+        Returns:
+            The ids of sets and of maps that are in none; then tiles, each ``id@version``, for a
+            set names versions, whatever has become current since.
+        """
+        sets, alone = self._sets_and_others()
+        tiles = list(dict.fromkeys(tile.ref for of in sets for tile in of.tiles))
         return (*(of.manifest.id for of in sets), *alone, *tiles[:_MAX_TILES_AT_START])
 
-    def _sets_and_others(self) -> tuple[list[SetOutline], list[str], list[str]]:
-        """Return the sets, the ids of maps that are in none, and those of tiles.
+    def _sets_and_others(self) -> tuple[list[SetOutline], list[str]]:
+        """Return the sets, and the ids of maps that are in none.
 
         What a set names needs no look of its own: once the sets are known, of thousands of tiles
         nothing is read.
         """
         sets, maps, tiles = list[SetOutline](), list[str](), set[str]()
-        ids = self._store.ids()
-        for map_id in sorted(ids, key=lambda one: one not in self._set_ids):
+        for map_id in sorted(self._store.ids(), key=lambda one: one not in self._set_ids):
             if map_id in tiles:
                 continue
             try:
@@ -159,8 +164,7 @@ class Listing:
                 tiles.update(tile.map for tile in outline.tiles)
             else:
                 maps.append(map_id)
-        alone = [map_id for map_id in maps if map_id not in tiles]
-        return sets, alone, [map_id for map_id in ids if map_id in tiles]
+        return sets, [map_id for map_id in maps if map_id not in tiles]
 
 
 def _reaches(outline: MapOutline | SetOutline, near: Near) -> bool:

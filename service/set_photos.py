@@ -25,27 +25,39 @@ class Places:
     """Room for photos that were read, which take much more memory than those that wait.
 
     Args:
-        count: requests whose photos may be in memory at once.
+        count: photos that may be in memory at once; a rig of more has all places.
 
     Attributes:
         waiting: photos that wait for room.
     """
 
     def __init__(self, count: int) -> None:
+        self._count = count
         self._free = asyncio.Semaphore(count)
+        self._turn = asyncio.Lock()
         self.waiting = 0
 
-    async def take(self, photos: int) -> None:
-        """Wait for room."""
+    async def take(self, photos: int) -> int:
+        """Wait for room; return how many places were taken."""
+        taken = 0
         self.waiting += photos
         try:
-            await self._free.acquire()
+            # One request after the other: two that each have half of what they need wait for ever.
+            async with self._turn:
+                while taken < min(photos, self._count):
+                    await self._free.acquire()
+                    taken += 1
+        except BaseException:
+            self.give_back(taken)
+            raise
         finally:
             self.waiting -= photos
+        return taken
 
-    def give_back(self) -> None:
-        """Let another request in."""
-        self._free.release()
+    def give_back(self, places: int) -> None:
+        """Let other requests in."""
+        for _ in range(places):
+            self._free.release()
 
 
 class SetPhotos:
@@ -73,7 +85,7 @@ class SetPhotos:
         self._places, self._workers, self._of, self._options = places, workers, of, options
         self._asked = self.queries = tuple(queries)
         self._submitted = time()
-        self._holds = False
+        self._places_held = 0
 
     async def __aenter__(self) -> SetPhotos:
         await self._enter()
@@ -100,6 +112,7 @@ class SetPhotos:
             for query in self.queries
         )
         self.queries = tuple(one.query for one in chosen)
+        self._submitted = time()  # the next wait begins here
         return [one.scores for one in chosen]
 
     async def aside(self, work: Awaitable[T]) -> T:
@@ -112,10 +125,8 @@ class SetPhotos:
         return found
 
     async def _enter(self) -> None:
-        await self._places.take(len(self._asked))
-        self._holds = True
+        self._places_held = await self._places.take(len(self._asked))
 
     def _leave(self) -> None:
-        if self._holds:
-            self._holds = False
-            self._places.give_back()
+        held, self._places_held = self._places_held, 0
+        self._places.give_back(held)

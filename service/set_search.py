@@ -61,7 +61,7 @@ from visloc.types import InstantAnswer, Localized, LocalizeOptions, NotLocalized
 AnyLocalization = TypeVar("AnyLocalization", Localization, InstantLocalization)
 T = TypeVar("T")
 
-# Codes that begin so say that a map cannot be had.
+# Codes that begin so say that a map cannot be had, when nothing is wrong with the map itself.
 _OF_A_MAP = ("map.", "maps.")
 
 
@@ -261,7 +261,7 @@ def tile_unavailable(tile: TileRecord, error: VislocError) -> Unavailable:
 
 
 def _says_tile_is_away(error: VislocError) -> bool:
-    return error.code.startswith(_OF_A_MAP)
+    return isinstance(error, MapCorrupt | Conflict) or error.code.startswith(_OF_A_MAP)
 
 
 async def answers_of(searches: Sequence[Coroutine[Any, Any, T]]) -> list[T]:

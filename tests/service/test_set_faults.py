@@ -7,9 +7,9 @@ import os
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
 from time import sleep
@@ -22,9 +22,11 @@ import pytest
 from clients import Client, Instant, Near, Odometry, RigImage
 from mapping.georeference import given_place, publish_anchored
 from mapping.sets import publish_set
+from service.catalog import Catalog
 from service.jobs import Near as Circle
 from service.listing import Listing
 from service.metrics import ServiceState
+from service.set_photos import Places
 from service.set_sequences import SetSequence
 from tests.service.map_sets import (
     SITE_FROM_ROOM,
@@ -352,6 +354,7 @@ def test_a_version_that_a_set_names_stays_open_when_another_takes_over(
     copy_map(site_copy, "room", "room", "v2")
     with serve(site_copy) as doors, Client(doors.url) as client:
         engine = doors.server.engine
+        client.localize(query.image, "room", query.camera)  # by its own name, too
         client.use_version("room", "v2")
         wait_until(lambda: not engine._catalog._background)
         assert {before, "room@v2"} <= engine.workers.loaded.keys()
@@ -365,6 +368,85 @@ def test_a_version_that_a_set_names_stays_open_when_another_takes_over(
         assert {before, "room@v2"} <= engine.workers.loaded.keys()
 
 
+def test_the_versions_that_sets_name_are_opened_at_the_start(site_copy: Path, serve: Serve) -> None:
+    named = {f"{name}@{MapStore(site_copy).current_version(name)}" for name in ("room", "study")}
+    for name in ("room", "study"):
+        copy_map(site_copy, name, name, "v2")
+        (site_copy / name / "current").write_text("v2")
+    with serve(site_copy) as doors:
+        loaded = doors.server.engine.workers.loaded.keys()
+    assert named <= loaded
+    assert not {"room@v2", "study@v2"} & loaded
+
+
+def test_tiles_of_a_set_that_was_replaced_are_closed(
+    site_copy: Path, serve: Serve, query: Any
+) -> None:
+    store = MapStore(site_copy)
+    room, study = (f"{name}@{store.current_version(name)}" for name in ("room", "study"))
+    before = f"site@{store.current_version('site')}"
+    with serve(site_copy) as doors, Client(doors.url) as client:
+        engine = doors.server.engine
+        assert {room, study} <= engine.workers.loaded.keys()
+        publish_set(store, "site", [("room", SITE_FROM_ROOM)], quiet)
+        wait_until(lambda: before not in engine.workers.loaded)
+        wait_until(lambda: not engine._catalog._background)
+        assert room in engine.workers.loaded  # of the new set
+        assert study not in engine.workers.loaded
+        assert study not in {of.ref for of in engine._catalog.known}
+        assert client.localize(query.image, "site", query.camera).tile == room
+        # Of a set that was deleted, too.
+        assert "copy@v1" in engine.workers.loaded
+        client.delete_version("twice", store.current_version("twice"))
+        wait_until(lambda: not engine._catalog._background)
+        assert room in engine.workers.loaded
+        assert "copy@v1" not in engine.workers.loaded
+
+
+def test_a_tile_of_features_that_are_not_here_is_away(
+    client: Client, query: Any, in_study: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    using = Catalog.using
+
+    @asynccontextmanager
+    async def not_here(self: Catalog, where: Any, workers: Any) -> AsyncIterator[Any]:
+        if isinstance(where, tuple) and where[0].startswith("study@"):
+            raise Conflict("weights.missing", "there are no weights", field="map")
+        async with using(self, where, workers) as maps:
+            yield maps
+
+    monkeypatch.setattr(Catalog, "using", not_here)
+    assert client.localize(query.image, "site", query.camera).pose is not None
+    with pytest.raises(Unavailable) as away:
+        client.localize(in_study[0][0], "site", in_study[0][1])
+    assert (away.value.code, away.value.got) == ("set.tile_unavailable", "weights.missing")
+
+
+def test_rooms_for_photos_are_taken_by_photos() -> None:
+    async def in_turn() -> None:
+        places = Places(3)
+        assert await places.take(2) == 2
+        rigs = [asyncio.create_task(places.take(count)) for count in (16, 2, 2)]
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        assert (places.waiting, [rig.done() for rig in rigs]) == (20, [False] * 3)
+        rigs[1].cancel()  # a caller that hangs up
+        places.give_back(2)
+        assert await rigs[0] == 3
+        assert not rigs[2].done()
+        places.give_back(3)
+        assert await rigs[2] == 2
+        # One that ends while it waits for the rest gives back what it has.
+        last = asyncio.create_task(places.take(3))
+        await asyncio.sleep(0)
+        last.cancel()
+        places.give_back(2)
+        assert await places.take(3) == 3
+        assert places.waiting == 0
+
+    asyncio.run(in_turn())
+
+
 def test_tiles_of_sets_are_not_read_to_find_what_is_near(site: Path) -> None:
     read = list[str]()
 
@@ -373,8 +455,12 @@ def test_tiles_of_sets_are_not_read_to_find_what_is_near(site: Path) -> None:
             read.append(ref.partition("@")[0])
             return super().outline(ref)
 
+    room, study = (MapStore(site).current_version(name) for name in ("room", "study"))
     listing = Listing(Counting(site), {})
-    assert listing.opened_at_start() == ("model", "site", "twice", "copy", "room", "study")
+    assert listing.opened_at_start() == (
+        *("model", "site", "twice"),
+        *(f"room@{room}", f"study@{study}", "copy@v1"),
+    )
     read.clear()
     listing._described.clear()
     with pytest.raises(NotFound):
