@@ -47,6 +47,7 @@ function load(service: Partial<Service>, map = MAP) {
     signal: given.signal,
     onReset: () => told.push("forgotten"),
     onBlock: () => undefined,
+    onEnd: (loaded, total) => told.push(`${loaded} of ${total}`),
     onImages: () => undefined,
   });
   return { done, told, give_up: () => given.abort() };
@@ -151,7 +152,14 @@ describe("a set", () => {
     );
     await done;
     expect(asked).toEqual(["kitchen@7", "hall@7"]);
-    expect(told.slice(-3)).toEqual(["points 3", "points 3", "cameras 2"]);
+    expect(told.slice(-4)).toEqual(["points 3", "points 3", "6 of 6", "cameras 2"]);
+  });
+
+  test("of more landmarks than are shown says when all that are shown are here", async () => {
+    const set = { ...MAP, id: "house", kind: "set", landmarks: 600_000, images: 1 } as MapInfo;
+    const { done, told } = load({}, { ...set, tiles: [tile] });
+    await done;
+    expect(told).toContain("3 of 600000");
   });
 
   test("has the landmarks of a tile in its own frame", () => {

@@ -150,6 +150,7 @@ async function show(map: MapInfo): Promise<void> {
         progress.value = loaded;
         mapPanel.showBlock(block, loaded);
       },
+      onEnd: (loaded, total) => mapPanel.showEnd(loaded, total),
     });
   } catch (error) {
     if (signal.aborted) return;

@@ -26,6 +26,8 @@ export interface Loading {
   /** The viewer has forgotten what it showed. */
   onReset(): void;
   onBlock(block: PointBlock, loaded: number): void;
+  /** Of a set: all landmarks that are shown are here, of those that it has. */
+  onEnd(loaded: number, total: number): void;
   onImages(images: MapImages): void;
 }
 
@@ -117,9 +119,9 @@ async function loadTiles(
     const block = movedBlock(parsePoints(points), tile);
     viewer.addPoints(block);
     loaded += block.count;
-    // What is shown is what there is to come: the others are not asked for.
     loading.onBlock({ ...block, total: Math.max(map.landmarks, loaded) }, loaded);
   }
+  if (map.landmarks > 0) loading.onEnd(loaded, Math.max(map.landmarks, loaded));
   viewer.setMappingCameras(all.images, all.cameras);
   loading.onImages(all);
 }

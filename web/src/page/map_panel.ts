@@ -13,6 +13,8 @@ export interface MapPanel {
   showInstead(content: Node): void;
   showMap(map: MapInfo): void;
   showBlock(block: PointBlock, loaded: number): void;
+  /** No more landmarks come. */
+  showEnd(loaded: number, total: number): void;
   showImages(images: MapImages): void;
   /** Below the facts: what could not be loaded. */
   showProblem(problem: Node): void;
@@ -122,8 +124,11 @@ export function createMapPanel(host: HTMLElement, viewer: Viewer, theme: Theme):
       const all = Math.min(block.total, MAX_POINTS);
       if (loaded < all)
         say(progress, `${countText(loaded)} of ${counted(all, "landmark")} are here`);
-      else if (all === block.total) say(progress, "");
-      else say(progress, `An even sample of ${countText(all)} landmarks is shown`);
+      else this.showEnd(all, block.total);
+    },
+    showEnd(loaded, total) {
+      const sample = `An even sample of ${countText(loaded)} landmarks is shown`;
+      say(progress, loaded < total ? sample : "");
     },
     showImages(images) {
       if (images.total > MAX_IMAGES) {
