@@ -115,7 +115,7 @@ def publish_set(
             expected=f"at most {MAX_TILES}",
             got=len(tiles),
         )
-    refuse_map_of_this_name(store, set_id, "SET")
+    refuse_map_of_this_name(store, set_id, "ID")
     folders = [store.folder(ref) for ref, _ in tiles]
     _refuse_twice(folders)
     placed = []
@@ -255,7 +255,7 @@ def _refuse_other_place(placed: Sequence[_Placed], geodetic: Geodetic) -> None:
                 "set.anchor",
                 f"by its own anchor, {one.record.ref} lies elsewhere on Earth than by the set's; "
                 "anchor it anew, or correct its pose",
-                field="--poses",
+                field="MAP",
                 expected=f"at most {_MAX_PLACE_DIFFERENCE_M:g} m, or {_MAX_PLACE_SHARE:.0%} of its "
                 "extent, away",
                 got=f"{away:.4g} m",
@@ -272,7 +272,7 @@ def _is_metric(placed: Sequence[_Placed], anchor: Anchor | None) -> bool:
         raise Conflict(
             "set.scale",
             f"metres of {scales[least]} and {scales[most]} are not of one length in the set",
-            field="--poses",
+            field="MAP",
             expected="one scale for all metric maps",
             got=f"{least:g} and {most:g}",
         )
@@ -292,7 +292,7 @@ def _down(placed: Sequence[_Placed]) -> NDArray[np.float64] | None:
             raise Conflict(
                 "set.gravity",
                 f"{one.record.ref} has another down than the other maps, where it lies in the set",
-                field="--poses",
+                field="MAP",
                 expected=f"at most {math.degrees(_MAX_DOWN_DIFFERENCE):g} degrees from their mean",
                 got=f"{math.degrees(angle):.3g} degrees",
             )

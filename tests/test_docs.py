@@ -391,18 +391,18 @@ NOT_MET = {
 }
 
 
-def codes_in(node: ast.AST) -> Iterator[str]:
+def codes_in(node: ast.AST, pattern: re.Pattern[str] = CODE) -> Iterator[str]:
     """The codes among the strings of a module; ``field=`` names fields, which look the same."""
     if isinstance(node, ast.keyword) and node.arg == "field":
         return
     if (
         isinstance(node, ast.Constant)
         and isinstance(node.value, str)
-        and CODE.fullmatch(node.value)
+        and pattern.fullmatch(node.value)
     ):
         yield node.value
     for child in ast.iter_child_nodes(node):
-        yield from codes_in(child)
+        yield from codes_in(child, pattern)
 
 
 def test_the_codes_listed_are_those_that_a_client_may_meet() -> None:
@@ -421,6 +421,32 @@ def test_the_codes_listed_are_those_that_a_client_may_meet() -> None:
 
     assert len(listed) == len(set(listed))
     assert set(listed) - of_http == (in_source | of_options | of_priors | of_near) - NOT_MET
+
+
+def test_the_codes_of_commands_that_change_maps_are_listed() -> None:
+    pattern = re.compile(r"(set|split|merge|prune|update)\.[a-z_]+")
+    in_source = {
+        code
+        for sources in (
+            *("mapping/set*.py", "mapping/splitting.py", "mapping/editing.py"),
+            *(f"mapping/{name}/*.py" for name in ("merging", "pruning", "updating")),
+            "visloc/archive/set_rules.py",
+        )
+        for path in ROOT.glob(sources)
+        for code in codes_in(ast.parse(path.read_text()), pattern)
+    }
+    listed = [
+        code
+        for page in ("map-sets.md", "living-maps.md")
+        for row in (ROOT / "docs" / page).read_text().partition("\n## Errors\n")[2].splitlines()
+        if row.startswith("|")
+        for code in words(row.split("|")[1])
+        if pattern.fullmatch(code)
+    ]
+
+    assert len(listed) == len(set(listed))
+    by_option = {"update.poses", "update.method"}  # put together with the name of the option
+    assert set(listed) == in_source | by_option
 
 
 def test_the_errors_have_the_statuses_that_are_listed() -> None:

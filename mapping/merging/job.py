@@ -181,7 +181,8 @@ def _joined(
         global_features=kept,
         fusion=first.fusion if fused else EQUAL_GHARM,
         anchor=second.anchor if nothing_placed and on_earth else first.anchor,
-        gravity=first.gravity or second.gravity,
+        # What A knows may be its anchor's.
+        gravity=second.gravity if a.gravity is None else first.gravity,
     )
     all_kept = [*pictures[0], *pictures[1]] if all(pictures) else []
     return content, all_kept, tuple(left_out)

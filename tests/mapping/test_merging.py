@@ -17,7 +17,7 @@ from mapping.merging import join_as_set, merge_maps
 from mapping.publishing import publish_edited
 from mapping.sample import write_sample
 from mapping.stages import exclusive
-from visloc.archive import Map, MapStore, SetOutline
+from visloc.archive import Anchor, Geodetic, Map, MapStore, SetOutline
 from visloc.errors import Conflict, InvalidInput
 from visloc.geometry import Pose, Similarity, rotation_angle
 from visloc.kapture import read_dataset
@@ -146,6 +146,20 @@ def test_maps_of_different_metres_are_refused(halves: MapStore) -> None:
     assert "is 1.2 times as far" in error.value.message
     assert "not show the same place" not in error.value.message
     assert "wrong" not in halves.ids()
+
+
+def test_the_down_of_the_first_stays(halves: MapStore) -> None:
+    here = Geodetic(latitude_deg=45.0, longitude_deg=5.8, altitude_m=300.0)
+    anchor = Anchor(kind="correspondences", images=4, geodetic=here)
+    publish_edited(halves, replace(content_of(halves.open("a")), anchor=anchor), "on-earth")
+    tilted = replace(content_of(halves.open("b")), gravity=(1.0, 0.0, 0.0))
+    publish_edited(halves, tilted, "tilted")
+
+    merge_maps(halves, "on-earth", "tilted", "upright", quiet)
+
+    down = halves.open("upright").gravity
+    assert down is not None
+    np.testing.assert_allclose(down, [0, 0, -1], atol=1e-12)
 
 
 def test_too_little_overlap_is_refused(halves: MapStore) -> None:

@@ -224,6 +224,7 @@ def test_the_id_of_a_map_is_refused_before_the_long_part(store: MapStore) -> Non
     with pytest.raises(Conflict) as caught:
         split_map(store, "hall", "hall", quiet, tile=2.0, overlap=0.4)
     assert caught.value.code == "set.id_is_map"
+    assert caught.value.field == "--set"
     said: list[str] = []
     with pytest.raises(Conflict) as caught:
         publish_set(
@@ -233,6 +234,7 @@ def test_the_id_of_a_map_is_refused_before_the_long_part(store: MapStore) -> Non
             lambda stage, *_: said.append(stage),
         )
     assert caught.value.code == "set.id_is_map"
+    assert caught.value.field == "ID"
     with pytest.raises(InvalidInput) as wrong:
         split_map(store, "hall", "h" * 62, quiet, tile=2.0, overlap=0.4)
     assert (wrong.value.code, wrong.value.field) == ("map.id", "--set")
@@ -453,6 +455,7 @@ def test_anchors_that_contradict_where_maps_lie_are_refused(store: MapStore) -> 
     with pytest.raises(Conflict, match="far@") as caught:
         publish(store, "earth", [("here", same), ("far", same)])
     assert caught.value.code == "set.anchor"
+    assert caught.value.field == "MAP"
 
 
 def test_a_set_knows_down_when_all_of_its_maps_do(store: MapStore) -> None:
@@ -489,9 +492,11 @@ def test_maps_that_contradict_each_other_are_refused(store: MapStore) -> None:
     with pytest.raises(Conflict, match="another down") as caught:
         publish(store, "pair", [("hall", flat), (copy, tilted)])
     assert caught.value.code == "set.gravity"
+    assert caught.value.field == "MAP"
     with pytest.raises(Conflict, match="metres of") as caught:
         publish(store, "pair", [("hall", flat), (copy, larger)])
     assert caught.value.code == "set.scale"
+    assert caught.value.field == "MAP"
     for twice in (["hall", "hall"], ["hall", f"hall@{store.current_version('hall')}"]):
         with pytest.raises(InvalidInput, match="named twice") as wrong:
             publish(store, "pair", [(ref, flat) for ref in twice])
