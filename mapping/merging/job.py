@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mapping.editing import content_of, joined, moved, refuse_other_features, same_model
-from mapping.merging.registration import Registration, register
+from mapping.merging.registration import Registration, register, updates_of
 from mapping.publishing import photo_files, publish_edited
 from mapping.sets import publish_set
 from mapping.stages import exclusive
@@ -172,11 +172,13 @@ def _joined(
     weights = first.fusion.weights
     names = {one.fingerprint.name for one in kept}
     fused = weights is None or set(weights) <= names
+    updates = [*updates_of(first.settings), *updates_of(second.settings)]
     nothing_placed = first.anchor is None or first.anchor.geodetic is None
     on_earth = second.anchor is not None and second.anchor.geodetic is not None
     content = replace(
         content,
         method=first.method if first.method == second.method else "merged",
+        settings={**first.settings, "updates": updates} if updates else first.settings,
         notes=(*content.notes, _note(b, found), *left_out),
         global_features=kept,
         fusion=first.fusion if fused else EQUAL_GHARM,

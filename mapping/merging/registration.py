@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,7 +57,7 @@ def register(a: Map, b: Map, min_overlap: float, progress: Progress) -> Registra
     described = describe_together((a, b))
     progress("describing", 1, 1)
     rows_a, rows_b = np.split(described.descriptors, [len(a.images)])
-    depth = all(opened.manifest.method.name == "rgbd" for opened in (a, b))
+    depth = _by_depth(a) and _by_depth(b)
     seen, tried = _seen(b, a, rows_b, rows_a, lambda *done: progress("B in A", *done), depth=depth)
     back: dict[int, Seen] = {}
     if len(seen) >= MIN_PHOTOS:  # else it is refused below
@@ -80,6 +80,21 @@ def register(a: Map, b: Map, min_overlap: float, progress: Progress) -> Registra
             a, b, tried, f"only {found.tied.sum()} of them are tied, and {needed} are needed"
         )
     return Registration(tried, tuple(seen), found, described)
+
+
+def updates_of(settings: Mapping[str, object]) -> list[object]:
+    """What the settings of a map's method tell of its updates; they may be of any software."""
+    updates = settings.get("updates")
+    return updates if isinstance(updates, list) else []
+
+
+def _by_depth(opened: Map) -> bool:
+    """Whether depth made all landmarks of a map."""
+    method = opened.manifest.method
+    return method.name == "rgbd" and all(
+        isinstance(update, dict) and update.get("method") == "rgbd"
+        for update in updates_of(method.settings)
+    )
 
 
 def _no_overlap(a: Map, b: Map, tried: int, why: str) -> Conflict:

@@ -135,29 +135,41 @@ def test_another_building_is_refused(halves: MapStore, tmp_path: Path) -> None:
     assert "wrong" not in halves.ids()
 
 
-def test_maps_of_different_metres_are_refused(halves: MapStore) -> None:
+@pytest.mark.parametrize(
+    ("method", "why"), [("rgbd", "is 1.2 times as far"), ("sfm", "a metre of theirs is 0.83")]
+)
+def test_maps_of_different_metres_are_refused(halves: MapStore, method: str, why: str) -> None:
     longer = Similarity(1.2, np.eye(3), np.zeros(3))
-    publish_edited(halves, moved(content_of(halves.open("b")), longer, metric=True), "longer")
+    content = moved(content_of(halves.open("b")), longer, metric=True)
+    # Depth tells of landmarks that depth made.
+    settings = {**content.settings, "updates": [{"method": method}]}
+    publish_edited(halves, replace(content, settings=settings), "longer")
 
     with pytest.raises(Conflict) as error:
         merge_maps(halves, "a", "longer", "wrong", quiet)
 
     assert error.value.code == "merge.unit"
-    assert "is 1.2 times as far" in error.value.message
+    assert why in error.value.message
     assert "not show the same place" not in error.value.message
     assert "wrong" not in halves.ids()
 
 
-def test_the_down_of_the_first_stays(halves: MapStore) -> None:
+def test_the_down_of_the_first_and_the_updates_of_both_stay(halves: MapStore) -> None:
     here = Geodetic(latitude_deg=45.0, longitude_deg=5.8, altitude_m=300.0)
     anchor = Anchor(kind="correspondences", images=4, geodetic=here)
-    publish_edited(halves, replace(content_of(halves.open("a")), anchor=anchor), "on-earth")
-    tilted = replace(content_of(halves.open("b")), gravity=(1.0, 0.0, 0.0))
-    publish_edited(halves, tilted, "tilted")
+    a, b = content_of(halves.open("a")), content_of(halves.open("b"))
+    updates = [{"capture": "one", "method": "rgbd"}, {"capture": "two", "method": "sfm"}]
+    of_a = {**a.settings, "updates": updates[:1]}
+    of_b = {**b.settings, "updates": updates[1:]}
+    publish_edited(halves, replace(a, anchor=anchor, settings=of_a), "on-earth")
+    publish_edited(halves, replace(b, gravity=(1.0, 0.0, 0.0), settings=of_b), "tilted")
 
     merge_maps(halves, "on-earth", "tilted", "upright", quiet)
 
-    down = halves.open("upright").gravity
+    merged = halves.open("upright")
+    assert merged.manifest.method.name == "rgbd"
+    assert merged.manifest.method.settings["updates"] == updates
+    down = merged.gravity
     assert down is not None
     np.testing.assert_allclose(down, [0, 0, -1], atol=1e-12)
 
