@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import JsonValue
 
 from mapping.merging.describing import describe_together
 from mapping.stored_queries import match_stored, solve_stored
@@ -82,7 +83,7 @@ def register(a: Map, b: Map, min_overlap: float, progress: Progress) -> Registra
     return Registration(tried, tuple(seen), found, described)
 
 
-def updates_of(settings: Mapping[str, object]) -> list[object]:
+def updates_of(settings: Mapping[str, JsonValue]) -> list[JsonValue]:
     """What the settings of a map's method tell of its updates; they may be of any software."""
     updates = settings.get("updates")
     return updates if isinstance(updates, list) else []
