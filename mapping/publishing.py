@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-from mapping.imported_points import FILE_NAME as IMPORTED_POINTS
 from visloc.archive import Map, MapContent, MapStore, write_map
 from visloc.archive.anchoring import link_or_copy
 from visloc.archive.schema import photo_file
@@ -20,22 +19,12 @@ def photo_files(opened: Map) -> list[Path]:
     return [opened.path / name for name in names if name in opened.manifest.files]
 
 
-def files_beside(opened: Map) -> list[Path]:
-    """The pairs and imported points that a map keeps.
-
-    They stay true while all its photos stay, in their order and where they are.
-    """
-    names = [name for name in (PAIRS, IMPORTED_POINTS) if name in opened.manifest.files]
-    return [opened.path / name for name in names]
-
-
 def publish_edited(
     store: MapStore,
     content: MapContent,
     map_id: str,
     *,
     photos: Sequence[Path] = (),
-    beside: Sequence[Path] = (),
     based_on: str | None = None,
 ) -> Path:
     """Publish content that was made from maps as the current version of a map.
@@ -45,7 +34,6 @@ def publish_edited(
         content: the map.
         map_id: its id.
         photos: small pictures of all photos, in their order; or none.
-        beside: other files that stay true, which keep their names.
         based_on: the version that it was made from, if it is one of the same map.
 
     Returns:
@@ -58,8 +46,6 @@ def publish_edited(
         raise AssertionError(f"{len(photos)} pictures of {len(content.images)} photos")
     with store.incoming() as incoming:
         link_photos(incoming, photos)
-        for path in beside:
-            link_or_copy(path, incoming / path.name)
         return publish_content(store, incoming, content, map_id, based_on=based_on)
 
 

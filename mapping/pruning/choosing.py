@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from mapping.imported_points import FILE_NAME as IMPORTED_POINTS
+from mapping.publishing import PAIRS
 from visloc.archive import Map
 from visloc.archive.checks import json_text
 from visloc.archive.schema import photo_file
@@ -34,7 +36,7 @@ _COVERED_WITHIN = 0.4
 _LEAST = 50
 _HEADER_BYTES = 128  # of an ``.npy``
 # Neither is needed to localize, nor true of a part of the photos.
-LEFT_OUT = ("pairs.txt", "imported_points.npz")
+LEFT_OUT = (PAIRS, IMPORTED_POINTS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
