@@ -31,7 +31,7 @@ from service.listing import ServedMap
 from service.metrics import Metrics
 from service.scenes import Scenes
 from service.set_search import SetSearch, answers_of, check_no_tiles, parted
-from service.set_sequences import SetSequence, check_all_in_order
+from service.set_sequences import SetSequence
 from service.stores import Store
 from service.uploads import Uploads
 from service.wire import stopping_error
@@ -262,7 +262,8 @@ class Engine:
         """Answer the instants of a sequence in order, each as soon as its answer is final.
 
         The next instant is taken when the answers to those before have been taken; those that
-        are all there are checked before any work. The caller holds a place (``admit_batch``).
+        are all there are checked before any work; in a set of maps, only their order and the names
+        of tiles are. The caller holds a place (``admit_batch``).
         With several maps, nothing is answered until an instant is localized: its map is kept.
 
         Raises:
@@ -284,7 +285,7 @@ class Engine:
             if sets:
                 sequence = SetSequence(self._sets, self._catalog, self.workers, start, sets[0])
                 if isinstance(instants, Sequence):
-                    check_all_in_order(instants)
+                    sequence.check(instants)
                 found = sequence.answers(_in_turn(instants))
             else:
                 found = self._answers(start, instants, alone)

@@ -82,17 +82,6 @@ class _Looked:
     priors: Priors
 
 
-def check_all_in_order(instants: Sequence[Instant]) -> None:
-    """Refuse instants that are not in the order of time, before any is worked on.
-
-    Raises:
-        InvalidInput: ``sequence.timestamps``.
-    """
-    for index, (before, instant) in enumerate(pairwise(instants), start=1):
-        with inside(f"instants[{index}]"):
-            check_order(before.timestamp, instant.timestamp)
-
-
 class SetSequence:
     """One sequence that is localized in a set.
 
@@ -120,6 +109,18 @@ class SetSequence:
         self._track: Track | None = None
         self._held = AsyncExitStack()  # keeps the tile of the leg
 
+    def check(self, instants: Sequence[Instant]) -> None:
+        """Refuse what can be told of instants before any is worked on, whatever their tiles.
+
+        Raises:
+            InvalidInput: ``sequence.timestamps``, ``priors.maps``.
+        """
+        for index, (before, instant) in enumerate(pairwise(instants), start=1):
+            with inside(f"instants[{index}]"):
+                check_order(before.timestamp, instant.timestamp)
+        for index, instant in enumerate(instants):
+            self._check_names(index, instant)
+
     async def answers(
         self, instants: AsyncIterator[Instant]
     ) -> AsyncGenerator[InstantLocalization]:
@@ -130,7 +131,7 @@ class SetSequence:
             Unavailable: as ``SetSearch.search``.
         """
         self._within = await self._search.within(self._outline, self._start.maps)
-        self._check_names(self._start.priors)
+        self._check_tiles(self._start.priors)
         index, before = 0, None
         try:
             async for instant in instants:
@@ -159,9 +160,7 @@ class SetSequence:
         """Take one more instant; give the answers that are final now."""
         if self._track is not None:
             self._track = self._track.moved(instant.odometry)
-        if instant.priors is not None:
-            with inside(f"instants[{index}]"):
-                self._check_names(instant.priors)
+        self._check_names(index, instant)
         queries = [image.query for image in instant.images]
         leg = self._leg
         async with self._search.reading(self._of, queries, self._start.options) as photos:
@@ -189,8 +188,13 @@ class SetSequence:
             for answer in self._in_set(leg, added.answers):
                 yield answer
 
-    def _check_names(self, priors: Priors) -> None:
+    def _check_names(self, index: int, instant: Instant) -> None:
         """Refuse names of tiles that the set does not have, also while a leg goes on."""
+        if instant.priors is not None:
+            with inside(f"instants[{index}]"):
+                self._check_tiles(instant.priors)
+
+    def _check_tiles(self, priors: Priors) -> None:
         if priors.maps is not None:
             allowed_tiles(self._outline, Priors(maps=priors.maps))
 
