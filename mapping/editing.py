@@ -272,7 +272,10 @@ def _joined_landmarks(a: Landmarks, b: Landmarks, same: NDArray[np.int64] | None
     again = np.bincount(observed[observed < count], minlength=count)
     lengths = np.minimum(a.track_lengths + again, 65535).astype(np.uint16)
     points = (b.points[new] + (b.origin - a.origin)).astype(np.float32)
-    colored = a.colors is not None and b.colors is not None
+    # Colours of some landmarks alone are none of the map.
+    colors = (
+        None if a.colors is None or b.colors is None else np.concatenate([a.colors, b.colors[new]])
+    )
     return Landmarks(
         origin=a.origin,
         points=np.concatenate([a.points, points]),
@@ -282,7 +285,7 @@ def _joined_landmarks(a: Landmarks, b: Landmarks, same: NDArray[np.int64] | None
         offsets=np.concatenate([a.offsets, a.offsets[-1] + b.offsets[1:]]),
         observed=np.concatenate([a.observed, observed.astype(np.uint32)]),
         keypoints=np.concatenate([a.keypoints, b.keypoints]),
-        colors=np.concatenate([a.colors, b.colors[new]]) if colored else None,  # type: ignore[index]
+        colors=colors,
     )
 
 
