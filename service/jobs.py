@@ -203,6 +203,8 @@ class Localization:
         ypr: whether the caller wants the GeoPose in angles too.
         debug: when the caller wants it.
         tile: of a set, ``id@version`` of the map in it that gave the answer.
+        reach: how far that map's photos see, in units of the answer's frame (median).
+        anchor_rms: how far off its place on Earth the frame may be, in its unit; 0 when unknown.
     """
 
     answer: Answer
@@ -212,6 +214,13 @@ class Localization:
     ypr: bool = False
     debug: MatchPicture | None = None
     tile: str | None = None
+    reach: float = 0.0
+    anchor_rms: float = 0.0
+
+    @property
+    def ref(self) -> str:
+        """``id@version`` of the map that gave the answer."""
+        return self.tile or f"{self.map_id}@{self.map_version}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,6 +233,13 @@ class InstantLocalization:
     geodetic: Geodetic | None = None
     ypr: bool = False
     tile: str | None = None
+    reach: float = 0.0
+    anchor_rms: float = 0.0
+
+    @property
+    def ref(self) -> str:
+        """``id@version`` of the map that gave the answer."""
+        return self.tile or f"{self.map_id}@{self.map_version}"
 
 
 def check_order(before: int, timestamp: int) -> None:

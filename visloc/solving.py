@@ -123,6 +123,10 @@ class Solved:
     pose: GeneralizedPose | None
     inliers: tuple[NDArray[np.bool_], ...]
 
+    def refused(self, refusal: Refusal) -> Solved:
+        """Return the same without its pose."""
+        return replace(self, answer=replace(self.answer, pose=None, refusal=refusal), pose=None)
+
 
 def solve_instant(
     images: Sequence[SeenImage],
