@@ -255,7 +255,8 @@ class Engine:
         The next instant is taken when the answers to those before have been taken; those that
         are all there are checked before any work; in a set of maps, only their order and the names
         of tiles are. The caller holds a place (``admit_batch``).
-        With several maps, nothing is answered until an instant is localized: its map is kept.
+        With several maps, nothing is answered until one map alone explains an instant: that map is
+        kept.
 
         Raises:
             InvalidInput: ``sequence.*``, ``rig.*``, ``options.*``, ``priors.*``.

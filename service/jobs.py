@@ -158,7 +158,7 @@ class SequenceStart:
     """What all instants of a sequence share.
 
     Attributes:
-        maps: where to search; of several maps, that of the first localized instant is kept.
+        maps: where to search; of several maps, one is kept once it alone explains an instant.
         rig: how the cameras sit; None when every instant is one image of one camera.
         time_unit: of the timestamps; None to tell by their size.
         max_gap_s: longest time between measured instants across which gaps are filled; 0: none.

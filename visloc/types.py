@@ -155,7 +155,7 @@ class Reason(StrEnum):
     NO_PHOTO_NEAR = "no_photo_near"  # the map has no photo where the priors allow the device
     CONTRADICTS_PRIOR = "contradicts_prior"
     CONTRADICTS_MOTION = "contradicts_motion"  # the images of its neighbours, and how it moved
-    AMBIGUOUS = "ambiguous"  # of a set: two places far apart explain the photo about equally well
+    AMBIGUOUS = "ambiguous"  # two of several places explain the images about equally well
     NO_USABLE_IMAGE = "no_usable_image"  # none of an instant's images could be read
 
 

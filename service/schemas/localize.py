@@ -38,7 +38,9 @@ GivenMaps = Annotated[
     list[str] | None,
     FailFast(),
     converted(_maps_from_text),
-    Field(description=f"instead of map: at most {MAX_MAPS} maps to search; the best answer counts"),
+    Field(
+        description=f"instead of map: at most {MAX_MAPS} maps to search; refused as ambiguous where two explain it"
+    ),
 ]
 
 

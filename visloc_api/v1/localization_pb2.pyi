@@ -525,7 +525,7 @@ class LocalizeRequest(_message.Message):
     def options(self) -> Global___LocalizeOptions: ...
     @_builtins.property
     def maps(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
-        """instead of map: search all of these, the best answer counts"""
+        """instead of map: search all of these; ambiguous where two explain it"""
 
     @_builtins.property
     def priors(self) -> Global___Priors: ...
