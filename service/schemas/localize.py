@@ -39,7 +39,8 @@ GivenMaps = Annotated[
     FailFast(),
     converted(_maps_from_text),
     Field(
-        description=f"instead of map: at most {MAX_MAPS} maps to search; refused as ambiguous where two explain it"
+        description=f"instead of map: at most {MAX_MAPS} maps to search; a photo that two of them "
+        "explain is refused as ambiguous"
     ),
 ]
 
