@@ -17,7 +17,8 @@ from service.jobs import (
     RigSensor,
 )
 from service.tiles import Read, summed
-from visloc.archive import Map, anchor_rms
+from visloc.archive import Map
+from visloc.archive.places import anchor_rms
 from visloc.constraints import Constraints
 from visloc.errors import InvalidInput, NotFound, TooLarge
 from visloc.geometry import Pose

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 from service.jobs import InstantLocalization, Localization
-from visloc.archive import similarity_on_earth
+from visloc.archive.places import similarity_on_earth
 from visloc.geometry import Similarity
 from visloc.judge import STDS, TIE_REACH_SHARE, Candidate, Tie, inliers_of, judge
 from visloc.priors import NO_PRIORS, Priors

@@ -36,7 +36,8 @@ from service.set_photos import Places, SetPhotos
 from service.together import together
 from service.worker import MapFolder
 from service.workers import Workers
-from visloc.archive import SetOutline, TileRecord, anchor_rms
+from visloc.archive import SetOutline, TileRecord
+from visloc.archive.places import anchor_rms
 from visloc.errors import (
     Conflict,
     InvalidInput,

@@ -43,7 +43,7 @@ from service.judging import judged
 from service.sequences import SequenceRun
 from service.tiles import Read, TileChooser, read_query, summed, written
 from service.worker import Abandoned, Added, Chosen, Loaded, MapFolder, Seen, WorkerSettings
-from visloc.archive import anchor_rms
+from visloc.archive.places import anchor_rms
 from visloc.archive.store import open_published, open_published_set
 from visloc.constraints import MapGeometry
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, VislocError

@@ -4,13 +4,7 @@ from __future__ import annotations
 
 from visloc.archive.anchoring import write_anchored
 from visloc.archive.checks import sha256_of
-from visloc.archive.places import (
-    GeoCircle,
-    anchor_rms,
-    circle_of,
-    down_of,
-    similarity_on_earth,
-)
+from visloc.archive.places import GeoCircle, circle_of, down_of
 from visloc.archive.reader import Map, MapOutline, open_map, read_outline, verify_map
 from visloc.archive.schema import (
     Anchor,
@@ -58,7 +52,6 @@ __all__ = [
     "SimilarityRecord",
     "TileRecord",
     "World",
-    "anchor_rms",
     "circle_of",
     "down_of",
     "open_map",
@@ -68,7 +61,6 @@ __all__ = [
     "read_outline",
     "read_set_outline",
     "sha256_of",
-    "similarity_on_earth",
     "verify_any",
     "verify_map",
     "verify_set",

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from visloc.archive import Geodetic, similarity_on_earth
-from visloc.archive.places import enu_of, origin_of
+from visloc.archive import Geodetic
+from visloc.archive.places import enu_of, origin_of, similarity_on_earth
 from visloc.geodesy import ecef_from_geodetic, geodetic_from_enu
 
 HALF = np.sqrt(0.5)
