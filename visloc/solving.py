@@ -434,8 +434,8 @@ def _with_turned_photos(refusal: Refusal, looks: Sequence[Look]) -> Refusal:
     if not orientations or refusal.reason not in _REASONS_OF_TURNED_PHOTOS:
         return refusal
     exif = ", ".join(map(str, orientations))
-    hint = f"stored turned (EXIF orientation {exif}) and read as stored: try read_as=upright"
-    return replace(refusal, message=f"{refusal.message}; the photo is {hint}")
+    hint = f"stored turned, EXIF orientation {exif}, and was read as stored: try read_as=upright"
+    return replace(refusal, message=f"{refusal.message} (the photo is {hint})")
 
 
 def _near_pose_prior(

@@ -176,6 +176,20 @@ def edit_manifest(**changes: object) -> Callable[[Path], None]:
     return edit
 
 
+def edit_images(folder: Path, turn: object) -> None:
+    """Say how the photos were turned, or leave it out."""
+    path = folder / "images.json"
+    images = json.loads(path.read_text())
+    for image in images["images"]:
+        image["turn"] = turn
+        if turn is None:
+            del image["turn"]
+    path.write_text(json.dumps(images))
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["files"]["images.json"]["size"] = path.stat().st_size
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
 def escape(folder: Path) -> None:
     manifest = json.loads((folder / "manifest.json").read_text())
     manifest["files"]["../../etc/passwd"] = manifest["files"]["landmarks.npy"]
@@ -228,6 +242,20 @@ def test_a_damaged_map_is_refused_at_opening_with_the_reason(
 def test_a_newer_minor_format_with_unknown_fields_opens(folder: Path) -> None:
     edit_manifest(format_version="2.9", colours="yes")(folder)
     assert open_map(folder).manifest.format_version == "2.9"
+
+
+@pytest.mark.parametrize("turn", [None, 6])
+def test_photos_of_formats_before_2_2_were_not_turned(folder: Path, turn: int | None) -> None:
+    edit_images(folder, turn)
+    assert [image.turn for image in open_map(folder).images] == [turn or 1] * 3
+
+
+@pytest.mark.parametrize("turn", [0, 9, "6h"])
+def test_a_turn_that_is_none_is_refused(folder: Path, turn: object) -> None:
+    edit_images(folder, turn)
+    with pytest.raises(MapCorrupt) as caught:
+        open_map(folder)
+    assert caught.value.code == "map.json"
 
 
 def test_programs_that_know_formats_1_call_this_one_newer(
