@@ -572,7 +572,10 @@ def _content(
         else {},
         images=tuple(
             ImageRecord(
-                name=photo.name, camera=photo.record.sensor_id, timestamp=photo.record.timestamp
+                name=photo.name,
+                camera=photo.record.sensor_id,
+                timestamp=photo.record.timestamp,
+                turn=features.turn(photo),
             )
             for photo in placed
         ),

@@ -79,6 +79,11 @@ class Photo:
         """Height of the stored pixels."""
         return int(self.rgb.shape[0])
 
+    @property
+    def is_on_its_side(self) -> bool:
+        """Whether width and height are those of the upright picture swapped."""
+        return self.exif_orientation >= 5
+
 
 _DEFAULT_LIMITS = ImageLimits()
 
@@ -114,6 +119,15 @@ def read_photo_file(path: Path, limits: ImageLimits = _DEFAULT_LIMITS) -> Photo:
     return _read(data, limits, field=str(path))
 
 
+def turn_of(exif_orientation: int) -> int:
+    """Return the orientation (1, 3, 6 or 8) that turns as this one (1 to 8) without mirroring.
+
+    Front cameras store what the sensor saw, and some ask viewers to mirror it (2, 4, 5 and 7). A
+    mirrored picture has no camera and matches nothing.
+    """
+    return {2: 1, 4: 3, 5: 6, 7: 8}.get(exif_orientation, exif_orientation)
+
+
 def upright(rgb: NDArray[np.uint8], exif_orientation: int) -> NDArray[np.uint8]:
     """Turn stored pixels (H, W, 3) the way their EXIF orientation (1 to 8) asks for."""
     flip_x, flip_y, transpose = _turn(exif_orientation)
@@ -133,6 +147,19 @@ def stored_from_upright(
     return np.column_stack(
         [stored_width - x if flip_x else x, stored_height - y if flip_y else y]
     ).astype(points.dtype, copy=False)
+
+
+def upright_from_stored(
+    points: NDArray[np.floating], exif_orientation: int, stored_width: int, stored_height: int
+) -> NDArray[np.floating]:
+    """Move points (N, 2) in stored pixels to ``upright(rgb, exif_orientation)``.
+
+    The inverse of ``stored_from_upright``.
+    """
+    flip_x, flip_y, transpose = _turn(exif_orientation)
+    x, y = points[:, 0], points[:, 1]
+    turned = [stored_width - x if flip_x else x, stored_height - y if flip_y else y]
+    return np.column_stack(turned[::-1] if transpose else turned).astype(points.dtype, copy=False)
 
 
 def _turn(exif_orientation: int) -> tuple[bool, bool, bool]:

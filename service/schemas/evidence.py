@@ -63,10 +63,19 @@ class CameraUsed(BaseModel):
 
 
 class Orientation(BaseModel):
-    """How the pixels were read."""
+    """How the photo was turned to find features.
+
+    Camera, keypoints and pose are those of the stored pixels, whatever this says.
+    """
 
     exif: Annotated[int, Field(description="1 to 8 as stored in the photo, 1 when absent")]
-    read_as: visloc.types.ReadAs
+    read_as: Annotated[
+        visloc.types.ReadAs,
+        Field(
+            description="upright: features were found in the photo turned by its EXIF orientation; "
+            "stored: in the pixels as stored, or the features were sent"
+        ),
+    ]
 
     @staticmethod
     def of(evidence: visloc.types.Evidence) -> Orientation:

@@ -27,7 +27,9 @@ from service.http import create_app
 from service.jobs import LocalizeJob
 from service.request_bodies import EXAMPLE_REQUEST
 from service.settings import ServiceSettings
+from tests.turning import png, turned_camera, turned_pixels, turned_pose
 from visloc.geometry import Pose, rotation_angle
+from visloc.images import read_photo
 
 
 def encoded(image: Image.Image, file_format: str = "PNG", **options: Any) -> bytes:
@@ -79,7 +81,7 @@ def test_a_query_is_localized_where_it_was_taken(doors: Any, query: Any) -> None
     )
     assert np.array(answer["pose"]["covariance"]).reshape(6, 6).trace() > 0
     assert answer["camera"]["source"] == "given"
-    assert answer["orientation"] == {"exif": 1, "read_as": "stored"}
+    assert answer["orientation"] == {"exif": 1, "read_as": "upright"}
     assert answer["map"]["id"] == "room"
     assert answer["retrieved"][0]["similarities"].keys() == {"densevlad", "localvlad"}
     assert {"queued", "decode", "local_features", "pose"} <= answer["seconds"].keys()
@@ -130,15 +132,28 @@ def test_grey_transparent_palette_and_16_bit_photos_are_localized(
     assert answer["status"] == "localized"
 
 
-def test_a_photo_with_exif_orientation_is_read_as_stored(doors: Any, query: Any) -> None:
-    exif = Image.Exif()
-    exif[274] = 6
-    photo = Image.open(io.BytesIO(query.image))
-    plain = comparable(post(doors, encoded(photo), camera=camera_text(query.camera)))
-    turned = comparable(post(doors, encoded(photo, exif=exif), camera=camera_text(query.camera)))
+def test_a_photo_stored_turned_is_read_upright(doors: Any, query: Any) -> None:
+    stored = png(turned_pixels(read_photo(query.image).rgb, 6), 6)
+    camera = camera_text(turned_camera(query.camera, 6))
+    answer = comparable(post(doors, stored, camera=camera))
+
+    assert answer["orientation"] == {"exif": 6, "read_as": "upright"}
+    assert answer["status"] == "localized"
+    found = answer["pose"]["cam_from_world"]
+    cam_from_world = Pose.from_quaternion(found["rotation_wxyz"], found["translation"])
+    truth = turned_pose(query.cam_from_world, 6)  # of the stored pixels
+    assert np.linalg.norm(cam_from_world.center - truth.center) < 0.05
+    assert rotation_angle(cam_from_world.rotation @ truth.rotation.T) < np.radians(1)
+
+
+def test_a_photo_with_exif_orientation_may_be_read_as_stored(doors: Any, query: Any) -> None:
+    pixels, camera = read_photo(query.image).rgb, camera_text(query.camera)
+    options = json.dumps({"read_as": "stored"})
+    plain = comparable(post(doors, png(pixels), camera=camera))
+    turned = comparable(post(doors, png(pixels, 6), camera=camera, options=options))
 
     assert turned.pop("orientation") == {"exif": 6, "read_as": "stored"}
-    assert plain.pop("orientation") == {"exif": 1, "read_as": "stored"}
+    assert plain.pop("orientation") == {"exif": 1, "read_as": "upright"}
     assert turned == plain
 
 

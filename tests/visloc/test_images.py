@@ -19,7 +19,9 @@ from visloc.images import (
     read_photo,
     read_photo_file,
     stored_from_upright,
+    turn_of,
     upright,
+    upright_from_stored,
 )
 
 ORIENTATIONS = range(1, 9)
@@ -166,6 +168,26 @@ def test_points_of_the_upright_photo_return_to_the_stored_pixel(orientation: int
     column, row = np.floor(stored).astype(int).T
     np.testing.assert_array_equal(stored - np.floor(stored), 0.5)
     np.testing.assert_array_equal(stored_index[row, column], turned.reshape(-1, 3))
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_points_go_to_the_upright_photo_and_come_back(orientation: int) -> None:
+    stored = np.random.default_rng(0).uniform(0, 5, (20, 2)).astype(np.float32)
+
+    there = upright_from_stored(stored, orientation, 7, 5)
+    back = stored_from_upright(there, orientation, 7, 5)
+
+    assert there.dtype == np.float32
+    np.testing.assert_allclose(back, stored, atol=1e-6)
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_the_turn_of_an_orientation_is_all_of_it_but_the_mirroring(orientation: int) -> None:
+    asked, turned = (upright(texture(7, 5), one) for one in (orientation, turn_of(orientation)))
+
+    mirrored = orientation in (2, 4, 5, 7)
+    np.testing.assert_array_equal(turned, asked[:, ::-1] if mirrored else asked)
+    assert turn_of(orientation) in (1, 3, 6, 8)
 
 
 def test_moving_points_keeps_their_type_and_takes_none() -> None:

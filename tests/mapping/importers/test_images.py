@@ -78,6 +78,18 @@ def test_photos_of_one_camera_share_a_sensor_with_the_focal_length_of_exif(tmp_p
     assert model.notes == ("1 of 4 photos do not tell their focal length",)
 
 
+def test_photos_of_a_phone_in_all_orientations_share_a_camera(tmp_path: Path) -> None:
+    for orientation in range(1, 9):
+        top = PHONE | {int(ExifTags.Base.Orientation): orientation}
+        write_photo(tmp_path / f"{orientation}.jpg", top=top, details=FOCAL)
+    model = read(tmp_path)
+    assert {image.sensor for image in model.images} == {"camera1"}
+    camera = model.sensors["camera1"].camera
+    assert camera is not None
+    assert (camera.width, camera.height) == (64, 48)  # of the stored pixels
+    assert camera.params == pytest.approx((FOCAL_PX, 32, 24, 0))
+
+
 def test_timestamps_are_ranks_by_the_time_of_exif(tmp_path: Path) -> None:
     write_photo(tmp_path / "a.jpg", details=taken("2024:05:06 07:08:10"))
     write_photo(tmp_path / "b.jpg", details=taken("2024:05:06 07:08:09", "75"))
