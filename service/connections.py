@@ -12,6 +12,7 @@ import h11
 from starlette.requests import Request
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from service.acceptor import Connection, OpenConnections
 from service.grpc_calls import Handler, behaviour_of, handler_like
 from service.grpc_envelope import Context, Envelope
 from visloc.errors import Overloaded, TimedOut, TooLarge
@@ -22,7 +23,7 @@ _LARGE_MESSAGES = ("Localize", "LocalizeRig")
 SLOWEST_BYTES_PER_S = 100_000
 
 
-def http_protocol(grace_s: float) -> type[H11Protocol]:
+def http_protocol(grace_s: float, connections: OpenConnections) -> type[H11Protocol]:
     """Return uvicorn's HTTP/1.1, for connections on which somebody is at work.
 
     A connection is closed when the head of a request is not there after ``grace_s`` seconds;
@@ -31,7 +32,7 @@ def http_protocol(grace_s: float) -> type[H11Protocol]:
     that is wanted is ``Arrivals``' business, idle connections are uvicorn's.
     """
 
-    class TimelyProtocol(H11Protocol):
+    class TimelyProtocol(H11Protocol, Connection):
         _arriving: asyncio.TimerHandle | None = None
         _leaving: asyncio.TimerHandle | None = None
 
@@ -49,9 +50,22 @@ def http_protocol(grace_s: float) -> type[H11Protocol]:
 
         def connection_lost(self, exc: Exception | None) -> None:
             super().connection_lost(exc)
+            connections.remove(self)
             for timer in (self._arriving, self._leaving):
                 if timer is not None:
                     timer.cancel()
+
+        @property
+        def is_sending(self) -> bool:
+            transport: asyncio.Transport | None = self.transport
+            return transport is not None and transport.get_write_buffer_size() > 0
+
+        def abandon(self) -> None:
+            transport: asyncio.Transport | None = self.transport
+            if transport is not None:
+                transport.abort()
+            elif self.opening is not None:
+                self.opening.cancel()
 
         def pause_writing(self) -> None:
             super().pause_writing()
@@ -66,6 +80,8 @@ def http_protocol(grace_s: float) -> type[H11Protocol]:
 
         def _watch(self, *, first: bool = False) -> None:
             """Start the clock when it is the client's turn; what it sends does not set it back."""
+            in_use = self.cycle is not None and not self.cycle.response_complete
+            connections.note(self, in_use=in_use)
             state = self.conn.their_state
             has_part_of_head = state is h11.IDLE and (first or bool(self.conn.trailing_data[0]))
             is_unwanted = state is h11.SEND_BODY and self.conn.our_state is h11.DONE

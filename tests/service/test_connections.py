@@ -16,6 +16,7 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
+from service.acceptor import OpenConnections
 from service.connections import SLOWEST_BYTES_PER_S, Arrivals, arrivals_of, http_protocol
 from service.responses import problem_response
 from visloc.errors import VislocError
@@ -49,7 +50,11 @@ def server() -> Iterator[tuple[int, Arrivals]]:
     app = Starlette(routes=routes)
     app.state.arrivals = arrivals
     config = uvicorn.Config(
-        app, port=0, log_level="critical", lifespan="off", http=http_protocol(GRACE_S)
+        app,
+        port=0,
+        log_level="critical",
+        lifespan="off",
+        http=http_protocol(GRACE_S, OpenConnections(1000)),
     )
     running = uvicorn.Server(config)
     thread = threading.Thread(target=running.run)

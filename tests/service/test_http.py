@@ -21,6 +21,7 @@ from pydantic import BaseModel
 
 import visloc
 from service import schemas
+from service.acceptor import OpenConnections
 from service.access import open_access
 from service.connections import Arrivals
 from service.http import create_app
@@ -536,6 +537,7 @@ def test_what_fastapi_refuses_is_a_problem_too(doors: Any) -> None:
         observer=doors.server.observer,
         access=open_access(settings),
         arrivals=Arrivals(1.0, 1),
+        connections=OpenConnections(1000),
         state=doors.server.state,
     )
     app.get("/cube")(_cube)
