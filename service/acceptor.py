@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import socket
 import ssl
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from time import monotonic
 from typing import Any
 
 logger = logging.getLogger(__name__)
 
 # Accepted in one turn of the event loop, so that requests have their turn in a flood.
 _BATCH = 64
+# A new connection is not closed for the next before it had this long to send a request; a flood
+# waits in the backlog instead, in which nobody is passed over.
+_LEAST_IDLE_S = 0.1
 # Pause before accepting again when the system has nothing left for a connection.
 _RETRY_S = 0.1
 # How long nothing of that kind may happen until the episode counts as over.
@@ -49,7 +54,7 @@ class OpenConnections:
     def __init__(self, limit: int) -> None:
         self._limit = limit
         self._open: set[Connection] = set()
-        self._idle: dict[Connection, None] = {}  # the longest idle first
+        self._idle: dict[Connection, float] = {}  # since when, the longest idle first
 
     def __len__(self) -> int:
         return len(self._open)
@@ -62,7 +67,7 @@ class OpenConnections:
     def add(self, connection: Connection) -> None:
         """Count a new connection."""
         self._open.add(connection)
-        self._idle[connection] = None
+        self._idle[connection] = monotonic()
 
     def remove(self, connection: Connection) -> None:
         """Forget a connection that is closed."""
@@ -74,20 +79,39 @@ class OpenConnections:
         if in_use:
             self._idle.pop(connection, None)
         elif connection in self._open:
-            self._idle.setdefault(connection)
+            self._idle.setdefault(connection, monotonic())
 
-    def make_room(self) -> bool:
-        """Close the longest idle connection at the limit; False when all are in use."""
-        return len(self._open) < self._limit or self.close_idle()
+    def make_room(self) -> float:
+        """Close the longest idle connection at the limit.
 
-    def close_idle(self) -> bool:
-        """Close the longest idle connection; False when all are in use."""
-        found = next((each for each in self._idle if not each.is_sending), None)
-        if found is None:
-            return False
-        self.remove(found)
-        found.abandon()
-        return True
+        Returns:
+            After how many seconds there is room: 0 for now, infinity when all are in use.
+        """
+        if len(self._open) < self._limit:
+            return 0.0
+        idlest = self._idlest()
+        if idlest is None:
+            return math.inf
+        wait_s = self._idle[idlest] + _LEAST_IDLE_S - monotonic()
+        if wait_s > 0:
+            return wait_s
+        self._close(idlest)
+        return 0.0
+
+    def close_idle(self, most: int) -> None:
+        """Close the connections that are idle longest."""
+        for _ in range(most):
+            idlest = self._idlest()
+            if idlest is None:
+                return
+            self._close(idlest)
+
+    def _idlest(self) -> Connection | None:
+        return next((each for each in self._idle if not each.is_sending), None)
+
+    def _close(self, connection: Connection) -> None:
+        self.remove(connection)
+        connection.abandon()
 
 
 class Acceptor:
@@ -119,7 +143,8 @@ class Acceptor:
         if context is not None:
             self._tls = {"ssl": context, "ssl_handshake_timeout": handshake_s}
         self._loop = asyncio.get_running_loop()
-        self._retry: asyncio.TimerHandle | None = None
+        self._accepted: socket.socket | None = None  # waits for room
+        self._pausing: asyncio.TimerHandle | None = None
         self._episode: asyncio.TimerHandle | None = None
         listener.setblocking(False)
         self._resume()
@@ -127,49 +152,63 @@ class Acceptor:
     def close(self) -> None:
         """Take in who has connected already, and nobody else."""
         self._accept()
-        for timer in (self._retry, self._episode):
+        for timer in (self._pausing, self._episode):
             if timer is not None:
                 timer.cancel()
         self._loop.remove_reader(self._listener)
         self._listener.close()
+        if self._accepted is not None:
+            self._accepted.close()
 
     def _resume(self) -> None:
         self._loop.add_reader(self._listener, self._accept)
+        self._accept()
+
+    def _pause(self, seconds: float) -> None:
+        self._loop.remove_reader(self._listener)
+        self._pausing = self._loop.call_later(seconds, self._resume)
 
     def _accept(self) -> None:
         for _ in range(_BATCH):
             try:
-                accepted, _address = self._listener.accept()
+                accepted = self._accepted or self._listener.accept()[0]
             except (BlockingIOError, InterruptedError, ConnectionAbortedError):
                 return
             except OSError as error:  # of descriptors or of memory
-                self._pause(error)
+                self._note_shortage(error)
+                self._connections.close_idle(_BATCH)
+                self._pause(_RETRY_S)
                 return
-            if not self._connections.make_room():
+            wait_s = self._connections.make_room()
+            if 0 < wait_s < math.inf:
+                self._accepted = accepted
+                self._pause(wait_s)
+                return
+            self._accepted = None
+            if wait_s == 0:
+                self._open(accepted)
+            else:
                 accepted.close()
-                continue
-            connection = self._make()
-            self._connections.add(connection)
-            connection.opening = self._loop.create_task(self._open(connection, accepted))
 
-    async def _open(self, connection: Connection, accepted: socket.socket) -> None:
+    def _open(self, accepted: socket.socket) -> None:
+        connection = self._make()
+        self._connections.add(connection)
+        connection.opening = self._loop.create_task(self._connect(connection, accepted))
+
+    async def _connect(self, connection: Connection, accepted: socket.socket) -> None:
         try:
             await self._loop.connect_accepted_socket(lambda: connection, accepted, **self._tls)
         except OSError:  # TLS did not come about: the client's affair
             self._connections.remove(connection)
 
-    def _pause(self, error: OSError) -> None:
-        """Let go of idle connections, and accept again in a moment."""
+    def _note_shortage(self, error: OSError) -> None:
+        """Log the beginning of an episode of this error, and its end later."""
         if self._episode is None:
             logger.error("no connection can be accepted, idle ones are closed: %s", error)
         else:
             self._episode.cancel()
         self._episode = self._loop.call_later(_EPISODE_S, self._end_episode)
-        for _ in range(_BATCH):
-            self._connections.close_idle()
-        self._loop.remove_reader(self._listener)
-        self._retry = self._loop.call_later(_RETRY_S, self._resume)
 
     def _end_episode(self) -> None:
         self._episode = None
-        logger.info("connections are accepted again without pauses")
+        logger.warning("connections have been accepted for %g s again", _EPISODE_S)

@@ -5,17 +5,19 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
 from contextlib import aclosing, asynccontextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import grpc
 import h11
+from google.protobuf.message import DecodeError
 from starlette.requests import Request
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from service.acceptor import Connection, OpenConnections
 from service.grpc_calls import Handler, behaviour_of, handler_like
+from service.grpc_connections import GrpcConnections
 from service.grpc_envelope import Context, Envelope
-from visloc.errors import Overloaded, TimedOut, TooLarge
+from visloc.errors import InvalidInput, Overloaded, TimedOut, TooLarge
 
 # Calls whose only message may be large.
 _LARGE_MESSAGES = ("Localize", "LocalizeRig")
@@ -174,17 +176,25 @@ def arrivals_of(request: Request) -> Arrivals:
 
 
 class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
-    """Ends calls over gRPC whose messages do not come.
+    """Ends calls over gRPC whose messages do not come, or are no messages.
 
     Args:
         envelope: answers calls that end so before they have begun.
+        connections: are told which of them have calls.
         grace_s: longest silence within a stream.
         max_message_bytes: of one message. How much of it is there cannot be seen, so that each
             has the time of the largest: ``grace_s``, and a second for every 100 kB.
     """
 
-    def __init__(self, envelope: Envelope, grace_s: float, max_message_bytes: int) -> None:
+    def __init__(
+        self,
+        envelope: Envelope,
+        connections: GrpcConnections,
+        grace_s: float,
+        max_message_bytes: int,
+    ) -> None:
         self._envelope = envelope
+        self._connections = connections
         self._patience_s = grace_s + max_message_bytes / SLOWEST_BYTES_PER_S
         self._silence_s = grace_s
 
@@ -202,12 +212,29 @@ class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         patience_s = self._patience_s if name in _LARGE_MESSAGES else self._silence_s
 
         async def serve(messages: AsyncIterator[Any], context: Context) -> Any:
-            try:
-                return await behaviour(_timely(messages, patience_s), context)
-            except TimedOut as error:  # before the method's own envelope
-                await self._envelope.refuse(name, error, context)
+            with self._connections.in_use(context.peer()):
+                try:
+                    return await behaviour(_timely(messages, patience_s), context)
+                except (TimedOut, InvalidInput) as error:  # before the method's own envelope
+                    await self._envelope.refuse(name, error, context)
 
-        return handler_like(handler, serve)
+        return handler_like(handler, serve, _readable_or_not(handler.request_deserializer))
+
+
+class _Unreadable(NamedTuple):
+    """Stands for a message that could not be parsed; gRPC would end the call as its own error."""
+
+    reason: str
+
+
+def _readable_or_not(parse: Callable[[bytes], Any] | None) -> Callable[[bytes], Any]:
+    def parsed(message: bytes) -> Any:
+        try:
+            return message if parse is None else parse(message)
+        except DecodeError as error:
+            return _Unreadable(str(error))
+
+    return parsed
 
 
 async def _timely(messages: AsyncIterator[Any], patience_s: float) -> AsyncGenerator[Any]:
@@ -219,6 +246,13 @@ async def _timely(messages: AsyncIterator[Any], patience_s: float) -> AsyncGener
             raise _too_slow(patience_s, "no message in that time") from None
         if message is None:
             return
+        if isinstance(message, _Unreadable):
+            raise InvalidInput(
+                "request.malformed",
+                "the message is not what the method takes",
+                expected="a protobuf message as in localization.proto",
+                got=message.reason,
+            )
         yield message
 
 
