@@ -266,12 +266,19 @@ def test_a_message_that_is_no_protobuf_is_refused_counted_and_logged_in_a_line(
     assert info.metadata["kind"] == "InvalidInput"
     assert len(info.metadata["request_id"]) == 32
     deadline = time.monotonic() + 20
-    while not caplog.records and time.monotonic() < deadline:
-        time.sleep(0.01)  # it is written when the caller has been answered
-    (line,) = caplog.records
-    assert line.name == "service.access"
-    assert line.exc_info is None
-    assert [value_of(metrics, name) for name in (requests, errors)] == [n + 1 for n in counted]
+    while not (lines := lines_of(caplog, "request.malformed")) and time.monotonic() < deadline:
+        time.sleep(0.01)  # the caller is answered first
+    (line,) = lines
+    assert (line["route"], line["status"]) == (method, "INVALID_ARGUMENT")
+    assert not any(record.exc_info for record in caplog.records)
+    assert value_of(metrics, requests) > counted[0]
+    assert value_of(metrics, errors) == counted[1] + 1
+
+
+def lines_of(caplog: pytest.LogCaptureFixture, code: str) -> list[dict[str, Any]]:
+    """What the access log has of requests that were refused with a code."""
+    every = [getattr(record, "facts", {}) for record in caplog.records]
+    return [facts for facts in every if facts.get("code") == code]
 
 
 def value_of(metrics: Metrics, sample: str) -> float:
