@@ -237,6 +237,8 @@ class RequestEnvelope:
                     record.status = str(message["status"])
                     ours = MutableHeaders(scope=message)
                     ours["X-Request-Id"] = id_
+                    if self._is_stopping():  # else the next request would be cut off
+                        ours["Connection"] = "close"
                     if record.trace is not None:
                         ours["traceresponse"] = record.trace.traceparent
                 await send(message)

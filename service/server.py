@@ -29,6 +29,10 @@ from service.tracing import open_spans
 from service.worker import WorkerSettings
 from visloc.types import Inference
 
+# When it stops: so long a request may be on its way over a connection that is open already. It is
+# answered with 503; then idle connections are closed.
+_LAST_WORDS_S = 0.3
+
 
 class Server:
     """Listens as soon as it is made, answers after ``open``, localizes after ``load``.
@@ -223,6 +227,7 @@ class _HttpServer(uvicorn.Server):
         """Accept nothing more, and end when all requests have."""
         del sockets
         self._acceptor.close()
+        await asyncio.sleep(_LAST_WORDS_S)
         await super().shutdown()
 
     @contextmanager

@@ -219,7 +219,7 @@ def test_the_balancer_is_told_what_its_configuration_asks(objects: Objects) -> N
 def asked_by_the_balancer() -> set[str]:
     """Variables that its configuration cannot do without."""
     lines = [line for line in CONFIG.read_text().splitlines() if not line.startswith("#")]
-    return set(re.findall(r"\$\{(\w+)", "\n".join(lines))) - {"NAMESERVER"}
+    return set(re.findall(r"\$\{(\w+)[}\[]", "\n".join(lines))) - {"NAMESERVER"}
 
 
 def test_compose_tells_the_balancer_the_same() -> None:

@@ -221,6 +221,15 @@ def test_too_large_a_body_is_refused_before_it_is_read(
     assert server[1].bytes_held == 0
 
 
+@pytest.mark.parametrize("size", [2**63, 2**64 - 1, 10**19])
+def test_however_large_a_length_is_it_is_refused_before_any_of_it_comes(
+    server: tuple[int, Arrivals], size: int
+) -> None:
+    with connected(server[0]) as connection:
+        connection.sendall(head("/read", size))
+        assert b'"code":"request.too_large"' in one_answer(connection)
+
+
 def test_together_bodies_take_no_more_than_there_is_room_for(
     server: tuple[int, Arrivals],
 ) -> None:

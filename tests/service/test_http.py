@@ -18,13 +18,14 @@ import numpy as np
 import pytest
 from PIL import Image
 from pydantic import BaseModel
+from starlette.responses import PlainTextResponse
 
 import visloc
 from service import schemas
 from service.acceptor import OpenConnections
 from service.access import open_access
 from service.connections import Arrivals
-from service.http import create_app
+from service.http import RequestEnvelope, create_app
 from service.jobs import LocalizeJob
 from service.request_bodies import EXAMPLE_REQUEST
 from service.settings import ServiceSettings
@@ -306,6 +307,19 @@ def test_a_full_queue_is_429_with_retry_after(
 
     assert problem(response, 429, "server.busy")["kind"] == "Overloaded"
     assert response.headers["retry-after"] == "1"
+
+
+def test_a_server_that_stops_closes_each_connection_with_its_answer(doors: Any) -> None:
+    async def ask(is_stopping: bool) -> httpx.Response:
+        app = RequestEnvelope(
+            PlainTextResponse("ok"), doors.server.observer, OpenConnections(1), lambda: is_stopping
+        )
+        transport = httpx.ASGITransport(app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as http:
+            return await http.get("/")
+
+    assert asyncio.run(ask(True)).headers["connection"] == "close"
+    assert "connection" not in asyncio.run(ask(False)).headers
 
 
 @pytest.fixture
