@@ -10,6 +10,7 @@ import sys
 from multiprocessing import forkserver, get_context
 from typing import TYPE_CHECKING
 
+from service.descriptors import fit_connections
 from service.logs import configure_logging
 from service.settings import ServiceSettings, SettingsError, read_settings
 
@@ -29,6 +30,10 @@ def main() -> None:
     except SettingsError as error:
         sys.exit(f"visloc-service: {error}")
     configure_logging(settings)
+    try:
+        settings = fit_connections(settings)
+    except SettingsError as error:
+        sys.exit(f"visloc-service: {error}")
     # What libraries read once, when they are loaded: hence the late import below.
     os.environ.setdefault("OMP_NUM_THREADS", str(settings.threads_per_worker))
     # What takes long is computed by torch and OpenVINO. OpenBLAS's threads would wait for each

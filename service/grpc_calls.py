@@ -41,8 +41,10 @@ def behaviour_of(handler: Handler) -> Behaviour:
     return behaviour
 
 
-def handler_like(handler: Handler, behaviour: Behaviour) -> Handler:
-    """Return a method with the messages of another.
+def handler_like(
+    handler: Handler, behaviour: Behaviour, parse: Callable[[bytes], Any] | None = None
+) -> Handler:
+    """Return a method with the messages of another, unless ``parse`` is to read them.
 
     It is called as soon as the call begins, also where there is one message only: gRPC itself
     would call it when that has arrived, however long that takes.
@@ -52,5 +54,7 @@ def handler_like(handler: Handler, behaviour: Behaviour) -> Handler:
         if handler.response_streaming
         else grpc.stream_unary_rpc_method_handler
     )
-    made: Handler = make(behaviour, handler.request_deserializer, handler.response_serializer)
+    made: Handler = make(
+        behaviour, parse or handler.request_deserializer, handler.response_serializer
+    )
     return made

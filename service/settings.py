@@ -97,7 +97,8 @@ class ServiceSettings(BaseModel):
     max_queue: Annotated[int, Field(ge=0)] = 64
     """photos that may wait for a worker; beyond it a request is refused"""
     max_connections: Count = 1000
-    """connections (HTTP) and calls (gRPC) that a door keeps open at once"""
+    """connections that HTTP and gRPC each have open at once, and calls of gRPC; for one more, the
+    longest idle is closed. Lowered where the system allows too few open files"""
     max_buffered_bytes: Count = 512 * 2**20
     """bytes of requests held while they arrive; beyond it a request is refused"""
     request_timeout_s: Seconds = 60.0

@@ -18,6 +18,7 @@ from typing import Annotated
 import typer
 
 from benchmarks.reliability.checks import print_checks
+from benchmarks.reliability.idle_connections import idle_connections
 from benchmarks.reliability.kills import kill_service, kill_workers
 from benchmarks.reliability.maps import SampleMaps, make_maps
 from benchmarks.reliability.refusals import refusals
@@ -82,6 +83,16 @@ def slow_clients_command(
         print_checks(
             "slow clients", asyncio.run(slow_clients(maps, work, connections, seconds, rounds))
         )
+
+
+@app.command("idle-connections")
+def idle_connections_command(
+    connections: Annotated[int, typer.Option(help="Idle ones, at once.")] = 2500,
+) -> None:
+    """Connections that say nothing, with 1024 open files allowed."""
+    with _prepared() as (maps, work):
+        checks = asyncio.run(idle_connections(maps.folder, work, connections))
+        print_checks("idle connections", checks)
 
 
 @app.command("refusals")

@@ -18,12 +18,14 @@ import numpy as np
 import pytest
 from PIL import Image
 from pydantic import BaseModel
+from starlette.responses import PlainTextResponse
 
 import visloc
 from service import schemas
+from service.acceptor import OpenConnections
 from service.access import open_access
 from service.connections import Arrivals
-from service.http import create_app
+from service.http import RequestEnvelope, create_app
 from service.jobs import LocalizeJob
 from service.request_bodies import EXAMPLE_REQUEST
 from service.settings import ServiceSettings
@@ -322,19 +324,17 @@ def test_a_full_queue_is_429_with_retry_after(
     assert response.headers["retry-after"] == "1"
 
 
-def test_connections_over_the_limit_are_503(serve: Any, tmp_path: Any) -> None:
-    with serve(tmp_path, load=False, max_connections=8) as doors:
-        address = ("127.0.0.1", doors.server.http_port)
-        idle = [socket.create_connection(address) for _ in range(7)]
-        assert doors.http.get("/healthz").status_code == 200  # the eighth
-        idle.append(socket.create_connection(address))
-        # The server counts a connection when its loop gets to accept it, a moment later.
-        deadline = time.monotonic() + 30
-        while doors.http.get("/healthz").status_code != 503:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-        for connection in idle:
-            connection.close()
+def test_a_server_that_stops_closes_each_connection_with_its_answer(doors: Any) -> None:
+    async def ask(is_stopping: bool) -> httpx.Response:
+        app = RequestEnvelope(
+            PlainTextResponse("ok"), doors.server.observer, OpenConnections(1), lambda: is_stopping
+        )
+        transport = httpx.ASGITransport(app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as http:
+            return await http.get("/")
+
+    assert asyncio.run(ask(True)).headers["connection"] == "close"
+    assert "connection" not in asyncio.run(ask(False)).headers
 
 
 @pytest.fixture
@@ -551,6 +551,7 @@ def test_what_fastapi_refuses_is_a_problem_too(doors: Any) -> None:
         observer=doors.server.observer,
         access=open_access(settings),
         arrivals=Arrivals(1.0, 1),
+        connections=OpenConnections(1000),
         state=doors.server.state,
     )
     app.get("/cube")(_cube)
