@@ -43,6 +43,7 @@ from mapping.places import (
     work_place,
 )
 from mapping.previews import keep_photos
+from mapping.progress import one_step
 from mapping.publishing import PAIRS, publish_content
 from mapping.rgbd import DepthSettings, landmarks_from_depth, refuse_without_depth
 from mapping.sfm import (
@@ -239,9 +240,8 @@ def write_pairs_of(
     photos, _ = collect_photos(dataset, with_files=False, progress=partial(progress, "photos"))
     described = [_read_global(dataset, name, features_dir, photos) for name in global_features]
     scene = make_scene(dataset, photos, described, settings)
-    progress("pairs", 0, 1)
-    found = find_pairs(scene, settings)
-    progress("pairs", 1, 1)
+    with one_step(progress, "pairs"):
+        found = find_pairs(scene, settings)
     write_pairs(output, scene, found)
     return len(found)
 
@@ -421,7 +421,8 @@ def _build(
         for name in settings.global_features
         if is_ready_made(name)
     }
-    _refuse_early(settings, dataset, photos)
+    with one_step(progress, "checks"):
+        _refuse_early(settings, dataset, photos)
     find_local_features(features, photos, workers, progress)
     global_features = [
         brought[name]
@@ -626,14 +627,13 @@ def _publish(
     try:
         if kept:
             keep_photos(work, incoming, kept, workers, progress)
-        progress("archive", 0, 1)
-        if made.pairs is not None:
-            write_pairs(incoming / PAIRS, *made.pairs)
-        if made.imported is not None:
-            made.imported.write(incoming)
-        folder = publish_content(store, incoming, content, settings.map_id)
-        wrote(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
-        progress("archive", 1, 1)
+        with one_step(progress, "archive"):
+            if made.pairs is not None:
+                write_pairs(incoming / PAIRS, *made.pairs)
+            if made.imported is not None:
+                made.imported.write(incoming)
+            folder = publish_content(store, incoming, content, settings.map_id)
+            wrote(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
         return folder
     finally:
         shutil.rmtree(incoming, ignore_errors=True)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mapping.executors import Executor
 from mapping.photos import MappingPhoto
+from mapping.progress import one_step
 from mapping.stages import Item, WorkFolder, key_of
 from visloc.archive import FingerprintRecord, GlobalFeatures, Map
 from visloc.errors import DatasetError, InvalidInput, Unavailable
@@ -341,26 +342,29 @@ def describe_photos(
         workers.run(task.find_words, learned_from, partial(progress, f"{name} words"))
         word_keys = [task.words_key(photo) for photo in learned_from]
         vocabulary_key = _key("vocabulary", fingerprint=task.fingerprint, words=word_keys)
-        vocabulary = work.get(
-            vocabulary_key,
-            lambda: descriptor.learn_vocabulary(
-                np.concatenate(read_all("words", word_keys)), seed=0
-            ),
-        )
+        with one_step(progress, f"{name} vocabulary"):
+            vocabulary = work.get(
+                vocabulary_key,
+                lambda: descriptor.learn_vocabulary(
+                    np.concatenate(read_all("words", word_keys)), seed=0
+                ),
+            )
     workers.run(partial(task.pool, vocabulary_key), photos, partial(progress, name))
     pooled_keys = [task.pooled_key(vocabulary_key, photo) for photo in photos]
     taught_by = _evenly(pooled_keys, _PROJECTION_PHOTOS)
-    projection = work.get(
-        _key("projection", pooled=taught_by),
-        lambda: descriptor.learn_projection(np.stack(read_all("pooled", taught_by))),
-    )
-    model = {**vocabulary, **projection}
-    blocks = [
-        descriptor.project(
-            np.stack(read_all("pooled", pooled_keys[first : first + _PROJECTED_TOGETHER])), model
+    with one_step(progress, f"{name} projection"):
+        projection = work.get(
+            _key("projection", pooled=taught_by),
+            lambda: descriptor.learn_projection(np.stack(read_all("pooled", taught_by))),
         )
-        for first in range(0, len(photos), _PROJECTED_TOGETHER)
-    ]
+        model = {**vocabulary, **projection}
+        blocks = [
+            descriptor.project(
+                np.stack(read_all("pooled", pooled_keys[first : first + _PROJECTED_TOGETHER])),
+                model,
+            )
+            for first in range(0, len(photos), _PROJECTED_TOGETHER)
+        ]
     return GlobalFeatures(
         FingerprintRecord.of(descriptor.fingerprint), np.concatenate(blocks), model
     )

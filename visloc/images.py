@@ -10,7 +10,7 @@ import io
 import math
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,8 +26,16 @@ from PIL.TiffImagePlugin import BITSPERSAMPLE, SAMPLEFORMAT, TiffImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from visloc.errors import InvalidInput, NotFound, TooLarge
+from visloc.file_kinds import HEAD_BYTES, file_kind
 
 FORMATS = "JPEG, PNG, WebP, TIFF or BMP"
+_READERS: Mapping[str, Callable[[io.BytesIO], ImageFile]] = {
+    "JPEG": JpegImageFile,
+    "PNG": PngImageFile,
+    "WebP": WebPImageFile,
+    "TIFF": TiffImageFile,
+    "BMP": BmpImageFile,
+}
 # What Pillow's parsers raise on malformed files. It is not documented; this is what fuzzing and
 # reading them showed.
 _MALFORMED = (
@@ -218,17 +226,17 @@ def _too_many_pixels(field: str, limits: ImageLimits, got: str) -> TooLarge:
 def _open_header(data: bytes, field: str) -> ImageFile:
     # The classes instead of Image.open: that one has a pixel limit of its own, a process-wide
     # variable, and warns or raises before ours can be compared.
-    reader = _reader(data)
-    if reader is None:
+    kind = file_kind(data[:HEAD_BYTES])
+    if kind is None or not kind.is_read:
         raise InvalidInput(
             "image.format",
-            "not an image that is read here",
+            "not an image that is read here" if kind is None else kind.refusal,
             field=field,
             expected=FORMATS,
-            got=f"bytes that begin with {data[:12].hex(' ')}",
+            got=f"bytes that begin with {data[:12].hex(' ')}" if kind is None else kind.name,
         )
     try:
-        header = reader(io.BytesIO(data))
+        header = _READERS[kind.name](io.BytesIO(data))
     except _MALFORMED as error:
         raise InvalidInput(
             "image.undecodable",
@@ -240,20 +248,6 @@ def _open_header(data: bytes, field: str) -> ImageFile:
     if isinstance(header, TiffImageFile):
         _check_tiff(header, field)
     return header
-
-
-def _reader(data: bytes) -> Callable[[io.BytesIO], ImageFile] | None:
-    if data.startswith(b"\xff\xd8\xff"):
-        return JpegImageFile
-    if data.startswith(b"\x89PNG\r\n\x1a\n"):
-        return PngImageFile
-    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
-        return WebPImageFile
-    if data.startswith((b"II*\0", b"MM\0*")):
-        return TiffImageFile
-    if data.startswith(b"BM"):
-        return BmpImageFile
-    return None
 
 
 def _check_tiff(header: TiffImageFile, field: str) -> None:

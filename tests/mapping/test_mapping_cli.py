@@ -288,8 +288,7 @@ def test_build_shows_each_stage_and_what_was_made(run: Run, sample: Path, tmp_pa
     assert status == 0
     stages = [re.fullmatch(r"([a-z ]+): (\d+)/\2 in [\d.]+ s", line) for line in err.splitlines()]
     assert [stage and stage[1] for stage in stages] == [
-        *("photos", "local features", "localvlad words", "localvlad", "depth", "landmarks"),
-        "archive",
+        *("photos", "local features", "localvlad words", "localvlad", "depth"),
     ]
     opened = open_map(MapStore(tmp_path).folder("room"))
     assert opened.ref in out

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image, ImageOps, TiffImagePlugin
 
 from visloc.errors import InvalidInput, NotFound, TooLarge
 from visloc.images import (
@@ -295,6 +295,35 @@ def test_what_is_not_an_image_is_refused_with_the_formats_that_are_read(data: by
 
     assert error.code == "image.format"
     assert error.expected == "JPEG, PNG, WebP, TIFF or BMP"
+
+
+@pytest.mark.parametrize(
+    ("data", "name", "part"),
+    [
+        (b"\0\0\0\x18ftypheic\0\0\0\0mif1heic", "HEIC", "convert them to JPEG"),
+        (b"\0\0\0\x1cftypmif1\0\0\0\0mif1avif", "AVIF", "convert them to JPEG"),
+        (b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom", "MP4", "take frames out of them"),
+        (b"GIF89a" + bytes(100), "GIF", "save them as PNG"),
+    ],
+)
+def test_a_kind_that_is_not_read_is_named_with_what_to_do(
+    data: bytes, name: str, part: str
+) -> None:
+    error = refusal(data)
+
+    assert (error.code, error.got) == ("image.format", name)
+    assert part in error.message
+
+
+def test_a_raw_photo_is_not_taken_for_its_thumbnail() -> None:
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    tags[50706] = b"\x01\x04\x00\x00"  # DNGVersion
+    file = io.BytesIO()
+    Image.fromarray(texture(40, 30)).save(file, "TIFF", tiffinfo=tags)
+
+    error = refusal(file.getvalue())
+
+    assert (error.code, error.got) == ("image.format", "raw")
 
 
 @pytest.mark.parametrize("file_format", ["JPEG", "PNG", "WEBP", "TIFF", "BMP"])
