@@ -31,6 +31,7 @@ HEALTHY_WITHIN_S = 1.0
 MEMORY_MAY_GROW = 1.3
 _ROUNDS = 3
 _HEALTH_PAUSE_S = 0.05
+_MEMORY_AFTER_S = 12.0
 
 _Send = Callable[[ServiceProcess], str]
 
@@ -72,7 +73,7 @@ def many_values(maps: SampleMaps, work: Path, clients: int) -> list[Check]:
             before = resident_bytes(service.pid)
             health = pool.submit(_longest_health_s, service, done)
             answers = Counter(pool.map(send, [service] * clients * _ROUNDS))
-            time.sleep(1)
+            time.sleep(_MEMORY_AFTER_S)
             done.set()
             after, longest_s = resident_bytes(service.pid), health.result()
         checks.append(
