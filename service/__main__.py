@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from service.descriptors import fit_connections
 from service.logs import configure_logging
+from service.memory import give_back_memory
 from service.settings import ServiceSettings, SettingsError, read_settings
 
 if TYPE_CHECKING:
@@ -66,6 +67,7 @@ async def _serve(settings: ServiceSettings) -> None:
     # The doors open first, so that /readyz can be asked while the maps are loaded.
     await server.open()
     loading = asyncio.create_task(_load(server))
+    tidying = asyncio.create_task(give_back_memory())
     await asyncio.wait({loading, stopping}, return_when=asyncio.FIRST_COMPLETED)
     if loading.done():
         loading.result()
@@ -77,6 +79,7 @@ async def _serve(settings: ServiceSettings) -> None:
         await stopping
     logger.info("stopping")
     loading.cancel()
+    tidying.cancel()
     await asyncio.wait({loading})
     await server.close(settings.drain_timeout_s)
 

@@ -311,7 +311,9 @@ class Vision:
         return [run.localization(answer) for answer in run.finish()]
 
     def _read(self, query: Query) -> Read:
-        return read_query(query, self._limits, self._extractor)
+        read = read_query(query, self._limits, self._extractor)
+        self._step()
+        return read
 
     def _sequence(self, state: bytes, maps: Sequence[MapFolder]) -> SequenceRun:
         run = _Unpickler(state, {of.ref: self.localizer(of) for of in maps}).load()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import struct
 import zlib
 from collections.abc import Callable, Mapping
@@ -29,6 +30,7 @@ from visloc.errors import InvalidInput, NotFound, TooLarge
 from visloc.file_kinds import HEAD_BYTES, file_kind
 
 FORMATS = "JPEG, PNG, WebP, TIFF or BMP"
+<<<<<<< HEAD
 _READERS: Mapping[str, Callable[[io.BytesIO], ImageFile]] = {
     "JPEG": JpegImageFile,
     "PNG": PngImageFile,
@@ -36,6 +38,9 @@ _READERS: Mapping[str, Callable[[io.BytesIO], ImageFile]] = {
     "TIFF": TiffImageFile,
     "BMP": BmpImageFile,
 }
+=======
+_JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+>>>>>>> work
 # What Pillow's parsers raise on malformed files. It is not documented; this is what fuzzing and
 # reading them showed.
 _MALFORMED = (
@@ -48,6 +53,17 @@ _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolution
 # In units of the longer side: from a 127 degree lens to a long telescope. What lies outside was
 # written by mistake.
 _PLAUSIBLE_FOCAL = (0.25, 50.0)
+# A decoder goes over all pixels once per scan of a JPEG. libjpeg's own script has 10 scans for
+# colour and 18 for CMYK; libtiff refuses more than 100 in the JPEGs that it holds.
+_MAX_SCANS = 100
+# The largest photo may have so many. Photos with fewer pixels may have more, up to _MAX_SCANS.
+_MAX_SCANS_OF_LARGEST = 20
+# Segments of a JPEG or chunks of a PNG. 20 MiB of image data in the usual pieces are 2 600 chunks.
+_MAX_PARTS = 100_000
+# JPEG markers that begin a segment with a length, and the end of the image (ITU T.81, table B.1).
+# Decoders pass over the others byte by byte, or refuse the file.
+_JPEG_MARKER = re.compile(rb"\xff[\xc0-\xc7\xc9-\xcf\xd9-\xef\xfe]")
+_END_OF_IMAGE, _START_OF_SCAN = 0xD9, 0xDA
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +118,7 @@ def read_photo(data: bytes, limits: ImageLimits = _DEFAULT_LIMITS) -> Photo:
     Raises:
         InvalidInput: ``image.empty``, ``image.format`` (not an image that is read here) or
             ``image.undecodable`` (malformed or cut off).
-        TooLarge: ``image.too_large`` or ``image.too_many_pixels``.
+        TooLarge: ``image.too_large``, ``image.too_many_pixels`` or ``image.too_complex``.
     """
     return _read(data, limits, field="image")
 
@@ -188,6 +204,7 @@ def _read(data: bytes, limits: ImageLimits, field: str) -> Photo:
             expected=f"at most {limits.max_bytes} bytes",
             got=f"{len(data)} bytes" if field == "image" else "more",
         )
+    scans = _count_passes(data, field)
     try:
         header = _open_header(data, field)
     except Image.DecompressionBombError as error:  # Pillow's own limit, checked for WebP only
@@ -195,6 +212,11 @@ def _read(data: bytes, limits: ImageLimits, field: str) -> Photo:
     width, height = header.size
     if width * height > limits.max_pixels:
         raise _too_many_pixels(field, limits, f"{width} x {height}")
+    max_scans = min(_MAX_SCANS, _MAX_SCANS_OF_LARGEST * limits.max_pixels // (width * height))
+    if scans > max_scans:
+        raise _too_complex(
+            field, f"at most {max_scans} scans of {width} x {height} pixels", f"{scans} scans"
+        )
     rgb = _decode(_only_pixels(data) if isinstance(header, PngImageFile) else data)
     if rgb is None or rgb.shape != (height, width, 3):
         raise InvalidInput(
@@ -221,6 +243,66 @@ def _too_many_pixels(field: str, limits: ImageLimits, got: str) -> TooLarge:
         expected=f"at most {limits.max_pixels} pixels",
         got=got,
     )
+
+
+def _too_complex(field: str, expected: str, got: str) -> TooLarge:
+    return TooLarge(
+        "image.too_complex",
+        "the photo takes too much work to decode; save it again as an ordinary JPEG or PNG",
+        field=field,
+        expected=expected,
+        got=got,
+    )
+
+
+def _count_passes(data: bytes, field: str) -> int:
+    """Return the scans of a JPEG; 0 for other formats.
+
+    Raises:
+        TooLarge: ``image.too_complex`` for too many segments or chunks: Pillow takes microseconds
+            for each.
+    """
+    scans = parts = 0
+    if data.startswith(_JPEG):
+        scans, parts = _jpeg_scans(data)
+    elif data.startswith(_PNG):
+        parts = _png_chunks(data)
+    if parts > _MAX_PARTS:
+        raise _too_complex(field, f"at most {_MAX_PARTS} segments or chunks", "more")
+    return scans
+
+
+def _jpeg_scans(jpeg: bytes) -> tuple[int, int]:
+    """Count the scans of the first image, and its segments with the bytes lost between them.
+
+    Segments are found as libjpeg finds them, so that it decodes no scan that is not counted here.
+    Thumbnails are within segments; what a camera appends comes after the end of the image. Stops
+    once ``_MAX_PARTS`` is exceeded.
+    """
+    scans = parts = 0
+    position = 2
+    while parts <= _MAX_PARTS and (marker := _JPEG_MARKER.search(jpeg, position)):
+        kind = jpeg[marker.start() + 1]
+        if kind == _END_OF_IMAGE and scans:
+            break
+        parts += 1
+        if scans == 0:  # later, image data lies between segments
+            parts += marker.start() - position
+        scans += kind == _START_OF_SCAN
+        position = marker.end()
+        if kind != _END_OF_IMAGE:  # Pillow passes over one that comes before any scan
+            # The length counts its own two bytes.
+            position += max(2, int.from_bytes(jpeg[position : position + 2], "big"))
+    return scans, parts
+
+
+def _png_chunks(png: bytes) -> int:
+    """Count the chunks; stops once ``_MAX_PARTS`` is exceeded."""
+    position, chunks = len(_PNG), 0
+    while chunks <= _MAX_PARTS and position + 12 <= len(png):
+        position += 12 + int.from_bytes(png[position : position + 4], "big")
+        chunks += 1
+    return chunks
 
 
 def _open_header(data: bytes, field: str) -> ImageFile:
@@ -250,6 +332,23 @@ def _open_header(data: bytes, field: str) -> ImageFile:
     return header
 
 
+<<<<<<< HEAD
+=======
+def _reader(data: bytes) -> Callable[[io.BytesIO], ImageFile] | None:
+    if data.startswith(_JPEG):
+        return JpegImageFile
+    if data.startswith(_PNG):
+        return PngImageFile
+    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
+        return WebPImageFile
+    if data.startswith((b"II*\0", b"MM\0*")):
+        return TiffImageFile
+    if data.startswith(b"BM"):
+        return BmpImageFile
+    return None
+
+
+>>>>>>> work
 def _check_tiff(header: TiffImageFile, field: str) -> None:
     """Refuse those of TIFF's many kinds that would come out wrong without a word."""
     bits = header.tag_v2.get(BITSPERSAMPLE, (1,))
