@@ -42,12 +42,6 @@ def behaviour_of(handler: Handler) -> Behaviour:
     return behaviour
 
 
-<<<<<<< HEAD
-def handler_like(
-    handler: Handler, behaviour: Behaviour, parse: Callable[[bytes], Any] | None = None
-) -> Handler:
-    """Return a method with the messages of another, unless ``parse`` is to read them.
-=======
 def _forgetful(behaviour: Behaviour) -> Behaviour:
     """Drop what a call held when it ends, its message above all.
 
@@ -72,9 +66,10 @@ def _forgetful(behaviour: Behaviour) -> Behaviour:
     return serve
 
 
-def handler_like(handler: Handler, behaviour: Behaviour) -> Handler:
-    """Return a method with the messages of another.
->>>>>>> work
+def handler_like(
+    handler: Handler, behaviour: Behaviour, parse: Callable[[bytes], Any] | None = None
+) -> Handler:
+    """Return a method with the messages of another, unless ``parse`` is to read them.
 
     It is called as soon as the call begins, also where there is one message only: gRPC itself
     would call it when that has arrived, however long that takes.
@@ -85,10 +80,8 @@ def handler_like(handler: Handler, behaviour: Behaviour) -> Handler:
         else grpc.stream_unary_rpc_method_handler
     )
     made: Handler = make(
-<<<<<<< HEAD
-        behaviour, parse or handler.request_deserializer, handler.response_serializer
-=======
-        _forgetful(behaviour), handler.request_deserializer, handler.response_serializer
->>>>>>> work
+        _forgetful(behaviour),
+        parse or handler.request_deserializer,
+        handler.response_serializer,
     )
     return made

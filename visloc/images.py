@@ -30,7 +30,6 @@ from visloc.errors import InvalidInput, NotFound, TooLarge
 from visloc.file_kinds import HEAD_BYTES, file_kind
 
 FORMATS = "JPEG, PNG, WebP, TIFF or BMP"
-<<<<<<< HEAD
 _READERS: Mapping[str, Callable[[io.BytesIO], ImageFile]] = {
     "JPEG": JpegImageFile,
     "PNG": PngImageFile,
@@ -38,9 +37,7 @@ _READERS: Mapping[str, Callable[[io.BytesIO], ImageFile]] = {
     "TIFF": TiffImageFile,
     "BMP": BmpImageFile,
 }
-=======
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
->>>>>>> work
 # What Pillow's parsers raise on malformed files. It is not documented; this is what fuzzing and
 # reading them showed.
 _MALFORMED = (
@@ -332,23 +329,6 @@ def _open_header(data: bytes, field: str) -> ImageFile:
     return header
 
 
-<<<<<<< HEAD
-=======
-def _reader(data: bytes) -> Callable[[io.BytesIO], ImageFile] | None:
-    if data.startswith(_JPEG):
-        return JpegImageFile
-    if data.startswith(_PNG):
-        return PngImageFile
-    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
-        return WebPImageFile
-    if data.startswith((b"II*\0", b"MM\0*")):
-        return TiffImageFile
-    if data.startswith(b"BM"):
-        return BmpImageFile
-    return None
-
-
->>>>>>> work
 def _check_tiff(header: TiffImageFile, field: str) -> None:
     """Refuse those of TIFF's many kinds that would come out wrong without a word."""
     bits = header.tag_v2.get(BITSPERSAMPLE, (1,))

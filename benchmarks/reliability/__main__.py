@@ -18,11 +18,8 @@ from typing import Annotated
 import typer
 
 from benchmarks.reliability.checks import print_checks
-<<<<<<< HEAD
-from benchmarks.reliability.idle_connections import idle_connections
-=======
 from benchmarks.reliability.heavy_requests import heavy_photos, many_values
->>>>>>> work
+from benchmarks.reliability.idle_connections import idle_connections
 from benchmarks.reliability.kills import kill_service, kill_workers
 from benchmarks.reliability.maps import SampleMaps, make_maps
 from benchmarks.reliability.refusals import refusals
@@ -89,7 +86,6 @@ def slow_clients_command(
         )
 
 
-<<<<<<< HEAD
 @app.command("idle-connections")
 def idle_connections_command(
     connections: Annotated[int, typer.Option(help="Idle ones, at once.")] = 2500,
@@ -98,7 +94,8 @@ def idle_connections_command(
     with _prepared() as (maps, work):
         checks = asyncio.run(idle_connections(maps.folder, work, connections))
         print_checks("idle connections", checks)
-=======
+
+
 @app.command("heavy-photos")
 def heavy_photos_command(
     deadline: Annotated[float, typer.Option(help="Of the callers, seconds.")] = 0.5,
@@ -115,7 +112,6 @@ def many_values_command(
     """Messages of many small values, which take long to parse."""
     with _prepared() as (maps, work):
         print_checks("many values", many_values(maps, work, clients))
->>>>>>> work
 
 
 @app.command("refusals")
