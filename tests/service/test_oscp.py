@@ -269,7 +269,7 @@ def test_what_cannot_be_answered_is_refused_by_name(
         (b"\xff", "request.malformed"),
         (b'{"timestamp": NaN}', "request.malformed"),
         (b"[" * 100_000, "request.malformed"),
-        (b'{"a": [' + b"1," * 1001 + b"1]}", "request.too_large"),
+        (b'{"a": [' + b"1," * 100_000 + b"1]}", "request.too_large"),
     ],
 )
 def test_what_is_no_json_or_too_much_of_it_is_refused(text: bytes, code: str) -> None:
