@@ -119,7 +119,7 @@ def _heavy_photos() -> Iterator[tuple[str, bytes]]:
     yield "an interlaced PNG of 16 bits", _interlaced_png()
     yield (
         "a JPEG of 5 million segments",
-        head[:2] + b"\xff\xfe\0\2" * (5 * 2**20 - 10) + head[2:300],
+        head[:2] + b"\xff\xfe\0\2" * (5 * 2**20 - 1000) + head[2:300],
     )
 
 

@@ -386,6 +386,91 @@ def test_a_png_chunk_that_claims_gigabytes_never_reaches_the_decoder(
     assert refusal(lying).code == "image.undecodable"
 
 
+# Work
+
+
+def progressive(
+    mode: str = "RGB", more: bytes = b"", times: int = 1, size: tuple[int, int] = (48, 32)
+) -> bytes:
+    """A JPEG with ``more`` and a copy of its last scan, so many times, before its end."""
+    jpeg = encode(Image.fromarray(texture(*size)).convert(mode), "JPEG", progressive=True)
+    last, end = jpeg.rindex(b"\xff\xda"), jpeg.rindex(b"\xff\xd9")
+    return jpeg[:end] + (more + jpeg[last:end]) * (times if more or times > 1 else 0) + jpeg[end:]
+
+
+@pytest.mark.parametrize(
+    "before_each",
+    [
+        *(b"\xff" * 3, b"\0\1 garbage \xff\0", b"\xff\xd0\xff\xd7", b"\xff\x01\xff\xbf"),
+        *(b"\xff\xfe\0\2", b"\xff\xe1\0\4\xff\xd9", b"\xff\xfe\0\0", b"\xff\xdd\0\4\0\1"),
+        *(b"\xff\xd8", b"\xff\xf0\0\xff", b"\xff\xc8"),
+    ],
+)
+def test_a_jpeg_of_very_many_scans_is_refused_before_it_is_decoded(
+    before_each: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("visloc.images._decode", lambda _: pytest.fail("it was decoded"))
+
+    error = refusal(progressive(more=before_each, times=300))
+
+    assert isinstance(error, TooLarge)
+    assert (error.code, error.field) == ("image.too_complex", "image")
+    assert (error.expected, error.got) == ("at most 100 scans of 48 x 32 pixels", "310 scans")
+
+
+def test_the_largest_photos_may_have_fewer_scans() -> None:
+    limits = ImageLimits(max_pixels=48 * 32)
+
+    assert read_photo(progressive(times=10), limits).width == 48  # 10 of its own
+    error = refusal(progressive(times=11), limits)
+
+    assert (error.code, error.got) == ("image.too_complex", "21 scans")
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB", "CMYK"])
+def test_what_encoders_write_is_far_from_too_many_scans(mode: str) -> None:
+    image = Image.fromarray(texture()).convert(mode)
+    for options in ({}, {"progressive": True}, {"restart_marker_blocks": 1}):
+        read_photo(encode(image, "JPEG", **options), ImageLimits(max_pixels=48 * 32))
+
+
+def test_scans_of_thumbnails_and_of_what_follows_the_picture_do_not_count() -> None:
+    other = progressive(times=50)
+    parts = b"".join(
+        b"\xff\xe2" + (len(other) + 2).to_bytes(2, "big") + other  # a thumbnail
+        for _ in range(10)
+    )
+    jpeg = encode(Image.fromarray(texture()), "JPEG")
+
+    photo = read_photo(jpeg[:2] + parts + jpeg[2:] + other * 10 + b"\xff\xda" * 1000)
+
+    np.testing.assert_array_equal(photo.rgb, read_photo(jpeg).rgb)
+
+
+@pytest.mark.parametrize(
+    "filler",
+    [
+        b"\xff\xfe\0\2" * 100_001,  # comments without a word
+        b"\xff" * 100_001,
+        b"\xff\0" * 50_001,
+        b"\xff\xd0" * 50_001,
+        b"\xff\xd9" + b"\xff\xe1\0\2" * 100_001,
+    ],
+)
+def test_a_jpeg_of_very_many_segments_is_refused(filler: bytes) -> None:
+    jpeg = encode(Image.fromarray(texture()), "JPEG")
+
+    assert refusal(jpeg[:2] + filler + jpeg[2:]).code == "image.too_complex"
+
+
+def test_a_png_of_very_many_chunks_is_refused() -> None:
+    png = encode(Image.fromarray(texture()), "PNG")
+    chunk = struct.pack(">I4sI", 0, b"prVt", zlib.crc32(b"prVt"))
+
+    assert refusal(png[:33] + chunk * 100_000 + png[33:]).code == "image.too_complex"
+    assert read_photo(png[:33] + chunk * 90_000 + png[33:]).width == 48
+
+
 def test_a_png_with_two_headers_is_refused() -> None:
     # Whose size was checked, and whose is decoded?
     small = encode(Image.fromarray(texture()), "PNG")
