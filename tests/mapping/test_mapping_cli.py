@@ -382,7 +382,9 @@ def test_pairs_that_need_no_poses_take_photos_without(
     (dataset / "sensors" / "trajectories.txt").unlink()
     photos = len(read_dataset(dataset).images)
 
-    status, out, _ = run("pairs", dataset, "--output", tmp_path / "all.txt", "--pairs", "exhaustive")
+    status, out, _ = run(
+        "pairs", dataset, "--output", tmp_path / "all.txt", "--pairs", "exhaustive"
+    )
 
     assert (status, out.split()[0]) == (0, str(photos * (photos - 1) // 2))
     _, _, err = run("pairs", dataset, "--output", tmp_path / "near.txt", "--pairs", "distance")
