@@ -319,7 +319,7 @@ def pairs(
     pixel_origin: PixelOriginOption = PixelOrigin.CORNER,
     maps_dir: MapsDirOption = Path("maps"),
 ) -> None:
-    """Pair the photos of a posed dataset without building, for build --pairs-file or other tools.
+    """Pair the photos of a dataset without building, for build --pairs-file or other tools.
 
     Pairs by global features that are made of the photos come with a build: pairs.txt of its map.
     """
@@ -328,7 +328,7 @@ def pairs(
     )
     known = None if covisible_in is None else open_map(map_folder(covisible_in, maps_dir))
     with StageProgress(_err, if_stopped="nothing was written") as progress:
-        count = write_pairs_of(
+        count, notes = write_pairs_of(
             dataset,
             output,
             SfmSettings(pairs=_names(pairs), pairing=pairing, covisible_in=known),
@@ -338,6 +338,8 @@ def pairs(
             progress,
         )
     _out.print(f"{count} pairs: {output}", highlight=False, soft_wrap=True)
+    for note in notes:
+        _out.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
     _out.print(f"peak memory {peak_memory_bytes() / 2**30:.2f} GiB")
 
 

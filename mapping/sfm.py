@@ -1,6 +1,6 @@
 """Landmarks from matches: pairs, matches, verification, triangulation.
 
-The mapping strategy for posed photos without depth of Humenberger et al. 2020 (section 4.2); with
+The mapping strategy for posed photos without depth of Humenberger et al. 2020; with
 estimated poses also for photos without poses.
 """
 

@@ -7,7 +7,7 @@ finds one pose from all images of an instant.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -66,11 +66,24 @@ _MOST_KEYPOINTS: Mapping[Extraction, int] = {Extraction.FAST: 1000, Extraction.D
 # asked too: they may show that the priors are wrong.
 _NUM_ELSEWHERE = 5
 
-# Of one photo: what an extractor found with a limit, the limit, and the pixels it looked at.
-FeatureCache = dict[
-    tuple[LocalFeatureExtractor, ReadAs, Extraction],
-    tuple[LocalFeatures, int, NDArray[np.uint8]],
-]
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundFeatures:
+    """Local features of a photo, kept for the next map that asks for them.
+
+    Attributes:
+        local: with keypoints in the stored pixels.
+        max_keypoints: how many the extractor might have returned.
+        rgb: (height, width, 3) pixels that it looked at, upright where that was asked for.
+    """
+
+    local: LocalFeatures
+    max_keypoints: int
+    rgb: NDArray[np.uint8]
+
+
+# Of one photo, by what found them and how.
+FeatureCache = dict[tuple[LocalFeatureExtractor, ReadAs, Extraction], FoundFeatures]
 
 
 class Localizer:
@@ -447,8 +460,8 @@ def find_features(
     """
     most = min(most, _MOST_KEYPOINTS.get(options.extraction, most))
     key = extractor, options.read_as, options.extraction
-    local, limit, rgb = (found or {}).get(key) or (None, 0, photo.rgb)
-    if local is None or limit < most:
+    known = None if found is None else found.get(key)
+    if known is None or known.max_keypoints < most:
         local, rgb = extract_features(
             photo,
             extractor,
@@ -456,10 +469,11 @@ def find_features(
             read_as=options.read_as,
             extraction=options.extraction,
         )
-        limit = most
+        known = FoundFeatures(local, most, rgb)
         if found is not None:
-            found[key] = local, limit, rgb
-    return (local if limit == most else _strongest(local, most)), rgb
+            found[key] = known
+    local = known.local if known.max_keypoints == most else _strongest(known.local, most)
+    return local, known.rgb
 
 
 def _strongest(local: LocalFeatures, most: int) -> LocalFeatures:

@@ -8,6 +8,12 @@ from pydantic import BaseModel, Field
 
 import visloc.types
 
+# Of every stated uncertainty.
+NOT_COVERED = (
+    "; from the scatter of the matches alone, without errors that landmarks share (depth, "
+    "calibration, poses of mapping photos): on maps from depth the error was 9 to 13 times as large"
+)
+
 
 class Refusal(BaseModel):
     """Why there is no pose."""
