@@ -64,7 +64,7 @@ APART_M = 10_000.0
 app = typer.Typer(add_completion=False, no_args_is_help=True)
 
 
-def run(command: str, *arguments: str | Path) -> None:
+def run(command: str, *arguments: object) -> None:
     """Run a command of ours; stop at the first that fails."""
     subprocess.run([Path(sys.executable).with_name(command), *map(str, arguments)], check=True)
 

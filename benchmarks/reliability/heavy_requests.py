@@ -23,7 +23,7 @@ from benchmarks.reliability.asking import camera_text
 from benchmarks.reliability.checks import Check, counts_text
 from benchmarks.reliability.maps import Photo, SampleMaps
 from benchmarks.reliability.service_process import ServiceProcess, resident_bytes
-from visloc_api.v1.localization_pb2 import LocalizeRigRequest
+from visloc_api.v1 import localization_pb2 as pb2
 
 SIDE = 7000  # 49 megapixels, a little below the limit
 NEXT_WITHIN_S = 2.0
@@ -157,6 +157,7 @@ def _interlaced_png() -> bytes:
 
 def _messages() -> Mapping[str, _Send]:
     sensor = {"rotation_wxyz": [1.0, 0.0, 0.0, 0.0], "translation": [0.1, 0.0, 0.0]}
+    transform = pb2.Transform(**sensor)
     sensors = {f"camera{number}": {"cam_from_rig": sensor} for number in range(150_000)}
     rig = json.dumps({"map": "room", "rig": {"sensors": sensors}, "images": []}).encode()
     empty = json.dumps(
@@ -170,7 +171,7 @@ def _messages() -> Mapping[str, _Send]:
     names = b"{" + b",".join(b'"%x":1' % n for n in range(500_000)) + b"}"
     tiles = {"maps": [f"tile{n}" for n in range(10**6)]}
     priors = json.dumps({"map": "room", "image": "", "priors": tiles}).encode()
-    readings = {"sensorReadings": {"cameraReadings": [{} for _ in range(10**6)]}}
+    readings: dict[str, object] = {"sensorReadings": {"cameraReadings": [{} for _ in range(10**6)]}}
     return {
         "a rig of 150 000 sensors": _by_http("/localize/rig", rig),
         "a rig of 600 000 empty sensors": _by_http("/localize/rig", empty),
@@ -180,9 +181,11 @@ def _messages() -> Mapping[str, _Send]:
         "priors of a million tiles": _by_http("/localize", priors),
         "a million camera readings": _by_http("/geopose", json.dumps(readings).encode()),
         "a rig of 150 000 sensors over gRPC": _by_grpc(
-            LocalizeRigRequest(
+            pb2.LocalizeRigRequest(
                 map="room",
-                calibration={"sensors": {name: {"cam_from_rig": sensor} for name in sensors}},
+                calibration=pb2.RigCalibration(
+                    sensors={name: pb2.RigSensor(cam_from_rig=transform) for name in sensors}
+                ),
             ).SerializeToString()
         ),
     }
@@ -205,7 +208,7 @@ def _by_grpc(message: bytes) -> _Send:
     def send(service: ServiceProcess) -> str:
         with grpc.insecure_channel(service.grpc) as channel:
             # The message as it is: made from an object, each would take its time here.
-            call = channel.unary_unary("/visloc.v1.Localization/LocalizeRig")
+            call = channel.unary_unary("/visloc.v1.Localization/LocalizeRig", None, None)
             try:
                 call(message, timeout=90)
             except grpc.RpcError as error:
