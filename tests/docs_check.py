@@ -189,12 +189,12 @@ def judged(command: Command) -> Rule:
     if command.is_inline:
         return Rule(Tier.PARSED, "", "", "usage in a sentence")
     text = command.text.replace(".venv/bin/", "")
-    for rule in RULES:
-        if re.search(rule.pages, command.page) and re.match(rule.pattern, text):
-            return rule
-    if command.words[0] not in PROGRAMS:
+    matching = (r for r in RULES if re.search(r.pages, command.page) and re.match(r.pattern, text))
+    rule = next(matching, Rule(Tier.RUN, "", ""))
+    known = {Tier.RUN: PROGRAMS, Tier.PARSED: (*_PARSERS, "make")}
+    if rule.tier is not Tier.ELSEWHERE and command.words[0] not in known[rule.tier]:
         raise ValueError(f"{command.page}:{command.line}: nothing is known of {command.text!r}")
-    return Rule(Tier.RUN, "", "")
+    return rule
 
 
 # Parsing

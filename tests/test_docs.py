@@ -235,7 +235,7 @@ def test_the_example_that_reads_points_sees_the_map(built_maps: Path, desk: Desk
         # of ready-made features, uploads and keys; `make docs-check` runs those commands as well.
         if not re.match(
             r"make|\.venv/bin/(visloc-service|pip |"
-            r"mapping (build|anchor|set|split|prune|merge|update))"
+            r"mapping (build|anchor|set|split|prune|merge|update|pack))"
             r"|.*/mapping import .* --map|.* --features-dir|.*/localize maps push"
             r"|.* https://maps\.example\.org",
             line,
@@ -333,6 +333,7 @@ def test_every_command_is_known_and_parses(page: Path) -> None:
         ('ARGS="--no-such-flag" make bench', True, False),
         ("docker compose up", True, True),
         ("unheard-of --flag", False, True),
+        ("pip install visloc", True, True),
     ],
 )
 def test_a_command_that_does_not_work_is_noticed(text: str, is_known: bool, parses: bool) -> None:
@@ -342,6 +343,12 @@ def test_a_command_that_does_not_work_is_noticed(text: str, is_known: bool, pars
         docs_check.judged(command)
     with nullcontext() if parses else pytest.raises(ValueError, match=r"."):
         docs_check.parse(command)
+
+
+@pytest.mark.parametrize("page", ["docs/results.md", "docs/new.md"])
+def test_no_page_hides_a_program_that_nobody_knows(page: str) -> None:
+    with pytest.raises(ValueError, match="nothing is known"):
+        docs_check.judged(docs_check.Command(page, 1, "unheard-of --flag"))
 
 
 def test_every_make_target_exists() -> None:
