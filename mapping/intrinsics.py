@@ -139,12 +139,12 @@ def doubt_of(
         camera: refined.
         prior_px: its focal length before; None where nothing was known of it.
         rise_px: of the reprojection errors in its photos, as its focal length changes by ``STEP``
-            and all else adapts to that: root mean square.
+            and all else adapts to that: root mean square. None for a camera that is not plausible.
     """
     focal = float(camera.mean_focal_length())
-    if not is_plausible(camera):
+    if rise_px is None:
         return Doubt("implausible", focal)
-    if not rise_px >= MIN_RISE_PX:
+    if rise_px < MIN_RISE_PX:
         return Doubt("undetermined", focal)
     if prior_px is not None and abs(focal / prior_px - 1) > MAX_MOVE:
         return Doubt("moved", focal)

@@ -16,6 +16,7 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from mapping.importers.model import ImportedImage, ImportedModel
+from mapping.intrinsics import FROM_EXIF
 from visloc.errors import DatasetError, InvalidInput, NotFound, VislocError
 from visloc.geometry import Camera
 from visloc.images import FORMATS, ImageLimits, read_photo
@@ -206,7 +207,8 @@ def _cameras(found: list[_Found]) -> dict[tuple[object, ...], Sensor]:
         else:
             params_px = (photo.focal_length_px, width / 2, height / 2, 0.0)
             camera = Camera("SIMPLE_RADIAL", width, height, params_px)
-            cameras[key] = Sensor.with_camera(sensor_id, camera, name=photo.camera)
+            name = f"{photo.camera} {FROM_EXIF}".lstrip()
+            cameras[key] = Sensor.with_camera(sensor_id, camera, name=name)
     return cameras
 
 
