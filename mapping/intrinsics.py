@@ -47,7 +47,7 @@ CAMERAS = "cameras"
 # Ends the name of a sensor whose focal length is EXIF's.
 FROM_EXIF = "(EXIF)"
 
-Reason = Literal["implausible", "undetermined", "moved"]
+Reason = Literal["implausible", "undetermined", "moved", "unsettled"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,8 @@ class Doubt:
 
     Attributes:
         reason: ``implausible``: no lens has them. ``undetermined``: the photos fit other focal
-            lengths as well. ``moved``: too far from the prior.
+            lengths as well. ``moved``: too far from the prior. ``unsettled``: not in doubt itself,
+            but as often as some cameras were kept, others came in doubt.
         focal_length_px: what refinement made of it; may be negative or not finite.
     """
 
@@ -178,6 +179,8 @@ _WHY: Mapping[Reason, str] = {
     "undetermined": "the photos fit other focal lengths almost as well. That is so for photos that "
     "look straight down at flat ground, and for photos taken from one place",
     "moved": f"refinement moved it by more than {MAX_MOVE:.0%}",
+    "unsettled": "as often as the focal length of some cameras was kept, refinement moved others "
+    "too far",
 }
 _CALIBRATE = "give a calibration in sensors.txt of the dataset"
 _ADVICE: Mapping[Reason, str] = {
@@ -185,6 +188,7 @@ _ADVICE: Mapping[Reason, str] = {
     "undetermined": "Sizes and heights in the map are as good as this value. To have it refined, "
     f"take some oblique photos too; or {_CALIBRATE}",
     "moved": f"If the value is wrong, which bends the map, {_CALIBRATE}",
+    "unsettled": f"If these photos matter, {_CALIBRATE}",
 }
 
 

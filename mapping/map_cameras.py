@@ -26,6 +26,7 @@ _DOUBTS: Mapping[str, str] = {
     "implausible": "refinement gave what no lens has",
     "undetermined": "the photos do not determine it",
     "moved": "refinement moved it too far",
+    "unsettled": "refinement did not settle",
 }
 
 
@@ -123,8 +124,10 @@ def _line(name: str, camera: MapCamera) -> str:
     if camera.moved_percent:
         source += f", refined by {camera.moved_percent:+.1f} %"
     if camera.doubt:
-        source += f"; {_DOUBTS[camera.doubt]}"
+        kept = "" if camera.moved_percent is None else ", not refined"
+        source += f"{kept}: {_DOUBTS[camera.doubt]}"
+    photos = "1 photo" if camera.photos == 1 else f"{camera.photos} photos"
     return (
         f"{name}: {camera.model} {camera.width}x{camera.height}, focal length "
-        f"{camera.focal_length_px:.1f} px ({source}), {camera.photos} photos"
+        f"{camera.focal_length_px:.1f} px ({source}), {photos}"
     )

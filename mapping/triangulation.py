@@ -38,9 +38,9 @@ T = TypeVar("T")
 REFINABLE = ("poses", "points", "intrinsics")
 # Scale of the robust loss in bundle adjustment.
 _LOSS_SCALE_PX = 1.0
-# Each solves anew without the cameras in doubt. After the second, all that have a prior keep it:
-# focal lengths that still move are not determined either.
-_MAX_JUDGEMENTS = 2
+# After each that puts cameras in doubt, all is solved again; after the last, no camera is refined
+# that has a prior.
+_MAX_JUDGEMENTS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,7 +281,7 @@ def _believed(
         doubts |= again
         if judgements == _MAX_JUDGEMENTS:
             doubts |= {
-                sensor: Doubt("undetermined", float(model.camera(camera_id).mean_focal_length()))
+                sensor: Doubt("unsettled", float(model.camera(camera_id).mean_focal_length()))
                 for camera_id, sensor in free.items()
                 if sensor not in doubts and priors[sensor] is not None
             }
