@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import resource
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 from rich.console import Console
@@ -14,6 +15,7 @@ from rich.table import Table
 from mapping.costs import StageCost
 from mapping.georeference import Georeference
 from mapping.importers import ImportSummary
+from mapping.map_cameras import camera_lines, cameras_of
 from mapping.rig_calibration import OUTLIER_MULTIPLE, RigCalibration, Spread
 from visloc.archive import Map
 from visloc.archive.schema import photo_file
@@ -33,6 +35,7 @@ def summary_of(opened: Map) -> dict[str, Any]:
         "bytes_per_observation": opened.size_bytes / counts["observations"],
         "mean_track_length": float(opened.track_lengths.mean()),
         "cameras": len(opened.cameras),
+        "focal_lengths": {name: asdict(one) for name, one in cameras_of(opened).items()},
         "rigs": {rig: sorted(members) for rig, members in opened.rigs.items()},
         # What a geodetic anchor tells of it is not in every manifest.
         "gravity": None if opened.gravity is None else opened.gravity.tolist(),
@@ -53,6 +56,7 @@ def print_map(out: Console, opened: Map) -> None:
     table = Table(show_header=False, box=None, title=f"map {opened.ref}", title_justify="left")
     rows = {
         "photos": f"{counts['images']} by {summary['cameras']} cameras",
+        "cameras": "\n".join(camera_lines(opened)),
         "rigs": "; ".join(f"{rig}: {', '.join(names)}" for rig, names in summary["rigs"].items())
         or "none",
         "landmarks": f"{counts['landmarks']}, seen by {summary['mean_track_length']:.1f} photos "

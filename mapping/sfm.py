@@ -18,6 +18,7 @@ from pydantic import JsonValue
 from mapping.anchor import align_positions, known_positions
 from mapping.executors import Executor
 from mapping.features import LocalFeaturesSource, Progress
+from mapping.intrinsics import CAMERAS, CameraOrigin, Doubt, notes_on, origin_of
 from mapping.landmarks import MadeLandmarks, Observations, View, assemble_landmarks
 from mapping.matching import Matches, Verification, camera_values, match_pairs, pose_values
 from mapping.pairing import Pairs, PairSettings, Scene, pair_photos, read_pairs
@@ -38,7 +39,7 @@ from visloc.geometry import Camera, Pose, Similarity
 from visloc.kapture import Dataset, read_reconstruction
 
 # Raised when the code of the stage changes what comes out.
-_MODEL_REVISION = 1
+_MODEL_REVISION = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +117,8 @@ def landmarks_from_matches(
     absent = [photo.name for photo, v in zip(photos, model.views, strict=True) if v is None]
     if absent:
         notes.append(f"{len(absent)} of {len(photos)} photos found no place: {_some(absent)}")
+    origins = _origins(dataset, photos, model)
+    notes += notes_on(origins, _names_by_sensor(photos))
     rig_scale: float | None = 1.0
     anchor = Anchor(kind="dataset", images=len(photos))
     if settings.estimate_poses:
@@ -135,13 +138,39 @@ def landmarks_from_matches(
         views=tuple(views),
         landmarks=landmarks,
         rows=tuple(rows),
-        settings=_settings_record(settings),
+        settings=_settings_record(settings) | _origins_record(origins, settings),
         metric=metric,
         anchor=anchor,
         rig_scale=rig_scale,
         notes=tuple(notes),
         pairs=(scene, pairs),
     )
+
+
+def _origins(
+    dataset: Dataset, photos: Sequence[MappingPhoto], model: SparseModel
+) -> dict[str, CameraOrigin]:
+    """Where the focal lengths of the photos' cameras come from, by sensor."""
+    return {
+        sensor: origin_of(dataset.sensors[sensor], model.doubts.get(sensor))
+        for sensor in _names_by_sensor(photos)
+    }
+
+
+def _origins_record(
+    origins: Mapping[str, CameraOrigin], settings: SfmSettings
+) -> dict[str, JsonValue]:
+    """What the manifest says of them; nothing where all cameras are those of the dataset."""
+    if not (settings.estimate_poses or "intrinsics" in settings.refine):
+        return {}
+    return {CAMERAS: {sensor: one.model_dump() for sensor, one in origins.items()}}
+
+
+def _names_by_sensor(photos: Sequence[MappingPhoto]) -> dict[str, list[str]]:
+    names: dict[str, list[str]] = {}
+    for photo in photos:
+        names.setdefault(photo.record.sensor_id, []).append(photo.name)
+    return names
 
 
 def find_pairs(scene: Scene, settings: SfmSettings) -> Pairs:
@@ -328,6 +357,9 @@ def _to_item(model: SparseModel) -> Item:
         "points": model.points,
         "angles_deg": model.angles_deg,
         "on_rigs": np.array(model.on_rigs),
+        "doubt_sensors": np.array(list(model.doubts), dtype=np.str_),
+        "doubt_reasons": np.array([doubt.reason for doubt in model.doubts.values()], dtype=np.str_),
+        "doubt_px": np.array([doubt.focal_length_px for doubt in model.doubts.values()]),
         **{f"observed_{name}": array for name, array in asdict(model.observations).items()},
     }
 
@@ -344,8 +376,16 @@ def _from_item(item: Item, photos: Sequence[MappingPhoto]) -> SparseModel:
     observations = Observations(
         *(item[f"observed_{name}"] for name in ("points", "views", "rows", "pixels"))
     )
+    doubts = zip(
+        *(item[f"doubt_{name}"].tolist() for name in ("sensors", "reasons", "px")), strict=True
+    )
     return SparseModel(
-        tuple(views), item["points"], observations, item["angles_deg"], bool(item["on_rigs"])
+        tuple(views),
+        item["points"],
+        observations,
+        item["angles_deg"],
+        bool(item["on_rigs"]),
+        {sensor: Doubt(reason, focal) for sensor, reason, focal in doubts},
     )
 
 

@@ -5,9 +5,10 @@ The mapper's thresholds are those of table 2 of Humenberger et al. 2020.
 
 from __future__ import annotations
 
+import math
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +20,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mapping.anchor import align_poses
+from mapping.intrinsics import STEP, Doubt, doubt_of, is_plausible, no_lens
 from mapping.landmarks import (
     Observations,
     View,
@@ -36,6 +38,9 @@ T = TypeVar("T")
 REFINABLE = ("poses", "points", "intrinsics")
 # Scale of the robust loss in bundle adjustment.
 _LOSS_SCALE_PX = 1.0
+# After each that puts cameras in doubt, all is solved again; after the last, no camera is refined
+# that has a prior.
+_MAX_JUDGEMENTS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +112,8 @@ class SparseModel:
         observations: of the points; ``views`` are rows of the photos.
         angles_deg: (P,) largest angle between two rays.
         on_rigs: whether known rigs held cameras together; the model then has their unit.
+        doubts: by sensor, why refined intrinsics are not believed: those that were known stayed
+            as they were, and of the others, photos with a camera that no lens has were left out.
     """
 
     views: tuple[View | None, ...]
@@ -114,6 +121,7 @@ class SparseModel:
     observations: Observations
     angles_deg: NDArray[np.float32]
     on_rigs: bool
+    doubts: Mapping[str, Doubt]
 
 
 def triangulate(
@@ -132,30 +140,37 @@ def triangulate(
         matches: verified.
         config: thresholds.
         refine: names of ``REFINABLE``: what bundle adjustment may change afterwards. When it
-            changes poses, the result is aligned to the given ones again.
+            changes poses, the result is aligned to the given ones again. Intrinsics in doubt
+            (``SparseModel.doubts``) stay.
         work: folder for temporary files.
 
     Raises:
         InvalidInput: ``sfm.no_points``.
     """
     with _database(photos, rigs, matches, work) as (path, scene):
-        model = scene.with_poses(photos)
         options = _pipeline_options(config)
 
-        def run(token: pycolmap.CancellationToken) -> pycolmap.Reconstruction:
-            return pycolmap.triangulate_points(
-                model,
-                path,
-                path.parent,
-                path.parent,
-                options=options,
-                cancellation_token=token,
-            )
+        def solve(held: Collection[str]) -> pycolmap.Reconstruction:
+            model = scene.with_poses(photos)
 
-        result = _interruptible(run)
-    if refine:
-        _refine(result, photos, scene, refine)
-    return _checked(scene.read(result, photos, refine), config)
+            def run(token: pycolmap.CancellationToken) -> pycolmap.Reconstruction:
+                return pycolmap.triangulate_points(
+                    model,
+                    path,
+                    path.parent,
+                    path.parent,
+                    options=options,
+                    cancellation_token=token,
+                )
+
+            result = _interruptible(run)
+            if refine:
+                _refine(result, photos, scene, refine, held)
+            return result
+
+        refined = set(scene.cameras) if "intrinsics" in refine else set()
+        result, doubts = _believed(solve, scene, photos, refined, poses="poses" in refine)
+    return _checked(scene.read(result, photos, refine, doubts), config)
 
 
 def reconstruct(
@@ -169,20 +184,17 @@ def reconstruct(
 ) -> SparseModel:
     """Find poses and points by incremental mapping; the frame and the unit of it are arbitrary.
 
-    Known intrinsics stay as they are unless ``refine`` names them. Of several models that do not
-    connect the largest is taken. ``progress`` is told how many photos were placed, of the model
-    that is being made, and of how many.
+    Known intrinsics stay as they are unless ``refine`` names them, and those in doubt
+    (``SparseModel.doubts``) all the same. Of several models that do not connect the largest is
+    taken. ``progress`` is told how many photos were placed, of the model that is being made, and of
+    how many.
 
     Raises:
-        InvalidInput: ``sfm.no_model``, ``sfm.no_points``.
+        InvalidInput: ``sfm.no_model``, ``sfm.camera``, ``sfm.no_points``.
     """
     with _database(photos, rigs, matches, work) as (path, scene):
-        options = _pipeline_options(config)
-        options.constant_cameras = {
-            scene.camera_ids[photo.sensor]
-            for photo in photos
-            if photo.camera_known and "intrinsics" not in refine
-        }
+        known = {photo.sensor for photo in photos if photo.camera_known}
+        constant = set() if "intrinsics" in refine else known
 
         placed = 0
 
@@ -197,28 +209,160 @@ def reconstruct(
             placed = min(placed + 1, len(photos) - 1)
             progress(placed, len(photos))
 
-        def run(token: pycolmap.CancellationToken) -> dict[int, pycolmap.Reconstruction]:
-            return pycolmap.incremental_mapping(
-                path,
-                path.parent,
-                path.parent,
-                options=options,
-                initial_image_pair_callback=first_pair,
-                next_image_callback=one_more,
-                cancellation_token=token,
+        def solve(doubts: Mapping[str, Doubt]) -> pycolmap.Reconstruction:
+            left_out = doubts.keys() - known
+            options = _pipeline_options(config)
+            options.constant_cameras = {
+                scene.camera_ids[sensor] for sensor in constant | (doubts.keys() & known)
+            }
+            options.image_names = [p.name for p in photos if p.sensor not in left_out]
+
+            def run(token: pycolmap.CancellationToken) -> dict[int, pycolmap.Reconstruction]:
+                return pycolmap.incremental_mapping(
+                    path,
+                    path.parent,
+                    path.parent,
+                    options=options,
+                    initial_image_pair_callback=first_pair,
+                    next_image_callback=one_more,
+                    cancellation_token=token,
+                )
+
+            # No names would mean all photos.
+            models = _interruptible(run) if options.image_names else {}
+            if models:
+                return max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()))
+            if left_out:
+                raise no_lens({sensor: doubts[sensor] for sensor in left_out}, _names(photos))
+            raise InvalidInput(
+                "sfm.no_model",
+                "no two photos could be placed relative to each other"
+                + (" with their focal length as it was known" if doubts else ""),
+                field="dataset",
+                expected="photos that overlap; see --pairs and --mapper",
+                got=f"{len(photos)} photos, {len(matches)} pairs with verified matches",
             )
 
-        models = _interruptible(run)
-    if not models:
-        raise InvalidInput(
-            "sfm.no_model",
-            "no two photos could be placed relative to each other",
-            field="dataset",
-            expected="photos that overlap; see --pairs and --mapper",
-            got=f"{len(photos)} photos, {len(matches)} pairs with verified matches",
+        result, doubts = _believed(
+            solve, scene, photos, scene.cameras.keys() - constant, poses=True
         )
-    largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    return _checked(scene.read(largest, photos, ("poses", "intrinsics")), config)
+    return _checked(scene.read(result, photos, ("poses", "intrinsics"), doubts), config)
+
+
+def _believed(
+    solve: Callable[[dict[str, Doubt]], pycolmap.Reconstruction],
+    scene: _Scene,
+    photos: Sequence[SfmPhoto],
+    refined: Collection[str],
+    *,
+    poses: bool,
+) -> tuple[pycolmap.Reconstruction, dict[str, Doubt]]:
+    """Solve, and solve again without refining the cameras that are in doubt.
+
+    Args:
+        solve: makes a model; of the sensors that it is given, those with a prior stay at it, and
+            photos of the others are left out.
+        scene: what the model is of.
+        photos: the same.
+        refined: sensors whose intrinsics ``solve`` refines.
+        poses: whether it refines poses too.
+
+    Returns:
+        The model, and all doubts. Sensors without a prior that are merely undetermined have theirs,
+        and are in the model.
+    """
+    priors = {p.sensor: p.camera.focal_length if p.camera_known else None for p in photos}
+    doubts: dict[str, Doubt] = {}
+    judgements = 0
+    while True:
+        model = solve(doubts)
+        used = {model.image(image_id).camera_id for image_id in model.reg_image_ids()}
+        free = {
+            camera_id: sensor
+            for sensor, camera_id in scene.camera_ids.items()
+            if sensor in refined and sensor not in doubts and camera_id in used
+        }
+        if not free:
+            return model, doubts
+        sound = [camera_id for camera_id in free if is_plausible(model.camera(camera_id))]
+        rises = _rises(model, sound, poses=poses)
+        found = {
+            sensor: doubt
+            for camera_id, sensor in free.items()
+            if (doubt := doubt_of(model.camera(camera_id), priors[sensor], rises.get(camera_id)))
+        }
+        again = {
+            sensor: doubt
+            for sensor, doubt in found.items()
+            if priors[sensor] is not None or doubt.reason == "implausible"
+        }
+        if not again:
+            return model, doubts | found
+        judgements += 1
+        doubts |= again
+        if judgements == _MAX_JUDGEMENTS:
+            doubts |= {
+                sensor: Doubt("unsettled", float(model.camera(camera_id).mean_focal_length()))
+                for camera_id, sensor in free.items()
+                if sensor not in doubts and priors[sensor] is not None
+            }
+
+
+def _rises(
+    model: pycolmap.Reconstruction, camera_ids: Collection[int], *, poses: bool
+) -> dict[int, float]:
+    """By camera, how reprojection errors rise as the focal lengths change and all else adapts.
+
+    All cameras change at once, by ``STEP``: in a scene that determines none of them, each would
+    still be determined by the others.
+
+    Returns:
+        Pixels, root mean square: of the squared errors, the mean after minus that before.
+    """
+    before, after = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
+    others = set(model.cameras) - set(camera_ids)
+    with _quiet():
+        for copy, step in ((before, 0.0), (after, STEP)):
+            for camera_id in camera_ids:
+                camera = copy.camera(camera_id)
+                for index in camera.focal_length_idxs():
+                    camera.params[index] *= 1 + step
+            options = _adjustment_options(poses=poses, intrinsics=True)
+            options.refine_focal_length = False
+            _adjust(copy, options, others, poses=poses)
+    errors = _squared_errors(before), _squared_errors(after)
+    return {
+        camera_id: math.sqrt(max(errors[1].get(camera_id, 0.0) - errors[0].get(camera_id, 0.0), 0))
+        for camera_id in camera_ids
+    }
+
+
+def _squared_errors(model: pycolmap.Reconstruction) -> dict[int, float]:
+    """By camera, the mean of the squared reprojection errors in its photos."""
+    sums: dict[int, NDArray[np.float64]] = {}
+    for image_id in model.reg_image_ids():
+        image = model.image(image_id)
+        seen = image.get_observation_points2D()
+        if not seen:
+            continue
+        points = np.array([model.point3D(point.point3D_id).xyz for point in seen])
+        pixels = np.array([point.xy for point in seen])
+        projected = np.asarray(
+            model.camera(image.camera_id).img_from_cam(image.cam_from_world() * points)
+        )
+        squared = np.sum((projected - pixels) ** 2, axis=1)
+        squared = squared[np.isfinite(squared)]
+        total = sums.setdefault(image.camera_id, np.zeros(2))
+        total += squared.sum(), len(squared)
+    return {camera_id: total / count for camera_id, (total, count) in sums.items() if count}
+
+
+def _names(photos: Sequence[SfmPhoto]) -> dict[str, list[str]]:
+    """Names of photos by sensor."""
+    names: dict[str, list[str]] = {}
+    for photo in photos:
+        names.setdefault(photo.sensor, []).append(photo.name)
+    return names
 
 
 class _Scene:
@@ -310,7 +454,11 @@ class _Scene:
         return model
 
     def read(
-        self, model: pycolmap.Reconstruction, photos: Sequence[SfmPhoto], changed: Sequence[str]
+        self,
+        model: pycolmap.Reconstruction,
+        photos: Sequence[SfmPhoto],
+        changed: Sequence[str],
+        doubts: Mapping[str, Doubt],
     ) -> SparseModel:
         """The model in our terms; what was not to change is taken from the photos."""
         rows_of_images = {image.image_id: row for row, image in enumerate(self.images)}
@@ -337,7 +485,7 @@ class _Scene:
         observations = Observations(table[:, 0], table[:, 1], table[:, 2], pixels)
         xyz = np.array(points, dtype=np.float64).reshape(-1, 3)
         angles = np.zeros(len(xyz), np.float32)
-        return SparseModel(tuple(views), xyz, observations, angles, self.on_rigs)
+        return SparseModel(tuple(views), xyz, observations, angles, self.on_rigs, doubts)
 
 
 _Rigs = Mapping[str, Mapping[str, Pose]]
@@ -410,6 +558,7 @@ def _usable_rigs(photos: Sequence[SfmPhoto], rigs: _Rigs) -> _Rigs:
 def _pipeline_options(config: MapperConfig) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
+    options.num_threads = 1  # sums of several are not the same bits each time
     options.extract_colors = False
     options.min_num_matches = config.min_num_matches
     options.ba_local_max_num_iterations = config.ba_local_max_num_iterations
@@ -435,24 +584,15 @@ def _refine(
     photos: Sequence[SfmPhoto],
     scene: _Scene,
     refine: Sequence[str],
+    held: Collection[str],
 ) -> None:
-    """Bundle adjustment of what may change; the points always do."""
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_rig_from_world = "poses" in refine
-    options.refine_sensor_from_rig = False
-    options.refine_focal_length = options.refine_extra_params = "intrinsics" in refine
+    """Bundle adjustment of what may change, but not intrinsics of ``held``; points always do."""
+    poses = "poses" in refine
+    options = _adjustment_options(poses=poses, intrinsics="intrinsics" in refine)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = _LOSS_SCALE_PX
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
-        config.add_image(image_id)
-    if "poses" in refine:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    # Not pycolmap.bundle_adjustment: that prints on stderr whatever it is told.
-    adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
     with _quiet():
-        _interruptible(lambda token: adjuster.solve())  # noqa: ARG005  it cannot be cancelled
+        _adjust(model, options, {scene.camera_ids[sensor] for sensor in held}, poses=poses)
         if "poses" in refine:
             given = [photo.cam_from_world for photo in photos if photo.cam_from_world is not None]
             moved = [
@@ -465,6 +605,36 @@ def _refine(
             model.transform(
                 pycolmap.Sim3d(back.scale, pycolmap.Rotation3d(back.rotation), back.translation)
             )
+
+
+def _adjustment_options(*, poses: bool, intrinsics: bool) -> pycolmap.BundleAdjustmentOptions:
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_rig_from_world = poses
+    options.refine_sensor_from_rig = False
+    options.refine_focal_length = options.refine_extra_params = intrinsics
+    options.ceres.solver_options.num_threads = 1  # as the mapper
+    return options
+
+
+def _adjust(
+    model: pycolmap.Reconstruction,
+    options: pycolmap.BundleAdjustmentOptions,
+    constant: Collection[int],
+    *,
+    poses: bool,
+) -> None:
+    """Bundle adjustment of a model, without the intrinsics of the cameras ``constant``."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    for camera_id in constant:
+        config.set_constant_cam_intrinsics(camera_id)
+    if poses:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # Not pycolmap.bundle_adjustment: that prints on stderr whatever it is told.
+    adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
+    _interruptible(lambda token: adjuster.solve())  # noqa: ARG005  it cannot be cancelled
 
 
 def _checked(model: SparseModel, config: MapperConfig) -> SparseModel:
@@ -498,6 +668,7 @@ def _checked(model: SparseModel, config: MapperConfig) -> SparseModel:
         ),
         angles[good],
         model.on_rigs,
+        model.doubts,
     )
 
 

@@ -17,6 +17,7 @@ from PIL import ExifTags, Image
 
 from mapping.importers.left_out import notes_on
 from mapping.importers.model import ImportedImage, ImportedModel
+from mapping.intrinsics import FROM_EXIF
 from visloc.errors import DatasetError, InvalidInput, NotFound, TooLarge
 from visloc.file_kinds import HEAD_BYTES, FileKind, file_kind
 from visloc.geometry import Camera
@@ -303,7 +304,8 @@ def _cameras(found: list[_Found]) -> dict[tuple[object, ...], Sensor]:
         else:
             params_px = (photo.focal_length_px, width / 2, height / 2, 0.0)
             camera = Camera("SIMPLE_RADIAL", width, height, params_px)
-            cameras[key] = Sensor.with_camera(sensor_id, camera, name=photo.camera)
+            name = f"{photo.camera} {FROM_EXIF}".lstrip()
+            cameras[key] = Sensor.with_camera(sensor_id, camera, name=name)
     return cameras
 
 

@@ -147,7 +147,8 @@ def summary_of_report(data: Mapping[str, Any]) -> dict[str, Any]:
 
     Each photo counts by the run that left out the fewest others. ``likely`` and ``unlikely`` are
     the shares of places and directions with a chance of 90 % and more, and of less than 10 %.
-    ``up`` is ``gravity``, or ``cameras`` where it was guessed from how these were held.
+    ``cameras`` are in words. ``up`` is ``gravity``, or ``cameras`` where it was guessed from how
+    these were held.
     """
     within = data["coverage"]["within"]
     kindest: dict[int, Mapping[str, Any]] = {}
@@ -165,6 +166,7 @@ def summary_of_report(data: Mapping[str, Any]) -> dict[str, Any]:
     chances = [chance for cell in data["coverage"]["cells"] for chance in cell["probability"]]
     return {
         "map": f"{data['map']['id']}@{data['map']['version']}",
+        "cameras": data["map"]["cameras"],
         "up": data["up"]["source"],
         "within": within,
         "held_out": len(kindest),
@@ -219,6 +221,8 @@ def _print_summary(summary: Mapping[str, Any], *, metric: bool, decimals: int) -
     def say(text: str) -> None:
         _out.print(text, markup=False, highlight=False, soft_wrap=True)
 
+    for line in summary["cameras"]:
+        say(f"cameras: {line}")
     within, unit = summary["within"], " m" if metric else " units"
     limits = f"within {within['position']:g}{unit} and {within['orientation_deg']:g} degrees"
     failed = summary["failed"]

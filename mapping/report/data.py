@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mapping.map_cameras import camera_lines
 from mapping.report.grid import Grid, Plan, forecast_grid, make_grid
 from mapping.report.held_out import HeldOut, hold_out
 from mapping.report.model import Forecast, Learned, Within, learn, tolerance_of
@@ -158,6 +159,7 @@ def _about(opened: Map) -> dict[str, Any]:
         "local_features": manifest.local_features.fingerprint.name,
         "global_features": [g.fingerprint.name for g in manifest.global_features],
         "metric": manifest.world.metric,
+        "cameras": camera_lines(opened),
         "images": manifest.counts.images,
         "landmarks": manifest.counts.landmarks,
         "observations": manifest.counts.observations,

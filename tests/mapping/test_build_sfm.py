@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mapping.map_cameras import cameras_of
 from mapping.pairing import PAIRINGS, PairSettings
 from mapping.sample import ANCHOR_ALTITUDE_M, ANCHOR_LATITUDE_DEG, ANCHOR_LONGITUDE_DEG
 from mapping.sfm import SfmSettings
@@ -17,7 +18,7 @@ from visloc.archive import Map, MapStore
 from visloc.errors import DatasetError, InvalidInput, VislocError
 from visloc.evaluation import pose_error
 from visloc.geodesy import enu_from_geodetic, geodetic_from_enu
-from visloc.geometry import Pose
+from visloc.geometry import Camera, Pose
 from visloc.kapture import GnssRecord, Sensor, read_dataset
 
 Build = Callable[..., Map]
@@ -120,6 +121,25 @@ def test_what_is_refined_changes_and_nothing_else_and_the_frame_stays(
     assert localization_errors(built, walk / "query")[:, 0].max() < 0.02
 
 
+def test_a_focal_length_far_from_the_known_one_stays_as_known_and_is_told(
+    walk_copy: Path, tmp_path: Path, build_walk: Build, rewrite: Rewrite
+) -> None:
+    sensors = dict(read_dataset(walk_copy).sensors)
+    true = sensors["left"].camera
+    assert true is not None
+    params = (1.15 * true.focal_length, true.width / 2, true.height / 2, 0.0)
+    wrong = Camera("SIMPLE_RADIAL", true.width, true.height, params)
+    sensors["left"] = Sensor.with_camera("left", wrong, name="Maker One (EXIF)")
+    rewrite(walk_copy, sensors=sensors)
+    built = build_walk(walk_copy, tmp_path / "maps", sfm=sfm(refine=("intrinsics",)))
+    left, right = (cameras_of(built)[name] for name in ("left", "right"))
+    assert built.cameras["left"] == wrong
+    assert (left.source, left.moved_percent, left.doubt) == ("exif", 0.0, "moved")
+    assert (right.source, right.doubt) == ("given", None)
+    (note,) = (note for note in built.manifest.notes if "focal length" in note)
+    assert f"left: {wrong.focal_length:.1f} px of EXIF" in note
+
+
 ANCHOR = np.array([ANCHOR_LATITUDE_DEG, ANCHOR_LONGITUDE_DEG, ANCHOR_ALTITUDE_M])
 ESTIMATE = SfmSettings(pairing=PairSettings(top_k=4), estimate_poses=True)
 
@@ -150,6 +170,7 @@ def test_without_any_position_the_world_is_said_to_be_arbitrary(
         assert truth is not None
         assert camera.model == "SIMPLE_RADIAL"
         assert camera.focal_length == pytest.approx(truth.focal_length, rel=0.1)
+    assert {camera.source for camera in cameras_of(built).values()} == {"estimated"}
 
 
 def test_gnss_says_where_the_map_lies_and_one_wrong_fix_does_no_harm(

@@ -69,7 +69,7 @@ def test_photos_of_one_camera_share_a_sensor_with_the_focal_length_of_exif(tmp_p
     ]
     assert all(image.cam_from_world is None for image in model.images)
     first = model.sensors["camera1"]
-    assert first.name == "Maker Inc. One"
+    assert first.name == "Maker Inc. One (EXIF)"
     assert first.camera is not None
     assert first.camera.model == "SIMPLE_RADIAL"
     assert first.camera.params == pytest.approx((FOCAL_PX, 32, 24, 0))

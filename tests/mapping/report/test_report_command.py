@@ -48,7 +48,7 @@ def _run(image: int, left_out: int, error: float | None) -> dict[str, Any]:
 
 def _data(**changes: Any) -> dict[str, Any]:
     return {
-        "map": {"id": "room", "version": "v1"},
+        "map": {"id": "room", "version": "v1", "cameras": ["cam: PINHOLE"]},
         "up": {"direction": [0.0, 0.0, 1.0], "source": "gravity"},
         "images": [{"name": "a.jpg"}, {"name": "[b].jpg"}, {"name": "c.jpg"}],
         "held_out": [

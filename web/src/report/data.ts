@@ -59,6 +59,8 @@ export interface ReportData {
     observations: number;
     size_bytes: number;
     extent: { min: Vector3; max: Vector3 };
+    /** Each camera in words, or of many a summary. */
+    cameras: string[];
     notes: string[];
   };
   /** The command that made this, and the version of visloc. */

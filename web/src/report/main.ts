@@ -82,6 +82,7 @@ function heading(data: ReportData): HTMLElement[] {
         `${countText(map.observations)} observations, ${bytesText(map.size_bytes)}` +
         (map.metric ? "." : "; not metric: lengths are in units of its own."),
     ),
+    element("p", { class: "note" }, `Cameras: ${map.cameras.join("; ")}.`),
     ...map.notes.map((text) => element("p", { class: "note" }, `Note: ${text}`)),
   ];
 }
