@@ -60,10 +60,7 @@ class IncomingMessage(BaseModel):
             InvalidInput: ``request.missing_field``, ``request.unknown_field``,
                 ``request.invalid``, or a code of the field.
         """
-        try:
-            return cls.model_validate(value, context=limits)
-        except ValidationError as refused:
-            raise refusal_of(refused.errors(include_url=False)[0], cls.path) from None
+        return cls._checked(lambda: cls.model_validate(value, context=limits))
 
     @classmethod
     def read_json(
@@ -82,10 +79,17 @@ class IncomingMessage(BaseModel):
             TooLarge: ``request.too_large``.
         """
         check_json_values(text, max_values, cls.path.rstrip("."))
+        return cls._checked(lambda: cls.model_validate_json(text, context=limits))
+
+    @classmethod
+    def _checked(cls, validate: Callable[[], Self]) -> Self:
         try:
-            return cls.model_validate_json(text, context=limits)
+            return validate()
         except ValidationError as refused:
-            raise refusal_of(refused.errors(include_url=False)[0], cls.path) from None
+            refusal = refusal_of(refused.errors(include_url=False)[0], cls.path)
+        # Out of there, so that it does not hold what it comes from: pydantic's errors hold all
+        # that was sent.
+        raise refusal
 
 
 def check_json_values(text: str | bytes, max_values: int, field: str = "") -> None:
