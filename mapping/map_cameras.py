@@ -11,7 +11,7 @@ from typing import Literal
 from pydantic import JsonValue, ValidationError
 
 from mapping.intrinsics import CAMERAS, CameraOrigin, Reason
-from visloc.archive import Map
+from visloc.archive import ImageRecord, Map
 
 # With more cameras than this, their lines are summed up.
 _LISTED = 5
@@ -76,6 +76,26 @@ def cameras_of(opened: Map) -> dict[str, MapCamera]:
             photos=photos[name],
         )
     return cameras
+
+
+def origins_record(a: Map, b: Map, images: Sequence[ImageRecord]) -> dict[str, JsonValue]:
+    """Return what the manifest of a joined map says of its cameras.
+
+    Args:
+        a: the first map, whose cameras keep their names.
+        b: the second one.
+        images: of the joined map: those of ``a``, then those of ``b``.
+    """
+    cameras = {image.camera: (a, image.camera) for image in a.images}
+    for image, own in zip(images[len(a.images) :], b.images, strict=True):
+        cameras.setdefault(image.camera, (b, own.camera))
+    origins = {
+        name: _origin(opened.manifest.method.settings, camera)
+        for name, (opened, camera) in cameras.items()
+    }
+    if all(origin is not None and origin.source == "given" for origin in origins.values()):
+        return {}
+    return {CAMERAS: {name: one.model_dump() for name, one in origins.items() if one is not None}}
 
 
 def _origin(settings: Mapping[str, JsonValue], camera: str) -> CameraOrigin | None:

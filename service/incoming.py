@@ -21,8 +21,8 @@ from visloc.errors import InvalidInput, TooLarge, VislocError
 _NOT_AN_OBJECT, _UNKNOWN_FIELD, _REFUSED = "not_an_object", "unknown_field", "refused"
 _MAX_NAME = 100  # characters of a name from outside
 # A message of many small values takes many times its size, and its time, when it is parsed: so they
-# are counted before. One photo needs a few dozen, or the names of all tiles of a set.
-MAX_JSON_VALUES = 10_000
+# are counted before. One photo needs a few dozen, and the names of all tiles of a set: 10 000.
+MAX_JSON_VALUES = 11_000
 # A rig of 256 cameras and the images of one instant need 25 000 at the most.
 MAX_INSTANT_VALUES = 100_000
 

@@ -10,7 +10,7 @@ from typing import TypeVar
 from service.jobs import InstantLocalization, Localization
 from visloc.archive.places import similarity_on_earth
 from visloc.geometry import Similarity
-from visloc.judge import STDS, TIE_REACH_SHARE, Candidate, Tie, inliers_of, judge
+from visloc.judge import STDS, TIE_REACH_SHARE, Candidate, Tie, inliers_of, judge, measured_pose
 from visloc.priors import NO_PRIORS, Priors
 from visloc.types import NotLocalized, Refusal
 
@@ -23,14 +23,21 @@ def judged(
     """Choose one answer of several, or refuse the query as ambiguous (``visloc.judge``).
 
     Args:
-        found: at least one, of maps, of sets, or of the tiles of one set. Of several that one map
-            gave, by itself and as a tile, the first counts.
+        found: at least one, of maps, of sets, or of the tiles of one set. Of several poses that one
+            map gave, by itself and as a tile, the first counts.
         priors: those that they obey.
 
     Returns:
         Its row and the answer. A refusal carries the evidence of the place with the most inliers.
     """
-    rows = list({each.ref: row for row, each in reversed(list(enumerate(found)))}.values())[::-1]
+    measured: set[str] = set()
+    rows = []
+    for row, each in enumerate(found):
+        if measured_pose(each.answer) is not None:
+            if each.ref in measured:
+                continue
+            measured.add(each.ref)
+        rows.append(row)
     asked = [found[row] for row in rows]
     verdict = judge(
         [Candidate(each.ref, each.answer) for each in asked],
@@ -50,14 +57,16 @@ def judged(
 def _tie(a: AnyLocalization, b: AnyLocalization, priors: Priors) -> Tie | None:
     """Say how the frames of two answers lie to each other; None where nothing ties them.
 
-    Tiles of one set share its frame, and versions of a map theirs. So do all maps where the caller
-    says, in one frame, where the device is. Anchored maps are compared on Earth. Other maps cannot
-    be compared: their coordinates may be alike where their places are not, as on two floors that
-    were both mapped from the lift onwards.
+    Tiles of one set share its frame. Anchored maps are compared on Earth. Of maps that are not
+    anchored, versions of one map are taken to share a frame, and so are all maps where the caller
+    says, in one frame, where the device is. Other maps cannot be compared: their coordinates may
+    be alike where their places are not, as on two floors that were both mapped from the lift
+    onwards.
     """
-    if a.map_id == b.map_id or priors.position is not None or priors.pose is not None:
-        return Tie(Similarity.identity(), TIE_REACH_SHARE * max(a.reach, b.reach))
-    if a.geodetic is None or b.geodetic is None:
+    same_map = a.map_id == b.map_id
+    if (same_map and a.map_version == b.map_version) or a.geodetic is None or b.geodetic is None:
+        if same_map or priors.position is not None or priors.pose is not None:
+            return Tie(Similarity.identity(), TIE_REACH_SHARE * max(a.reach, b.reach))
         return None
     a_from_b = similarity_on_earth(a.geodetic, b.geodetic)
     reach = max(a.reach, a_from_b.scale * b.reach)

@@ -41,8 +41,9 @@ Names = Annotated[tuple[str, ...], BeforeValidator(_names_of)]
 REQUEST_OVERHEAD_BYTES = 64 * 1024
 # Largest message with a piece of a packed map: 1 MiB, and a little around it.
 PIECE_BYTES = 2**20 + 64 * 1024
-# Room in a sequence for the numbers of one photo: camera, sensor, its share of the instant's.
-VALUES_PER_IMAGE = 32
+# Room in a sequence for the numbers of one photo, its camera and sensor, and for those of an
+# instant: odometry with its covariance, and a pose prior.
+VALUES_PER_IMAGE, VALUES_PER_INSTANT = 32, 150
 
 
 class SettingsError(ValueError):
@@ -150,8 +151,8 @@ class ServiceSettings(BaseModel):
     @property
     def max_sequence_values(self) -> int:
         """Values in the JSON of a sequence: each takes about a microsecond and 100 bytes."""
-        images = (self.max_rig_images + 1) * (self.max_instants + 1)
-        return max(MAX_INSTANT_VALUES, VALUES_PER_IMAGE * images)
+        per_instant = VALUES_PER_IMAGE * (self.max_rig_images + 1) + VALUES_PER_INSTANT
+        return max(MAX_INSTANT_VALUES, per_instant * (self.max_instants + 1))
 
 
 def read_settings(arguments: Sequence[str], environment: Mapping[str, str]) -> ServiceSettings:

@@ -90,7 +90,14 @@ def judge(candidates: Sequence[Candidate], ties: Ties) -> int | Refusal:
         if tie is None or not _agree(answers[i], answers[j], tie):
             return _ambiguous(candidates[i], candidates[j], tied=tie is not None)
     similar = [i for i in rivals if inliers_of(answers[i]) >= _SIMILAR_SHARE * most]
-    return min(similar, key=lambda i: _spread(answers[i]))
+    first = similar[0]
+
+    def spread(i: int) -> float:
+        """In the unit of the first, so that variances can be compared."""
+        tie = None if i == first else ties(first, i)
+        return _spread(answers[i]) * (1.0 if tie is None else tie.a_from_b.scale**2)
+
+    return min(similar, key=spread)
 
 
 def measured_pose(answer: Answer | InstantAnswer) -> tuple[Pose, NDArray[np.float64]] | None:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mapping.importers.colmap_checks import check_model, has_model
 from mapping.importers.largest import ModelSize, largest_model
 from mapping.importers.model import ImportedImage, ImportedModel
-from visloc.errors import DatasetError, InvalidInput, NotFound
+from visloc.errors import DatasetError, InvalidInput, NotFound, VislocError
 from visloc.geometry import CAMERA_MODELS, Camera, Pose
 from visloc.kapture import GnssRecord, Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
@@ -99,13 +99,22 @@ def _subfolders(path: Path) -> list[Path]:
 
 
 def _largest(folders: list[Path]) -> tuple[pycolmap.Reconstruction, Path, list[str]]:
-    models = [_reconstruction(folder) for folder in folders]
+    """Read the models of one place; a damaged one is left out with a note if there is another."""
+    models: list[tuple[pycolmap.Reconstruction, Path]] = []
+    damaged: list[VislocError] = []
+    for folder in folders:
+        try:
+            models.append((_reconstruction(folder), folder))
+        except VislocError as error:
+            damaged.append(error)
+    if not models:
+        raise damaged[0]
     sizes = [
         ModelSize(folder.name, photos=model.num_reg_images(), points=model.num_points3D())
-        for folder, model in zip(folders, models, strict=True)
+        for model, folder in models
     ]
     row, notes = largest_model(str(folders[0].parent), sizes)
-    return models[row], folders[row], notes
+    return *models[row], [*notes, *(f"a model was left out: {error}" for error in damaged)]
 
 
 def _places(path: Path, folder: Path | None) -> list[Path]:

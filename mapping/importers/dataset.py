@@ -332,16 +332,16 @@ def _check_sizes(model: ImportedModel) -> None:
         assert expected is not None  # what a camera has
         if size in (None, expected) or (size == expected[::-1] and is_stored_turned(path)):
             continue
-        wrong.append((path, size, expected))
+        wrong.append((path, size, expected, image.sensor))
     if not wrong:
         return
-    path, (width, height), expected = wrong[0]
+    path, (width, height), expected, sensor = wrong[0]
     raise DatasetError(
         "import.photo_size",
         f"{len(wrong)} of {len(model.images)} photos are not of the size of their camera, this one "
         "is the first; name the folder of photos of that size with --photos, or scale the cameras "
         "in the model: size, focal length and principal point",
         field=str(path),
-        expected=f"{expected[0]} x {expected[1]} pixels, as its camera {image.sensor}",
+        expected=f"{expected[0]} x {expected[1]} pixels, as its camera {sensor}",
         got=f"{width} x {height} pixels",
     )

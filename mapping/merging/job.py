@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mapping.editing import content_of, joined, moved, refuse_other_features, same_model
+from mapping.map_cameras import origins_record
 from mapping.merging.registration import Registration, register, updates_of
 from mapping.publishing import photo_files, publish_edited
 from mapping.sets import publish_set
@@ -178,7 +179,11 @@ def _joined(
     content = replace(
         content,
         method=first.method if first.method == second.method else "merged",
-        settings={**first.settings, "updates": updates} if updates else first.settings,
+        settings={
+            **first.settings,
+            **origins_record(a, b, content.images),
+            **({"updates": updates} if updates else {}),
+        },
         notes=(*content.notes, _note(b, found), *left_out),
         global_features=kept,
         fusion=first.fusion if fused else EQUAL_GHARM,

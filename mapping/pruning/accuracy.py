@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.photos import read_in_frame
 from mapping.pruning.choosing import Kept
 from mapping.report.held_out import left_out_sets, vanishing
 from mapping.report.viewpoints import Viewpoints
@@ -19,7 +20,6 @@ from visloc.errors import InvalidInput
 from visloc.evaluation import Threshold, median_errors_localized, pose_error
 from visloc.features import GlobalDescriptor, LocalFeatureExtractor
 from visloc.geometry import Pose
-from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localizer import FeatureCache, Localizer
 from visloc.retrieval.index import retrieve
@@ -95,11 +95,13 @@ def of_queries(
     errors: list[list[tuple[float, float]]] = [[] for _ in maps]
     for done, record in enumerate(records):
         progress(done, len(records))
-        photo, found = read_photo_file(dataset.path_of(record)), FeatureCache()
-        camera, truth = dataset.sensors[record.sensor_id].camera, dataset.pose(record)
+        sensor, truth = dataset.sensors[record.sensor_id], dataset.pose(record)
         assert truth is not None
+        assert sensor.image_size is not None  # what a camera has
+        photo = read_in_frame(dataset.path_of(record), sensor.image_size, sensor.id)
+        found = FeatureCache()
         for localizer, own in zip(localizers, errors, strict=True):
-            answer = localizer.localize(photo, camera, LocalizeOptions(), found=found)
+            answer = localizer.localize(photo, sensor.camera, LocalizeOptions(), found=found)
             if isinstance(answer, Localized):
                 own.append(pose_error(answer.cam_from_world, truth))
     progress(len(records), len(records))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from mapping.map_cameras import camera_lines, cameras_of
+from mapping.map_cameras import camera_lines, cameras_of, origins_record
 from visloc.archive import ImageRecord, Map, MapStore
 from visloc.geometry import Camera
 
@@ -74,3 +74,22 @@ def test_a_map_of_an_older_program_says_that_it_does_not_know(opened: Map) -> No
     for settings in ({"poses": "estimate"}, {"refine": ["intrinsics"], "poses": "given"}):
         (camera,) = cameras_of(with_cameras(opened, dict(settings), 500.0)).values()
         assert camera.source == "unknown"
+
+
+def test_a_joined_map_keeps_where_the_focal_lengths_of_both_come_from(opened: Map) -> None:
+    from_depth = with_cameras(opened, {"voxel_size": 0.01}, 500.0)
+    from_photos = with_cameras(
+        opened, {"cameras": {"0": origin("exif", 600.0, "undetermined")}}, 600.0
+    )
+    of_both = (*from_depth.images, replace(from_photos.images[0], camera="0-2"))
+
+    joined = replace(
+        with_cameras(opened, dict(origins_record(from_depth, from_photos, of_both)), 500.0),
+        cameras={"0": from_depth.cameras["0"], "0-2": from_photos.cameras["0"]},
+        images=of_both,
+    )
+
+    cameras = cameras_of(joined)
+    assert (cameras["0"].source, cameras["0"].doubt) == ("given", None)
+    assert (cameras["0-2"].source, cameras["0-2"].doubt) == ("exif", "undetermined")
+    assert origins_record(from_depth, from_depth, (*from_depth.images, *from_depth.images)) == {}

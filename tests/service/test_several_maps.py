@@ -126,8 +126,14 @@ def test_anchored_maps_are_compared_on_earth(on_earth: Client, anchored: Path, q
     versions = on_earth.localize(query.image, [f"room@{first}", f"room@{second}"], query.camera)
     assert versions.localized
 
-    for where in (["room", "upstairs"], HERE):
-        floors = on_earth.localize(query.image, where, query.camera)
+    # Where maps lie on Earth says more than a prior in the frame of one of them.
+    inside = Priors(position=PositionPrior(query.cam_from_world.center, 0.5))
+    for where, priors in (
+        (["room", "upstairs"], Priors()),
+        (["room", "upstairs"], inside),
+        (HERE, Priors()),
+    ):
+        floors = on_earth.localize(query.image, where, query.camera, priors=priors)
         assert floors.refusal is not None
         assert floors.refusal.reason == "ambiguous"
         assert "at different places" in floors.refusal.message

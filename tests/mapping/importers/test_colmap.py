@@ -227,6 +227,15 @@ def test_of_several_models_the_one_with_most_photos_is_taken_and_the_others_told
     assert image.name == "c/alone.jpg"
 
 
+def test_a_damaged_model_beside_a_whole_one_is_left_out_with_a_note(tmp_path: Path) -> None:
+    write_text(tmp_path / "sparse" / "0")
+    damaged = write_binary(tmp_path / "sparse" / "1") / "points3D.bin"
+    damaged.write_bytes(damaged.read_bytes()[:10])
+    model = read(tmp_path)
+    assert len(model.images) == 3
+    assert any("left out" in note and str(damaged) in note for note in model.notes)
+
+
 def test_a_single_model_needs_no_note(tmp_path: Path) -> None:
     write_text(tmp_path / "sparse" / "1")
     assert not any("largest" in note for note in read(tmp_path).notes)

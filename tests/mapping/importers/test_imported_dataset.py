@@ -275,6 +275,22 @@ def test_a_photo_of_another_size_than_its_camera_is_refused(
     assert not (tmp_path / "dataset").exists()
 
 
+def test_the_camera_of_the_photo_that_has_another_size_is_named(
+    model: ImportedModel, photos: Path, tmp_path: Path
+) -> None:
+    turned(photos / "a.jpg", 1)
+    other = replace(model.sensors["cam"], id="other")
+    last = replace(model.images[-1], sensor="other", depth=None)
+    two = replace(
+        model,
+        sensors={**model.sensors, "other": other},
+        images=(*model.images[:-1], last),
+    )
+    with pytest.raises(DatasetError) as caught:
+        write_imported(two, tmp_path / "dataset")
+    assert caught.value.expected == "64 x 48 pixels, as its camera cam"
+
+
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
 def test_a_photo_that_is_stored_turned_may_have_the_upright_size(
