@@ -11,7 +11,7 @@ import visloc.types
 # Of every stated uncertainty.
 NOT_COVERED = (
     "; from the scatter of the matches alone, without errors that landmarks share (depth, "
-    "calibration, poses of mapping photos): on maps from depth the error was 9 to 13 times as large"
+    "calibration, poses of mapping photos): on one map from depth the error was 13 times as large"
 )
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import os
 import importlib.metadata
 import json
 import sys
@@ -26,6 +27,7 @@ _WEIGHT_LEVELS, _ACTIVATION_LEVELS = 255, 256
 
 # Smallest and largest value of what enters a convolution, by the convolution's name.
 Ranges = Mapping[str, tuple[float, float]]
+_MAX_ISA = "AVX512_CORE_BF16"
 
 
 def import_openvino() -> tuple[ModuleType, ModuleType]:
@@ -38,6 +40,10 @@ def import_openvino() -> tuple[ModuleType, ModuleType]:
         ImportError: it is not installed, or cannot be loaded.
     """
     with _IMPORT_LOCK:
+        # OpenVINO 2026.4 crashes the process where AMX computes Fast-R2D2 in 8 bits on wide, low
+        # pictures (40 x 2000, 200 x 8000). Without AMX, 8-bit features are also the same bits on
+        # all processors. Read when the first network is compiled.
+        os.environ.setdefault("ONEDNN_MAX_CPU_ISA", _MAX_ISA)
         converter_was_hidden = _CONVERTER not in sys.modules
         if converter_was_hidden:
             sys.modules[_CONVERTER] = None  # type: ignore[assignment]

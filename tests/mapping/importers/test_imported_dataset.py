@@ -279,12 +279,11 @@ def test_the_camera_of_the_photo_that_has_another_size_is_named(
     model: ImportedModel, photos: Path, tmp_path: Path
 ) -> None:
     turned(photos / "a.jpg", 1)
-    other = replace(model.sensors["cam"], id="other")
-    last = replace(model.images[-1], sensor="other", depth=None)
+    a, b = sorted(model.images, key=lambda each: each.name)
     two = replace(
         model,
-        sensors={**model.sensors, "other": other},
-        images=(*model.images[:-1], last),
+        sensors={**model.sensors, "other": replace(model.sensors["cam"], id="other")},
+        images=(a, replace(b, sensor="other", depth=None)),
     )
     with pytest.raises(DatasetError) as caught:
         write_imported(two, tmp_path / "dataset")

@@ -92,7 +92,7 @@ export function inShort(answer: LocalizeResponse): string {
 
 const LEFT_OUT =
   "This leaves out errors that landmarks share, of depth, calibration and the mapping photos’ poses: " +
-  "on maps from depth the error was 9 to 13 times as large. " +
+  "on one map from depth the error was 13 times as large. " +
   "Look-alike places, prints, mirrors and a wrong camera can fool it.";
 
 function localized(answer: LocalizeResponse, pose: PoseEstimate, metric: boolean): HTMLElement {
