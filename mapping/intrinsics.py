@@ -177,7 +177,7 @@ def notes_on(origins: Mapping[str, CameraOrigin], photos: Mapping[str, Sequence[
 _WHY: Mapping[Reason, str] = {
     "implausible": "refinement gave a camera that no lens has",
     "undetermined": "the photos fit other focal lengths almost as well. That is so for photos that "
-    "look straight down at flat ground, and for photos taken from one place",
+    "look straight down at flat ground, along a straight path, or from one place",
     "moved": f"refinement moved it by more than {MAX_MOVE:.0%}",
     "unsettled": "as often as the focal length of some cameras was kept, refinement moved others "
     "too far",
@@ -186,7 +186,7 @@ _CALIBRATE = "give a calibration in sensors.txt of the dataset"
 _ADVICE: Mapping[Reason, str] = {
     "implausible": f"If these photos matter, {_CALIBRATE}",
     "undetermined": "Sizes and heights in the map are as good as this value. To have it refined, "
-    f"take some oblique photos too; or {_CALIBRATE}",
+    f"take some photos in other directions too, such as oblique ones; or {_CALIBRATE}",
     "moved": f"If the value is wrong, which bends the map, {_CALIBRATE}",
     "unsettled": f"If these photos matter, {_CALIBRATE}",
 }
@@ -212,7 +212,7 @@ def _note_on_estimated(
     return (
         f"nothing tells the focal length for {_count(doubted, photos)}, and {_WHY[reason]}. "
         f"{_cases(doubted)}. Sizes and heights in the map may be far off. Use photos with a focal "
-        f"length in EXIF, take some oblique photos too, or {_CALIBRATE}"
+        f"length in EXIF, take some in other directions too, such as oblique ones, or {_CALIBRATE}"
     )
 
 

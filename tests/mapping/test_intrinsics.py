@@ -259,7 +259,7 @@ def test_notes_name_cameras_values_and_what_to_do() -> None:
     photos = {"drone": ["a", "b"], "cam": ["c"], "old": ["d.jpg"], "fine": ["e"]}
     undetermined, moved, left_out = notes_on(origins, photos)
     assert "848.6 px of EXIF, 1083.7 px by the photos (+27.7%)" in undetermined
-    assert "oblique photos" in undetermined
+    assert "such as oblique ones" in undetermined
     assert "1 camera of 2 photos" in undetermined
     assert "700.0 px of the dataset, 805.0 px by the photos (+15.0%)" in moved
     assert "d.jpg" in left_out
