@@ -53,7 +53,7 @@ def photos_by_viewpoint(opened: Map, cam_from_local: Pose, depth: float) -> NDAr
     angles = np.degrees(np.arccos(cosines))
     distances = np.linalg.norm(centres - cam_from_local.inverse().translation, axis=1)
     order = np.argsort(distances / depth + angles / 45.0, kind="stable")
-    return order[angles[order] < MAX_ANGLE_DEG][:MAX_PHOTOS]
+    return np.asarray(order[angles[order] < MAX_ANGLE_DEG][:MAX_PHOTOS])
 
 
 def matched_again(
@@ -83,7 +83,8 @@ def _in_window(
     landmarks, rows = opened.observations(photo)
     pixels = project(camera, cam_from_local.apply(opened.landmarks[landmarks].astype(np.float64)))
     # NaN, behind the camera, is nowhere near.
-    near = tree.query_ball_point(np.nan_to_num(pixels, nan=-1e6), WINDOW_PX)
+    around = tree.query_ball_point(np.nan_to_num(pixels, nan=-1e6), WINDOW_PX)
+    near: list[list[int]] = np.asarray(around).tolist()  # of many points, an array of lists
     counts = np.array([len(found) for found in near], dtype=np.int64)
     keypoints = np.array([k for found in near for k in found], dtype=np.int64)
     seen = np.repeat(np.arange(len(landmarks)), counts)
@@ -114,14 +115,14 @@ def measure(
         truth = dataset.pose(record)
         if not isinstance(answer, Localized) or truth is None:
             continue
-        ((local, _),) = found.values()
+        (features,) = found.values()
         camera = answer.evidence.camera
         first = answer.cam_from_world
         start = time.perf_counter()
         cam_from_local = Pose(first.rotation, first.translation + first.rotation @ origin)
         depth = float(np.median(cam_from_local.apply(look.matches.points[inliers])[:, 2]))
-        again = matched_again(opened, local, camera, cam_from_local, depth)
-        pixels = local.keypoints[again.keypoints].astype(np.float64)
+        again = matched_again(opened, features.local, camera, cam_from_local, depth)
+        pixels = features.local.keypoints[again.keypoints].astype(np.float64)
         points = opened.landmarks[again.landmarks].astype(np.float64)
         old = {tuple(pixel) for pixel in look.matches.pixels[inliers].tolist()}
         new = np.array([tuple(pixel) not in old for pixel in pixels.tolist()], dtype=bool)

@@ -167,10 +167,12 @@ def queries(
         found: FeatureCache = {}
         photo = read_photo_file(dataset.path_of(record))
         localizer.look(photo, camera, options, found=found)
-        ((local, rgb),) = found.values()
+        (features,) = found.values()
         yield Query(
             {
-                name: descriptors[name].describe(rgb, local, opened.global_models[name])
+                name: descriptors[name].describe(
+                    features.rgb, features.local, opened.global_models[name]
+                )
                 for name in names
             },
             shared_landmarks(opened, camera, pose) >= min_shared,

@@ -195,9 +195,9 @@ def localize_batch(
     """Localize all photos of a dataset or list, or their features for a map of ready-made ones.
 
     Writes results.jsonl, one answer per line, and at the end poses.txt with lines
-    'name qw qx qy qz tx ty tz' (cam_from_world) of the localized photos. The same command takes
-    up a stopped run where it was. A photo that cannot be answered is recorded and passed over;
-    where that was the server's fault, the same command asks again.
+    'name qw qx qy qz tx ty tz' (cam_from_world) of the localized photos, where a blank in a name
+    is %20. The same command takes up a stopped run where it was. A photo that cannot be answered
+    is recorded and passed over; where that was the server's fault, the same command asks again.
 
     All modes but single fill photos without a pose of their own: their status is filled, source
     says from what, and their poses are in poses_filled.txt. poses.txt has measured poses only.

@@ -123,7 +123,7 @@ class Client:
         Args:
             query: the encoded photo (JPEG, PNG, ...), the path of the file that holds it, or
                 the features that were found in it, which need a camera.
-            map: ``id`` or ``id@version``; of several, the best answer counts; or those that
+            map: ``id`` or ``id@version``; of several, one answer counts; or those that
                 are anchored around a place, as ``Near``.
             camera: intrinsics; without them the server uses EXIF, estimates or guesses, and says
                 so.
@@ -156,7 +156,7 @@ class Client:
 
         Args:
             images: the photos, each of another camera; some may be missing.
-            map: ``id`` or ``id@version``; of several, the best answer counts; or those that
+            map: ``id`` or ``id@version``; of several, one answer counts; or those that
                 are anchored around a place, as ``Near``.
             rig: how the cameras sit, or the id of a rig that the map knows (``MapInfo.rigs``).
             options: choices for this instant.

@@ -70,12 +70,12 @@ def print_result(console: Console, result: LocalizeResult, unit: str) -> None:
         f"{camera.model} {camera.width} x {camera.height}  {_numbers(camera.params, 6)}  "
         f"({_CAMERA_SOURCES.get(result.camera.source, result.camera.source)})",
     )
-    if result.orientation.exif != 1 or result.orientation.read_as != "stored":
+    if result.orientation.exif != 1:
         print_line(
             console,
             "orientation",
             f"EXIF {result.orientation.exif}, features found in the photo as "
-            f"{result.orientation.read_as}",
+            f"{result.orientation.read_as}; camera and pose are those of the stored pixels",
         )
     print_line(
         console, "seconds", ", ".join(f"{k} {v:.3f}" for k, v in _longest_first(result.seconds))

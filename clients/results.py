@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
+from urllib.parse import quote
 
 from clients.answers import parse_pose
 from clients.running import Outcome
@@ -145,7 +147,8 @@ def copy_lines(
 def write_poses(path: Path, poses: Iterable[tuple[str, PoseEstimate]]) -> None:
     """Write ``name qw qx qy qz tx ty tz`` lines of ``cam_from_world``, every digit as received.
 
-    Names may contain blanks; the last seven fields are always the numbers.
+    Readers of this format split at blanks, so blanks in a name, and ``%``, are percent-encoded:
+    ``a b.jpg`` becomes ``a%20b.jpg``, and ``urllib.parse.unquote`` gives the name back.
     """
     write_whole(path, (_pose_line(name, pose).encode() for name, pose in poses))
 
@@ -218,7 +221,8 @@ def _fill(entry: dict[str, Any], pose: TracedPose) -> None:
 
 def _pose_line(name: str, pose: PoseEstimate) -> str:
     numbers = (repr(value) for value in (*pose.rotation_wxyz, *pose.translation))
-    return f"{name} {' '.join(numbers)}\n"
+    encoded = re.sub(r"[\s%]", lambda found: quote(found[0]), name)
+    return f"{encoded} {' '.join(numbers)}\n"
 
 
 def _write_and_sync(file: BinaryIO, parts: Iterable[bytes]) -> None:

@@ -50,8 +50,9 @@ class LocalizeOptions:
         max_error_px: largest reprojection error of an inlier, pixels.
         min_inliers: fewest inliers of an accepted pose.
         min_inlier_ratio: smallest share of inliers among the correspondences, 0 to 1.
-        read_as: ``stored``, or ``upright`` to turn the photo by its EXIF orientation before
-            features are found; the pose refers to the pixels as stored either way.
+        read_as: ``upright`` (the server's default) to turn the photo by its EXIF orientation
+            before features are found, or ``stored``; camera, keypoints and pose are those of the
+            stored pixels either way.
         extraction: the effort that goes into finding the photo's features: fast, default or
             accurate. Features that are sent are taken as they are.
         fusion: how similarities under several global descriptors become one ranking, such as
@@ -201,11 +202,14 @@ class CameraUsed:
 
 @dataclass(frozen=True, slots=True)
 class Orientation:
-    """How the pixels were read.
+    """How the photo was turned to find features.
+
+    Camera, keypoints and pose are those of the stored pixels, whatever this says.
 
     Attributes:
         exif: the photo's EXIF orientation, 1 to 8; 1 when it has none.
-        read_as: stored or upright.
+        read_as: ``upright``: by its EXIF orientation; ``stored``: not at all, or features were
+            sent.
     """
 
     exif: int

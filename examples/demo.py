@@ -31,6 +31,8 @@ ROOT = Path(".demo")
 DATASET, MAPS = ROOT / "dataset", ROOT / "maps"
 REPORT, POSES, PICTURE = ROOT / "report.json", ROOT / "poses.txt", ROOT / "picture.png"
 SERVICE_LOG = ROOT / "service.log"
+# Photos of one moment under short names, for the commands of README.md and docs/api.md.
+PHOTOS = {"left": ROOT / "photo.jpg", "right": ROOT / "right.jpg"}
 COMMANDS = Path(sys.executable).parent
 READY_WITHIN_S = 60
 # The sample's poses are exact: this is what the system promises on it.
@@ -42,6 +44,8 @@ def main() -> int:
     shutil.rmtree(ROOT, ignore_errors=True)
     ROOT.mkdir()
     run("mapping", "sample", DATASET)
+    for camera, path in PHOTOS.items():
+        shutil.copy(DATASET / "query/sensors/records_data/query" / camera / "0001.jpg", path)
     run(
         *("mapping", "build", DATASET / "mapping", "--map", "sample", "--maps-dir", MAPS),
         "--keep-colours",
@@ -162,16 +166,15 @@ def draw_cameras(axes: plt.Axes, poses: list[Pose], colour: str, label: str) -> 
 def by_hand() -> None:
     """Print what to type next."""
     query = read_dataset(DATASET / "query")
-    record = query.images[0]
-    camera = query.sensors[record.sensor_id].camera
+    camera = query.sensors[query.images[0].sensor_id].camera
     assert camera is not None
     words = [camera.model, camera.width, camera.height, *camera.params]
     say(
         "\nTry it by hand:\n"
         f"  {COMMANDS}/visloc-service --maps-dir {MAPS} &\n"
         "and open http://127.0.0.1:8000/ in a browser, or\n"
-        f"  {COMMANDS}/localize image {query.path_of(record)} --map sample \\\n"
-        f"      --camera {','.join(str(word) for word in words)}"
+        f"  {COMMANDS}/localize image {PHOTOS['left']} --map sample \\\n"
+        f"      --camera {','.join(map(str, words))}"
     )
 
 

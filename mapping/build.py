@@ -31,7 +31,7 @@ from mapping.features import (
 from mapping.known_model import landmarks_from_reconstruction, refuse_without_points
 from mapping.landmarks import MadeLandmarks
 from mapping.outputs import refuse_existing
-from mapping.pairing import PAIRINGS, write_pairs
+from mapping.pairing import PAIRINGS, POSED_PAIRINGS, write_pairs
 from mapping.photos import MappingPhoto, collect_photos
 from mapping.places import (
     is_remote,
@@ -43,6 +43,7 @@ from mapping.places import (
     work_place,
 )
 from mapping.previews import keep_photos
+from mapping.progress import one_step
 from mapping.publishing import PAIRS, publish_content
 from mapping.rgbd import DepthSettings, landmarks_from_depth, refuse_without_depth
 from mapping.sfm import (
@@ -217,8 +218,11 @@ def write_pairs_of(
     features_dir: Path | None,
     pixel_origin: PixelOrigin,
     progress: Progress,
-) -> int:
-    """Pair the photos of a posed dataset and write the pairs file; return how many pairs.
+) -> tuple[int, list[str]]:
+    """Pair the photos of a dataset and write the pairs file.
+
+    Where a pairing goes by poses, photos without a pose or a camera are left out, as a build with
+    given poses leaves them out. The other pairings take all photos.
 
     Args:
         root: kapture folder; the photos themselves need not be there.
@@ -229,6 +233,9 @@ def write_pairs_of(
         pixel_origin: what the dataset's principal points count from.
         progress: told the stage, how much is done, and how much there is.
 
+    Returns:
+        How many pairs were written, and notes on the photos that were left out.
+
     Raises:
         Conflict: ``pairs.exists``.
         InvalidInput, DatasetError: with the option or the file that is wrong.
@@ -236,14 +243,18 @@ def write_pairs_of(
     refuse_existing(output, "pairs.exists")
     _check_names("--pairs", settings.pairs, tuple(PAIRINGS))
     dataset = read_dataset(root).with_pixels_from(pixel_origin)
-    photos, _ = collect_photos(dataset, with_files=False, progress=partial(progress, "photos"))
+    photos, notes = collect_photos(
+        dataset,
+        posed=not POSED_PAIRINGS.isdisjoint(settings.pairs),
+        with_files=False,
+        progress=partial(progress, "photos"),
+    )
     described = [_read_global(dataset, name, features_dir, photos) for name in global_features]
     scene = make_scene(dataset, photos, described, settings)
-    progress("pairs", 0, 1)
-    found = find_pairs(scene, settings)
-    progress("pairs", 1, 1)
+    with one_step(progress, "pairs"):
+        found = find_pairs(scene, settings)
     write_pairs(output, scene, found)
-    return len(found)
+    return len(found), notes
 
 
 def _read_global(
@@ -421,7 +432,8 @@ def _build(
         for name in settings.global_features
         if is_ready_made(name)
     }
-    _refuse_early(settings, dataset, photos)
+    with one_step(progress, "checks"):
+        _refuse_early(settings, dataset, photos)
     find_local_features(features, photos, workers, progress)
     global_features = [
         brought[name]
@@ -572,7 +584,10 @@ def _content(
         else {},
         images=tuple(
             ImageRecord(
-                name=photo.name, camera=photo.record.sensor_id, timestamp=photo.record.timestamp
+                name=photo.name,
+                camera=photo.record.sensor_id,
+                timestamp=photo.record.timestamp,
+                turn=features.turn(photo),
             )
             for photo in placed
         ),
@@ -623,14 +638,13 @@ def _publish(
     try:
         if kept:
             keep_photos(work, incoming, kept, workers, progress)
-        progress("archive", 0, 1)
-        if made.pairs is not None:
-            write_pairs(incoming / PAIRS, *made.pairs)
-        if made.imported is not None:
-            made.imported.write(incoming)
-        folder = publish_content(store, incoming, content, settings.map_id)
-        wrote(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
-        progress("archive", 1, 1)
+        with one_step(progress, "archive"):
+            if made.pairs is not None:
+                write_pairs(incoming / PAIRS, *made.pairs)
+            if made.imported is not None:
+                made.imported.write(incoming)
+            folder = publish_content(store, incoming, content, settings.map_id)
+            wrote(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
         return folder
     finally:
         shutil.rmtree(incoming, ignore_errors=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import sys
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -71,7 +72,7 @@ from mapping.options import (
 from mapping.packing import write_packed
 from mapping.pairing import PairSettings
 from mapping.places import open_store, place_of
-from mapping.progress import StageProgress
+from mapping.progress import StageProgress, one_step
 from mapping.pruning.command import prune
 from mapping.report.command import report
 from mapping.rgbd import DepthSettings
@@ -318,7 +319,7 @@ def pairs(
     pixel_origin: PixelOriginOption = PixelOrigin.CORNER,
     maps_dir: MapsDirOption = Path("maps"),
 ) -> None:
-    """Pair the photos of a posed dataset without building, for build --pairs-file or other tools.
+    """Pair the photos of a dataset without building, for build --pairs-file or other tools.
 
     Pairs by global features that are made of the photos come with a build: pairs.txt of its map.
     """
@@ -327,7 +328,7 @@ def pairs(
     )
     known = None if covisible_in is None else open_map(map_folder(covisible_in, maps_dir))
     with StageProgress(_err, if_stopped="nothing was written") as progress:
-        count = write_pairs_of(
+        count, notes = write_pairs_of(
             dataset,
             output,
             SfmSettings(pairs=_names(pairs), pairing=pairing, covisible_in=known),
@@ -337,6 +338,8 @@ def pairs(
             progress,
         )
     _out.print(f"{count} pairs: {output}", highlight=False, soft_wrap=True)
+    for note in notes:
+        _out.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
     _out.print(f"peak memory {peak_memory_bytes() / 2**30:.2f} GiB")
 
 
@@ -435,7 +438,8 @@ def import_command(
             "import.target", "say what to make", field="--map", expected="either --map or --output"
         )
     if output is not None:
-        summary = import_dataset(format_name, path, output, photos)
+        with StageProgress(_err, if_stopped="nothing was written") as progress:
+            summary = import_dataset(format_name, path, output, photos, progress)
         print_import(_out, summary)
         method, sfm = _method_for(summary)
         options = ["--method", method]
@@ -448,7 +452,11 @@ def import_command(
         _out.print(f"next: mapping build {output} --map ID {' '.join(options)}", soft_wrap=True)
         return
     assert map_id is not None
-    with imported(format_name, path, maps_dir, map_id, photos) as (dataset, summary):
+    with ExitStack() as stack:
+        with StageProgress(_err, if_stopped="nothing was written") as progress:
+            dataset, summary = stack.enter_context(
+                imported(format_name, path, maps_dir, map_id, photos, progress)
+            )
         print_import(_out, summary)
         method, sfm = _method_for(summary)
         _build(
@@ -570,7 +578,12 @@ def export(
     maps_dir: MapsDirOption = Path("maps"),
 ) -> None:
     """Write a map for other tools: a COLMAP model, a kapture dataset, or a PLY point cloud."""
-    notes = export_map(open_map(map_folder(map_ref, maps_dir)), output, format_name)
+    opened = open_map(map_folder(map_ref, maps_dir))
+    with (
+        StageProgress(_err, if_stopped="nothing was written") as progress,
+        one_step(progress, "export"),
+    ):
+        notes = export_map(opened, output, format_name)
     _out.print(f"{format_name}: {output}", soft_wrap=True)
     for note in notes:
         _out.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
@@ -583,7 +596,12 @@ def pack(
     maps_dir: MapsDirOption = Path("maps"),
 ) -> None:
     """Write a map into one file, for localize maps push; every byte is checked first."""
-    manifest = write_packed(map_folder(map_ref, maps_dir), output)
+    folder = map_folder(map_ref, maps_dir)
+    with (
+        StageProgress(_err, if_stopped="nothing was written") as progress,
+        one_step(progress, "pack"),
+    ):
+        manifest = write_packed(folder, output)
     size = output.stat().st_size / 2**20
     _out.print(
         f"{manifest.id}@{manifest.version}: {output}, {size:.1f} MiB",
@@ -638,9 +656,13 @@ def verify(
     if isinstance(read_any_manifest(folder), SetManifest):
         verify_tiles(_out, verify_set(folder), None if is_map_folder(map_ref) else maps_dir)
         return
-    opened = verify_map(folder)
+    with (
+        StageProgress(_err, if_stopped="nothing was changed") as progress,
+        one_step(progress, "verify"),
+    ):
+        opened = verify_map(folder)
+        read_imported_points(opened)  # raises when they are damaged
     num_files = len(opened.manifest.files)
-    read_imported_points(opened)  # raises when they are damaged
     _out.print(f"{opened.ref}: {num_files} files, every byte as published", soft_wrap=True)
     name = opened.manifest.local_features.fingerprint.name
     extractor = None if is_ready_made(name) else make_local_features(name, weights_dir)

@@ -16,8 +16,6 @@ from mapping.features import Progress
 from mapping.photos import MappingPhoto
 from mapping.stages import Item, WorkFolder, key_of
 from visloc.archive import Landmarks
-from visloc.errors import DatasetError
-from visloc.images import read_photo_file
 
 # Raised when the code of the stage changes what comes out.
 _REVISION = 1
@@ -44,8 +42,7 @@ def landmark_colours(
         progress: told how far it is.
 
     Raises:
-        DatasetError: ``dataset.photo_size``.
-        VislocError: what ``read_photo_file`` raises.
+        VislocError: what ``MappingPhoto.read`` raises.
     """
     bounds = list(pairwise(landmarks.offsets.tolist()))
     items = [
@@ -85,21 +82,9 @@ def _sample(work: WorkFolder, item: _Item) -> None:
 
 def _pixels(item: _Item) -> Item:
     """The pixels (m, 3) that the keypoints lie in."""
-    photo, camera = item.photo, item.photo.camera
-    rgb = read_photo_file(photo.path).rgb
-    height, width = rgb.shape[:2]
-    # Features found here have shown it before, ready-made ones have not.
-    if (width, height) != (camera.width, camera.height):
-        raise DatasetError(
-            "dataset.photo_size",
-            "the photo is not of the size of its camera",
-            field=str(photo.path),
-            expected=f"{camera.width} x {camera.height} as sensors.txt has it for "
-            f"{photo.record.sensor_id}",
-            got=f"{width} x {height}",
-        )
+    photo = item.photo.read()
     # Coordinates count from the corner of the first pixel. Those of other tools may lie on the far
     # edge or a little beyond.
-    last = np.array([width - 1, height - 1])
+    last = np.array([photo.width - 1, photo.height - 1])
     x, y = np.clip(np.floor(item.keypoints), 0, last).astype(np.int64).T
-    return {"rgb": rgb[y, x]}
+    return {"rgb": photo.rgb[y, x]}

@@ -50,6 +50,20 @@ class Executor(Protocol):
         """
         ...
 
+    def run_one(
+        self,
+        task: Callable[[T, Callable[[int, int], None]], object],
+        item: T,
+        progress: Callable[[int, int], None],
+    ) -> None:
+        """Do one long task; it tells the progress itself where it is done in this process.
+
+        Raises:
+            Unavailable: ``build.worker_died``.
+            Exception: what the task raised.
+        """
+        ...
+
 
 def open_executor(name: str, workers: int, ray_address: str) -> AbstractContextManager[Executor]:
     """Return an executor, which ends with its ``with`` block.

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mapping.photos import read_in_frame
 from visloc.archive import FingerprintRecord, Map
 from visloc.errors import Conflict
 from visloc.features import make_global_descriptor, make_local_features
-from visloc.images import read_photo_file
 from visloc.kapture import (
     Dataset,
     read_dataset,
@@ -20,7 +20,8 @@ from visloc.kapture import (
     write_global_features,
     write_local_features,
 )
-from visloc.types import Inference
+from visloc.photo_features import extract_features
+from visloc.types import Inference, ReadAs
 
 
 def export_features(
@@ -85,6 +86,7 @@ def export_features(
         "local_features": FingerprintRecord.of(extractor.fingerprint).model_dump(),
         "computed_with": extractor.computed_with,
         "max_keypoints": max_keypoints,
+        "read_as": ReadAs.UPRIGHT,
         "global_from": global_from and global_from.manifest.content_hash,
     }
     _claim(reconstruction / f"{local_features}.json", settings)
@@ -98,8 +100,10 @@ def export_features(
         for name in descriptors:
             last_written.append(reconstruction / "global_features" / name / f"{record.path}.gfeat")
         if not all(path.is_file() for path in last_written):
-            rgb = read_photo_file(dataset.path_of(record)).rgb
-            local = extractor.extract(rgb, max_keypoints=max_keypoints)
+            size = dataset.sensors[record.sensor_id].image_size
+            assert size is not None  # every sensor of a photo has one
+            photo = read_in_frame(dataset.path_of(record), size, record.sensor_id)
+            local, rgb = extract_features(photo, extractor, max_keypoints=max_keypoints)
             for name, (descriptor, model) in descriptors.items():
                 vector = descriptor.describe(rgb, local, model)
                 write_global_features(output, name, record.path, vector, name=name)

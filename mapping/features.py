@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mapping.executors import Executor
 from mapping.photos import MappingPhoto
+from mapping.progress import one_step
 from mapping.stages import Item, WorkFolder, key_of
 from visloc.archive import FingerprintRecord, GlobalFeatures, Map
 from visloc.errors import DatasetError, InvalidInput, Unavailable
@@ -33,8 +34,9 @@ from visloc.features.readymade import (
     to_local_features,
 )
 from visloc.geometry import PixelOrigin
-from visloc.images import read_photo_file
+from visloc.images import turn_of, upright
 from visloc.kapture import FeatureSet, open_local_features, read_local
+from visloc.photo_features import extract_features
 from visloc.types import Fingerprint, Inference, LocalFeatures
 
 T = TypeVar("T")
@@ -54,10 +56,12 @@ _NO_FEATURES = LocalFeatures(
     scores=np.empty(0, np.float32),
     scales=np.empty(0, np.float32),
 )
+# Name of an array beside those of the local features of a photo.
+_TURN = "turn"
 # Raised when the code of a stage here changes what comes out.
 _REVISION = {
-    **{"local_features": 1, "words": 1, "vocabulary": 1, "pooled": 1, "projection": 1},
-    **{"model": 1, "described": 1},
+    **{"local_features": 2, "words": 2, "vocabulary": 1, "pooled": 2, "projection": 1},
+    **{"model": 1, "described": 2},
 }
 
 
@@ -88,6 +92,9 @@ class LocalFeaturesSource(Protocol):
 
     def read(self, photo: MappingPhoto) -> LocalFeatures:
         """Return the features of a photo, found now if need be."""
+
+    def turn(self, photo: MappingPhoto) -> int:
+        """EXIF orientation by which the photo was turned before its features were found."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,24 +144,24 @@ class ExtractedFeatures:
         """Return the features of a photo, found now if need be.
 
         Raises:
-            DatasetError: ``dataset.photo_size``, and what ``read_photo_file`` raises.
+            VislocError: what ``MappingPhoto.read`` raises.
         """
-        return LocalFeatures(**self.work.get(self.key(photo), partial(self._extract, photo)))
+        item = self._get(photo)
+        return LocalFeatures(**{name: item[name] for name in item if name != _TURN})
+
+    def turn(self, photo: MappingPhoto) -> int:
+        """EXIF orientation by which the photo was turned before its features were found."""
+        return int(self._get(photo)[_TURN])
+
+    def _get(self, photo: MappingPhoto) -> Item:
+        return self.work.get(self.key(photo), partial(self._extract, photo))
 
     def _extract(self, photo: MappingPhoto) -> Item:
-        pixels = read_photo_file(photo.path)
-        if (pixels.width, pixels.height) != (photo.camera.width, photo.camera.height):
-            raise DatasetError(
-                "dataset.photo_size",
-                "the photo is not of the size of its camera",
-                field=str(photo.path),
-                expected=f"{photo.camera.width} x {photo.camera.height} as sensors.txt has "
-                f"it for {photo.record.sensor_id}",
-                got=f"{pixels.width} x {pixels.height}",
-            )
         extractor = open_extractor(self.name, self.weights_dir, self.inference)
         _refuse_other_computing(self.name, self.computed_with, extractor.computed_with)
-        return asdict(extractor.extract(pixels.rgb, max_keypoints=self.max_keypoints))
+        pixels = photo.read()
+        local, _ = extract_features(pixels, extractor, max_keypoints=self.max_keypoints)
+        return asdict(local) | {_TURN: np.array(turn_of(pixels.exif_orientation))}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,6 +234,10 @@ class ReadyMadeFeatures:
         rows = read_local(self.keypoints, self.descriptors, photo.name, size, self.origin)
         with _errors_in(self.descriptors, photo):
             return to_local_features(*rows)
+
+    def turn(self, _photo: MappingPhoto) -> int:
+        """Unknown; they are taken as found in the pixels as stored."""
+        return 1
 
 
 @cache
@@ -331,26 +342,29 @@ def describe_photos(
         workers.run(task.find_words, learned_from, partial(progress, f"{name} words"))
         word_keys = [task.words_key(photo) for photo in learned_from]
         vocabulary_key = _key("vocabulary", fingerprint=task.fingerprint, words=word_keys)
-        vocabulary = work.get(
-            vocabulary_key,
-            lambda: descriptor.learn_vocabulary(
-                np.concatenate(read_all("words", word_keys)), seed=0
-            ),
-        )
+        with one_step(progress, f"{name} vocabulary"):
+            vocabulary = work.get(
+                vocabulary_key,
+                lambda: descriptor.learn_vocabulary(
+                    np.concatenate(read_all("words", word_keys)), seed=0
+                ),
+            )
     workers.run(partial(task.pool, vocabulary_key), photos, partial(progress, name))
     pooled_keys = [task.pooled_key(vocabulary_key, photo) for photo in photos]
     taught_by = _evenly(pooled_keys, _PROJECTION_PHOTOS)
-    projection = work.get(
-        _key("projection", pooled=taught_by),
-        lambda: descriptor.learn_projection(np.stack(read_all("pooled", taught_by))),
-    )
-    model = {**vocabulary, **projection}
-    blocks = [
-        descriptor.project(
-            np.stack(read_all("pooled", pooled_keys[first : first + _PROJECTED_TOGETHER])), model
+    with one_step(progress, f"{name} projection"):
+        projection = work.get(
+            _key("projection", pooled=taught_by),
+            lambda: descriptor.learn_projection(np.stack(read_all("pooled", taught_by))),
         )
-        for first in range(0, len(photos), _PROJECTED_TOGETHER)
-    ]
+        model = {**vocabulary, **projection}
+        blocks = [
+            descriptor.project(
+                np.stack(read_all("pooled", pooled_keys[first : first + _PROJECTED_TOGETHER])),
+                model,
+            )
+            for first in range(0, len(photos), _PROJECTED_TOGETHER)
+        ]
     return GlobalFeatures(
         FingerprintRecord.of(descriptor.fingerprint), np.concatenate(blocks), model
     )
@@ -494,12 +508,18 @@ class _DescribeTask:
             "fingerprint": self.fingerprint,
             "computed_with": self.computed_with,
             "photo": photo.sha256 if self.needs_image else None,
+            "size": [photo.camera.width, photo.camera.height] if self.needs_image else None,
             "local": self.features.key(photo) if self.needs_local_features else None,
         }
 
     def _read(self, photo: MappingPhoto) -> tuple[NDArray[np.uint8], LocalFeatures]:
-        rgb = read_photo_file(photo.path).rgb if self.needs_image else _NO_PIXELS
+        rgb = _upright_pixels(photo) if self.needs_image else _NO_PIXELS
         return rgb, self.features.read(photo) if self.needs_local_features else _NO_FEATURES
+
+
+def _upright_pixels(photo: MappingPhoto) -> NDArray[np.uint8]:
+    pixels = photo.read()
+    return upright(pixels.rgb, turn_of(pixels.exif_orientation))
 
 
 def _refuse_other_computing(name: str, expected: str | None, here: str | None) -> None:

@@ -3,7 +3,7 @@
 Where the focal length of a camera comes from EXIF or a calibration, that is a prior: bundle
 adjustment may correct it, not replace it. ``mapping.triangulation`` judges every camera that it
 refined by the rules here, and holds the ones in doubt at their prior
-(docs/decisions/0023-focal-lengths-have-priors.md).
+(docs/decisions/0024-focal-lengths-have-priors.md).
 """
 
 from __future__ import annotations

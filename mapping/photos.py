@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mapping.depth import DepthMatch, DepthMatcher
 from visloc.archive import sha256_of
 from visloc.errors import DatasetError
 from visloc.geometry import Camera, Pose
+from visloc.images import Photo, read_photo_file, upright
 from visloc.kapture import Dataset, FileRecord
 from visloc.query_camera import GUESSED_FOCAL
 
@@ -48,6 +49,42 @@ class MappingPhoto:
         """``cam_from_world`` of a photo that was collected with poses."""
         assert self.cam_from_world is not None
         return self.cam_from_world
+
+    def read(self) -> Photo:
+        """Decode the file in the frame of its camera, as ``read_in_frame``."""
+        size = self.camera.width, self.camera.height
+        return read_in_frame(self.path, size, self.record.sensor_id)
+
+
+def read_in_frame(path: Path, size: tuple[int, int], sensor_id: str) -> Photo:
+    """Decode a photo of a dataset in the frame of its camera: the pixels as stored.
+
+    If the camera has the size of the upright picture instead (width and height swapped, EXIF
+    orientation 5 to 8), whatever made the dataset turned the pixels when it read them. Camera,
+    pose and depth map are then those of the upright picture, and so is what this returns.
+
+    Args:
+        path: the file.
+        size: width and height of the camera, pixels.
+        sensor_id: of the camera, for the error.
+
+    Raises:
+        DatasetError: ``dataset.photo_size``.
+        VislocError: what ``read_photo_file`` raises.
+    """
+    photo = read_photo_file(path)
+    stored = photo.width, photo.height
+    if stored == size:
+        return photo
+    if photo.is_on_its_side and stored[::-1] == size:
+        return replace(photo, rgb=upright(photo.rgb, photo.exif_orientation), exif_orientation=1)
+    raise DatasetError(
+        "dataset.photo_size",
+        "the photo is not of the size of its camera",
+        field=str(path),
+        expected=f"{size[0]} x {size[1]} as sensors.txt has it for {sensor_id}",
+        got=f"{stored[0]} x {stored[1]}",
+    )
 
 
 def collect_photos(

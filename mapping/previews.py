@@ -13,7 +13,6 @@ from mapping.features import Progress
 from mapping.photos import MappingPhoto
 from mapping.stages import Item, WorkFolder, key_of
 from visloc.archive.schema import MAX_PHOTO_SIDE, photo_file
-from visloc.images import read_photo_file
 
 _JPEG_QUALITY = 80
 # Raised when the code here changes what comes out.
@@ -29,10 +28,11 @@ def keep_photos(
 ) -> None:
     """Write small JPEGs of the photos, in this order, into the folder of a map.
 
-    They hold the pixels as stored and nothing else: no EXIF, no place, no time.
+    They hold pixels in the frame of the photo's camera and nothing else: no EXIF, no place, no
+    time.
 
     Raises:
-        VislocError: what ``read_photo_file`` raises.
+        VislocError: what ``MappingPhoto.read`` raises.
     """
     workers.run(partial(_keep, work), photos, partial(progress, "small photos"))
     for row, photo in enumerate(photos):
@@ -42,7 +42,8 @@ def keep_photos(
 
 
 def _key(photo: MappingPhoto) -> str:
-    return key_of("small_photos", _REVISION, photo=photo.sha256)
+    size = [photo.camera.width, photo.camera.height]
+    return key_of("small_photos", _REVISION, photo=photo.sha256, size=size)
 
 
 def _keep(work: WorkFolder, photo: MappingPhoto) -> None:
@@ -50,7 +51,7 @@ def _keep(work: WorkFolder, photo: MappingPhoto) -> None:
 
 
 def _small(photo: MappingPhoto) -> Item:
-    rgb = read_photo_file(photo.path).rgb
+    rgb = photo.read().rgb
     height, width = rgb.shape[:2]
     scale = min(1.0, MAX_PHOTO_SIDE / max(width, height))
     size = max(1, round(width * scale)), max(1, round(height * scale))

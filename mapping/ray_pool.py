@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import islice
 from types import TracebackType
 from typing import Any, TypeVar
@@ -117,6 +118,24 @@ class RayPool:
             for one in running:
                 ray.cancel(one, force=True)  # results appear whole or not at all
             raise
+
+    def run_one(
+        self,
+        task: Callable[[T, Callable[[int, int], None]], object],
+        item: T,
+        progress: Callable[[int, int], None],
+    ) -> None:
+        """Do one long task on the cluster, of which only the begin and the end are told.
+
+        Raises:
+            Unavailable: as ``run``.
+            Exception: what the task raised.
+        """
+        self.run(partial(_do_one, task), [item], progress)
+
+
+def _do_one(task: Callable[[T, Callable[[int, int], None]], object], item: T) -> None:
+    task(item, lambda _done, _total: None)  # progress does not travel from machine to machine
 
 
 def _reason(error: BaseException) -> str:

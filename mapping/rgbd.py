@@ -1,6 +1,6 @@
 """Landmarks from depth: keypoints lifted to 3D and merged across photos in a voxel grid.
 
-The mapping strategy for RGB-D data of Humenberger et al. 2020 (section 4.3), with a sub-pixel
+The mapping strategy for RGB-D data of Humenberger et al. 2020, with a sub-pixel
 depth lookup, and with landmarks at the mean of what fell into their cell instead of at the first
 point.
 """

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.editing import moved_anchor
+from mapping.progress import one_step
 from mapping.publishing import new_version
 from visloc.archive import (
     Anchor,
@@ -119,13 +120,15 @@ def publish_set(
     folders = [store.folder(ref) for ref, _ in tiles]
     _refuse_twice(folders)
     placed = []
+    progress("tiles", 0, len(tiles))
     for number, (folder, (_, set_from_tile)) in enumerate(zip(folders, tiles, strict=True), 1):
         placed.append(_placed(open_published(folder), set_from_tile))
         refuse_other_features(placed[-1].record.ref, placed[-1].features, placed[0].features)
         progress("tiles", number, len(tiles))
     world = _world(placed)
     if model is None:
-        model = learn(lambda tile: open_published(folders[tile]), len(folders))
+        with one_step(progress, "coarse model"):
+            model = learn(lambda tile: open_published(folders[tile]), len(folders))
     content = SetContent(
         world=world,
         local_features=placed[0].features,
@@ -183,6 +186,7 @@ def same_content(a: Path, b: Path) -> bool:
 def _described(
     folders: Sequence[Path], model: CoarseModel, progress: Progress
 ) -> Iterator[DescribedTile]:
+    progress("coarse index", 0, len(folders))
     for number, folder in enumerate(folders, 1):
         yield describe(open_published(folder), model)
         progress("coarse index", number, len(folders))

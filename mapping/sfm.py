@@ -1,12 +1,12 @@
 """Landmarks from matches: pairs, matches, verification, triangulation.
 
-The mapping strategy for posed photos without depth of Humenberger et al. 2020 (section 4.2); with
+The mapping strategy for posed photos without depth of Humenberger et al. 2020; with
 estimated poses also for photos without poses.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,7 @@ from mapping.landmarks import MadeLandmarks, Observations, View, assemble_landma
 from mapping.matching import Matches, Verification, camera_values, match_pairs, pose_values
 from mapping.pairing import Pairs, PairSettings, Scene, pair_photos, read_pairs
 from mapping.photos import MappingPhoto
+from mapping.progress import one_step
 from mapping.stages import Item, WorkFolder, key_of
 from mapping.triangulation import (
     MAPPER_CONFIGS,
@@ -84,9 +85,8 @@ def landmarks_from_matches(
     """
     config = MAPPER_CONFIGS[settings.mapper]
     scene = make_scene(dataset, photos, global_features, settings)
-    progress("pairs", 0, 1)
-    pairs = find_pairs(scene, settings)
-    progress("pairs", 1, 1)
+    with one_step(progress, "pairs"):
+        pairs = find_pairs(scene, settings)
     verification = Verification(
         max_error_px=config.filter_max_reproj_error,
         min_matches=config.min_num_matches,
@@ -108,7 +108,8 @@ def landmarks_from_matches(
         settings.estimate_poses,
     )
     key = _model_key(matches_key, photos, dataset, config, settings)
-    workers.run(task.make, [key], partial(progress, "triangulation"))
+    stage = "incremental mapping" if settings.estimate_poses else "triangulation"
+    workers.run_one(task.make, key, partial(progress, stage))
     model = _from_item(work.read(key), photos)
     placed = np.array([row for row, view in enumerate(model.views) if view is not None])
     views = [view for view in model.views if view is not None]
@@ -261,16 +262,18 @@ class _ModelTask:
     refine: tuple[str, ...]
     estimate_poses: bool
 
-    def make(self, key: str) -> None:
+    def make(self, key: str, progress: Callable[[int, int], None]) -> None:
         def compute() -> Item:
-            make = reconstruct if self.estimate_poses else triangulate
             given = [self._given(photo) for photo in self.photos]
-            model = make(
-                given, self.rigs, self.matches, self.config, self.refine, self.work.scratch
-            )
-            return _to_item(model)
+            inputs = given, self.rigs, self.matches, self.config, self.refine, self.work.scratch
+            if self.estimate_poses:
+                return _to_item(reconstruct(*inputs, progress))
+            return _to_item(triangulate(*inputs))
 
+        total = len(self.photos) if self.estimate_poses else 1
+        progress(0, total)
         self.work.get(key, compute)
+        progress(total, total)
 
     def _given(self, photo: MappingPhoto) -> SfmPhoto:
         return SfmPhoto(

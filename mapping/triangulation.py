@@ -180,12 +180,14 @@ def reconstruct(
     config: MapperConfig,
     refine: Sequence[str],
     work: Path,
+    progress: Callable[[int, int], None],
 ) -> SparseModel:
     """Find poses and points by incremental mapping; the frame and the unit of it are arbitrary.
 
     Known intrinsics stay as they are unless ``refine`` names them, and those in doubt
     (``SparseModel.doubts``) all the same. Of several models that do not connect the largest is
-    taken.
+    taken. ``progress`` is told how many photos were placed, of the model that is being made, and of
+    how many.
 
     Raises:
         InvalidInput: ``sfm.no_model``, ``sfm.camera``, ``sfm.no_points``.
@@ -193,6 +195,19 @@ def reconstruct(
     with _database(photos, rigs, matches, work) as (path, scene):
         known = {photo.sensor for photo in photos if photo.camera_known}
         constant = set() if "intrinsics" in refine else known
+
+        placed = 0
+
+        def first_pair() -> None:
+            nonlocal placed
+            placed = 2
+            progress(placed, len(photos))
+
+        def one_more() -> None:
+            nonlocal placed
+            # Not yet all: what follows the last photo takes long too.
+            placed = min(placed + 1, len(photos) - 1)
+            progress(placed, len(photos))
 
         def solve(doubts: Mapping[str, Doubt]) -> pycolmap.Reconstruction:
             left_out = doubts.keys() - known
@@ -204,7 +219,13 @@ def reconstruct(
 
             def run(token: pycolmap.CancellationToken) -> dict[int, pycolmap.Reconstruction]:
                 return pycolmap.incremental_mapping(
-                    path, path.parent, path.parent, options=options, cancellation_token=token
+                    path,
+                    path.parent,
+                    path.parent,
+                    options=options,
+                    initial_image_pair_callback=first_pair,
+                    next_image_callback=one_more,
+                    cancellation_token=token,
                 )
 
             # No names would mean all photos.

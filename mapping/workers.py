@@ -42,7 +42,8 @@ class Workers:
     """Does work in ``count`` processes, which end with the ``with`` block; one means this process.
 
     A single item is done in this process as well: Ctrl-C ends it at once, where it would wait for
-    another one. Every process uses one thread, so that their number does not change what comes out.
+    another one, and it can tell how far it is. Every process uses one thread, so that their number
+    does not change what comes out.
     Where a task of this process is the first to load torch, it uses all: for products of whole
     numbers, which are the same with any number of threads.
     """
@@ -106,6 +107,16 @@ class Workers:
                 "finished work is kept, the same command resumes",
                 field="--workers",
             ) from error
+
+    def run_one(
+        self,
+        task: Callable[[T, Callable[[int, int], None]], object],
+        item: T,
+        progress: Callable[[int, int], None],
+    ) -> None:
+        """Do one long task in this process; it tells the progress itself."""
+        with one_thread_here():
+            task(item, progress)
 
 
 def in_batches(items: Sequence[T]) -> list[Sequence[T]]:

@@ -10,7 +10,9 @@ import sys
 from multiprocessing import forkserver, get_context
 from typing import TYPE_CHECKING
 
+from service.descriptors import fit_connections
 from service.logs import configure_logging
+from service.memory import give_back_memory
 from service.settings import ServiceSettings, SettingsError, read_settings
 
 if TYPE_CHECKING:
@@ -29,12 +31,18 @@ def main() -> None:
     except SettingsError as error:
         sys.exit(f"visloc-service: {error}")
     configure_logging(settings)
+    try:
+        settings = fit_connections(settings)
+    except SettingsError as error:
+        sys.exit(f"visloc-service: {error}")
     # What libraries read once, when they are loaded: hence the late import below.
     os.environ.setdefault("OMP_NUM_THREADS", str(settings.threads_per_worker))
     # What takes long is computed by torch and OpenVINO. OpenBLAS's threads would wait for each
     # other at full speed, on the cores that those need.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(settings.max_image_pixels))
+    # Of a JPEG within a TIFF, as visloc.images allows the largest JPEG.
+    os.environ.setdefault("LIBTIFF_JPEG_MAX_ALLOWED_SCAN_NUMBER", "20")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # damaged photos are answered, not logged
     # The fork server loads the same libraries as this process, at the same time.
     context = get_context("forkserver")
@@ -61,6 +69,7 @@ async def _serve(settings: ServiceSettings) -> None:
     # The doors open first, so that /readyz can be asked while the maps are loaded.
     await server.open()
     loading = asyncio.create_task(_load(server))
+    tidying = asyncio.create_task(give_back_memory())
     await asyncio.wait({loading, stopping}, return_when=asyncio.FIRST_COMPLETED)
     if loading.done():
         loading.result()
@@ -72,6 +81,7 @@ async def _serve(settings: ServiceSettings) -> None:
         await stopping
     logger.info("stopping")
     loading.cancel()
+    tidying.cancel()
     await asyncio.wait({loading})
     await server.close(settings.drain_timeout_s)
 

@@ -12,6 +12,7 @@ from time import monotonic
 
 from service.key_file import Key, Scope
 from service.key_ring import KeyRing
+from service.logs import note_key
 from service.settings import ServiceSettings, SettingsError
 from visloc.errors import Forbidden, InvalidInput, Overloaded, Unauthenticated
 from visloc_api.v1 import localization_pb2 as pb2
@@ -153,7 +154,7 @@ class Access:
                 )
 
     def key_of(self, tokens: Collection[str], needed: Needed) -> Key | None:
-        """Return the key of a request; None when none is needed.
+        """Return the key of a request, which the log names; None when none is needed.
 
         Args:
             tokens: what was sent as keys.
@@ -180,6 +181,7 @@ class Access:
                 field="Authorization",
                 expected="one key, as the server's operator gave it",
             )
+        note_key(key.name)
         if not needed <= key.scopes:
             raise Forbidden(
                 "access.scope",

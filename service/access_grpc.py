@@ -14,7 +14,7 @@ from service.access_http import tokens_of
 from service.grpc_calls import Handler, behaviour_of, handler_like
 from service.grpc_envelope import Context, Envelope
 from service.key_file import Key
-from service.logs import UNMATCHED, note_key
+from service.logs import UNMATCHED
 from visloc.errors import Overloaded, TimedOut, VislocError
 
 # How long a call may stay open that needs no key (health). Its watchers ask again.
@@ -60,7 +60,6 @@ class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
             return self._few(handler, method)
         if key is None or handler is None:
             return handler  # type: ignore[return-value]  # None: gRPC says that there is none
-        note_key(key.name)
         return self._counted(handler, key, method)
 
     def _few(self, handler: Handler, method: str) -> Handler:

@@ -14,7 +14,6 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.access import Access, needed_over_http
 from service.key_file import Key
-from service.logs import note_key
 from service.observation import Observer
 from service.responses import problem_response
 from visloc.errors import VislocError
@@ -68,8 +67,6 @@ class AccessControl:
                 tokens = tokens_of(headers.getlist("authorization"), headers.getlist("x-api-key"))
                 needed = needed_over_http(scope["method"], scope["path"], page=self._page)
                 key = self._access.key_of(tokens, needed)
-                if key is not None:
-                    note_key(key.name)
                 stack.enter_context(self._access.place(key))
             except VislocError as error:
                 self._observer.error(error)

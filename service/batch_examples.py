@@ -66,7 +66,7 @@ RIG: dict[str, Any] = {
             },
             "orientation": {
                 "exif": 1,
-                "read_as": "stored",
+                "read_as": "upright",
             },
         },
         {
@@ -106,7 +106,7 @@ RIG: dict[str, Any] = {
             },
             "orientation": {
                 "exif": 1,
-                "read_as": "stored",
+                "read_as": "upright",
             },
         },
     ],
@@ -196,7 +196,7 @@ SEQUENCE: dict[str, Any] = {
                     },
                     "orientation": {
                         "exif": 1,
-                        "read_as": "stored",
+                        "read_as": "upright",
                     },
                 },
             ],

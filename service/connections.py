@@ -5,16 +5,19 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
 from contextlib import aclosing, asynccontextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import grpc
 import h11
+from google.protobuf.message import DecodeError
 from starlette.requests import Request
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from service.acceptor import Connection, OpenConnections
 from service.grpc_calls import Handler, behaviour_of, handler_like
+from service.grpc_connections import GrpcConnections
 from service.grpc_envelope import Context, Envelope
-from visloc.errors import Overloaded, TimedOut, TooLarge
+from visloc.errors import InvalidInput, Overloaded, TimedOut, TooLarge
 
 # Calls whose only message may be large.
 _LARGE_MESSAGES = ("Localize", "LocalizeRig")
@@ -22,7 +25,7 @@ _LARGE_MESSAGES = ("Localize", "LocalizeRig")
 SLOWEST_BYTES_PER_S = 100_000
 
 
-def http_protocol(grace_s: float) -> type[H11Protocol]:
+def http_protocol(grace_s: float, connections: OpenConnections) -> type[H11Protocol]:
     """Return uvicorn's HTTP/1.1, for connections on which somebody is at work.
 
     A connection is closed when the head of a request is not there after ``grace_s`` seconds;
@@ -31,7 +34,7 @@ def http_protocol(grace_s: float) -> type[H11Protocol]:
     that is wanted is ``Arrivals``' business, idle connections are uvicorn's.
     """
 
-    class TimelyProtocol(H11Protocol):
+    class TimelyProtocol(H11Protocol, Connection):
         _arriving: asyncio.TimerHandle | None = None
         _leaving: asyncio.TimerHandle | None = None
 
@@ -49,9 +52,22 @@ def http_protocol(grace_s: float) -> type[H11Protocol]:
 
         def connection_lost(self, exc: Exception | None) -> None:
             super().connection_lost(exc)
+            connections.remove(self)
             for timer in (self._arriving, self._leaving):
                 if timer is not None:
                     timer.cancel()
+
+        @property
+        def is_sending(self) -> bool:
+            transport: asyncio.Transport | None = self.transport
+            return transport is not None and transport.get_write_buffer_size() > 0
+
+        def abandon(self) -> None:
+            transport: asyncio.Transport | None = self.transport
+            if transport is not None:
+                transport.abort()
+            elif self.opening is not None:
+                self.opening.cancel()
 
         def pause_writing(self) -> None:
             super().pause_writing()
@@ -66,6 +82,8 @@ def http_protocol(grace_s: float) -> type[H11Protocol]:
 
         def _watch(self, *, first: bool = False) -> None:
             """Start the clock when it is the client's turn; what it sends does not set it back."""
+            in_use = self.cycle is not None and not self.cycle.response_complete
+            connections.note(self, in_use=in_use)
             state = self.conn.their_state
             has_part_of_head = state is h11.IDLE and (first or bool(self.conn.trailing_data[0]))
             is_unwanted = state is h11.SEND_BODY and self.conn.our_state is h11.DONE
@@ -109,7 +127,7 @@ class Arrivals:
             ClientDisconnect: when the client hung up.
         """
         declared = request.headers.get("content-length", "")
-        size = int(declared) if declared.isdecimal() and len(declared) < 20 else 0
+        size = int(declared[:20]) if declared.isdecimal() else 0  # HTTP's parser allows 20 digits
         if size > limit:
             raise _too_large(limit, f"{size} bytes")
         body = bytearray()
@@ -158,17 +176,25 @@ def arrivals_of(request: Request) -> Arrivals:
 
 
 class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
-    """Ends calls over gRPC whose messages do not come.
+    """Ends calls over gRPC whose messages do not come, or are no messages.
 
     Args:
         envelope: answers calls that end so before they have begun.
+        connections: are told which of them have calls.
         grace_s: longest silence within a stream.
         max_message_bytes: of one message. How much of it is there cannot be seen, so that each
             has the time of the largest: ``grace_s``, and a second for every 100 kB.
     """
 
-    def __init__(self, envelope: Envelope, grace_s: float, max_message_bytes: int) -> None:
+    def __init__(
+        self,
+        envelope: Envelope,
+        connections: GrpcConnections,
+        grace_s: float,
+        max_message_bytes: int,
+    ) -> None:
         self._envelope = envelope
+        self._connections = connections
         self._patience_s = grace_s + max_message_bytes / SLOWEST_BYTES_PER_S
         self._silence_s = grace_s
 
@@ -186,12 +212,29 @@ class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         patience_s = self._patience_s if name in _LARGE_MESSAGES else self._silence_s
 
         async def serve(messages: AsyncIterator[Any], context: Context) -> Any:
-            try:
-                return await behaviour(_timely(messages, patience_s), context)
-            except TimedOut as error:  # before the method's own envelope
-                await self._envelope.refuse(name, error, context)
+            with self._connections.in_use(context.peer()):
+                try:
+                    return await behaviour(_timely(messages, patience_s), context)
+                except (TimedOut, InvalidInput) as error:  # before the method's own envelope
+                    await self._envelope.refuse(name, error, context)
 
-        return handler_like(handler, serve)
+        return handler_like(handler, serve, _readable_or_not(handler.request_deserializer))
+
+
+class _Unreadable(NamedTuple):
+    """Stands for a message that could not be parsed; gRPC would end the call as its own error."""
+
+    reason: str
+
+
+def _readable_or_not(parse: Callable[[bytes], Any] | None) -> Callable[[bytes], Any]:
+    def parsed(message: bytes) -> Any:
+        try:
+            return message if parse is None else parse(message)
+        except DecodeError as error:
+            return _Unreadable(str(error))
+
+    return parsed
 
 
 async def _timely(messages: AsyncIterator[Any], patience_s: float) -> AsyncGenerator[Any]:
@@ -203,6 +246,13 @@ async def _timely(messages: AsyncIterator[Any], patience_s: float) -> AsyncGener
             raise _too_slow(patience_s, "no message in that time") from None
         if message is None:
             return
+        if isinstance(message, _Unreadable):
+            raise InvalidInput(
+                "request.malformed",
+                "the message is not what the method takes",
+                expected="a protobuf message as in localization.proto",
+                got=message.reason,
+            )
         yield message
 
 

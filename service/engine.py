@@ -27,6 +27,7 @@ from service.jobs import (
     RigJob,
     SequenceStart,
 )
+from service.judging import judged
 from service.listing import ServedMap
 from service.metrics import Metrics
 from service.scenes import Scenes
@@ -44,7 +45,6 @@ from visloc.errors import (
     VislocError,
 )
 from visloc.priors import NO_PRIORS
-from visloc.types import Localized
 
 logger = logging.getLogger(__name__)
 
@@ -196,13 +196,7 @@ class Engine:
                 found = [self._sets.localize(job, of) for of in sets]
                 if alone:
                     found.append(self.workers.run(worker.localize, job, alone, time()))
-                return max(
-                    await answers_of(found),
-                    key=lambda one: (
-                        isinstance(one.answer, Localized),
-                        one.answer.evidence.num_inliers,
-                    ),
-                )
+                return judged(await answers_of(found), job.priors)[1]
         finally:
             self._photos -= 1
 
@@ -251,10 +245,7 @@ class Engine:
             found = [self._sets.localize_rig(job, of) for of in sets]
             if alone:
                 found.append(solve_rig(self.workers, job, alone))
-            return max(
-                await answers_of(found),
-                key=lambda one: (one.answer.pose is not None, one.answer.num_inliers),
-            )
+            return judged(await answers_of(found), job.priors)[1]
 
     async def localize_sequence(
         self, start: SequenceStart, instants: AsyncIterator[Instant] | Sequence[Instant]
@@ -264,7 +255,8 @@ class Engine:
         The next instant is taken when the answers to those before have been taken; those that
         are all there are checked before any work; in a set of maps, only their order and the names
         of tiles are. The caller holds a place (``admit_batch``).
-        With several maps, nothing is answered until an instant is localized: its map is kept.
+        With several maps, nothing is answered until one map alone explains an instant: that map is
+        kept.
 
         Raises:
             InvalidInput: ``sequence.*``, ``rig.*``, ``options.*``, ``priors.*``.

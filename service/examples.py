@@ -49,7 +49,7 @@ LOCALIZED: dict[str, Any] = {
         "params": [457.6, 457.6, 321.92, 238.08],
         "source": "given",
     },
-    "orientation": {"exif": 1, "read_as": "stored"},
+    "orientation": {"exif": 1, "read_as": "upright"},
     "map": {"id": "sample", "version": "20261121T111436.881Z-7f9cafe0"},
     "seconds": {
         "queued": 7.9e-05,
@@ -99,7 +99,7 @@ NOT_LOCALIZED: dict[str, Any] = {
         "params": [1843.2, 768.0, 512.0],
         "source": "guess",
     },
-    "orientation": {"exif": 1, "read_as": "stored"},
+    "orientation": {"exif": 1, "read_as": "upright"},
     "map": {"id": "sample", "version": "20261121T111436.881Z-7f9cafe0"},
     "seconds": {
         "queued": 0.0022,

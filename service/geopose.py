@@ -138,7 +138,7 @@ class _Found:
 
 
 def _read(body: bytes, settings: ServiceSettings) -> tuple[GeoPoseRequest, LocalizeJob | RigJob]:
-    asked = GeoPoseRequest.read_json(body, settings.max_batch_values)
+    asked = GeoPoseRequest.read_json(body)
     return asked, asked.to_job(
         max_image_bytes=settings.max_image_bytes, max_images=settings.max_rig_images
     )

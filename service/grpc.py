@@ -15,6 +15,7 @@ from service.access_grpc import AccessInterceptor
 from service.connections import TimelyCalls
 from service.deadlines import within
 from service.engine import Engine
+from service.grpc_connections import GrpcConnections
 from service.grpc_envelope import Context, Envelope, message_of
 from service.grpc_requests import (
     instant_of,
@@ -150,13 +151,18 @@ class GrpcServer:
         self, engine: Engine, settings: ServiceSettings, observer: Observer, access: Access
     ) -> None:
         envelope = Envelope(observer)
+        self._connections = GrpcConnections(settings.max_connections)
+        patience_s = settings.arrival_timeout_s
         self._server = grpc.aio.server(
             interceptors=[
                 AccessInterceptor(access, envelope, max(1, settings.max_connections // 2)),
-                TimelyCalls(envelope, settings.arrival_timeout_s, settings.max_message_bytes),
+                TimelyCalls(envelope, self._connections, patience_s, settings.max_message_bytes),
             ],
             options=[
                 ("grpc.max_receive_message_length", settings.max_message_bytes),
+                *self._connections.options,
+                # Of a connection that says nothing, or not what HTTP/2 begins with.
+                ("grpc.server_handshake_timeout_ms", round(1000 * patience_s)),
                 ("grpc.so_reuseport", 0),  # a second server on the port is a mistake
                 # A robot that lost its network in the middle of a stream would keep its place.
                 ("grpc.keepalive_time_ms", 60_000),
@@ -186,6 +192,7 @@ class GrpcServer:
         """Accept calls. Health says NOT_SERVING."""
         await self._set_health(health_pb2.HealthCheckResponse.NOT_SERVING)
         await self._server.start()
+        self._watching = asyncio.create_task(self._connections.watch(self.port))
 
     async def set_serving(self) -> None:
         """Let health say SERVING."""
@@ -199,6 +206,7 @@ class GrpcServer:
         """Finish running calls, at most ``grace_s`` seconds long, and accept no new ones."""
         await self._health.enter_graceful_shutdown()
         await self._server.stop(grace_s)
+        self._watching.cancel()
 
     async def _set_health(self, status: health_pb2.HealthCheckResponse.ServingStatus) -> None:
         for name in ("", SERVICE_NAME, MAPS_SERVICE_NAME):

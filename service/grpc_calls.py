@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import aclosing
+from traceback import clear_frames
 from typing import Any, TypeAlias
 
 import grpc
@@ -41,8 +42,34 @@ def behaviour_of(handler: Handler) -> Behaviour:
     return behaviour
 
 
-def handler_like(handler: Handler, behaviour: Behaviour) -> Handler:
-    """Return a method with the messages of another.
+def _forgetful(behaviour: Behaviour) -> Behaviour:
+    """Drop what a call held when it ends, its message above all.
+
+    gRPC's iterator over messages and the generator that it reads from hold each other, and so do
+    the exception of a refusal and the variables of the call, by its traceback. Only the garbage
+    collector would free them: it counts objects and not their bytes, and comes after gigabytes.
+    """
+
+    async def serve(messages: AsyncIterator[Any], context: Context) -> Any:
+        received: Any = aiter(messages)
+        try:
+            async with aclosing(received):
+                return await behaviour(messages, context)
+        except grpc.aio.AbortError as aborted:
+            error: BaseException | None = aborted
+            while error is not None:
+                clear_frames(error.__traceback__)
+                error = error.__context__
+            del messages, received, context  # of this call too, which has not ended
+            raise
+
+    return serve
+
+
+def handler_like(
+    handler: Handler, behaviour: Behaviour, parse: Callable[[bytes], Any] | None = None
+) -> Handler:
+    """Return a method with the messages of another, unless ``parse`` is to read them.
 
     It is called as soon as the call begins, also where there is one message only: gRPC itself
     would call it when that has arrived, however long that takes.
@@ -52,5 +79,9 @@ def handler_like(handler: Handler, behaviour: Behaviour) -> Handler:
         if handler.response_streaming
         else grpc.stream_unary_rpc_method_handler
     )
-    made: Handler = make(behaviour, handler.request_deserializer, handler.response_serializer)
+    made: Handler = make(
+        _forgetful(behaviour),
+        parse or handler.request_deserializer,
+        handler.response_serializer,
+    )
     return made

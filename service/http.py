@@ -19,6 +19,7 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import visloc
+from service.acceptor import OpenConnections
 from service.access import Access
 from service.access_http import add_access
 from service.connections import Arrivals
@@ -53,9 +54,12 @@ from service.schemas import (
 )
 from service.settings import ServiceSettings
 from service.wire import internal_error, request_id, stopping_error
-from visloc.errors import InvalidInput, NotFound, VislocError
+from visloc.errors import InvalidInput, NotFound, Overloaded, VislocError
 
 logger = logging.getLogger(__name__)
+
+# Answered even when all connections are in use.
+_PROBED_PATHS = ("/healthz", "/readyz", "/metrics")
 
 _LOCALIZE_PROBLEMS = (404, 409, 413, 422, 429, 500, 503, 504)
 
@@ -67,6 +71,7 @@ def create_app(
     observer: Observer,
     access: Access,
     arrivals: Arrivals,
+    connections: OpenConnections,
     state: Callable[[], ServiceState],
 ) -> App:
     """Make the ASGI application. Starting and closing the engine is the caller's.
@@ -77,6 +82,7 @@ def create_app(
         observer: is told what becomes of every request.
         access: who may ask for what.
         arrivals: bodies of requests while they arrive.
+        connections: those that are open.
         state: how the service is doing, for /metrics.
     """
 
@@ -93,7 +99,12 @@ def create_app(
     )
     app.state.observer, app.state.arrivals = observer, arrivals
     add_access(app, access, observer, page=settings.page)
-    app.add_middleware(RequestEnvelope, observer=observer, is_stopping=lambda: engine.draining)
+    app.add_middleware(
+        RequestEnvelope,
+        observer=observer,
+        connections=connections,
+        is_stopping=lambda: engine.draining,
+    )
     app.add_exception_handler(VislocError, _on_error)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(HTTPException, _on_http_exception)
@@ -198,9 +209,16 @@ def create_app(
 class RequestEnvelope:
     """Gives every request an id, a line in the log, and an answer even when something broke."""
 
-    def __init__(self, app: ASGIApp, observer: Observer, is_stopping: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        app: ASGIApp,
+        observer: Observer,
+        connections: OpenConnections,
+        is_stopping: Callable[[], bool],
+    ) -> None:
         self._app = app
         self._observer = observer
+        self._connections = connections
         self._is_stopping = is_stopping
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -219,6 +237,8 @@ class RequestEnvelope:
                     record.status = str(message["status"])
                     ours = MutableHeaders(scope=message)
                     ours["X-Request-Id"] = id_
+                    if self._is_stopping():  # else the next request would be cut off
+                        ours["Connection"] = "close"
                     if record.trace is not None:
                         ours["traceresponse"] = record.trace.traceparent
                 await send(message)
@@ -230,6 +250,9 @@ class RequestEnvelope:
                     await self._refuse(
                         refused, id_, scope, receive, send_with_id, HTTPStatus.BAD_REQUEST
                     )
+                    return
+                if self._connections.is_busy and scope["path"] not in _PROBED_PATHS:
+                    await self._refuse(_busy(), id_, scope, receive, send_with_id)
                     return
                 await self._app(scope, receive, send_with_id)
             except asyncio.CancelledError:
@@ -259,6 +282,12 @@ class RequestEnvelope:
         response = problem_response(error, id_, status)
         response.headers["Connection"] = "close"
         await response(scope, receive, send)
+
+
+def _busy() -> Overloaded:
+    return Overloaded(
+        "server.busy", "requests are being served on all connections; try again shortly"
+    )
 
 
 def _ambiguous() -> InvalidInput:

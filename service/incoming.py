@@ -20,8 +20,11 @@ from visloc.errors import InvalidInput, TooLarge, VislocError
 
 _NOT_AN_OBJECT, _UNKNOWN_FIELD, _REFUSED = "not_an_object", "unknown_field", "refused"
 _MAX_NAME = 100  # characters of a name from outside
-# JSON takes many times its size when it is parsed, if it is made of many small values.
+# A message of many small values takes many times its size, and its time, when it is parsed: so they
+# are counted before. One photo needs a few dozen, or the names of all tiles of a set.
 MAX_JSON_VALUES = 10_000
+# A rig of 256 cameras and the images of one instant need 25 000 at the most.
+MAX_INSTANT_VALUES = 100_000
 
 
 class IncomingMessage(BaseModel):
@@ -57,10 +60,7 @@ class IncomingMessage(BaseModel):
             InvalidInput: ``request.missing_field``, ``request.unknown_field``,
                 ``request.invalid``, or a code of the field.
         """
-        try:
-            return cls.model_validate(value, context=limits)
-        except ValidationError as refused:
-            raise refusal_of(refused.errors(include_url=False)[0], cls.path) from None
+        return cls._checked(lambda: cls.model_validate(value, context=limits))
 
     @classmethod
     def read_json(
@@ -71,25 +71,56 @@ class IncomingMessage(BaseModel):
         Args:
             text: the message.
             limits: as of ``read``.
-            max_values: how many values and commas in texts it may have, about.
+            max_values: how many values it may have. They are counted by commas and brackets, those
+                in texts too.
 
         Raises:
             InvalidInput: as ``read``, and ``request.malformed``.
             TooLarge: ``request.too_large``.
         """
-        commas = text.count(",") if isinstance(text, str) else text.count(b",")
-        if commas > max_values:
-            raise TooLarge(
-                "request.too_large",
-                "the JSON has too many values; numbers of features go in base64",
-                field=cls.path.rstrip(".") or None,
-                expected=f"at most {max_values}",
-                got=commas,
-            )
+        check_json_values(text, max_values, cls.path.rstrip("."))
+        return cls._checked(lambda: cls.model_validate_json(text, context=limits))
+
+    @classmethod
+    def _checked(cls, validate: Callable[[], Self]) -> Self:
         try:
-            return cls.model_validate_json(text, context=limits)
+            return validate()
         except ValidationError as refused:
-            raise refusal_of(refused.errors(include_url=False)[0], cls.path) from None
+            refusal = refusal_of(refused.errors(include_url=False)[0], cls.path)
+        # Out of there, so that it does not hold what it comes from: pydantic's errors hold all
+        # that was sent.
+        raise refusal
+
+
+def check_json_values(text: str | bytes, max_values: int, field: str = "") -> None:
+    """Refuse JSON of too many values before it is parsed, which keeps all other threads waiting.
+
+    Raises:
+        TooLarge: ``request.too_large``.
+    """
+    # Brackets as well: a list within a list within a list has no comma.
+    values = (
+        sum(map(text.count, ",[{"))
+        if isinstance(text, str)
+        else sum(map(text.count, (b",", b"[", b"{")))
+    )
+    check_num_values(values, max_values, field)
+
+
+def check_num_values(values: int, max_values: int, field: str = "") -> None:
+    """Refuse a message of too many values.
+
+    Raises:
+        TooLarge: ``request.too_large``.
+    """
+    if values > max_values:
+        raise TooLarge(
+            "request.too_large",
+            "the request has too many values; numbers of features go in base64",
+            field=field or None,
+            expected=f"at most {max_values}",
+            got=values,
+        )
 
 
 def converted(convert: Callable[[Any], Any]) -> BeforeValidator:

@@ -18,6 +18,7 @@ from service.jobs import (
 )
 from service.tiles import Read, summed
 from visloc.archive import Map
+from visloc.archive.places import anchor_rms
 from visloc.constraints import Constraints
 from visloc.errors import InvalidInput, NotFound, TooLarge
 from visloc.geometry import Pose
@@ -43,7 +44,13 @@ class Target:
         """Return an answer with the map that gave it."""
         opened = self.localizer.map
         return InstantLocalization(
-            answer, opened.manifest.id, opened.manifest.version, opened.geodetic, ypr
+            answer,
+            opened.manifest.id,
+            opened.manifest.version,
+            opened.geodetic,
+            ypr,
+            reach=self.localizer.geometry.reach,
+            anchor_rms=anchor_rms(opened.manifest.world),
         )
 
 

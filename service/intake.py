@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncGenerator, Callable, Collection, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -12,6 +13,7 @@ from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import Request
 
 from service.connections import arrivals_of
+from service.incoming import MAX_INSTANT_VALUES
 from service.jobs import Instant, LocalizeJob, RigJob, SequenceStart
 from service.schemas import (
     BatchLimits,
@@ -26,6 +28,11 @@ from visloc.errors import InvalidInput
 _CHUNK_BYTES = 64 * 1024
 # The parts of the form of one photo that are files, and how curl sends them.
 _FILES = {"image": "photo.jpg", "features": "photo.json"}
+_FORM = "multipart/form-data"
+_KINDS = (_FORM, "application/json")
+# Parses the JSON of batches, one after the other: parsing keeps Python's lock, for half a second
+# for the largest sequence, and the event loop gets its turn between two of them.
+_BATCHES = ThreadPoolExecutor(1, thread_name_prefix="batches")
 
 JobT = TypeVar("JobT")
 
@@ -76,7 +83,7 @@ async def read_rig_job(request: Request, settings: ServiceSettings) -> RigJob:
     limits = _limits(settings)
 
     def job(text: str | bytes, files: Mapping[str, bytes]) -> RigJob:
-        read = LocalizeRigRequest.read_json(text, limits, settings.max_batch_values)
+        read = LocalizeRigRequest.read_json(text, limits, MAX_INSTANT_VALUES)
         return read.to_job(files)
 
     return await _read_batch(request, settings, job, max_files=settings.max_rig_images)
@@ -95,7 +102,7 @@ async def read_sequence_jobs(
     limits = _limits(settings)
 
     def jobs(text: str | bytes, files: Mapping[str, bytes]) -> tuple[SequenceStart, list[Instant]]:
-        read = LocalizeSequenceRequest.read_json(text, limits, settings.max_batch_values)
+        read = LocalizeSequenceRequest.read_json(text, limits, settings.max_sequence_values)
         return read.to_jobs(files)
 
     max_files = settings.max_rig_images * settings.max_instants
@@ -145,7 +152,7 @@ async def _read_batch(
 ) -> JobT:
     """Read several photos: JSON, or a form with that JSON as ``request`` and a file per photo."""
 
-    def from_form(body: bytes) -> JobT:
+    def from_form(body: bytes) -> tuple[str, Mapping[str, bytes]]:
         expected = f"a form with a text request (JSON) and at most {max_files} files"
         form = _parse_form(
             request.headers,
@@ -164,13 +171,13 @@ async def _read_batch(
                 expected="a text, as of curl -F 'request=<request.json'",
                 got="a file" if name is None and "request" in form.files else name,
             )
-        return to_job(form.texts["request"], form.files)
+        return form.texts["request"], form.files
 
-    return await _read(
-        request,
-        from_form=(from_form, settings.max_batch_bytes),
-        from_json=(lambda body: to_job(body, {}), settings.max_batch_bytes),
-    )
+    is_form = checked_media_type(request, _KINDS) == _FORM
+    async with arrivals_of(request).body(request, settings.max_batch_bytes) as body:
+        text, files = await asyncio.to_thread(from_form, body) if is_form else (body, {})
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(_BATCHES, to_job, text, files)
 
 
 async def _read(
@@ -180,8 +187,8 @@ async def _read(
     from_json: tuple[Callable[[bytes], JobT], int],
 ) -> JobT:
     """Read a body of either kind, each with its largest number of bytes."""
-    kinds = {"multipart/form-data": from_form, "application/json": from_json}
-    parse, limit = kinds[checked_media_type(request, kinds)]
+    is_form = checked_media_type(request, _KINDS) == _FORM
+    parse, limit = from_form if is_form else from_json
     async with arrivals_of(request).body(request, limit) as body:
         # Photos and features take milliseconds to parse and decode: off the event loop with them.
         return await asyncio.to_thread(parse, body)

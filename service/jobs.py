@@ -158,7 +158,7 @@ class SequenceStart:
     """What all instants of a sequence share.
 
     Attributes:
-        maps: where to search; of several maps, that of the first localized instant is kept.
+        maps: where to search; of several maps, one is kept once it alone explains an instant.
         rig: how the cameras sit; None when every instant is one image of one camera.
         time_unit: of the timestamps; None to tell by their size.
         max_gap_s: longest time between measured instants across which gaps are filled; 0: none.
@@ -203,6 +203,8 @@ class Localization:
         ypr: whether the caller wants the GeoPose in angles too.
         debug: when the caller wants it.
         tile: of a set, ``id@version`` of the map in it that gave the answer.
+        reach: how far that map's photos see, in units of the answer's frame (median).
+        anchor_rms: how far off its place on Earth the frame may be, in its unit; 0 when unknown.
     """
 
     answer: Answer
@@ -212,6 +214,13 @@ class Localization:
     ypr: bool = False
     debug: MatchPicture | None = None
     tile: str | None = None
+    reach: float = 0.0
+    anchor_rms: float = 0.0
+
+    @property
+    def ref(self) -> str:
+        """``id@version`` of the map that gave the answer."""
+        return self.tile or f"{self.map_id}@{self.map_version}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,6 +233,13 @@ class InstantLocalization:
     geodetic: Geodetic | None = None
     ypr: bool = False
     tile: str | None = None
+    reach: float = 0.0
+    anchor_rms: float = 0.0
+
+    @property
+    def ref(self) -> str:
+        """``id@version`` of the map that gave the answer."""
+        return self.tile or f"{self.map_id}@{self.map_version}"
 
 
 def check_order(before: int, timestamp: int) -> None:

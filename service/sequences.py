@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from service.incoming import inside
 from service.instants import Target, check_images, check_options, check_priors
 from service.jobs import Instant, InstantLocalization, SequenceStart, check_order
+from service.judging import judged
 from visloc.errors import InvalidInput, TooLarge
 from visloc.priors import Priors
 from visloc.sequence import SeenInstant, SequenceSolver, check_max_gap, check_odometry
-from visloc.solving import SeenImage
+from visloc.solving import SeenImage, Solved
 from visloc.trajectory import TimeUnit, guess_time_unit
-from visloc.types import InstantAnswer, RigPose
+from visloc.types import InstantAnswer, Reason, Refusal, RigPose
 
 
 class SequenceRun:
@@ -93,20 +95,26 @@ class SequenceRun:
             self._solvers = [self._solver(target, unit) for target in self.targets]
         assert self._last_checked is not None  # it was checked before
         with inside(f"instants[{self._last_checked[0]}]"):
-            for solver, held, seen in zip(self._solvers, self._held, images, strict=True):
-                held += solver.add(SeenInstant(instant.timestamp, seen, instant.odometry, priors))
-        if len(self.targets) > 1 and any(solver.measured for solver in self._solvers):
-            best = max(range(len(self.targets)), key=lambda i: self._solvers[i].measured)
-            self.targets = [self.targets[best]]
-            self._solvers = [self._solvers[best]]
-            self._held = [self._held[best]]
+            shown = [
+                SeenInstant(instant.timestamp, seen, instant.odometry, priors) for seen in images
+            ]
+            solved = [solver.solve(seen) for solver, seen in zip(self._solvers, shown, strict=True)]
+            settled, solved = self._judged(solved, priors)
+            for solver, held, seen, one in zip(
+                self._solvers, self._held, shown, solved, strict=True
+            ):
+                held += solver.take(seen, one)
+        if settled is not None:
+            self._keep(settled)
         return self._released() if len(self.targets) == 1 else []
 
     @property
     def pose(self) -> RigPose | None:
-        """What its own images measured of the newest instant; None when they do not localize it."""
-        best = max(self._solvers, key=lambda solver: solver.measured)
-        return best.newest
+        """What its own images measured of the newest instant, in the map that was settled on.
+
+        None when they do not localize it, or while several maps are searched.
+        """
+        return self._solvers[0].newest if len(self._solvers) == 1 else None
 
     def finish(self) -> list[InstantAnswer]:
         """Return the answers that waited for instants which will not come.
@@ -116,11 +124,45 @@ class SequenceRun:
         """
         if not self._solvers:
             raise InvalidInput("sequence.empty", "there is no instant", field="instants")
-        return [*self._released(), *self._solvers[0].finish()]
+        for held, solver in zip(self._held, self._solvers, strict=True):
+            held += solver.finish()
+        # Motion may place instants that no image localizes; in several maps, it tells nothing.
+        placed = [
+            i for i, held in enumerate(self._held) if any(each.pose is not None for each in held)
+        ]
+        if len(self._held) > 1 and len(placed) > 1:
+            self._held = [[_unplaced(answer) for answer in held] for held in self._held]
+        self._keep(placed[0] if placed else 0)
+        return self._released()
 
     def localization(self, answer: InstantAnswer) -> InstantLocalization:
         """Return an answer of ``add`` or ``finish`` with the map that gave it."""
         return self.targets[0].localization(answer, ypr=self._start.ypr)
+
+    def _judged(self, solved: list[Solved], priors: Priors) -> tuple[int | None, list[Solved]]:
+        """Say which map to settle on, if any, and what each map makes of an instant.
+
+        An instant that several maps explain counts in none of them.
+        """
+        if len(self.targets) == 1:
+            return None, solved
+        found = [
+            target.localization(one.answer, ypr=self._start.ypr)
+            for target, one in zip(self.targets, solved, strict=True)
+        ]
+        best, verdict = judged(found, priors)
+        if verdict.answer.pose is not None:
+            return best, solved
+        refusal = verdict.answer.refusal
+        if refusal is None or refusal.reason is not Reason.AMBIGUOUS:
+            return None, solved
+        return None, [one if one.pose is None else one.refused(refusal) for one in solved]
+
+    def _keep(self, index: int) -> None:
+        """Search only one of the maps from now on."""
+        self.targets = [self.targets[index]]
+        self._solvers = [self._solvers[index]]
+        self._held = [self._held[index]]
 
     def _released(self) -> list[InstantAnswer]:
         released, self._held[0] = self._held[0], []
@@ -134,6 +176,18 @@ class SequenceRun:
             time_unit=unit,
             max_gap_s=self._start.max_gap_s,
         )
+
+
+def _unplaced(answer: InstantAnswer) -> InstantAnswer:
+    """Take a pose back that another map contradicts."""
+    if answer.pose is None:
+        return answer
+    refusal = answer.refusal or Refusal(
+        "gate",
+        Reason.AMBIGUOUS,
+        "several of the maps explain the sequence; name one, or say where it is (priors)",
+    )
+    return replace(answer, pose=None, refusal=refusal)
 
 
 def _is_metric(target: Target) -> bool:

@@ -7,12 +7,15 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import uvicorn
 from starlette.applications import Starlette
 
+from service.acceptor import Acceptor, OpenConnections
 from service.access import open_access
 from service.connections import Arrivals, http_protocol
+from service.descriptors import METRICS_CONNECTIONS
 from service.engine import Engine
 from service.grpc import GrpcServer
 from service.http import create_app
@@ -21,10 +24,14 @@ from service.metrics_http import metrics_app
 from service.observation import Observer
 from service.settings import ServiceSettings, SettingsError
 from service.stores import open_store
-from service.tls import check_tls, tls_config
+from service.tls import TlsConfig, check_tls, tls_config
 from service.tracing import open_spans
 from service.worker import WorkerSettings
 from visloc.types import Inference
+
+# When it stops: so long a request may be on its way over a connection that is open already. It is
+# answered with 503; then idle connections are closed.
+_LAST_WORDS_S = 0.3
 
 
 class Server:
@@ -88,42 +95,35 @@ class Server:
             address = f"{settings.host}:{settings.grpc_port}"
             raise OSError(f"cannot listen on {address}: {error}") from None
         self.grpc_port = self._grpc.port
-        apps: list[Starlette] = [
-            create_app(
-                self.engine,
-                settings,
-                observer=self.observer,
-                access=access,
-                arrivals=self._arrivals,
-                state=self.state,
-            )
+        self._connections = OpenConnections(settings.max_connections)
+        app = create_app(
+            self.engine,
+            settings,
+            observer=self.observer,
+            access=access,
+            arrivals=self._arrivals,
+            connections=self._connections,
+            state=self.state,
+        )
+        grace_s = settings.arrival_timeout_s
+        self._http = [
+            _HttpServer(app, self._listeners[0], self._connections, grace_s, tls_config(settings))
         ]
         if settings.metrics_port is not None:
-            apps.append(metrics_app(self._render))
-        self._http = [
-            _HttpServer(
-                uvicorn.Config(
-                    app,
-                    log_config=None,
-                    log_level="warning",
-                    access_log=False,
-                    proxy_headers=False,  # whoever is on this machine could make them up
-                    http=http_protocol(settings.arrival_timeout_s),
-                    # uvicorn refuses the one that fills
-                    limit_concurrency=settings.max_connections + 1,
-                    **(tls_config(settings) if app is apps[0] else {}),
+            self._http.append(
+                _HttpServer(
+                    metrics_app(self._render),
+                    self._listeners[1],
+                    OpenConnections(METRICS_CONNECTIONS),
+                    grace_s,
+                    {},
                 )
             )
-            for app in apps
-        ]
 
     async def open(self) -> None:
         """Answer. Before ``load`` is done, /readyz and gRPC's health say that it is not ready."""
         await self._grpc.start()
-        self._serving = [
-            asyncio.create_task(server.serve(sockets=[listener]))
-            for server, listener in zip(self._http, self._listeners, strict=True)
-        ]
+        self._serving = [asyncio.create_task(server.serve()) for server in self._http]
 
     async def load(self) -> None:
         """Open the maps, warm up, and accept photos."""
@@ -169,7 +169,7 @@ class Server:
             loaded_maps=loaded,
             max_loaded_bytes=settings.max_loaded_bytes,
             unusable_maps={map_id: error.code for map_id, error in status.not_loaded.items()},
-            connections=len(self._http[0].server_state.connections),
+            connections=len(self._connections),
             max_connections=settings.max_connections,
             store_reachable=self._store.reachable,
             buffered_bytes=self._arrivals.bytes_held,
@@ -182,9 +182,63 @@ class Server:
 
 
 class _HttpServer(uvicorn.Server):
+    """uvicorn, which gets its connections from an ``Acceptor``.
+
+    Args:
+        app: answers.
+        listener: the listening socket.
+        connections: their bound.
+        grace_s: longest time for a handshake of TLS, a head, or a body that nobody wants.
+        tls: settings of uvicorn.
+    """
+
+    def __init__(
+        self,
+        app: Starlette,
+        listener: socket.socket,
+        connections: OpenConnections,
+        grace_s: float,
+        tls: TlsConfig,
+    ) -> None:
+        super().__init__(
+            uvicorn.Config(
+                app,
+                log_config=None,
+                log_level="warning",
+                access_log=False,
+                proxy_headers=False,  # whoever is on this machine could make them up
+                http=http_protocol(grace_s, connections),
+                **tls,
+            )
+        )
+        self._listener = listener
+        self._open = connections
+        self._grace_s = grace_s
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to accept."""
+        del sockets
+        await super().startup(sockets=[])  # uvicorn itself listens nowhere
+        self._acceptor = Acceptor(
+            self._listener, self._open, self._make_protocol, self.config.ssl, self._grace_s
+        )
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Accept nothing more, and end when all requests have."""
+        del sockets
+        self._acceptor.close()
+        await asyncio.sleep(_LAST_WORDS_S)
+        await super().shutdown()
+
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        yield  # signals end both doors: they are the business of main
+        """Leave signals, which end HTTP and gRPC alike, to ``main``."""
+        yield
+
+    def _make_protocol(self) -> Any:
+        return self.config.http_protocol_class(  # type: ignore[call-arg]
+            config=self.config, server_state=self.server_state, app_state=self.lifespan.state
+        )
 
 
 def _listen(host: str, port: int) -> socket.socket:

@@ -30,12 +30,14 @@ from service.jobs import (
     RigJob,
     Where,
 )
+from service.judging import AnyLocalization, judged
 from service.metrics import Metrics
 from service.set_photos import Places, SetPhotos
 from service.together import together
 from service.worker import MapFolder
 from service.workers import Workers
 from visloc.archive import SetOutline, TileRecord
+from visloc.archive.places import anchor_rms
 from visloc.errors import (
     Conflict,
     InvalidInput,
@@ -46,19 +48,15 @@ from visloc.errors import (
 )
 from visloc.priors import Priors
 from visloc.sets.choosing import (
-    Found,
     TileScore,
     allowed_tiles,
-    inliers_of,
     is_clear,
-    judge,
     plan,
     tiles_near,
 )
 from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
-from visloc.types import InstantAnswer, Localized, LocalizeOptions, NotLocalized, Refusal
+from visloc.types import Localized, LocalizeOptions
 
-AnyLocalization = TypeVar("AnyLocalization", Localization, InstantLocalization)
 T = TypeVar("T")
 
 # Codes that begin so say that a map cannot be had, when nothing is wrong with the map itself.
@@ -219,7 +217,8 @@ class SetSearch:
             raise tile_unavailable(*missing[0])
         if not found:
             raise unfit[0]
-        return _judged(outline, found)
+        chosen, answer = judged([each for _, each in found])
+        return found[chosen][0], answer
 
     async def _asked(
         self,
@@ -327,6 +326,8 @@ def in_set(found: AnyLocalization, outline: SetOutline, tile: TileRecord) -> Any
         map_version=outline.manifest.version,
         geodetic=outline.geodetic,
         tile=tile.ref,
+        reach=moved.scale * found.reach,
+        anchor_rms=anchor_rms(outline.manifest.world),
     )
     if isinstance(found, InstantLocalization):
         return replace(found, answer=answer_in_set(found.answer, moved))
@@ -352,19 +353,3 @@ def rig_in(tile: TileRecord, rig: Rig | None) -> Rig | None:
 def with_queries(images: Sequence[ImageJob], queries: Sequence[Query]) -> tuple[ImageJob, ...]:
     """Return images that were read."""
     return tuple(replace(image, query=query) for image, query in zip(images, queries, strict=True))
-
-
-def _judged(
-    outline: SetOutline, found: Sequence[tuple[int, AnyLocalization]]
-) -> tuple[int, AnyLocalization]:
-    answers = [Found(row, each.answer) for row, each in found]
-    verdict = judge(outline, answers)
-    if not isinstance(verdict, Refusal):
-        return found[verdict]
-    # What the refusal shows is that of the tile with the most inliers.
-    row, best = max(found, key=lambda one: inliers_of(one[1].answer))
-    answer = best.answer
-    if isinstance(answer, InstantAnswer):
-        return row, replace(best, answer=replace(answer, pose=None, refusal=verdict))
-    refused = NotLocalized(answer.evidence, verdict.stage, verdict.reason, verdict.message)
-    return row, replace(best, answer=refused)

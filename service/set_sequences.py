@@ -40,9 +40,9 @@ from service.worker import MapFolder, Seen
 from service.workers import Workers
 from visloc.archive import SetOutline
 from visloc.errors import InvalidInput, NotFound, Unavailable, VislocError
+from visloc.pose.centre import moved_pose
 from visloc.priors import Priors
 from visloc.sets.choosing import allowed_tiles, is_clear, nearest_tile
-from visloc.sets.frame import moved_pose
 from visloc.sets.handover import Track
 from visloc.trajectory import guess_time_unit
 from visloc.types import RigPose

@@ -17,6 +17,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
+from service.incoming import MAX_INSTANT_VALUES
+
 PREFIX = "VISLOC_"
 CONFIG_VARIABLE = "VISLOC_CONFIG"
 # The clients': where the service runs too, it is no mistake.
@@ -39,10 +41,8 @@ Names = Annotated[tuple[str, ...], BeforeValidator(_names_of)]
 REQUEST_OVERHEAD_BYTES = 64 * 1024
 # Largest message with a piece of a packed map: 1 MiB, and a little around it.
 PIECE_BYTES = 2**20 + 64 * 1024
-# Room in a request for the numbers of one photo: camera, sensor, its share of the instant's.
-VALUES_PER_IMAGE = 64
-# So many are parsed at least, that too many photos or instants can be told as such.
-FEWEST_BATCH_VALUES = 100_000
+# Room in a sequence for the numbers of one photo: camera, sensor, its share of the instant's.
+VALUES_PER_IMAGE = 32
 
 
 class SettingsError(ValueError):
@@ -97,7 +97,8 @@ class ServiceSettings(BaseModel):
     max_queue: Annotated[int, Field(ge=0)] = 64
     """photos that may wait for a worker; beyond it a request is refused"""
     max_connections: Count = 1000
-    """connections (HTTP) and calls (gRPC) that a door keeps open at once"""
+    """connections that HTTP and gRPC each have open at once, and calls of gRPC; for one more, the
+    longest idle is closed. Lowered where the system allows too few open files"""
     max_buffered_bytes: Count = 512 * 2**20
     """bytes of requests held while they arrive; beyond it a request is refused"""
     request_timeout_s: Seconds = 60.0
@@ -147,10 +148,10 @@ class ServiceSettings(BaseModel):
         return max(self.max_request_bytes, self.max_batch_bytes, PIECE_BYTES)
 
     @property
-    def max_batch_values(self) -> int:
-        """Values in the JSON of a request with several photos: parsed, each takes 100 bytes."""
+    def max_sequence_values(self) -> int:
+        """Values in the JSON of a sequence: each takes about a microsecond and 100 bytes."""
         images = (self.max_rig_images + 1) * (self.max_instants + 1)
-        return max(FEWEST_BATCH_VALUES, VALUES_PER_IMAGE * images)
+        return max(MAX_INSTANT_VALUES, VALUES_PER_IMAGE * images)
 
 
 def read_settings(arguments: Sequence[str], environment: Mapping[str, str]) -> ServiceSettings:

@@ -39,9 +39,11 @@ from service.jobs import (
     RigJob,
     SequenceStart,
 )
+from service.judging import judged
 from service.sequences import SequenceRun
 from service.tiles import Read, TileChooser, read_query, summed, written
 from service.worker import Abandoned, Added, Chosen, Loaded, MapFolder, Seen, WorkerSettings
+from visloc.archive.places import anchor_rms
 from visloc.archive.store import open_published, open_published_set
 from visloc.constraints import MapGeometry
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, VislocError
@@ -58,7 +60,7 @@ from visloc.localizer import Localizer
 from visloc.overlay import draw_overlay
 from visloc.priors import Priors
 from visloc.solving import Look, SeenImage
-from visloc.types import Answer, Localized, LocalizeOptions, QueryFeatures
+from visloc.types import Answer, LocalizeOptions, QueryFeatures
 
 logger = logging.getLogger(__name__)
 
@@ -183,7 +185,8 @@ class Vision:
         targets = self._targets(maps, None)
         check_options(targets, job.options)
         loaded = perf_counter()
-        found: list[tuple[Localizer, Look, Answer, NDArray[np.bool_]]] = []
+        looks: list[tuple[Look, NDArray[np.bool_]]] = []
+        found: list[Localization] = []
         read = self._read(job.query)
         query = read.query
         before = summed({"queued": max(0.0, queued), "open_map": loaded - started}, read.seconds)
@@ -196,10 +199,10 @@ class Vision:
                 look = localizer.look(query, job.camera, job.options, job.priors, read.found)
             self._step()
             answer, inliers = localizer.solve_look(look, job.options, job.priors)
-            found.append((localizer, look, answer, inliers))
-        localizer, look, answer, inliers = max(
-            found, key=lambda one: (isinstance(one[2], Localized), one[2].evidence.num_inliers)
-        )
+            looks.append((look, inliers))
+            found.append(_localization(localizer, answer, ypr=job.ypr))
+        row, best = judged(found, job.priors)
+        localizer, answer, (look, inliers) = targets[row].localizer, best.answer, looks[row]
         picture = None
         if job.debug and isinstance(query, Photo):
             self._step()
@@ -210,15 +213,7 @@ class Vision:
                 draw_overlay(query, localizer.map, look, answer, inliers),
             )
         evidence = replace(answer.evidence, seconds=summed(before, answer.evidence.seconds))
-        manifest = localizer.map.manifest
-        return Localization(
-            replace(answer, evidence=evidence),
-            manifest.id,
-            manifest.version,
-            localizer.map.geodetic,
-            job.ypr,
-            picture,
-        )
+        return replace(best, answer=replace(answer, evidence=evidence), debug=picture)
 
     def choose_tiles(
         self,
@@ -278,7 +273,7 @@ class Vision:
             self._step()
             solved = target.localizer.solve(images, job.options, job.priors, job.timestamp)
             found.append(target.localization(solved.answer, ypr=job.ypr))
-        return max(found, key=lambda one: (one.answer.pose is not None, one.answer.num_inliers))
+        return judged(found, job.priors)[1]
 
     def open_sequence(self, start: SequenceStart, maps: Sequence[MapFolder]) -> bytes:
         """As ``worker.open_sequence``."""
@@ -316,7 +311,9 @@ class Vision:
         return [run.localization(answer) for answer in run.finish()]
 
     def _read(self, query: Query) -> Read:
-        return read_query(query, self._limits, self._extractor)
+        read = read_query(query, self._limits, self._extractor)
+        self._step()
+        return read
 
     def _sequence(self, state: bytes, maps: Sequence[MapFolder]) -> SequenceRun:
         run = _Unpickler(state, {of.ref: self.localizer(of) for of in maps}).load()
@@ -350,6 +347,19 @@ class _Unpickler(pickle.Unpickler):
         kind, ref = pid
         localizer = self._localizers[ref]
         return localizer if kind == "localizer" else localizer.geometry
+
+
+def _localization(localizer: Localizer, answer: Answer, *, ypr: bool) -> Localization:
+    opened = localizer.map
+    return Localization(
+        answer,
+        opened.manifest.id,
+        opened.manifest.version,
+        opened.geodetic,
+        ypr,
+        reach=localizer.geometry.reach,
+        anchor_rms=anchor_rms(opened.manifest.world),
+    )
 
 
 def _size_of(opened: Localizer | TileChooser) -> int:

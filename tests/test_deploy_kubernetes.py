@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import socket
 import subprocess
+import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
+import httpx
 import kubernetes_validate
 import pytest
 import yaml
 
+from benchmarks.reliability.service_process import free_port
 from service.metrics import Metrics, ServiceState
 from service.settings import ServiceSettings, read_settings
 from service.uploads import MAX_UPLOADS
@@ -214,7 +219,7 @@ def test_the_balancer_is_told_what_its_configuration_asks(objects: Objects) -> N
 def asked_by_the_balancer() -> set[str]:
     """Variables that its configuration cannot do without."""
     lines = [line for line in CONFIG.read_text().splitlines() if not line.startswith("#")]
-    return set(re.findall(r"\$\{(\w+)", "\n".join(lines))) - {"NAMESERVER"}
+    return set(re.findall(r"\$\{(\w+)[}\[]", "\n".join(lines))) - {"NAMESERVER"}
 
 
 def test_compose_tells_the_balancer_the_same() -> None:
@@ -260,17 +265,26 @@ def test_prometheus_is_shown_ports_that_are_there(objects: Objects) -> None:
         assert {endpoint["port"] for endpoint in monitor["spec"]["podMetricsEndpoints"]} <= ports
 
 
+NEEDS_HAPROXY = pytest.mark.skipif(
+    shutil.which("haproxy") is None,
+    reason="needs HAProxy; on Debian and Ubuntu `make balancer`, as root, installs it",
+)
+
+
+def balancer_environment() -> dict[str, str]:
+    """What compose tells HAProxy."""
+    compose = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
+    return {"PATH": "/usr/sbin:/usr/bin", **compose["balancer"]["environment"]}
+
+
 @pytest.fixture
 def check_config(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
     """Let HAProxy read its configuration."""
-    if shutil.which("haproxy") is None:
-        pytest.skip("needs HAProxy; on Debian and Ubuntu `make balancer`, as root, installs it")
 
     def check(**changes: str) -> subprocess.CompletedProcess[str]:
-        compose = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
         return subprocess.run(
             ["haproxy", "-c", "-f", str(CONFIG)],
-            env={"PATH": "/usr/sbin:/usr/bin", **compose["balancer"]["environment"], **changes},
+            env=balancer_environment() | changes,
             cwd=tmp_path,
             capture_output=True,
             text=True,
@@ -281,11 +295,51 @@ def check_config(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[st
     return check
 
 
+@NEEDS_HAPROXY
 def test_haproxy_takes_its_configuration(
     check_config: Callable[..., subprocess.CompletedProcess[str]],
 ) -> None:
-    for changes in ({}, {"NAMESERVER": "127.0.0.1:53"}):
+    for changes in ({}, {"NAMESERVER": "127.0.0.1:53"}, {"MAX_PER_ADDRESS": "50"}):
         done = check_config(**changes)
         assert done.returncode == 0, done.stderr
         assert "WARNING" not in done.stderr
     assert check_config(MAX_REPLICAS="many").returncode != 0
+
+
+@NEEDS_HAPROXY
+def test_one_address_does_not_take_the_connections_of_others(tmp_path: Path) -> None:
+    most = 5
+    http, grpc, status = (free_port() for _ in range(3))
+    environment = balancer_environment() | {
+        "HTTP_BIND": f"127.0.0.1:{http}",
+        "GRPC_BIND": f"127.0.0.1:{grpc}",
+        "STATUS_BIND": f"127.0.0.1:{status}",
+        "NAMESERVER": "127.0.0.1:9",  # nobody, so that there are no replicas
+        "MAX_PER_ADDRESS": str(most),
+    }
+
+    def answers(path: str, port: int, source: str) -> bool:
+        transport = httpx.HTTPTransport(local_address=source)
+        with httpx.Client(transport=transport) as client:
+            try:
+                return client.get(f"http://127.0.0.1:{port}{path}").status_code in (200, 503)
+            except httpx.TransportError:
+                return False
+
+    with (tmp_path / "log").open("wb") as log, ExitStack() as stack:
+        process = subprocess.Popen(
+            ["haproxy", "-db", "-f", str(CONFIG)], env=environment, stdout=log, stderr=log
+        )
+        stack.callback(process.wait)
+        stack.callback(process.kill)
+        while not answers("/healthz", status, "127.0.0.1"):
+            assert process.poll() is None
+            time.sleep(0.05)
+        for port in [grpc, http] * most:
+            connection = stack.enter_context(socket.socket())
+            connection.bind(("127.0.0.2", 0))
+            with suppress(ConnectionError):
+                connection.connect(("127.0.0.1", port))
+
+        assert not answers("/", http, "127.0.0.2")
+        assert answers("/", http, "127.0.0.3")

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from http import HTTPStatus
 from itertools import pairwise
@@ -40,6 +41,8 @@ from service.schemas import (
 )
 from service.settings import CONFIG_VARIABLE, PREFIX, ServiceSettings, read_settings
 from service.wire import STATUSES
+from tests import docs_check
+from tests.docs_check import commands_of
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
@@ -71,14 +74,10 @@ def blocks(page: Path, language: str) -> list[str]:
 
 
 def shell_lines(page: Path) -> list[str]:
-    """The commands of a page, each on one line, without comments."""
-    lines = [
-        re.sub(r"\s+#.*", "", line).strip()
-        for block in blocks(page, "")
-        for line in block.replace("\\\n", " ").splitlines()
-    ]
-    known = ("make", "cp", "curl", ".venv/bin/")
-    return [line for line in lines if line.startswith(known)]
+    """The commands of a page that a reader pastes after ``make install``, each on one line."""
+    known = ("make", "curl", ".venv/bin/")
+    commands = (c for c in commands_of(page) if not (c.is_python or c.is_inline))
+    return [command.text for command in commands if command.text.startswith(known)]
 
 
 def table(first_column: str) -> list[list[str]]:
@@ -128,7 +127,8 @@ class Desk:
             (r"127\.0\.0\.1:8000", self.http),
             (r"127\.0\.0\.1:50051", self.grpc),
             (r"\.venv/bin/", f"{COMMANDS}/"),
-            (r"\bkitchen\b|(?<=map[= ])sample\b|(?<=maps/)sample(?=/)|(?<=\")sample(?=\")", "room"),
+            (r"\b(kitchen|hall)\b|(?<=map[= ])sample\b|(?<=maps[/ ])sample(?=[/ ])", "room"),
+            (r"(?<=\")sample(?=\")", "room"),
             (r"PINHOLE,[\d,.]+", self.camera_text),
             (r'Camera\("PINHOLE".*?\)\)', repr(self.camera)),
         ):
@@ -163,10 +163,10 @@ def desk(
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).symlink_to(target)
     export_map(MapStore(built_maps).open("room"), folder / "lund_door" / "colmap", "colmap")
-    for line in shell_lines(API):
-        if line.startswith("cp "):
-            subprocess.run(line.split(), cwd=folder, check=True)
-    assert (folder / "photo.jpg").read_bytes() == query.image
+    for camera, name in (("left", "photo.jpg"), ("right", "right.jpg")):
+        photo = sample / "query/sensors/records_data/query" / camera / "0001.jpg"
+        shutil.copy(photo, folder / ".demo" / name)
+    assert (folder / ".demo" / "photo.jpg").read_bytes() == query.image
     frame = {"file_path": "photo.jpg", "transform_matrix": np.eye(4).tolist()}
     recording = {"camera_angle_x": 1.0, "frames": [frame]}
     (folder / "RECORDING").mkdir()
@@ -231,11 +231,11 @@ def test_the_example_that_reads_points_sees_the_map(built_maps: Path, desk: Desk
         line
         for page in PAGES
         for line in shell_lines(page)
-        # cp and the service are run above, for the targets of make see below; building takes long
-        # and has tests of its own, as have a map of ready-made features, uploads and keys.
+        # The service is run above. Making maps takes long and has tests of its own, as have a map
+        # of ready-made features, uploads and keys; `make docs-check` runs those commands as well.
         if not re.match(
-            r"make|cp|\.venv/bin/(visloc-service|"
-            r"mapping (build|anchor|set|split|prune|merge|update))"
+            r"make|\.venv/bin/(visloc-service|pip |"
+            r"mapping (build|anchor|set|split|prune|merge|update|pack))"
             r"|.*/mapping import .* --map|.* --features-dir|.*/localize maps push"
             r"|.* https://maps\.example\.org",
             line,
@@ -259,7 +259,7 @@ def test_the_example_without_a_server_localizes_a_photo(built_maps: Path, desk: 
     example = ROOT / "examples" / "localize_in_process.py"
 
     printed = desk.run(
-        sys.executable, str(example), str(built_maps), "room", "photo.jpg", desk.camera_text
+        sys.executable, str(example), str(built_maps), "room", ".demo/photo.jpg", desk.camera_text
     )
 
     found = re.fullmatch(r"at (\S+) (\S+) (\S+), \d+ inliers\n", printed)
@@ -306,11 +306,54 @@ def test_the_numbers_of_the_example_follow_the_conventions_that_it_explains(devi
 # Names
 
 
+@pytest.mark.parametrize("page", docs_check.PAGES, ids=lambda page: page.name)
+def test_every_command_is_known_and_parses(page: Path) -> None:
+    for command in commands_of(page):
+        docs_check.judged(command)
+        docs_check.parse(command)
+
+
+@pytest.mark.parametrize(
+    ("text", "is_known", "parses"),
+    [
+        (".venv/bin/mapping build DATASET --map kitchen", True, True),
+        (".venv/bin/mapping build DATASET --map kitchen --no-such-flag", True, False),
+        ("mapping no-such-command", True, False),
+        ("localize maps list --no-such-flag", True, False),
+        (
+            "OPENBLAS_NUM_THREADS=1 python -m benchmarks.tiles --work DIR --out tiles.json",
+            True,
+            True,
+        ),
+        ("python -m benchmarks.retrieval maps/ID", True, False),
+        ("python benchmarks/no_such_file.py", True, False),
+        ("python -m training no-such-command", True, False),
+        ("visloc-service --no-such-flag", True, False),
+        ("make no-such-target", True, False),
+        ('ARGS="--no-such-flag" make bench', True, False),
+        ("docker compose up", True, True),
+        ("unheard-of --flag", False, True),
+        ("pip install visloc", True, True),
+    ],
+)
+def test_a_command_that_does_not_work_is_noticed(text: str, is_known: bool, parses: bool) -> None:
+    command = docs_check.Command("docs/new.md", 1, text)
+
+    with nullcontext() if is_known else pytest.raises(ValueError, match="nothing is known"):
+        docs_check.judged(command)
+    with nullcontext() if parses else pytest.raises(ValueError, match=r"."):
+        docs_check.parse(command)
+
+
+@pytest.mark.parametrize("page", ["docs/results.md", "docs/new.md"])
+def test_no_page_hides_a_program_that_nobody_knows(page: str) -> None:
+    with pytest.raises(ValueError, match="nothing is known"):
+        docs_check.judged(docs_check.Command(page, 1, "unheard-of --flag"))
+
+
 def test_every_make_target_exists() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
-    texts = [line for page in PAGES for line in shell_lines(page) if line.startswith("make ")]
-    texts += in_pages(r"`(make [a-z -]+)`")
-    named = {word for text in texts for word in text.split()[1:]}
+    named = {word for text in in_pages(r"`(make [a-z -]+)`") for word in text.split()[1:]}
 
     assert {"demo", "test", "install"} <= named <= targets
 
@@ -337,13 +380,6 @@ def test_every_command_and_flag_exists(capsys: pytest.CaptureFixture[str]) -> No
         "localize": options_of(clients.cli.app),
         "visloc-service": {"": of_service},
     }
-    for line in (line for page in PAGES for line in shell_lines(page)):
-        name, *arguments = line.removeprefix(".venv/bin/").split()
-        if name in programs:
-            command = "" if name == "visloc-service" else arguments[0]
-            flags = {word for word in arguments if word.startswith("--")}
-            assert flags <= programs[name][command], line
-
     for name, command in in_pages(r"`(mapping|localize) ([a-z][a-z-]*)"):
         assert command in programs[name], f"{name} {command}"
     known = {

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,8 +27,17 @@ from PIL.TiffImagePlugin import BITSPERSAMPLE, SAMPLEFORMAT, TiffImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from visloc.errors import InvalidInput, NotFound, TooLarge
+from visloc.file_kinds import HEAD_BYTES, file_kind
 
 FORMATS = "JPEG, PNG, WebP, TIFF or BMP"
+_READERS: Mapping[str, Callable[[io.BytesIO], ImageFile]] = {
+    "JPEG": JpegImageFile,
+    "PNG": PngImageFile,
+    "WebP": WebPImageFile,
+    "TIFF": TiffImageFile,
+    "BMP": BmpImageFile,
+}
+_JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 # What Pillow's parsers raise on malformed files. It is not documented; this is what fuzzing and
 # reading them showed.
 _MALFORMED = (
@@ -40,6 +50,17 @@ _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolution
 # In units of the longer side: from a 127 degree lens to a long telescope. What lies outside was
 # written by mistake.
 _PLAUSIBLE_FOCAL = (0.25, 50.0)
+# A decoder goes over all pixels once per scan of a JPEG. libjpeg's own script has 10 scans for
+# colour and 18 for CMYK; libtiff refuses more than 100 in the JPEGs that it holds.
+_MAX_SCANS = 100
+# The largest photo may have so many. Photos with fewer pixels may have more, up to _MAX_SCANS.
+_MAX_SCANS_OF_LARGEST = 20
+# Segments of a JPEG or chunks of a PNG. 20 MiB of image data in the usual pieces are 2 600 chunks.
+_MAX_PARTS = 100_000
+# JPEG markers that begin a segment with a length, and the end of the image (ITU T.81, table B.1).
+# Decoders pass over the others byte by byte, or refuse the file.
+_JPEG_MARKER = re.compile(rb"\xff[\xc0-\xc7\xc9-\xcf\xd9-\xef\xfe]")
+_END_OF_IMAGE, _START_OF_SCAN = 0xD9, 0xDA
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +100,11 @@ class Photo:
         """Height of the stored pixels."""
         return int(self.rgb.shape[0])
 
+    @property
+    def is_on_its_side(self) -> bool:
+        """Whether width and height are those of the upright picture swapped."""
+        return self.exif_orientation >= 5
+
 
 _DEFAULT_LIMITS = ImageLimits()
 
@@ -89,7 +115,7 @@ def read_photo(data: bytes, limits: ImageLimits = _DEFAULT_LIMITS) -> Photo:
     Raises:
         InvalidInput: ``image.empty``, ``image.format`` (not an image that is read here) or
             ``image.undecodable`` (malformed or cut off).
-        TooLarge: ``image.too_large`` or ``image.too_many_pixels``.
+        TooLarge: ``image.too_large``, ``image.too_many_pixels`` or ``image.too_complex``.
     """
     return _read(data, limits, field="image")
 
@@ -114,6 +140,15 @@ def read_photo_file(path: Path, limits: ImageLimits = _DEFAULT_LIMITS) -> Photo:
     return _read(data, limits, field=str(path))
 
 
+def turn_of(exif_orientation: int) -> int:
+    """Return the orientation (1, 3, 6 or 8) that turns as this one (1 to 8) without mirroring.
+
+    Front cameras store what the sensor saw, and some ask viewers to mirror it (2, 4, 5 and 7). A
+    mirrored picture has no camera and matches nothing.
+    """
+    return {2: 1, 4: 3, 5: 6, 7: 8}.get(exif_orientation, exif_orientation)
+
+
 def upright(rgb: NDArray[np.uint8], exif_orientation: int) -> NDArray[np.uint8]:
     """Turn stored pixels (H, W, 3) the way their EXIF orientation (1 to 8) asks for."""
     flip_x, flip_y, transpose = _turn(exif_orientation)
@@ -135,6 +170,19 @@ def stored_from_upright(
     ).astype(points.dtype, copy=False)
 
 
+def upright_from_stored(
+    points: NDArray[np.floating], exif_orientation: int, stored_width: int, stored_height: int
+) -> NDArray[np.floating]:
+    """Move points (N, 2) in stored pixels to ``upright(rgb, exif_orientation)``.
+
+    The inverse of ``stored_from_upright``.
+    """
+    flip_x, flip_y, transpose = _turn(exif_orientation)
+    x, y = points[:, 0], points[:, 1]
+    turned = [stored_width - x if flip_x else x, stored_height - y if flip_y else y]
+    return np.column_stack(turned[::-1] if transpose else turned).astype(points.dtype, copy=False)
+
+
 def _turn(exif_orientation: int) -> tuple[bool, bool, bool]:
     """Return what leads from stored to upright: mirror x, mirror y, and then transpose."""
     return exif_orientation in (2, 3, 7, 8), exif_orientation in (3, 4, 6, 7), exif_orientation >= 5
@@ -153,6 +201,7 @@ def _read(data: bytes, limits: ImageLimits, field: str) -> Photo:
             expected=f"at most {limits.max_bytes} bytes",
             got=f"{len(data)} bytes" if field == "image" else "more",
         )
+    scans = _count_passes(data, field)
     try:
         header = _open_header(data, field)
     except Image.DecompressionBombError as error:  # Pillow's own limit, checked for WebP only
@@ -160,6 +209,11 @@ def _read(data: bytes, limits: ImageLimits, field: str) -> Photo:
     width, height = header.size
     if width * height > limits.max_pixels:
         raise _too_many_pixels(field, limits, f"{width} x {height}")
+    max_scans = min(_MAX_SCANS, _MAX_SCANS_OF_LARGEST * limits.max_pixels // (width * height))
+    if scans > max_scans:
+        raise _too_complex(
+            field, f"at most {max_scans} scans of {width} x {height} pixels", f"{scans} scans"
+        )
     rgb = _decode(_only_pixels(data) if isinstance(header, PngImageFile) else data)
     if rgb is None or rgb.shape != (height, width, 3):
         raise InvalidInput(
@@ -188,20 +242,80 @@ def _too_many_pixels(field: str, limits: ImageLimits, got: str) -> TooLarge:
     )
 
 
+def _too_complex(field: str, expected: str, got: str) -> TooLarge:
+    return TooLarge(
+        "image.too_complex",
+        "the photo takes too much work to decode; save it again as an ordinary JPEG or PNG",
+        field=field,
+        expected=expected,
+        got=got,
+    )
+
+
+def _count_passes(data: bytes, field: str) -> int:
+    """Return the scans of a JPEG; 0 for other formats.
+
+    Raises:
+        TooLarge: ``image.too_complex`` for too many segments or chunks: Pillow takes microseconds
+            for each.
+    """
+    scans = parts = 0
+    if data.startswith(_JPEG):
+        scans, parts = _jpeg_scans(data)
+    elif data.startswith(_PNG):
+        parts = _png_chunks(data)
+    if parts > _MAX_PARTS:
+        raise _too_complex(field, f"at most {_MAX_PARTS} segments or chunks", "more")
+    return scans
+
+
+def _jpeg_scans(jpeg: bytes) -> tuple[int, int]:
+    """Count the scans of the first image, and its segments with the bytes lost between them.
+
+    Segments are found as libjpeg finds them, so that it decodes no scan that is not counted here.
+    Thumbnails are within segments; what a camera appends comes after the end of the image. Stops
+    once ``_MAX_PARTS`` is exceeded.
+    """
+    scans = parts = 0
+    position = 2
+    while parts <= _MAX_PARTS and (marker := _JPEG_MARKER.search(jpeg, position)):
+        kind = jpeg[marker.start() + 1]
+        if kind == _END_OF_IMAGE and scans:
+            break
+        parts += 1
+        if scans == 0:  # later, image data lies between segments
+            parts += marker.start() - position
+        scans += kind == _START_OF_SCAN
+        position = marker.end()
+        if kind != _END_OF_IMAGE:  # Pillow passes over one that comes before any scan
+            # The length counts its own two bytes.
+            position += max(2, int.from_bytes(jpeg[position : position + 2], "big"))
+    return scans, parts
+
+
+def _png_chunks(png: bytes) -> int:
+    """Count the chunks; stops once ``_MAX_PARTS`` is exceeded."""
+    position, chunks = len(_PNG), 0
+    while chunks <= _MAX_PARTS and position + 12 <= len(png):
+        position += 12 + int.from_bytes(png[position : position + 4], "big")
+        chunks += 1
+    return chunks
+
+
 def _open_header(data: bytes, field: str) -> ImageFile:
     # The classes instead of Image.open: that one has a pixel limit of its own, a process-wide
     # variable, and warns or raises before ours can be compared.
-    reader = _reader(data)
-    if reader is None:
+    kind = file_kind(data[:HEAD_BYTES])
+    if kind is None or not kind.is_read:
         raise InvalidInput(
             "image.format",
-            "not an image that is read here",
+            "not an image that is read here" if kind is None else kind.refusal,
             field=field,
             expected=FORMATS,
-            got=f"bytes that begin with {data[:12].hex(' ')}",
+            got=f"bytes that begin with {data[:12].hex(' ')}" if kind is None else kind.name,
         )
     try:
-        header = reader(io.BytesIO(data))
+        header = _READERS[kind.name](io.BytesIO(data))
     except _MALFORMED as error:
         raise InvalidInput(
             "image.undecodable",
@@ -213,20 +327,6 @@ def _open_header(data: bytes, field: str) -> ImageFile:
     if isinstance(header, TiffImageFile):
         _check_tiff(header, field)
     return header
-
-
-def _reader(data: bytes) -> Callable[[io.BytesIO], ImageFile] | None:
-    if data.startswith(b"\xff\xd8\xff"):
-        return JpegImageFile
-    if data.startswith(b"\x89PNG\r\n\x1a\n"):
-        return PngImageFile
-    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
-        return WebPImageFile
-    if data.startswith((b"II*\0", b"MM\0*")):
-        return TiffImageFile
-    if data.startswith(b"BM"):
-        return BmpImageFile
-    return None
 
 
 def _check_tiff(header: TiffImageFile, field: str) -> None:

@@ -7,8 +7,7 @@ finds one pose from all images of an instant.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,9 +21,10 @@ from visloc.features.lightglue import make_lightglue
 from visloc.features.readymade import is_ready_made
 from visloc.fingerprints import check_fingerprint
 from visloc.geometry import Camera, Pose
-from visloc.images import Photo, stored_from_upright, upright
+from visloc.images import Photo
 from visloc.matching.correspondences import CLEAR_RATIO, match_landmarks
 from visloc.matching.products import EightBitRows, in_eight_bits, start_threads
+from visloc.photo_features import extract_features
 from visloc.priors import NO_PRIORS, Priors
 from visloc.query_camera import resolve_camera
 from visloc.query_features import (
@@ -66,11 +66,24 @@ _MOST_KEYPOINTS: Mapping[Extraction, int] = {Extraction.FAST: 1000, Extraction.D
 # asked too: they may show that the priors are wrong.
 _NUM_ELSEWHERE = 5
 
-# Of one photo: what an extractor found with a limit, the limit, and the pixels it looked at.
-FeatureCache = dict[
-    tuple[LocalFeatureExtractor, ReadAs, Extraction],
-    tuple[LocalFeatures, int, NDArray[np.uint8]],
-]
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundFeatures:
+    """Local features of a photo, kept for the next map that asks for them.
+
+    Attributes:
+        local: with keypoints in the stored pixels.
+        max_keypoints: how many the extractor might have returned.
+        rgb: (height, width, 3) pixels that it looked at, upright where that was asked for.
+    """
+
+    local: LocalFeatures
+    max_keypoints: int
+    rgb: NDArray[np.uint8]
+
+
+# Of one photo, by what found them and how.
+FeatureCache = dict[tuple[LocalFeatureExtractor, ReadAs, Extraction], FoundFeatures]
 
 
 class Localizer:
@@ -190,8 +203,7 @@ class Localizer:
             priors: what is known of the camera.
 
         Raises:
-            InvalidInput: ``camera.required``, ``options.read_as``, ``options.fusion_weights``,
-                ``features.kind``,
+            InvalidInput: ``camera.required``, ``options.fusion_weights``, ``features.kind``,
                 ``features.keypoints``, ``features.descriptors``, ``features.global_descriptors``,
                 ``priors.*``.
             TooLarge: ``features.too_many``.
@@ -234,14 +246,6 @@ class Localizer:
                 "features cannot be localized without the camera that they were seen with",
                 field="camera",
                 expected="its model, size and parameters",
-            )
-        if options.read_as is not ReadAs.STORED:
-            raise InvalidInput(
-                "options.read_as",
-                "features are taken as they are: turn the photo before they are looked for",
-                field="options.read_as",
-                expected=ReadAs.STORED,
-                got=options.read_as,
             )
         fusion = self._fusion(options)
         constraints = Constraints(self.geometry, priors)
@@ -456,13 +460,20 @@ def find_features(
     """
     most = min(most, _MOST_KEYPOINTS.get(options.extraction, most))
     key = extractor, options.read_as, options.extraction
-    local, limit, rgb = (found or {}).get(key) or (None, 0, photo.rgb)
-    if local is None or limit < most:
-        local, rgb = _extracted(photo, extractor, most, options.read_as, options.extraction)
-        limit = most
+    known = None if found is None else found.get(key)
+    if known is None or known.max_keypoints < most:
+        local, rgb = extract_features(
+            photo,
+            extractor,
+            max_keypoints=most,
+            read_as=options.read_as,
+            extraction=options.extraction,
+        )
+        known = FoundFeatures(local, most, rgb)
         if found is not None:
-            found[key] = local, limit, rgb
-    return (local if limit == most else _strongest(local, most)), rgb
+            found[key] = known
+    local = known.local if known.max_keypoints == most else _strongest(known.local, most)
+    return local, known.rgb
 
 
 def _strongest(local: LocalFeatures, most: int) -> LocalFeatures:
@@ -470,21 +481,3 @@ def _strongest(local: LocalFeatures, most: int) -> LocalFeatures:
     return LocalFeatures(
         local.keypoints[:most], local.descriptors[:most], local.scores[:most], local.scales[:most]
     )
-
-
-def _extracted(
-    photo: Photo,
-    extractor: LocalFeatureExtractor,
-    max_keypoints: int,
-    read_as: ReadAs,
-    extraction: Extraction,
-) -> tuple[LocalFeatures, NDArray[np.uint8]]:
-    find = partial(extractor.extract, max_keypoints=max_keypoints, extraction=extraction)
-    if read_as is ReadAs.STORED or photo.exif_orientation == 1:
-        return find(photo.rgb), photo.rgb
-    rgb = upright(photo.rgb, photo.exif_orientation)
-    local = find(rgb)
-    keypoints = stored_from_upright(
-        local.keypoints, photo.exif_orientation, photo.width, photo.height
-    )
-    return replace(local, keypoints=keypoints), rgb

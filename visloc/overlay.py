@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from visloc.archive import Map
 from visloc.archive.schema import MAX_PHOTO_BYTES, MAX_PHOTO_SIDE
 from visloc.errors import InvalidInput, MapCorrupt
-from visloc.images import ImageLimits, Photo, read_photo, stored_from_upright, upright
+from visloc.images import ImageLimits, Photo, read_photo, turn_of, upright, upright_from_stored
 from visloc.solving import Look
 from visloc.types import Answer, Localized, NotLocalized, ReadAs
 
@@ -154,12 +154,9 @@ def draw_overlay(
 def _as_looked_at(photo: Photo, look: Look) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """The pixels that features were found in, and the matches' keypoints there."""
     pixels = look.matches.pixels
-    if look.evidence.read_as is ReadAs.STORED or photo.exif_orientation == 1:
-        return photo.rgb, pixels
-    rgb = upright(photo.rgb, photo.exif_orientation)
-    # The two quarter turns are each other's inverse; all others are their own.
-    back = {6: 8, 8: 6}.get(photo.exif_orientation, photo.exif_orientation)
-    return rgb, stored_from_upright(pixels, back, rgb.shape[1], rgb.shape[0]).astype(np.float64)
+    turn = turn_of(photo.exif_orientation) if look.evidence.read_as is ReadAs.UPRIGHT else 1
+    turned = upright_from_stored(pixels, turn, photo.width, photo.height)
+    return upright(photo.rgb, turn), turned.astype(np.float64)
 
 
 def _fit(width: int, height: int, corner: tuple[int, int], box: tuple[int, int]) -> _Panel:

@@ -31,13 +31,14 @@ def resolve_camera(photo: Photo, given: Camera | None) -> tuple[Camera, CameraSo
         return given, CameraSource.GIVEN
     if given.has_aspect_of(width, height):
         return given.scaled(width, height), CameraSource.GIVEN_SCALED
-    turned = photo.exif_orientation >= 5 and given.has_aspect_of(height, width)
+    turned = photo.is_on_its_side and given.has_aspect_of(height, width)
     raise InvalidInput(
         "camera.size_mismatch",
         "the camera is not for this photo"
         + (
             "; the photo is stored turned (EXIF orientation "
-            f"{photo.exif_orientation}) and the camera must be that of the stored pixels"
+            f"{photo.exif_orientation}), and the camera must be that of the stored pixels: send "
+            "that one, or turn the photo's pixels and leave the EXIF orientation out"
             if turned
             else ""
         ),

@@ -10,15 +10,13 @@ from numpy.typing import NDArray
 
 from visloc.archive import Map
 from visloc.features.lightglue import SeenKeypoints
-from visloc.images import stored_from_upright
+from visloc.geometry import Camera
+from visloc.images import turn_of, upright_from_stored
 from visloc.matching.correspondences import Pairs
 from visloc.types import Evidence, LocalFeatures, ReadAs
 
 if TYPE_CHECKING:
     from visloc.features.lightglue_torch import LightGlue
-
-# EXIF orientations and those that undo them; the others undo themselves.
-_UNDONE_BY = {6: 8, 8: 6}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,13 +40,13 @@ class Rematching:
             Keypoints, landmarks, and the cosine similarities of their descriptors.
         """
         landmarks, rows = self.opened.observations(image)
-        camera = self.opened.cameras[self.opened.images[image].camera]
+        record = self.opened.images[image]
         scale = np.float32(self.opened.manifest.local_features.descriptor_scale)
-        theirs = SeenKeypoints(
+        theirs = _seen_upright(
             self.opened.keypoints(image),
             rows.astype(np.float32) * scale,
-            camera.width,
-            camera.height,
+            self.opened.cameras[record.camera],
+            record.turn,
         )
         i, j, _ = self.network.match(self.seen, theirs)
         similarities = np.einsum("nd,nd->n", self.seen.descriptors[i], theirs.descriptors[j])
@@ -56,13 +54,19 @@ class Rematching:
 
 
 def seen_as_found(local: LocalFeatures, evidence: Evidence) -> SeenKeypoints:
-    """Return keypoints in the photo as their descriptors saw it: upright, where it was turned."""
-    width, height = evidence.camera.width, evidence.camera.height
-    keypoints: NDArray[np.floating] = local.keypoints
-    orientation = evidence.exif_orientation
-    if evidence.read_as is ReadAs.UPRIGHT and orientation != 1:
-        if orientation >= 5:
-            width, height = height, width
-        undone_by = _UNDONE_BY.get(orientation, orientation)
-        keypoints = stored_from_upright(keypoints, undone_by, width, height)
-    return SeenKeypoints(keypoints.astype(np.float32), local.descriptors, width, height)
+    """Return the keypoints of a query where its descriptors were computed, in the upright photo."""
+    turn = turn_of(evidence.exif_orientation) if evidence.read_as is ReadAs.UPRIGHT else 1
+    return _seen_upright(local.keypoints, local.descriptors, evidence.camera, turn)
+
+
+def _seen_upright(
+    keypoints: NDArray[np.floating],
+    descriptors: NDArray[np.float32],
+    camera: Camera,
+    turn: int,
+) -> SeenKeypoints:
+    """Turn keypoints (N, 2) in stored pixels by an EXIF orientation."""
+    width, height = camera.width, camera.height
+    turned = upright_from_stored(keypoints, turn, width, height)
+    size = (height, width) if turn >= 5 else (width, height)
+    return SeenKeypoints(turned.astype(np.float32), descriptors, *size)

@@ -119,12 +119,6 @@ class SequenceSolver:
         self._rest = 0  # instants to come before a window without any pose is searched again
 
     @property
-    def measured(self) -> int:
-        """Inliers of the newest instant if its own images localize it, else 0."""
-        newest = self._entries[-1].solved.pose if self._entries else None
-        return 0 if newest is None else newest.num_inliers
-
-    @property
     def newest(self) -> RigPose | None:
         """What its own images measured of the newest instant; None when they do not localize it."""
         return self._entries[-1].solved.answer.pose if self._entries else None
@@ -133,16 +127,27 @@ class SequenceSolver:
         """Take one more instant; return the answers that are final now.
 
         Raises:
+            InvalidInput: as ``solve``.
+        """
+        return self.take(seen, self.solve(seen))
+
+    def solve(self, seen: SeenInstant) -> Solved:
+        """Solve an instant on its own.
+
+        Raises:
             InvalidInput: ``sequence.odometry`` for a map that is not metric; ``priors.*`` that
                 mean nothing in the map.
         """
         check_odometry(seen.odometry, metric=self._metric)
+        return solve_instant(
+            seen.images, self._geometry, self._options, seen.priors, seen.timestamp
+        )
+
+    def take(self, seen: SeenInstant, solved: Solved) -> list[InstantAnswer]:
+        """Take one more instant that was solved; return the answers that are final now."""
         if self._first_timestamp is None:
             self._first_timestamp = seen.timestamp
         ticks = seen.timestamp - self._first_timestamp
-        solved = solve_instant(
-            seen.images, self._geometry, self._options, seen.priors, seen.timestamp
-        )
         self._entries.append(_Entry(seen, solved, ticks))
         self._rest = max(0, self._rest - 1)
         return self._answer(ended=False)
@@ -369,8 +374,9 @@ def check_odometry(odometry: Odometry | None, *, metric: bool) -> None:
 
 def _window_instant(solved: Solved) -> WindowInstant:
     refusal = solved.answer.refusal
-    if refusal is not None and refusal.reason is Reason.CONTRADICTS_PRIOR:
-        # Matches that lying priors allowed would pass together the gate that refused each alone.
+    if refusal is not None and refusal.reason in (Reason.CONTRADICTS_PRIOR, Reason.AMBIGUOUS):
+        # Matches that lying priors allowed would pass together the gate that refused each alone;
+        # those that another map explains as well are no evidence of this one.
         return WindowInstant((), None)
     if any(view.focal_unknown for view in solved.views):
         # A window takes cameras as they are: such pixels would fit a wrong pose.

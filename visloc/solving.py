@@ -29,6 +29,7 @@ from visloc.types import (
     ImageAnswer,
     InstantAnswer,
     LocalizeOptions,
+    ReadAs,
     Reason,
     Refusal,
     RegistrationPreset,
@@ -47,6 +48,10 @@ _AMBIGUOUS_SHARE = 0.7
 # chi-square with six degrees of freedom, above this once in a thousand times.
 _SURE_INLIERS = 100
 _MAX_HALVES_MAHALANOBIS2 = 22.46
+# What becomes of a photo whose features were found on its side.
+_REASONS_OF_TURNED_PHOTOS = (
+    *(Reason.TOO_FEW_MATCHES, Reason.NO_POSE, Reason.TOO_FEW_INLIERS, Reason.LOW_INLIER_RATIO),
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,6 +128,10 @@ class Solved:
     pose: GeneralizedPose | None
     inliers: tuple[NDArray[np.bool_], ...]
 
+    def refused(self, refusal: Refusal) -> Solved:
+        """Return the same without its pose."""
+        return replace(self, answer=replace(self.answer, pose=None, refusal=refusal), pose=None)
+
 
 def solve_instant(
     images: Sequence[SeenImage],
@@ -160,6 +169,7 @@ def solve_instant(
         if refusal is None or refusal.reason is not Reason.CONTRADICTS_PRIOR:
             elsewhere = _views_of(images, [look.elsewhere for look in looks], options)
             refusal = _better_elsewhere(elsewhere, found, options) or refusal
+        refusal = refusal and _with_turned_photos(refusal, looks)
     pose = None
     if refusal is None and found is not None and found.covariance is not None:
         pose = rig_pose(found.rig_from_world, found.covariance, geometry, PoseSource.ESTIMATED)
@@ -414,6 +424,22 @@ def _halves_disagree(
         f"the best pose explains only {found.num_inliers} matches, and two halves of the matches "
         "give poses that contradict each other: the photo is blurred, or of another place",
     )
+
+
+def _with_turned_photos(refusal: Refusal, looks: Sequence[Look]) -> Refusal:
+    """Add to the message that photos were read on their side, where that may be the cause."""
+    orientations = sorted(
+        {
+            look.evidence.exif_orientation
+            for look in looks
+            if look.evidence.read_as is ReadAs.STORED and look.evidence.exif_orientation != 1
+        }
+    )
+    if not orientations or refusal.reason not in _REASONS_OF_TURNED_PHOTOS:
+        return refusal
+    exif = ", ".join(map(str, orientations))
+    hint = f"stored turned, EXIF orientation {exif}, and was read as stored: try read_as=upright"
+    return replace(refusal, message=f"{refusal.message} (the photo is {hint})")
 
 
 def _near_pose_prior(

@@ -155,7 +155,7 @@ class Reason(StrEnum):
     NO_PHOTO_NEAR = "no_photo_near"  # the map has no photo where the priors allow the device
     CONTRADICTS_PRIOR = "contradicts_prior"
     CONTRADICTS_MOTION = "contradicts_motion"  # the images of its neighbours, and how it moved
-    AMBIGUOUS = "ambiguous"  # of a set: two places far apart explain the photo about equally well
+    AMBIGUOUS = "ambiguous"  # two of several places explain the images about equally well
     NO_USABLE_IMAGE = "no_usable_image"  # none of an instant's images could be read
 
 
@@ -231,8 +231,8 @@ class LocalizeOptions:
             for photos of 640 px and more on the longer side, and shrinks with smaller ones.
         min_inliers: fewest inliers of an accepted pose.
         min_inlier_ratio: smallest share of inliers among the correspondences, 0 to 1.
-        read_as: whether to turn the photo upright by its EXIF orientation before finding
-            features. Camera, pose and 2D points refer to the pixels as stored either way.
+        read_as: the orientation in which features are found. Camera, pose and 2D points refer
+            to the pixels as stored either way.
         extraction: the effort that goes into finding the photo's local features.
         fusion: how similarities under several global descriptors become one ranking; None for the
             map's way.
@@ -248,7 +248,7 @@ class LocalizeOptions:
     max_error_px: float | None = None
     min_inliers: int | None = None
     min_inlier_ratio: float | None = None
-    read_as: ReadAs = ReadAs.STORED
+    read_as: ReadAs = ReadAs.UPRIGHT
     extraction: Extraction = Extraction.DEFAULT
     fusion: Fusion | None = None
     fusion_weights: Mapping[str, float] | None = field(default=None, hash=False)  # a dict

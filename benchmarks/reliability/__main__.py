@@ -18,6 +18,8 @@ from typing import Annotated
 import typer
 
 from benchmarks.reliability.checks import print_checks
+from benchmarks.reliability.heavy_requests import heavy_photos, many_values
+from benchmarks.reliability.idle_connections import idle_connections
 from benchmarks.reliability.kills import kill_service, kill_workers
 from benchmarks.reliability.maps import SampleMaps, make_maps
 from benchmarks.reliability.refusals import refusals
@@ -82,6 +84,34 @@ def slow_clients_command(
         print_checks(
             "slow clients", asyncio.run(slow_clients(maps, work, connections, seconds, rounds))
         )
+
+
+@app.command("idle-connections")
+def idle_connections_command(
+    connections: Annotated[int, typer.Option(help="Idle ones, at once.")] = 2500,
+) -> None:
+    """Connections that say nothing, with 1024 open files allowed."""
+    with _prepared() as (maps, work):
+        checks = asyncio.run(idle_connections(maps.folder, work, connections))
+        print_checks("idle connections", checks)
+
+
+@app.command("heavy-photos")
+def heavy_photos_command(
+    deadline: Annotated[float, typer.Option(help="Of the callers, seconds.")] = 0.5,
+) -> None:
+    """Small photos that take long to decode, whose callers give up."""
+    with _prepared() as (maps, work):
+        print_checks("heavy photos", heavy_photos(maps, work, deadline))
+
+
+@app.command("many-values")
+def many_values_command(
+    clients: Annotated[int, typer.Option(help="At once.")] = 8,
+) -> None:
+    """Messages of many small values, which take long to parse."""
+    with _prepared() as (maps, work):
+        print_checks("many values", many_values(maps, work, clients))
 
 
 @app.command("refusals")

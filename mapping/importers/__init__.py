@@ -9,13 +9,15 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import cast
 
+from mapping.costs import Progress
 from mapping.importers.dataset import write_imported
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.outputs import refuse_existing
+from mapping.progress import one_step
 from mapping.stages import exclusive
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput
@@ -41,6 +43,10 @@ IMPORTERS: Mapping[str, tuple[str, str]] = {
     "openmvg": ("mapping.importers.openmvg", "read"),
     "opensfm": ("mapping.importers.opensfm", "read"),
 }
+
+
+def _untold(_stage: str, _done: int, _total: int) -> None:
+    """What is told to nobody."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +82,12 @@ class ImportSummary:
 
 @contextmanager
 def imported(
-    name: str, path: Path, maps_dir: Path, map_id: str, photos: Path | None
+    name: str,
+    path: Path,
+    maps_dir: Path,
+    map_id: str,
+    photos: Path | None,
+    progress: Progress = _untold,
 ) -> Iterator[tuple[Path, ImportSummary]]:
     """Have a foreign reconstruction as a dataset while a map is made of it.
 
@@ -90,20 +101,23 @@ def imported(
     dataset = maps_dir / ".work" / f".imported-{map_id}"
     with exclusive(dataset.with_name(f"{dataset.name}.lock")):
         shutil.rmtree(dataset, ignore_errors=True)  # of an import that was killed
-        summary = import_dataset(name, path, dataset, photos)
+        summary = import_dataset(name, path, dataset, photos, progress)
         try:
             yield dataset, summary
         finally:
             shutil.rmtree(dataset, ignore_errors=True)
 
 
-def read_model(name: str, path: Path, photos: Path | None = None) -> ImportedModel:
+def read_model(
+    name: str, path: Path, photos: Path | None = None, progress: Progress = _untold
+) -> ImportedModel:
     """Read a foreign reconstruction.
 
     Args:
         name: a key of ``IMPORTERS``.
         path: the file or folder that the format consists of.
         photos: the folder that names of photos are relative to; None takes the usual place.
+        progress: told the stage, how much of it is done, and how much there is.
 
     Raises:
         InvalidInput: ``import.unknown_format``, ``import.photos``.
@@ -126,14 +140,19 @@ def read_model(name: str, path: Path, photos: Path | None = None) -> ImportedMod
             got=str(photos),
         )
     module, function = IMPORTERS[name]
-    read = cast(
-        "Callable[[Path, Path | None], ImportedModel]", getattr(import_module(module), function)
-    )
-    return read(path, photos)
+    read: Callable[..., ImportedModel] = getattr(import_module(module), function)
+    if name == "images":  # the only one that decodes photos, which takes long
+        return read(path, photos, partial(progress, "photos"))
+    with one_step(progress, "reading"):
+        return read(path, photos)
 
 
 def import_dataset(
-    name: str, path: Path, output: Path, photos: Path | None = None
+    name: str,
+    path: Path,
+    output: Path,
+    photos: Path | None = None,
+    progress: Progress = _untold,
 ) -> ImportSummary:
     """Read a foreign reconstruction and write it as a kapture 1.1 dataset.
 
@@ -142,14 +161,16 @@ def import_dataset(
         path: the file or folder that the format consists of.
         output: the dataset to make; it must not exist, and does not if this fails.
         photos: the folder that names of photos are relative to; None takes the usual place.
+        progress: told the stage, how much of it is done, and how much there is.
 
     Raises:
         Conflict: ``import.exists``.
         InvalidInput, DatasetError: as ``read_model`` and ``write_imported``.
     """
     refuse_existing(output, "import.exists")  # before the long work
-    model = read_model(name, path, photos)
-    notes = write_imported(model, output)
+    model = read_model(name, path, photos, progress)
+    with one_step(progress, "dataset"):
+        notes = write_imported(model, output)
     with_keypoints = [image for image in model.images if image.keypoints is not None]
     kinds = [sensor.kind for sensor in model.sensors.values()]
     return ImportSummary(

@@ -19,6 +19,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mapping.importers.colmap_checks import check_model, has_model
+from mapping.importers.largest import ModelSize, largest_model
 from mapping.importers.model import ImportedImage, ImportedModel
 from visloc.errors import DatasetError, InvalidInput, NotFound
 from visloc.geometry import CAMERA_MODELS, Camera, Pose
@@ -55,9 +56,9 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     """Read a model, a database, or a model with the database that it was made of.
 
     Args:
-        path: a folder with a model, or with one in ``sparse/0``, ``sparse`` or in just one of its
-            subfolders; or a database; a folder with nothing but a ``database.db`` (or a single
-            ``*.db``) is taken for that.
+        path: a folder with a model, or with models in subfolders of ``sparse``, in ``sparse`` or
+            in subfolders of its own, of which the largest is taken; or a database; a folder with
+            nothing but a ``database.db`` (or a single ``*.db``) is taken for that.
         photos: folder that names are relative to; None takes ``images`` in or beside ``path``.
 
     Raises:
@@ -65,7 +66,8 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
         DatasetError: ``import.colmap`` for a damaged file, ``camera.model`` for a camera that
             kapture cannot hold, ``import.duplicate_image``.
     """
-    folder = _model_folder(path)
+    folders = _model_folders(path)
+    model, folder, notes = _largest(folders) if folders else (None, None, [])
     places = _places(path, folder)
     database_path = path if path.is_file() else _database_in(places)
     if folder is None and database_path is None:
@@ -74,24 +76,36 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
             "there is neither a COLMAP model nor a database",
             field=str(path),
             expected="cameras, images and points3D (.bin or .txt), there, in sparse/0, sparse or "
-            "one subfolder; or a database.db",
+            "a subfolder; or a database.db",
         )
     if photos is None:
         photos = next((p / "images" for p in places if (p / "images").is_dir()), None)
     database = None if database_path is None else _read_database(database_path)
-    if folder is not None:
-        return _model(_reconstruction(folder), folder, database, photos)
+    if model is not None and folder is not None:
+        return _model(model, folder, database, photos, notes)
     assert database is not None
     return _model_of_database(database, photos)
 
 
-def _model_folder(path: Path) -> Path | None:
-    candidates = (path, path / "sparse" / "0", path / "sparse")
-    found = next((folder for folder in candidates if has_model(folder)), None)
-    if found is None and path.is_dir():
-        below = [folder for folder in sorted(path.iterdir()) if has_model(folder)]
-        return below[0] if len(below) == 1 else None
-    return found
+def _model_folders(path: Path) -> list[Path]:
+    """Return the folders with models in the first of the usual places that has any."""
+    sparse = path / "sparse"
+    places = ([path], _subfolders(sparse), [sparse], _subfolders(path))
+    return next((found for place in places if (found := [f for f in place if has_model(f)])), [])
+
+
+def _subfolders(path: Path) -> list[Path]:
+    return sorted(path.iterdir()) if path.is_dir() else []
+
+
+def _largest(folders: list[Path]) -> tuple[pycolmap.Reconstruction, Path, list[str]]:
+    models = [_reconstruction(folder) for folder in folders]
+    sizes = [
+        ModelSize(folder.name, photos=model.num_reg_images(), points=model.num_points3D())
+        for folder, model in zip(folders, models, strict=True)
+    ]
+    row, notes = largest_model(str(folders[0].parent), sizes)
+    return models[row], folders[row], notes
 
 
 def _places(path: Path, folder: Path | None) -> list[Path]:
@@ -134,8 +148,8 @@ def _model(
     folder: Path,
     database: _Database | None,
     photos: Path | None,
+    notes: list[str],
 ) -> ImportedModel:
-    notes: list[str] = []
     colmap_images = sorted(model.images.values(), key=lambda image: image.name)
     rows = {image.image_id: row for row, image in enumerate(colmap_images)}
     keypoints = [_points2d(image) for image in colmap_images]

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from mapping.importers.left_out import list_path, notes_on, write_list
 from mapping.importers.model import ImportedImage, ImportedModel
+from mapping.importers.photo_names import is_stored_turned, photo_size
 from mapping.outputs import complete_output
 from visloc.errors import DatasetError
 from visloc.kapture import (
@@ -37,7 +39,8 @@ def write_imported(model: ImportedModel, output: Path) -> tuple[str, ...]:
     """Write a kapture 1.1 dataset: sensors, poses, records, keypoints, descriptors and points.
 
     Photos are not copied: ``sensors/records_data`` is a symbolic link to their folder. A photo
-    without its file stays in the dataset, with a note.
+    without its file stays in the dataset, with a note. Files that are not used are listed beside
+    the dataset, see ``left_out.list_path``.
 
     Args:
         model: the model. The depth map of a photo is of the sensor ``depth_sensor_id`` of the
@@ -45,19 +48,21 @@ def write_imported(model: ImportedModel, output: Path) -> tuple[str, ...]:
         output: the folder to make; it must not exist, and does not if this fails.
 
     Returns:
-        The model's notes, and those on missing photos.
+        The model's notes, and those on files that are missing or left out.
 
     Raises:
         Conflict: ``import.exists``.
         DatasetError: ``import.empty``, ``import.name``, ``import.duplicate_image``,
             ``import.duplicate_record``, ``import.sensor``, ``import.features``,
             ``import.points``, ``import.observations``; ``import.photos_missing`` if no photo has
-            its file and the model lacks descriptors, which would have to be made of photos.
+            its file and the model lacks descriptors, which would have to be made of photos;
+            ``import.photo``, ``import.photo_size`` for a photo that is not of its camera's size.
     """
     _check_images(model)
     _check_features(model)
     _check_points(model)
-    notes = (*model.notes, *_check_photos(model))
+    notes = (*model.notes, *notes_on(model.left_out), *_check_photos(model))
+    _check_sizes(model)
     with complete_output(output, "import.exists") as root:
         sensors = root / "sensors"
         sensors.mkdir(parents=True)
@@ -67,7 +72,7 @@ def write_imported(model: ImportedModel, output: Path) -> tuple[str, ...]:
         _write_features(model, root)
         if len(model.points):
             write_reconstruction(root, _reconstruction(model))
-    return notes
+    return (*notes, *write_list(model.left_out, list_path(output)))
 
 
 def _dataset(model: ImportedModel, root: Path) -> Dataset:
@@ -311,3 +316,32 @@ def _check_photos(model: ImportedModel) -> list[str]:
             got="no folder of photos" if model.photos is None else "none of them",
         )
     return [f"{len(missing)} of {len(model.images)} photos are missing: {text}"]
+
+
+def _check_sizes(model: ImportedModel) -> None:
+    """Refuse photos of another size than their camera: its numbers are in pixels of that size.
+
+    A photo that is stored turned may have the size that it has when it is upright.
+    """
+    if model.photos is None:
+        return
+    wrong = []
+    for image in model.images:
+        path = model.photos / image.name
+        size, expected = photo_size(path), model.sensors[image.sensor].image_size
+        assert expected is not None  # what a camera has
+        if size in (None, expected) or (size == expected[::-1] and is_stored_turned(path)):
+            continue
+        wrong.append((path, size, expected))
+    if not wrong:
+        return
+    path, (width, height), expected = wrong[0]
+    raise DatasetError(
+        "import.photo_size",
+        f"{len(wrong)} of {len(model.images)} photos are not of the size of their camera, this one "
+        "is the first; name the folder of photos of that size with --photos, or scale the cameras "
+        "in the model: size, focal length and principal point",
+        field=str(path),
+        expected=f"{expected[0]} x {expected[1]} pixels, as its camera {image.sensor}",
+        got=f"{width} x {height} pixels",
+    )

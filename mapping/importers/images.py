@@ -8,16 +8,18 @@ from __future__ import annotations
 import io
 import math
 import os
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from PIL import ExifTags, Image
 
+from mapping.importers.left_out import notes_on
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.intrinsics import FROM_EXIF
-from visloc.errors import DatasetError, InvalidInput, NotFound, VislocError
+from visloc.errors import DatasetError, InvalidInput, NotFound, TooLarge
+from visloc.file_kinds import HEAD_BYTES, FileKind, file_kind
 from visloc.geometry import Camera
 from visloc.images import FORMATS, ImageLimits, read_photo
 from visloc.kapture import GnssRecord, Sensor
@@ -27,7 +29,11 @@ from visloc.kapture.text import has_control_characters
 _SUFFIXES = {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
 _LIMITS = ImageLimits()
 _GNSS = "gnss"
-_NAMED = 3
+# Beside what begins with a dot: what Windows, macOS and network storage put among photos.
+_SYSTEM_NAMES = {"thumbs.db", "desktop.ini", "@eadir", "__macosx", "$recycle.bin"}
+_SYSTEM = "hidden, or of the operating system"
+_LINKED = "links out of the folder and linked folders are not followed"
+_RENAME = f"photos whose names do not end in {', '.join(sorted(_SUFFIXES))}: rename them"
 # What Pillow raises on malformed EXIF beside giving none; found by fuzzing ``visloc.images``.
 _MALFORMED = (
     *(OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, AttributeError),
@@ -62,20 +68,39 @@ class _Found:
     dop: float
 
 
-def read(path: Path, photos: Path | None = None) -> ImportedModel:
+@dataclass(slots=True)
+class _Files:
+    """The files of a folder, by path relative to it.
+
+    Attributes:
+        photos: those that may be photos, in the order of their names.
+        left_out: the others by reason, as in ``ImportedModel``.
+    """
+
+    photos: list[str] = field(default_factory=list)
+    left_out: dict[str, list[str]] = field(default_factory=dict)
+
+    def leave_out(self, name: str, reason: str) -> None:
+        self.left_out.setdefault(reason, []).append(name)
+
+
+def read(
+    path: Path, photos: Path | None = None, progress: Callable[[int, int], None] | None = None
+) -> ImportedModel:
     """Read a folder of photos, with the folders in it.
 
     Links that lead out of the folder, and linked folders, are not followed. A camera is what has
     the same maker, model, focal length and size: SIMPLE_RADIAL without distortion if EXIF tells
-    the focal length, else of unknown intrinsics. Files that are no readable photos are left out,
-    with a note.
+    the focal length, else of unknown intrinsics. Every file that is not used is in the model's
+    ``left_out``, with the reason.
 
     Args:
         path: the folder.
         photos: must be None: the folder is that of the photos.
+        progress: told how many photos were read, and of how many.
 
     Raises:
-        InvalidInput: ``import.photos`` if ``photos`` is given.
+        InvalidInput: ``import.photos`` if ``photos`` is given; ``import.folder`` for a file.
         NotFound: ``import.missing`` if there is no such folder.
         DatasetError: ``import.empty`` if it holds no readable photo.
     """
@@ -87,31 +112,31 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
             expected="only PATH",
             got=str(photos),
         )
+    if path.is_file():
+        raise _not_a_folder(path)
     if not path.is_dir():
         raise NotFound(
             "import.missing", "no such folder", field=str(path), expected="a folder of photos"
         )
+    files = _files_in(path)
     found: list[_Found] = []
-    unreadable: list[str] = []
-    for name in sorted(_photo_names(path)):
+    for done, name in enumerate(files.photos):
+        if progress is not None:
+            progress(done, len(files.photos))
         try:
             found.append(_read_photo(path, name))
-        except VislocError as error:
-            unreadable.append(str(error))
+        except InvalidInput as error:
+            files.leave_out(name, _reason(error))
+    if progress is not None:
+        progress(len(files.photos), len(files.photos))
     if not found:
         raise DatasetError(
             "import.empty",
-            "the folder holds no readable photo" + "".join(f"; {text}" for text in unreadable[:1]),
+            "; ".join(["the folder holds no readable photo", *notes_on(files.left_out)]),
             field=str(path),
             expected=f"photos of {FORMATS}",
         )
     notes = []
-    if unreadable:
-        notes.append(
-            f"{len(unreadable)} files cannot be read and were left out: "
-            + "; ".join(unreadable[:_NAMED])
-            + ("; ..." if len(unreadable) > _NAMED else "")
-        )
     dated = [photo for photo in found if photo.taken is not None]
     if len(dated) == len(found):
         found.sort(key=lambda photo: (photo.taken or "", photo.name))
@@ -139,21 +164,84 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
         observations=np.empty((0, 3), np.int64),
         gnss=gnss,
         notes=tuple(notes),
+        left_out=files.left_out,
     )
 
 
-def _photo_names(folder: Path) -> Iterator[str]:
+def _not_a_folder(file: Path) -> InvalidInput:
+    kind = _kind_of(file)
+    if kind is None:
+        advice = "name the folder that it lies in"
+    elif kind.is_read:
+        advice = "a map takes several photos: name the folder that they lie in"
+    else:
+        advice = kind.refusal
+    return InvalidInput(
+        "import.folder",
+        f"this is a file; {advice}",
+        field=str(file),
+        expected="a folder of photos",
+        got="a file" if kind is None else f"a file, {kind.name}",
+    )
+
+
+def _files_in(folder: Path) -> _Files:
+    """Find every file in a folder and the folders in it."""
     inside = Path(os.path.realpath(folder))  # unlike Path.resolve, silent on links in a circle
-    for where, _, files in os.walk(folder, followlinks=False):
-        for file in files:
-            path = Path(where) / file
-            if path.suffix.lower() not in _SUFFIXES:
-                continue
-            if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(inside):
-                continue
-            if path.exists() and not path.is_file():  # reading from a pipe would wait for ever
-                continue
-            yield path.relative_to(folder).as_posix()
+    found = _Files()
+
+    def unreadable(error: OSError) -> None:
+        name = Path(error.filename).relative_to(folder).as_posix()
+        found.leave_out(f"{name}/", f"folders that cannot be read: {error.strerror}")
+
+    for where, folders, files in os.walk(folder, onerror=unreadable):
+        entered = []
+        for name in sorted(folders):
+            path = Path(where) / name
+            if _is_of_system(name):
+                found.leave_out(f"{path.relative_to(folder).as_posix()}/", _SYSTEM)
+            elif path.is_symlink():
+                found.leave_out(f"{path.relative_to(folder).as_posix()}/", _LINKED)
+            else:
+                entered.append(name)
+        folders[:] = entered
+        for name in sorted(files):
+            path = Path(where) / name
+            reason = _why_not_read(path, inside)
+            if reason is None:
+                found.photos.append(path.relative_to(folder).as_posix())
+            else:
+                found.leave_out(path.relative_to(folder).as_posix(), reason)
+    found.photos.sort()
+    return found
+
+
+def _is_of_system(name: str) -> bool:
+    return name.startswith(".") or name.lower() in _SYSTEM_NAMES
+
+
+def _why_not_read(path: Path, inside: Path) -> str | None:
+    """Return why a file is not read as a photo; None for one that is to be read."""
+    if _is_of_system(path.name):
+        return _SYSTEM
+    if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(inside):
+        return _LINKED
+    if path.exists() and not path.is_file():  # reading from a pipe would wait for ever
+        return "neither files nor folders"
+    if path.suffix.lower() in _SUFFIXES:
+        return None
+    kind = _kind_of(path)
+    if kind is None:
+        return "not photos"
+    return _RENAME if kind.is_read else kind.refusal
+
+
+def _kind_of(path: Path) -> FileKind | None:
+    try:
+        with path.open("rb") as file:
+            return file_kind(file.read(HEAD_BYTES))
+    except OSError:
+        return None
 
 
 def _read_photo(folder: Path, name: str) -> _Found:
@@ -188,6 +276,15 @@ def _read_photo(folder: Path, name: str) -> _Found:
         altitude_m=_altitude(gps),
         dop=max(_number(gps.get(ExifTags.GPS.GPSDOP)) or 0.0, 0.0),
     )
+
+
+def _reason(error: InvalidInput) -> str:
+    """Return why a photo cannot be read, in the same words for all photos of that trouble."""
+    if isinstance(error, TooLarge):
+        return f"{error.message}, expected {error.expected}"
+    if error.code == "image.unreadable":
+        return f"{error.message}: {error.got}"
+    return error.message
 
 
 def _camera_key(photo: _Found) -> tuple[object, ...]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.importers.left_out import LeftOut
 from visloc.geometry import Pose
 from visloc.kapture import GnssRecord, Sensor
 
@@ -54,6 +55,7 @@ class ImportedModel:
         gnss: fixes.
         metric: whether a unit of the world is known to be a metre.
         notes: what was left out or assumed, one sentence each.
+        left_out: names of files in the folder of photos that are not used, by reason.
     """
 
     sensors: Mapping[str, Sensor]
@@ -66,3 +68,4 @@ class ImportedModel:
     gnss: tuple[GnssRecord, ...] = ()
     metric: bool = False
     notes: tuple[str, ...] = ()
+    left_out: LeftOut = field(default_factory=dict)

@@ -13,17 +13,17 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapping.depth import DEFAULT_DEPTH_SCALE
 from mapping.importers.dataset import depth_sensor_id
 from mapping.importers.json_fields import JsonValue, read_json
 from mapping.importers.model import ImportedImage, ImportedModel
-from mapping.importers.photo_names import photo_size
+from mapping.importers.photo_names import photo_names, photo_size
 from mapping.importers.tracks import rotation_from_matrix
 from visloc.errors import DatasetError, InvalidInput
 from visloc.geometry import MAX_IMAGE_SIDE, Camera, Pose
 from visloc.kapture import Sensor
-from visloc.kapture.text import is_field, relative_path
 
 _FILE = "transforms.json"
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
@@ -66,17 +66,24 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
         photos: folder that ``file_path`` is relative to; None takes that of the file.
 
     Raises:
-        DatasetError: ``import.missing``, ``import.json``, ``import.name`` or ``camera.*``, with
-            the file and the frame.
+        DatasetError: ``import.missing``, ``import.json``, ``import.photo_name`` or ``camera.*``,
+            with the file and the frame.
     """
     file = path / _FILE if path.is_dir() else path
     top = read_json(file)
     folder = file.parent if photos is None else photos
     frames = top["frames"].elements()
+    paths = [frame["file_path"] for frame in frames]
+    raw = [(path.text(), path.where) for path in paths]
+    names, name_notes = photo_names(raw, file.parent, folder)
     seen = _Seen()
-    images = tuple(_image(top, frame, rank, folder, seen) for rank, frame in enumerate(frames))
+    images = tuple(
+        _image(top, frame, _with_suffix(name, folder), rank, file.parent, folder, seen)
+        for rank, (frame, name) in enumerate(zip(frames, names, strict=True))
+    )
     with_depth = any(image.depth is not None for image in images)
     notes, is_scaled = _notes(top, with_depth)
+    notes += name_notes
     notes += [
         f"{len(names)} {why}: {', '.join(names[:_NAMED])}" + (", ..." if names[_NAMED:] else "")
         for why, names in seen.left_out.items()
@@ -99,10 +106,17 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     )
 
 
-def _image(top: JsonValue, frame: JsonValue, rank: int, folder: Path, seen: _Seen) -> ImportedImage:
-    name = _photo_name(frame["file_path"], folder)
+def _image(
+    top: JsonValue,
+    frame: JsonValue,
+    name: str,
+    rank: int,
+    base: Path,
+    folder: Path,
+    seen: _Seen,
+) -> ImportedImage:
     camera = _camera(top, frame, folder / name)
-    depth, depth_size = _depth(frame, folder, seen)
+    depth, depth_size = _depth(frame, base, folder, seen)
     return ImportedImage(
         name=name,
         sensor=seen.sensor_of(camera, depth_size),
@@ -112,30 +126,12 @@ def _image(top: JsonValue, frame: JsonValue, rank: int, folder: Path, seen: _See
     )
 
 
-def _photo_name(value: JsonValue, folder: Path) -> str:
-    name = _path_in(value, folder)
+def _with_suffix(name: str, folder: Path) -> str:
     # The synthetic scenes of NeRF name photos without their suffix.
     if PurePosixPath(name).suffix.lower() not in (s.lower() for s in _SUFFIXES):
         for suffix in _SUFFIXES:
             if _exists(folder / (name + suffix)):
                 return name + suffix
-    return name
-
-
-def _path_in(value: JsonValue, folder: Path) -> str:
-    text = value.text()
-    try:
-        name = relative_path(text)
-    except ValueError:
-        name = ""
-    if not name or not is_field(name):
-        raise DatasetError(
-            "import.name",
-            "not a usable path of a file",
-            field=value.where,
-            expected=f"a path below {folder}, without commas; --photos names another folder",
-            got=text,
-        )
     return name
 
 
@@ -145,15 +141,37 @@ def _exists(path: Path) -> bool:
 
 def _pose(value: JsonValue) -> Pose:
     rows = [row.numbers(4) for row in value.elements()]
-    matrix = np.array(rows, np.float64)
-    is_affine = len(rows) == 3 or (len(rows) == 4 and rows[3] == [0, 0, 0, 1])
-    rotation = rotation_from_matrix(matrix[:3, :3]) if is_affine else None
-    if rotation is None:
+    if len(rows) not in (3, 4) or rows[3:] not in ([], [[0, 0, 0, 1]]):
         raise value.error(
             "not a pose", expected="a rotation and a position, camera to world: 3 or 4 rows of 4"
         )
+    matrix = np.array(rows, np.float64)
+    rotation = rotation_from_matrix(matrix[:3, :3])
+    if rotation is None:
+        raise _no_rotation(matrix[:3, :3], value)
     cam_from_world = _OURS_FROM_OPENGL @ rotation.T
     return Pose(cam_from_world, -cam_from_world @ matrix[:3, 3])
+
+
+def _no_rotation(matrix: NDArray[np.float64], value: JsonValue) -> DatasetError:
+    """Say what is wrong with the left three columns of a transform."""
+    lengths = np.linalg.norm(matrix, axis=0)
+    determinant = float(np.linalg.det(matrix))
+    scale = abs(determinant) ** (1 / 3)
+    shown = ", ".join(f"{length:.6g}" for length in lengths)
+    if determinant < 0:
+        message = "the pose is mirrored: its frame is left-handed; negate one axis of the frame"
+    elif scale > 0 and rotation_from_matrix(matrix / scale) is not None:
+        message = f"the pose is scaled by {scale:.6g}; divide its first three columns by that"
+    else:
+        message = "the first three columns of the pose are not a rotation"
+    return DatasetError(
+        "import.json",
+        message,
+        field=value.where,
+        expected="three columns of length 1 at right angles, with determinant 1",
+        got=f"columns of length {shown} and determinant {determinant:.6g}",
+    )
 
 
 def _camera(top: JsonValue, frame: JsonValue, photo: Path) -> Camera:
@@ -227,13 +245,17 @@ def _size(width: JsonValue | None, height: JsonValue | None) -> tuple[int, int] 
 
 
 def _depth(
-    frame: JsonValue, folder: Path, seen: _Seen
+    frame: JsonValue, base: Path, folder: Path, seen: _Seen
 ) -> tuple[str | None, tuple[int, int] | None]:
     """Return the depth map of a frame and its size; None for both without a usable one."""
     value = frame.get("depth_file_path")
     if value is None or value.value is None:
         return None, None
-    name = _path_in(value, folder)
+    (name,), shortened = photo_names([(value.text(), value.where)], base, folder)
+    if shortened:
+        seen.left_out.setdefault(
+            "names of depth maps lead out of the folder; their last part was taken", []
+        ).append(value.text())
     if PurePosixPath(name).suffix.lower() != ".png":
         seen.left_out.setdefault("depth maps are not PNGs and left out", []).append(name)
         return None, None

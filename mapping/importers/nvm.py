@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from mapping.importers.centered import kept_measurements, note_on_absent, with_measurements
+from mapping.importers.largest import ModelSize, largest_model
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.photo_names import photo_names, photo_size
 from mapping.importers.text_lines import TextLines
@@ -89,9 +90,12 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
             parts.append(part)
     if not parts:
         raise DatasetError("import.empty", "the file holds no model", field=str(path))
-    largest = max(parts, key=lambda part: (len(part.points) > 0, len(part.cameras)))
-    notes = _notes_on_others(parts, largest)
-    return _model(path, photos, largest, fixed, notes)
+    sizes = [
+        ModelSize(f"model {number}", photos=len(part.cameras), points=len(part.points))
+        for number, part in enumerate(parts)
+    ]
+    largest, notes = largest_model("the file", sizes)
+    return _model(path, photos, parts[largest], fixed, notes)
 
 
 def _nvm_file(path: Path) -> Path:
@@ -194,17 +198,6 @@ def _read_point(lines: TextLines, point: int, part: _Part) -> None:
                 lines.to_number(y),
             )
         )
-
-
-def _notes_on_others(parts: list[_Part], largest: _Part) -> list[str]:
-    others = [part for part in parts if part is not largest]
-    if not others:
-        return []
-    sizes = ", ".join(f"{len(p.cameras)} photos and {len(p.points)} points" for p in others)
-    return [
-        f"the file holds {len(parts)} models, each in a world of its own; the largest was taken, "
-        f"with {len(largest.cameras)} photos and {len(largest.points)} points, not: {sizes}"
-    ]
 
 
 def _model(

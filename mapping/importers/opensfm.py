@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from mapping.anchor import scale_doubt
 from mapping.importers.json_fields import JsonValue, read_json
+from mapping.importers.largest import ModelSize, largest_model
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.opensfm_features import Features, read_features
 from mapping.importers.photo_names import photo_names
@@ -136,18 +137,21 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
 
 
 def _largest(top: JsonValue) -> tuple[JsonValue, list[str]]:
-    sizes = [sum(1 for _ in r["shots"].fields()) for r in top.elements()]
-    if not sizes:
+    reconstructions = top.elements()
+    if not reconstructions:
         raise DatasetError("import.empty", "the file holds no reconstruction", field=top.where)
-    largest = sizes.index(max(sizes))
-    others = [str(size) for index, size in enumerate(sizes) if index != largest]
-    notes = []
-    if others:
-        notes.append(
-            f"the file holds {len(sizes)} reconstructions, each in a world of its own; the largest "
-            f"was taken, with {sizes[largest]} photos, not those with {', '.join(others)}"
+    sizes = []
+    for number, reconstruction in enumerate(reconstructions):
+        points = reconstruction.get("points")
+        sizes.append(
+            ModelSize(
+                f"reconstruction {number}",
+                photos=len(list(reconstruction["shots"].fields())),
+                points=0 if points is None else len(list(points.fields())),
+            )
         )
-    return top.elements()[largest], notes
+    largest, notes = largest_model("the file", sizes)
+    return reconstructions[largest], notes
 
 
 def _read_cameras(cameras: JsonValue) -> tuple[dict[str, Camera], dict[str, str]]:

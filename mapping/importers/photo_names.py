@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
 
-from PIL import Image
+from PIL import ExifTags, Image
 
 from visloc.errors import DatasetError
+from visloc.file_kinds import HEAD_BYTES, file_kind
 from visloc.kapture.text import has_control_characters, is_field
 
+T = TypeVar("T")
+
+_SWAPPING = (5, 6, 7, 8)  # EXIF orientations
 _WINDOWS_DRIVE = re.compile(r"[A-Za-z]:/")
 # What Pillow's parsers raise on malformed files beside OSError.
 _MALFORMED = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, OverflowError)
@@ -90,9 +95,27 @@ def photo_size(path: Path) -> tuple[int, int] | None:
     """
     if not _is_file(path):
         return None
+    return _from_header(path, lambda image: image.size)
+
+
+def is_stored_turned(path: Path) -> bool:
+    """Tell whether EXIF says that width and height swap when the photo is turned upright.
+
+    Raises:
+        DatasetError: ``import.photo`` if it is not a readable image.
+    """
+    # The base class's method: that of PNGs would decode all pixels to look behind them.
+    return _from_header(path, Image.Image.getexif).get(ExifTags.Base.Orientation) in _SWAPPING
+
+
+def _from_header(path: Path, look: Callable[[Image.Image], T]) -> T:
     try:
+        with path.open("rb") as file:
+            kind = file_kind(file.read(HEAD_BYTES))
+        if kind is not None and not kind.is_read:
+            raise DatasetError("import.photo", kind.refusal, field=str(path), got=kind.name)
         with Image.open(path) as image:
-            return image.size
+            return look(image)
     except (*_MALFORMED, Image.DecompressionBombError) as error:
         raise DatasetError(
             "import.photo", "not a readable photo", field=str(path), got=str(error)

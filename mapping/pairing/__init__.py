@@ -28,6 +28,8 @@ PAIRINGS: Mapping[str, Pairing] = {
     "sequence": pair_by_sequence,
     "exhaustive": pair_exhaustively,
 }
+# Those that go by where the photos were taken.
+POSED_PAIRINGS = frozenset({"distance", "frustum"})
 
 
 def pair_photos(scene: Scene, names: Sequence[str], settings: PairSettings) -> Pairs:
@@ -68,6 +70,7 @@ def pair_photos(scene: Scene, names: Sequence[str], settings: PairSettings) -> P
 
 __all__ = [
     "PAIRINGS",
+    "POSED_PAIRINGS",
     "PairSettings",
     "Pairing",
     "Pairs",

@@ -58,7 +58,12 @@ def part_of_map(
             for rig, members in known_rigs(dataset, sensors).items()
         },
         images=tuple(
-            ImageRecord(names[row], photos[row].record.sensor_id, photos[row].record.timestamp)
+            ImageRecord(
+                names[row],
+                photos[row].record.sensor_id,
+                photos[row].record.timestamp,
+                features.turn(photos[row]),
+            )
             for row in made.photos
         ),
         image_poses=np.array([pose_row(view.cam_from_world) for view in made.views]),

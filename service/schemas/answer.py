@@ -12,6 +12,7 @@ from pydantic.json_schema import WithJsonSchema
 import visloc.types
 from service.jobs import Localization, MatchPicture
 from service.schemas.evidence import (
+    NOT_COVERED,
     CameraUsed,
     MapRef,
     Orientation,
@@ -38,16 +39,21 @@ class PoseEstimate(BaseModel):
         list[float],
         Field(
             description="6 x 6, row by row: rotation (rad), then translation, for "
-            "R <- Exp(w) R and t <- t + dt of cam_from_world"
+            "R <- Exp(w) R and t <- t + dt of cam_from_world" + NOT_COVERED
         ),
     ]
     position_std: Annotated[
         list[float],
-        Field(description="standard deviations of the position along the world's axes"),
+        Field(
+            description="standard deviations of the position along the world's axes" + NOT_COVERED
+        ),
     ]
     orientation_std_deg: Annotated[
         list[float],
-        Field(description="standard deviations about the camera's x, y and z axes, degrees"),
+        Field(
+            description="standard deviations about the camera's x, y and z axes, degrees"
+            + NOT_COVERED
+        ),
     ]
 
 

@@ -8,6 +8,12 @@ from pydantic import BaseModel, Field
 
 import visloc.types
 
+# Of every stated uncertainty.
+NOT_COVERED = (
+    "; from the scatter of the matches alone, without errors that landmarks share (depth, "
+    "calibration, poses of mapping photos): on maps from depth the error was 9 to 13 times as large"
+)
+
 
 class Refusal(BaseModel):
     """Why there is no pose."""
@@ -63,10 +69,19 @@ class CameraUsed(BaseModel):
 
 
 class Orientation(BaseModel):
-    """How the pixels were read."""
+    """How the photo was turned to find features.
+
+    Camera, keypoints and pose are those of the stored pixels, whatever this says.
+    """
 
     exif: Annotated[int, Field(description="1 to 8 as stored in the photo, 1 when absent")]
-    read_as: visloc.types.ReadAs
+    read_as: Annotated[
+        visloc.types.ReadAs,
+        Field(
+            description="upright: features were found in the photo turned by its EXIF orientation; "
+            "stored: in the pixels as stored, or the features were sent"
+        ),
+    ]
 
     @staticmethod
     def of(evidence: visloc.types.Evidence) -> Orientation:

@@ -10,6 +10,7 @@ from pydantic import BaseModel, Field
 import visloc.types
 from service.jobs import InstantLocalization
 from service.schemas.evidence import (
+    NOT_COVERED,
     CameraUsed,
     MapRef,
     Orientation,
@@ -41,16 +42,20 @@ class RigPose(BaseModel):
         list[float],
         Field(
             description="6 x 6, row by row: rotation (rad), then translation, for "
-            "R <- Exp(w) R and t <- t + dt of rig_from_world"
+            "R <- Exp(w) R and t <- t + dt of rig_from_world" + NOT_COVERED
         ),
     ]
     position_std: Annotated[
         list[float],
-        Field(description="standard deviations of the position along the world's axes"),
+        Field(
+            description="standard deviations of the position along the world's axes" + NOT_COVERED
+        ),
     ]
     orientation_std_deg: Annotated[
         list[float],
-        Field(description="standard deviations about the rig's x, y and z axes, degrees"),
+        Field(
+            description="standard deviations about the rig's x, y and z axes, degrees" + NOT_COVERED
+        ),
     ]
 
 

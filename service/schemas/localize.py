@@ -38,7 +38,10 @@ GivenMaps = Annotated[
     list[str] | None,
     FailFast(),
     converted(_maps_from_text),
-    Field(description=f"instead of map: at most {MAX_MAPS} maps to search; the best answer counts"),
+    Field(
+        description=f"instead of map: at most {MAX_MAPS} maps to search; a photo that two of them "
+        "explain is refused as ambiguous"
+    ),
 ]
 
 

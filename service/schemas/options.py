@@ -75,8 +75,9 @@ class LocalizeOptions(IncomingMessage):
     read_as: Annotated[
         str | None,
         Field(
-            description="stored (default), or upright: turn the photo by its EXIF orientation "
-            "before features are found"
+            description="upright (default): turn the photo by its EXIF orientation before features "
+            "are found; or stored. Camera, keypoints and pose are those of the stored pixels "
+            "either way. It has no meaning for features that are sent"
         ),
     ] = None
     extraction: Annotated[

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from service.incoming import inside, refusal_of
+from service.incoming import MAX_INSTANT_VALUES, check_json_values, inside, refusal_of
 from service.jobs import ImageJob, LocalizeJob, Near, RigJob, RigSensor
 from service.schemas.geopose import MAX_RADIUS_M, GeoPose
 from service.schemas.oscp_images import image_bytes
@@ -134,20 +134,14 @@ class GeoPoseRequest(_Read):
     positions: list[GeolocationReading] = []
 
     @classmethod
-    def read_json(cls, text: bytes, max_values: int) -> Self:
+    def read_json(cls, text: bytes) -> Self:
         """Check a request written as JSON.
 
         Raises:
             InvalidInput: ``request.malformed``, ``request.missing_field``, ``request.invalid``.
             TooLarge: ``request.too_large``.
         """
-        if text.count(b",") > max_values:
-            raise TooLarge(
-                "request.too_large",
-                "the JSON has too many values",
-                expected=f"at most {max_values}",
-                got=text.count(b","),
-            )
+        check_json_values(text, MAX_INSTANT_VALUES)
         try:
             body = json.loads(text, parse_constant=_refuse_constant)
         except (ValueError, RecursionError):

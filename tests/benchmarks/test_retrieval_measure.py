@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +13,7 @@ import typer
 from benchmarks.retrieval import (
     Query,
     chosen,
+    main,
     recalls,
     shared_landmarks,
     visible_landmarks,
@@ -110,3 +112,18 @@ def test_ranks_are_counted_from_one(text: str) -> None:
     with pytest.raises(typer.BadParameter, match="not numbers from 1"):
         whole_numbers(text)
     assert whole_numbers("1, 20") == [1, 20]
+
+
+def test_the_command_measures_a_map(
+    sample: Path, built_maps: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(built_maps / "room", sample / "query", top_k="1,8")
+
+    said, _, table = capsys.readouterr().out.partition("\n\n")
+    assert said.startswith("3 of 3 queries share 30 landmarks or more")
+    rows = [line.strip("|").split("|") for line in table.splitlines()]
+    assert rows[0] == [" retrieval by ", " top 1 ", " top 8 "]
+    assert {len(row) for row in rows} == {3}
+    assert [row[0].strip() for row in rows[2:4]] == ["`densevlad`", "`localvlad`"]
+    # Of all photos of the map, no ranking misses one.
+    assert all(row[2].endswith("(100.0) ") for row in rows[2:])

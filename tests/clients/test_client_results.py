@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import pytest
 
@@ -127,11 +128,26 @@ def test_poses_are_written_as_received(http_url: str, grpc_url: str, tmp_path: P
     assert (
         written
         == [
-            "a b.jpg 0.9298410554097046 0.01755162593 0.31931803130557 0.1819987554486438 "
+            "a%20b.jpg 0.9298410554097046 0.01755162593 0.31931803130557 0.1819987554486438 "
             "0.24164110554685916 -0.0 1e-17\n"
         ]
         * 2
     )
+
+
+@pytest.mark.parametrize("name", ["a b.jpg", "50%.jpg", "a%20b.jpg", "\u00a0\u3000.jpg", "ä/é.jpg"])
+def test_every_name_is_one_field_of_a_pose_line_and_comes_back(
+    name: str, url: str, tmp_path: Path
+) -> None:
+    result = outcome_of(name, url).result
+    assert result is not None
+    assert result.pose is not None
+    write_poses(tmp_path / "poses.txt", [(name, result.pose)])
+
+    written, *numbers = (tmp_path / "poses.txt").read_text(encoding="utf-8").split()
+
+    assert unquote(written) == name
+    assert len(numbers) == 7
 
 
 def test_a_file_that_cannot_be_finished_leaves_the_old_one(tmp_path: Path) -> None:

@@ -115,4 +115,8 @@ class Images:
             file = io.BytesIO()
             image.save(file, kind, **options)
             yield file.getvalue()
+            if kind == "JPEG" and options.get("progressive"):
+                jpeg = file.getvalue()  # its last scan again, nearly as often as it may be
+                last, end = jpeg.rindex(b"\xff\xda"), jpeg.rindex(b"\xff\xd9")
+                yield jpeg[:end] + jpeg[last:end] * 85 + jpeg[end:]
         yield cv2.imencode(".png", noise.astype(np.uint16) << 8)[1].tobytes()

@@ -118,7 +118,7 @@ def test_a_descriptor_without_vocabulary_has_one_stage_and_rows_as_a_query_would
     work: WorkFolder, photos: list[MappingPhoto]
 ) -> None:
     found, stages = describe(work, photos)
-    assert set(stages) == {"corner"}
+    assert set(stages) == {"corner", "corner projection"}
     assert Corner.asked == (WEIGHTS, Inference.TORCH, 1)
     assert found.descriptors.shape == (5, 4)
     assert set(found.model) == {"mean", "axes"}
@@ -168,7 +168,8 @@ def test_a_descriptor_of_local_features_is_made_again_with_them(
     work: WorkFolder, photos: list[MappingPhoto]
 ) -> None:
     _, stages = describe(work, photos, "localvlad")
-    assert set(stages) == {"localvlad words", "localvlad"}
+    steps = ("words", "vocabulary", "projection")
+    assert set(stages) == {"localvlad", *(f"localvlad {step}" for step in steps)}
     pooled = set((work.root / "pooled").iterdir())
     describe(work, photos, "localvlad", sift(work, max_keypoints=50))
     assert len(set((work.root / "pooled").iterdir()) - pooled) == len(photos)

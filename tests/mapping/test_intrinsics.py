@@ -96,6 +96,10 @@ def around_an_object() -> tuple[NDArray[np.float64], list[Pose]]:
     ]
 
 
+def quiet(_done: int, _total: int) -> None:
+    pass
+
+
 def above_flat_ground() -> tuple[NDArray[np.float64], list[Pose]]:
     """A drone 40 m above a beach, in three lines, held level within two degrees."""
     random = np.random.default_rng(0)
@@ -117,7 +121,7 @@ def solved(
     radius: float = np.inf,
 ) -> SparseModel:
     photos, shown = taken(*scene, lens or camera(FOCAL), prior, radius=radius)
-    return reconstruct(photos, {}, matched(shown), CONFIG, ("intrinsics",), work)
+    return reconstruct(photos, {}, matched(shown), CONFIG, ("intrinsics",), work, quiet)
 
 
 def cameras_in(model: SparseModel) -> set[Camera]:
@@ -209,7 +213,7 @@ def test_of_several_cameras_only_the_photos_of_nonsense_are_left_out(tmp_path: P
     good, shown = taken(points, poses[:6], camera(FOCAL), camera(FOCAL))
     bad, shown_badly = taken(points, poses[6:], NONSENSE, None, "odd", radius=230)
     model = reconstruct(
-        [*good, *bad], {}, matched([*shown, *shown_badly]), CONFIG, ("intrinsics",), tmp_path
+        [*good, *bad], {}, matched([*shown, *shown_badly]), CONFIG, ("intrinsics",), tmp_path, quiet
     )
     assert [view is not None for view in model.views] == [True] * 6 + [False] * 2
     assert model.doubts.keys() == {"odd"}
@@ -220,7 +224,9 @@ def test_the_same_photos_give_the_same_bits(tmp_path: Path) -> None:
     points = np.random.default_rng(0).uniform(-2.5, 2.5, (3300, 3))
     scene = points, around_an_object()[1]
     photos, shown = taken(*scene, camera(FOCAL), camera(FOCAL))
-    models = [reconstruct(photos, {}, matched(shown), CONFIG, (), tmp_path) for _ in range(2)]
+    models = [
+        reconstruct(photos, {}, matched(shown), CONFIG, (), tmp_path, quiet) for _ in range(2)
+    ]
     assert np.array_equal(models[0].points, models[1].points)
 
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -288,8 +289,7 @@ def test_build_shows_each_stage_and_what_was_made(run: Run, sample: Path, tmp_pa
     assert status == 0
     stages = [re.fullmatch(r"([a-z ]+): (\d+)/\2 in [\d.]+ s", line) for line in err.splitlines()]
     assert [stage and stage[1] for stage in stages] == [
-        *("photos", "local features", "localvlad words", "localvlad", "depth", "landmarks"),
-        "archive",
+        *("photos", "local features", "localvlad words", "localvlad", "depth"),
     ]
     opened = open_map(MapStore(tmp_path).folder("room"))
     assert opened.ref in out
@@ -372,6 +372,36 @@ def test_pairs_are_written_without_a_build_and_once(run: Run, sample: Path, tmp_
     status, _, err = run(*arguments)
     assert status == 1
     assert f"error [pairs.exists] {output}" in err
+
+
+def test_pairs_that_need_no_poses_take_photos_without(
+    run: Run, sample: Path, tmp_path: Path
+) -> None:
+    dataset = shutil.copytree(sample / "mapping", tmp_path / "unposed")
+    (dataset / "sensors" / "trajectories.txt").unlink()
+    photos = len(read_dataset(dataset).images)
+
+    status, out, _ = run(
+        "pairs", dataset, "--output", tmp_path / "all.txt", "--pairs", "exhaustive"
+    )
+
+    assert (status, out.split()[0]) == (0, str(photos * (photos - 1) // 2))
+    _, _, err = run("pairs", dataset, "--output", tmp_path / "near.txt", "--pairs", "distance")
+    assert "error [dataset.no_photos]" in err
+    assert f"{photos} of {photos} photos have no pose" in err
+
+
+def test_pairs_by_pose_say_which_photos_they_leave_out(
+    run: Run, sample: Path, tmp_path: Path
+) -> None:
+    dataset = shutil.copytree(sample / "mapping", tmp_path / "partly")
+    poses = dataset / "sensors" / "trajectories.txt"
+    poses.write_text("".join(poses.read_text().splitlines(keepends=True)[:-2]))
+
+    status, out, _ = run("pairs", dataset, "--output", tmp_path / "near.txt", "--pairs", "distance")
+
+    assert status == 0
+    assert re.search(r"^note: \d of 8 photos have no pose: \S+", out, re.M)
 
 
 @pytest.mark.parametrize(

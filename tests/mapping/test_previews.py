@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 
 from mapping.build import BuildSettings, build_map
+from mapping.photos import MappingPhoto
 from mapping.previews import keep_photos
 from mapping.stages import WorkFolder
 from mapping.workers import Workers
 from visloc.archive import Map, MapStore, open_map, verify_map
 from visloc.errors import MapCorrupt
+from visloc.geometry import Camera
 from visloc.images import read_photo, read_photo_file
+from visloc.kapture import FileRecord
 
 
 def quiet(*_: object) -> None:
@@ -55,7 +58,10 @@ def test_photos_become_at_most_640_pixels_and_lose_their_exif(tmp_path: Path) ->
     for name, pixels in (("large", large), ("noise", noise)):
         path = tmp_path / f"{name}.png"
         cv2.imwrite(str(path), pixels)
-        photos.append(type("Photo", (), {"path": path, "sha256": name})())
+        height, width = pixels.shape[:2]
+        camera = Camera("SIMPLE_PINHOLE", width, height, (500.0, width / 2, height / 2))
+        record = FileRecord(0, "camera", path.name)
+        photos.append(MappingPhoto(record, path, name, camera, True, None, None, None))
     folder = tmp_path / "map"
 
     with Workers(1) as workers:

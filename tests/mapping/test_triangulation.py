@@ -204,7 +204,15 @@ def test_refined_intrinsics_come_nearer_to_the_truth(tmp_path: Path) -> None:
 def test_without_poses_the_same_world_comes_back_up_to_a_similarity(tmp_path: Path) -> None:
     world = make_world()
     photos = [replace(photo, cam_from_world=None) for photo in world.photos]
-    model = reconstruct(photos, {}, world.matches, CONFIG, (), tmp_path)
+    told: list[tuple[int, int]] = []
+    model = reconstruct(
+        photos, {}, world.matches, CONFIG, (), tmp_path, lambda *now: told.append(now)
+    )
+    placed = [done for done, total in told if total == len(photos)]
+    assert placed[0] == 2
+    assert len(placed) >= len(photos) - 1
+    assert placed == sorted(placed)
+    assert placed[-1] == len(photos) - 1  # the end is told by whoever reads the result
     assert all(view is not None for view in model.views)
     centers = np.array([view.cam_from_world.center for view in model.views if view])
     known = np.array([p.cam_from_world.center for p in world.photos if p.cam_from_world])
@@ -227,5 +235,5 @@ def test_photos_that_share_nothing_cannot_be_placed(tmp_path: Path) -> None:
     world = make_world(num_photos=3)
     photos = [replace(photo, cam_from_world=None) for photo in world.photos]
     with pytest.raises(InvalidInput) as caught:
-        reconstruct(photos, {}, [], CONFIG, (), tmp_path)
+        reconstruct(photos, {}, [], CONFIG, (), tmp_path, lambda *_: None)
     assert caught.value.code == "sfm.no_matches"

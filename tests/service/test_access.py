@@ -34,6 +34,7 @@ from service.access import (
 from service.access_grpc import AccessInterceptor
 from service.access_http import add_access
 from service.connections import TimelyCalls
+from service.grpc_connections import GrpcConnections
 from service.grpc_envelope import Envelope
 from service.key_file import Key, Scope, edited_keys, new_key
 from service.key_ring import KeyRing
@@ -517,7 +518,7 @@ def grpc_door(access: Access, grace_s: float = 20.0) -> Iterator[GrpcDoor]:
         server = grpc.aio.server(
             interceptors=(
                 AccessInterceptor(access, envelope, 10),
-                TimelyCalls(envelope, grace_s, 0),
+                TimelyCalls(envelope, GrpcConnections(100), grace_s, 0),
             )
         )
         pb2_grpc.add_LocalizationServicer_to_server(servicer, server)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from service.grpc_requests import instant_of, rig_job_of, sequence_start_of
+from service.incoming import MAX_INSTANT_VALUES, IncomingMessage
 from service.jobs import ONLY_SENSOR, InstantLocalization, RigJob
 from service.schemas import (
     MAX_SENSORS,
@@ -18,6 +19,7 @@ from service.schemas import (
     LocalizeSequenceRequest,
 )
 from service.schemas import InstantAnswer as AnswerWords
+from service.settings import ServiceSettings
 from visloc.errors import InvalidInput, TooLarge
 from visloc.geometry import Camera, Pose
 from visloc.trajectory import TimeUnit
@@ -75,6 +77,94 @@ def refused(read: Any, message: object, files: dict[str, bytes] | None = None) -
     with pytest.raises(InvalidInput) as caught:
         read(message, files)
     return caught.value
+
+
+# How much may be said
+
+FULL_CAMERA = CAMERA | {"model": "FULL_OPENCV", "params": [1.5] * 12}
+MATRIX = [0.0] * 36
+
+
+def num_values(message: object) -> int:
+    text = json.dumps(message)
+    return sum(map(text.count, ",[{"))
+
+
+def test_a_rig_of_as_many_cameras_and_images_as_there_may_be_is_read() -> None:
+    array = {"dtype": "int8", "shape": [0, 64], "data": ""}
+    features = {"kind": "sift", "keypoints": array, "descriptors": array}
+    features |= {"global_descriptors": {f"kind{i}": array for i in range(4)}}
+    sensor = {"cam_from_rig": IDENTITY, "camera": FULL_CAMERA}
+    message = rig_request(
+        rig={"sensors": {str(i): sensor for i in range(MAX_SENSORS)}},
+        images=[
+            {"sensor": str(i), "features": features, "camera": FULL_CAMERA, "timestamp": 1}
+            for i in range(MAX_SENSORS)
+        ],
+        priors={"pose": {"device_from_world": IDENTITY, "covariance": MATRIX}},
+    )
+    limits = BatchLimits(max_images=MAX_SENSORS, max_instants=1)
+
+    assert num_values(message) < MAX_INSTANT_VALUES
+    LocalizeRigRequest.read_json(json.dumps(message), limits, MAX_INSTANT_VALUES)
+
+
+def test_a_sequence_of_as_many_instants_and_images_as_there_may_be_has_room() -> None:
+    settings = ServiceSettings(maps_dir="maps")
+    images = [image(str(i), camera=FULL_CAMERA) for i in range(settings.max_rig_images)]
+    instant = {
+        "timestamp": 1,
+        "images": images,
+        "odometry": {"rig_from_odometry": IDENTITY, "covariance": MATRIX},
+        "priors": {"pose": {"device_from_world": IDENTITY, "covariance": MATRIX}},
+    }
+
+    assert num_values(instant) * settings.max_instants < settings.max_sequence_values
+
+
+@pytest.mark.parametrize(
+    ("model", "max_values"),
+    [(LocalizeRigRequest, MAX_INSTANT_VALUES), (LocalizeSequenceRequest, 600_000)],
+)
+def test_json_of_more_values_is_refused_before_it_is_parsed(
+    model: type[IncomingMessage], max_values: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(model, "model_validate_json", lambda *_, **__: pytest.fail("parsed"))
+    text = '{"rig": {"sensors": {' + '"a": {}, ' * max_values + "}}}"
+
+    with pytest.raises(TooLarge) as caught:
+        model.read_json(text, LIMITS, max_values)
+
+    assert caught.value.code == "request.too_large"
+
+
+def many_sensors() -> pb2.LocalizeRigRequest:
+    message = pb2.LocalizeRigRequest(map="room")
+    for number in range(100_001):
+        message.calibration.sensors[str(number)].SetInParent()
+    return message
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        many_sensors(),
+        pb2.LocalizeRigRequest(map="room", rig_id="a", images=[pb2.RigImage()] * 100_001),
+        pb2.LocalizeRigRequest(maps=[""] * 100_001),
+        pb2.LocalizeRigRequest(images=[pb2.RigImage(camera={"params": [1.0] * 1000})] * 101),
+        pb2.LocalizeRigRequest(priors={"gravity": {"direction": [1.0] * 100_001}}),
+    ],
+    ids=["sensors", "images", "maps", "numbers of many images", "numbers"],
+)
+def test_a_message_of_more_values_is_refused_before_it_is_looked_at(
+    message: pb2.LocalizeRigRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.grpc_requests._plain_fields", lambda _: pytest.fail("looked at"))
+
+    with pytest.raises(TooLarge) as caught:
+        rig_job_of(message, LIMITS)
+
+    assert (caught.value.code, caught.value.expected) == ("request.too_large", "at most 100000")
 
 
 # What is said
@@ -299,7 +389,7 @@ def instant(**changes: object) -> dict[str, Any]:
     [
         ({"instants": None}, "request.invalid", "instants"),
         ({"instants": [instant()] * 4}, "sequence.too_many_instants", "instants"),
-        ({"instants": [0] * 10_000}, "sequence.too_many_instants", "instants"),
+        ({"instants": [0] * 9_000}, "sequence.too_many_instants", "instants"),
         ({"instants": [instant(), {}]}, "request.missing_field", "instants[1].timestamp"),
         ({"instants": [instant(timestamp=NAN)]}, "request.invalid", "instants[0].timestamp"),
         (

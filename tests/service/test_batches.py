@@ -422,34 +422,6 @@ def test_json_form_lines_and_grpc_give_the_same_answers_bit_for_bit(
     assert bits(over_grpc) == answers
 
 
-def test_instants_before_one_that_is_refused_are_answered_first(
-    doors: Any, sequence: dict[str, Any]
-) -> None:
-    first, broken, _ = sequence["instants"]
-    array = {"dtype": "float32", "shape": [0, 2], "data": ""}
-    features = {"kind": "xfeat", "keypoints": array, "descriptors": array}
-    # Features have no EXIF: what is found when the image's turn comes, and concerns all images.
-    refusing = {"timestamp": broken["timestamp"] + 100, "images": [{"sensor": "left"}]}
-    refusing["images"][0]["features"] = features
-    options = FAST | {"read_as": "upright"}
-    message = {**sequence, "instants": [first, broken, refusing], "options": options}
-
-    lines = post(doors, "sequence", message, headers={"Accept": "application/x-ndjson"})
-    *answers, last = [json.loads(line) for line in lines.text.splitlines()]
-    call = doors.stub.LocalizeSequence(as_stream(message))
-    over_grpc = [as_json(next(call)) for _ in answers]
-    info = reason_of(list, call)
-
-    assert lines.status_code == 200
-    # The second no longer waits for a third beside it.
-    assert [answer["source"] for answer in answers] == ["estimated", "nearest"]
-    assert bits(over_grpc) == bits(answers)
-    problem = last["problem"]
-    assert (problem["status"], problem["code"]) == (422, "options.read_as")
-    assert (info.reason, info.metadata["message"]) == (problem["code"], problem["detail"])
-    assert refused(post(doors, "sequence", message), 422, "options.read_as")
-
-
 def test_an_instant_without_images_says_so(doors: Any) -> None:
     message = {"map": "room", "instants": [{"timestamp": 1_700_000_000, "images": []}]}
     (answer,) = answer_of(post(doors, "sequence", message))["answers"]

@@ -16,6 +16,7 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
+from service.acceptor import OpenConnections
 from service.connections import SLOWEST_BYTES_PER_S, Arrivals, arrivals_of, http_protocol
 from service.responses import problem_response
 from visloc.errors import VislocError
@@ -49,7 +50,11 @@ def server() -> Iterator[tuple[int, Arrivals]]:
     app = Starlette(routes=routes)
     app.state.arrivals = arrivals
     config = uvicorn.Config(
-        app, port=0, log_level="critical", lifespan="off", http=http_protocol(GRACE_S)
+        app,
+        port=0,
+        log_level="critical",
+        lifespan="off",
+        http=http_protocol(GRACE_S, OpenConnections(1000)),
     )
     running = uvicorn.Server(config)
     thread = threading.Thread(target=running.run)
@@ -214,6 +219,15 @@ def test_too_large_a_body_is_refused_before_it_is_read(
     assert answer.status_code == 413
     assert answer.json()["code"] == "request.too_large"
     assert server[1].bytes_held == 0
+
+
+@pytest.mark.parametrize("size", [2**63, 2**64 - 1, 10**19])
+def test_however_large_a_length_is_it_is_refused_before_any_of_it_comes(
+    server: tuple[int, Arrivals], size: int
+) -> None:
+    with connected(server[0]) as connection:
+        connection.sendall(head("/read", size))
+        assert b'"code":"request.too_large"' in one_answer(connection)
 
 
 def test_together_bodies_take_no_more_than_there_is_room_for(

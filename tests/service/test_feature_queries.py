@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import grpc
 import httpx
 import numpy as np
 import pytest
-from google.protobuf.json_format import MessageToDict
+from google.protobuf.json_format import MessageToDict, ParseDict
 from google.rpc.error_details_pb2 import ErrorInfo
 from grpc_status import rpc_status
 from numpy.typing import NDArray
@@ -238,8 +239,12 @@ HOSTILE = [
 
 
 def refusal_over_grpc(doors: Any, message: dict[str, Any]) -> ErrorInfo:
+    return reason_of(lambda: doors.stub.Localize(as_message(message)))
+
+
+def reason_of(ask: Callable[[], object]) -> ErrorInfo:
     with pytest.raises(grpc.RpcError) as caught:
-        doors.stub.Localize(as_message(message))
+        ask()
     call: Any = caught.value
     details = rpc_status.from_call(call)
     info = ErrorInfo()
@@ -426,3 +431,51 @@ def test_a_map_of_ready_made_features_is_served_without_an_extractor(
     assert (other["code"], other["expected"]) == ("features.kind", "kapture:SIFT")
     assert at_most["code"] == "features.descriptors"
     assert (more["code"], more["expected"]) == ("features.too_many", "at most 20000")
+
+
+def test_instants_before_one_that_is_refused_are_answered_first(
+    serve: Any, ready_made_maps: Path, query: Any, features: dict[str, Any]
+) -> None:
+    brought = features | {
+        "kind": "kapture:SIFT",
+        "global_descriptors": {"kapture:Dense": features["global_descriptors"]["densevlad"]},
+    }
+    image = {"sensor": "left", "camera": camera_of(query)}
+    photo = base64.b64encode(query.image).decode()
+    # The third is what the map does not take at all: it is found when the image's turn comes, and
+    # concerns all images.
+    images = [
+        image | {"features": brought},
+        image | {"features": brought | {"kind": "other"}},
+        image | {"image": photo},
+    ]
+    instants = [
+        {"timestamp": 1_700_000_000_000 + 100 * n, "images": [given]}
+        for n, given in enumerate(images)
+    ]
+    message = {"map": "room", "instants": instants}
+
+    def stream() -> Iterator[pb2.LocalizeSequenceRequest]:
+        yield pb2.LocalizeSequenceRequest(start=pb2.SequenceStart(map="room"))
+        for instant in instants:
+            parsed = ParseDict(instant, pb2.Instant())
+            yield pb2.LocalizeSequenceRequest(instant=parsed)
+
+    with serve(ready_made_maps) as doors:
+        lines = doors.http.post(
+            "/localize/sequence", json=message, headers={"Accept": "application/x-ndjson"}
+        )
+        whole = doors.http.post("/localize/sequence", json=message)
+        call = doors.stub.LocalizeSequence(stream())
+        over_grpc = [next(call) for _ in range(2)]
+        info = reason_of(lambda: list(call))
+    *answers, last = [json.loads(line) for line in lines.text.splitlines()]
+
+    assert lines.status_code == 200
+    # The second no longer waits for a third beside it.
+    assert [answer["source"] for answer in answers] == ["estimated", "nearest"]
+    assert [answer.source for answer in over_grpc] == ["estimated", "nearest"]
+    problem = last["problem"]
+    assert (problem["status"], problem["code"]) == (422, "features.required")
+    assert (info.reason, info.metadata["message"]) == (problem["code"], problem["detail"])
+    assert (whole.status_code, whole.json()["code"]) == (422, "features.required")

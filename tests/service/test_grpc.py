@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import struct
 import threading
+import time
 from typing import Any, NoReturn
 
 import grpc
@@ -17,6 +19,7 @@ import visloc
 from clients.messages import plain
 from service.grpc import SERVICE_NAME
 from service.jobs import LocalizeJob
+from service.metrics import Metrics, ServiceState
 from visloc_api.v1 import localization_pb2 as pb2
 
 
@@ -42,7 +45,10 @@ def refused(
 ) -> ErrorInfo:
     with pytest.raises(grpc.RpcError) as caught:
         doors.stub.Localize(request)
-    call: Any = caught.value
+    return info_of(caught.value, status, code)
+
+
+def info_of(call: Any, status: grpc.StatusCode, code: str) -> ErrorInfo:
     info = ErrorInfo()
     details = rpc_status.from_call(call)
     assert details is not None
@@ -223,6 +229,64 @@ def test_a_message_over_the_limit_is_not_taken(doors: Any, query: Any) -> None:
         doors.stub.Localize(request_for(query, image=bytes(1_000_000)))
     call: Any = caught.value
     assert call.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+
+
+METHODS = [
+    (service.full_name, method.name)
+    for service in pb2.DESCRIPTOR.services_by_name.values()
+    for method in service.methods
+]
+A_START = pb2.LocalizeSequenceRequest(start=pb2.SequenceStart(map="room")).SerializeToString()
+
+
+@pytest.mark.parametrize(
+    ("service", "method", "before"),
+    [*((*each, []) for each in METHODS), (SERVICE_NAME, "LocalizeSequence", [A_START])],
+)
+def test_a_message_that_is_no_protobuf_is_refused_counted_and_logged_in_a_line(
+    service: str,
+    method: str,
+    before: list[bytes],
+    doors: Any,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    metrics = doors.server.observer.metrics
+    labels = f'door="grpc",route="{method}",status="INVALID_ARGUMENT"'
+    requests, errors = (
+        f"visloc_requests_total{{{labels}}}",
+        'visloc_errors_total{code="request.malformed",door="grpc",kind="InvalidInput"}',
+    )
+    counted = [value_of(metrics, name) for name in (requests, errors)]
+    call = doors.channel.stream_stream(f"/{service}/{method}")
+    with pytest.raises(grpc.RpcError) as caught:
+        list(call(iter([*before, b"\xff" * 10])))
+
+    info = info_of(caught.value, grpc.StatusCode.INVALID_ARGUMENT, "request.malformed")
+    assert info.metadata["kind"] == "InvalidInput"
+    assert len(info.metadata["request_id"]) == 32
+    deadline = time.monotonic() + 20
+    while not (lines := lines_of(caplog, "request.malformed")) and time.monotonic() < deadline:
+        time.sleep(0.01)  # the caller is answered first
+    (line,) = lines
+    assert (line["route"], line["status"]) == (method, "INVALID_ARGUMENT")
+    assert not any(record.exc_info for record in caplog.records)
+    assert value_of(metrics, requests) > counted[0]
+    assert value_of(metrics, errors) == counted[1] + 1
+
+
+def lines_of(caplog: pytest.LogCaptureFixture, code: str) -> list[dict[str, Any]]:
+    """What the access log has of requests that were refused with a code."""
+    every = [getattr(record, "facts", {}) for record in caplog.records]
+    return [facts for facts in every if facts.get("code") == code]
+
+
+def value_of(metrics: Metrics, sample: str) -> float:
+    text = metrics.render(ServiceState(ready=True))[0].decode()
+    return next(
+        (float(line.rpartition(" ")[2]) for line in text.splitlines() if line.startswith(sample)),
+        0.0,
+    )
 
 
 def test_who_watches_health_leaves_room_for_others(serve: Any, tmp_path: Any) -> None:

@@ -18,16 +18,20 @@ import numpy as np
 import pytest
 from PIL import Image
 from pydantic import BaseModel
+from starlette.responses import PlainTextResponse
 
 import visloc
 from service import schemas
+from service.acceptor import OpenConnections
 from service.access import open_access
 from service.connections import Arrivals
-from service.http import create_app
+from service.http import RequestEnvelope, create_app
 from service.jobs import LocalizeJob
 from service.request_bodies import EXAMPLE_REQUEST
 from service.settings import ServiceSettings
+from tests.turning import png, turned_camera, turned_pixels, turned_pose
 from visloc.geometry import Pose, rotation_angle
+from visloc.images import read_photo
 
 
 def encoded(image: Image.Image, file_format: str = "PNG", **options: Any) -> bytes:
@@ -79,7 +83,7 @@ def test_a_query_is_localized_where_it_was_taken(doors: Any, query: Any) -> None
     )
     assert np.array(answer["pose"]["covariance"]).reshape(6, 6).trace() > 0
     assert answer["camera"]["source"] == "given"
-    assert answer["orientation"] == {"exif": 1, "read_as": "stored"}
+    assert answer["orientation"] == {"exif": 1, "read_as": "upright"}
     assert answer["map"]["id"] == "room"
     assert answer["retrieved"][0]["similarities"].keys() == {"densevlad", "localvlad"}
     assert {"queued", "decode", "local_features", "pose"} <= answer["seconds"].keys()
@@ -130,15 +134,28 @@ def test_grey_transparent_palette_and_16_bit_photos_are_localized(
     assert answer["status"] == "localized"
 
 
-def test_a_photo_with_exif_orientation_is_read_as_stored(doors: Any, query: Any) -> None:
-    exif = Image.Exif()
-    exif[274] = 6
-    photo = Image.open(io.BytesIO(query.image))
-    plain = comparable(post(doors, encoded(photo), camera=camera_text(query.camera)))
-    turned = comparable(post(doors, encoded(photo, exif=exif), camera=camera_text(query.camera)))
+def test_a_photo_stored_turned_is_read_upright(doors: Any, query: Any) -> None:
+    stored = png(turned_pixels(read_photo(query.image).rgb, 6), 6)
+    camera = camera_text(turned_camera(query.camera, 6))
+    answer = comparable(post(doors, stored, camera=camera))
+
+    assert answer["orientation"] == {"exif": 6, "read_as": "upright"}
+    assert answer["status"] == "localized"
+    found = answer["pose"]["cam_from_world"]
+    cam_from_world = Pose.from_quaternion(found["rotation_wxyz"], found["translation"])
+    truth = turned_pose(query.cam_from_world, 6)  # of the stored pixels
+    assert np.linalg.norm(cam_from_world.center - truth.center) < 0.05
+    assert rotation_angle(cam_from_world.rotation @ truth.rotation.T) < np.radians(1)
+
+
+def test_a_photo_with_exif_orientation_may_be_read_as_stored(doors: Any, query: Any) -> None:
+    pixels, camera = read_photo(query.image).rgb, camera_text(query.camera)
+    options = json.dumps({"read_as": "stored"})
+    plain = comparable(post(doors, png(pixels), camera=camera))
+    turned = comparable(post(doors, png(pixels, 6), camera=camera, options=options))
 
     assert turned.pop("orientation") == {"exif": 6, "read_as": "stored"}
-    assert plain.pop("orientation") == {"exif": 1, "read_as": "stored"}
+    assert plain.pop("orientation") == {"exif": 1, "read_as": "upright"}
     assert turned == plain
 
 
@@ -307,19 +324,17 @@ def test_a_full_queue_is_429_with_retry_after(
     assert response.headers["retry-after"] == "1"
 
 
-def test_connections_over_the_limit_are_503(serve: Any, tmp_path: Any) -> None:
-    with serve(tmp_path, load=False, max_connections=8) as doors:
-        address = ("127.0.0.1", doors.server.http_port)
-        idle = [socket.create_connection(address) for _ in range(7)]
-        assert doors.http.get("/healthz").status_code == 200  # the eighth
-        idle.append(socket.create_connection(address))
-        # The server counts a connection when its loop gets to accept it, a moment later.
-        deadline = time.monotonic() + 30
-        while doors.http.get("/healthz").status_code != 503:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-        for connection in idle:
-            connection.close()
+def test_a_server_that_stops_closes_each_connection_with_its_answer(doors: Any) -> None:
+    async def ask(is_stopping: bool) -> httpx.Response:
+        app = RequestEnvelope(
+            PlainTextResponse("ok"), doors.server.observer, OpenConnections(1), lambda: is_stopping
+        )
+        transport = httpx.ASGITransport(app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as http:
+            return await http.get("/")
+
+    assert asyncio.run(ask(True)).headers["connection"] == "close"
+    assert "connection" not in asyncio.run(ask(False)).headers
 
 
 @pytest.fixture
@@ -536,6 +551,7 @@ def test_what_fastapi_refuses_is_a_problem_too(doors: Any) -> None:
         observer=doors.server.observer,
         access=open_access(settings),
         arrivals=Arrivals(1.0, 1),
+        connections=OpenConnections(1000),
         state=doors.server.state,
     )
     app.get("/cube")(_cube)

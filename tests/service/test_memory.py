@@ -1,8 +1,13 @@
 from __future__ import annotations
 
+import asyncio
+import ctypes
 from pathlib import Path
+from types import SimpleNamespace
 
-from service.memory import memory_limit, resident_memory
+import pytest
+
+from service.memory import give_back_memory, memory_limit, resident_memory
 
 
 def write(path: Path, text: str) -> None:
@@ -40,3 +45,30 @@ def test_version_1_of_cgroups_says_no_limit_with_a_huge_one(tmp_path: Path) -> N
     write(tmp_path / "memory" / "memory.limit_in_bytes", "9223372036854771712\n")
 
     assert memory_limit(tmp_path, tmp_path) == 1000 * 1024
+
+
+def test_freed_memory_is_given_back_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def wait_for_three() -> None:
+        given, third = 0, asyncio.Event()
+        loop = asyncio.get_running_loop()
+
+        def trim(kept: int) -> None:
+            nonlocal given
+            assert kept == 0
+            given += 1
+            if given == 3:
+                loop.call_soon_threadsafe(third.set)
+
+        monkeypatch.setattr(ctypes, "CDLL", lambda _: SimpleNamespace(malloc_trim=trim))
+        monkeypatch.setattr("service.memory._GIVE_BACK_EVERY_S", 0.0)
+        giving = asyncio.create_task(give_back_memory())
+        await asyncio.wait_for(third.wait(), 10)
+        giving.cancel()
+
+    asyncio.run(wait_for_three())
+
+
+def test_another_c_library_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: SimpleNamespace())
+
+    asyncio.run(give_back_memory())

@@ -16,6 +16,7 @@ from fastapi import FastAPI
 from starlette.datastructures import Headers
 
 import service.page
+from service.acceptor import OpenConnections
 from service.access import open_access
 from service.caching import is_current, takes_gzip
 from service.connections import Arrivals
@@ -61,6 +62,7 @@ def app_with(**settings: Any) -> FastAPI:
         observer=Observer(Metrics()),
         access=open_access(read),
         arrivals=Arrivals(1.0, 1),
+        connections=OpenConnections(1000),
         state=lambda: ServiceState(ready=True),
     )
 

@@ -352,6 +352,18 @@ def test_json_of_very_many_values_is_refused_before_it_is_parsed(text: str) -> N
     assert (caught.value.code, caught.value.expected) == ("request.too_large", "at most 10000")
 
 
+@pytest.mark.parametrize("as_text", [str, str.encode])
+@pytest.mark.parametrize("inside", ["1,", "[],", '{"a":0},', "[" * 100 + "]" * 100 + ","])
+def test_values_are_counted_by_commas_and_brackets(as_text: Any, inside: str) -> None:
+    text = '{"map": "room", "maps": [' + inside * 10_000 + "1]}"
+
+    with pytest.raises(TooLarge) as caught:
+        LocalizeRequest.read_json(as_text(text))
+
+    counted = 3 + 10_000 * sum(map(inside.count, ",[{"))
+    assert (caught.value.code, caught.value.got) == ("request.too_large", str(counted))
+
+
 def test_too_many_global_descriptors_are_refused() -> None:
     array = {"dtype": "int8", "shape": [0], "data": ""}
     features = {"kind": "sift", "keypoints": array, "descriptors": array}

@@ -1,7 +1,10 @@
 from __future__ import annotations
 
 import asyncio
+import io
+import logging
 import ssl
+import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
@@ -24,6 +27,7 @@ from cryptography.hazmat.primitives.serialization import (
 from clients import AsyncClient, Client
 from service.access import ANY_KEY, needed_over_http
 from service.key_file import Scope, edited_keys, new_key
+from service.logs import TextFormatter
 from service.server import Server
 from service.settings import ServiceSettings, SettingsError
 from service.tls import check_tls, grpc_credentials, tls_config
@@ -182,6 +186,28 @@ def test_the_server_says_over_both_doors_why_it_refuses(guarded: Guarded, door: 
             client.delete_version("room", "1")
         with pytest.raises(Forbidden):
             client.map_version("room", "1")
+
+
+@pytest.mark.parametrize("door", ["http", "grpc"])
+def test_the_log_names_the_key_that_was_refused(guarded: Guarded, door: str) -> None:
+    log, written = logging.getLogger("service.access"), io.StringIO()
+    handler = logging.StreamHandler(written)
+    handler.setFormatter(TextFormatter())
+    log.addHandler(handler)
+    level = log.level
+    log.setLevel(logging.INFO)
+    try:
+        with guarded.client(door, Scope.LOCALIZE) as client, pytest.raises(Forbidden):
+            client.maps()
+        deadline = time.monotonic() + 20
+        while "code=access.scope" not in written.getvalue() and time.monotonic() < deadline:
+            time.sleep(0.01)  # the caller is answered first
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)
+    (line,) = written.getvalue().splitlines()
+    assert "code=access.scope" in line
+    assert "key=localize" in line
 
 
 @pytest.mark.parametrize("door", ["http", "grpc"])

@@ -7,16 +7,19 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+import numpy as np
 import pytest
 
 from service import vision
 from service.jobs import ImageJob, LocalizeJob, RigJob, SequenceStart
+from service.tiles import Read
 from service.vision import Vision
-from service.worker import MapFolder, WorkerSettings
+from service.worker import Abandoned, MapFolder, WorkerSettings
 from visloc.archive import MapStore
 from visloc.errors import Conflict, InvalidInput, WeightsError
 from visloc.features import GlobalDescriptor, make_global_descriptor
-from visloc.types import Inference, LocalizeOptions, Matcher, Solver
+from visloc.priors import NO_PRIORS
+from visloc.types import Inference, LocalizeOptions, Matcher, QueryFeatures, Solver
 
 WEIGHTS = Path("weights")
 SETTINGS = WorkerSettings(WEIGHTS, 1, 10**9, 8, 8, 10**8, 10**8, Inference.FP32)
@@ -52,6 +55,23 @@ def test_a_map_whose_descriptor_has_no_weights_here_is_a_conflict(
             MapFolder("room@1", MapStore(built_maps).folder("room"))
         )
     assert caught.value.code == "weights.missing"
+
+
+def test_work_that_was_given_up_ends_when_its_photo_is_decoded(
+    open_maps: tuple[Vision, list[MapFolder]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, maps = open_maps
+    given_up = ctypes.c_bool()
+    process = Vision(SETTINGS, given_up)
+
+    def decode(*_: object) -> Read:
+        given_up.value = True
+        return Read(QueryFeatures("sift", *[np.empty((0, 2))] * 2, {}), {}, {})
+
+    monkeypatch.setattr(vision, "read_query", decode)
+    image = ImageJob("left", IMAGE, None)
+    with pytest.raises(Abandoned):
+        process.look_at_image(image, maps, None, LocalizeOptions(), NO_PRIORS, 0.0)
 
 
 # Options that do not fit

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image, ImageOps, TiffImagePlugin
 
 from visloc.errors import InvalidInput, NotFound, TooLarge
 from visloc.images import (
@@ -19,7 +19,9 @@ from visloc.images import (
     read_photo,
     read_photo_file,
     stored_from_upright,
+    turn_of,
     upright,
+    upright_from_stored,
 )
 
 ORIENTATIONS = range(1, 9)
@@ -168,6 +170,26 @@ def test_points_of_the_upright_photo_return_to_the_stored_pixel(orientation: int
     np.testing.assert_array_equal(stored_index[row, column], turned.reshape(-1, 3))
 
 
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_points_go_to_the_upright_photo_and_come_back(orientation: int) -> None:
+    stored = np.random.default_rng(0).uniform(0, 5, (20, 2)).astype(np.float32)
+
+    there = upright_from_stored(stored, orientation, 7, 5)
+    back = stored_from_upright(there, orientation, 7, 5)
+
+    assert there.dtype == np.float32
+    np.testing.assert_allclose(back, stored, atol=1e-6)
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_the_turn_of_an_orientation_is_all_of_it_but_the_mirroring(orientation: int) -> None:
+    asked, turned = (upright(texture(7, 5), one) for one in (orientation, turn_of(orientation)))
+
+    mirrored = orientation in (2, 4, 5, 7)
+    np.testing.assert_array_equal(turned, asked[:, ::-1] if mirrored else asked)
+    assert turn_of(orientation) in (1, 3, 6, 8)
+
+
 def test_moving_points_keeps_their_type_and_takes_none() -> None:
     points = np.array([[0.25, 1.75]], dtype=np.float32)
 
@@ -275,6 +297,35 @@ def test_what_is_not_an_image_is_refused_with_the_formats_that_are_read(data: by
     assert error.expected == "JPEG, PNG, WebP, TIFF or BMP"
 
 
+@pytest.mark.parametrize(
+    ("data", "name", "part"),
+    [
+        (b"\0\0\0\x18ftypheic\0\0\0\0mif1heic", "HEIC", "convert them to JPEG"),
+        (b"\0\0\0\x1cftypmif1\0\0\0\0mif1avif", "AVIF", "convert them to JPEG"),
+        (b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom", "MP4", "take frames out of them"),
+        (b"GIF89a" + bytes(100), "GIF", "save them as PNG"),
+    ],
+)
+def test_a_kind_that_is_not_read_is_named_with_what_to_do(
+    data: bytes, name: str, part: str
+) -> None:
+    error = refusal(data)
+
+    assert (error.code, error.got) == ("image.format", name)
+    assert part in error.message
+
+
+def test_a_raw_photo_is_not_taken_for_its_thumbnail() -> None:
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    tags[50706] = b"\x01\x04\x00\x00"  # DNGVersion
+    file = io.BytesIO()
+    Image.fromarray(texture(40, 30)).save(file, "TIFF", tiffinfo=tags)
+
+    error = refusal(file.getvalue())
+
+    assert (error.code, error.got) == ("image.format", "raw")
+
+
 @pytest.mark.parametrize("file_format", ["JPEG", "PNG", "WEBP", "TIFF", "BMP"])
 @pytest.mark.parametrize("kept", [0.05, 0.3, 0.6, 0.95])
 @pytest.mark.filterwarnings("ignore:Truncated File Read", "ignore:Corrupt EXIF data")
@@ -333,6 +384,91 @@ def test_a_png_chunk_that_claims_gigabytes_never_reaches_the_decoder(
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
 
     assert refusal(lying).code == "image.undecodable"
+
+
+# Work
+
+
+def progressive(
+    mode: str = "RGB", more: bytes = b"", times: int = 1, size: tuple[int, int] = (48, 32)
+) -> bytes:
+    """A JPEG with ``more`` and a copy of its last scan, so many times, before its end."""
+    jpeg = encode(Image.fromarray(texture(*size)).convert(mode), "JPEG", progressive=True)
+    last, end = jpeg.rindex(b"\xff\xda"), jpeg.rindex(b"\xff\xd9")
+    return jpeg[:end] + (more + jpeg[last:end]) * (times if more or times > 1 else 0) + jpeg[end:]
+
+
+@pytest.mark.parametrize(
+    "before_each",
+    [
+        *(b"\xff" * 3, b"\0\1 garbage \xff\0", b"\xff\xd0\xff\xd7", b"\xff\x01\xff\xbf"),
+        *(b"\xff\xfe\0\2", b"\xff\xe1\0\4\xff\xd9", b"\xff\xfe\0\0", b"\xff\xdd\0\4\0\1"),
+        *(b"\xff\xd8", b"\xff\xf0\0\xff", b"\xff\xc8"),
+    ],
+)
+def test_a_jpeg_of_very_many_scans_is_refused_before_it_is_decoded(
+    before_each: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("visloc.images._decode", lambda _: pytest.fail("it was decoded"))
+
+    error = refusal(progressive(more=before_each, times=300))
+
+    assert isinstance(error, TooLarge)
+    assert (error.code, error.field) == ("image.too_complex", "image")
+    assert (error.expected, error.got) == ("at most 100 scans of 48 x 32 pixels", "310 scans")
+
+
+def test_the_largest_photos_may_have_fewer_scans() -> None:
+    limits = ImageLimits(max_pixels=48 * 32)
+
+    assert read_photo(progressive(times=10), limits).width == 48  # 10 of its own
+    error = refusal(progressive(times=11), limits)
+
+    assert (error.code, error.got) == ("image.too_complex", "21 scans")
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB", "CMYK"])
+def test_what_encoders_write_is_far_from_too_many_scans(mode: str) -> None:
+    image = Image.fromarray(texture()).convert(mode)
+    for options in ({}, {"progressive": True}, {"restart_marker_blocks": 1}):
+        read_photo(encode(image, "JPEG", **options), ImageLimits(max_pixels=48 * 32))
+
+
+def test_scans_of_thumbnails_and_of_what_follows_the_picture_do_not_count() -> None:
+    other = progressive(times=50)
+    parts = b"".join(
+        b"\xff\xe2" + (len(other) + 2).to_bytes(2, "big") + other  # a thumbnail
+        for _ in range(10)
+    )
+    jpeg = encode(Image.fromarray(texture()), "JPEG")
+
+    photo = read_photo(jpeg[:2] + parts + jpeg[2:] + other * 10 + b"\xff\xda" * 1000)
+
+    np.testing.assert_array_equal(photo.rgb, read_photo(jpeg).rgb)
+
+
+@pytest.mark.parametrize(
+    "filler",
+    [
+        b"\xff\xfe\0\2" * 100_001,  # comments without a word
+        b"\xff" * 100_001,
+        b"\xff\0" * 50_001,
+        b"\xff\xd0" * 50_001,
+        b"\xff\xd9" + b"\xff\xe1\0\2" * 100_001,
+    ],
+)
+def test_a_jpeg_of_very_many_segments_is_refused(filler: bytes) -> None:
+    jpeg = encode(Image.fromarray(texture()), "JPEG")
+
+    assert refusal(jpeg[:2] + filler + jpeg[2:]).code == "image.too_complex"
+
+
+def test_a_png_of_very_many_chunks_is_refused() -> None:
+    png = encode(Image.fromarray(texture()), "PNG")
+    chunk = struct.pack(">I4sI", 0, b"prVt", zlib.crc32(b"prVt"))
+
+    assert refusal(png[:33] + chunk * 100_000 + png[33:]).code == "image.too_complex"
+    assert read_photo(png[:33] + chunk * 90_000 + png[33:]).width == 48
 
 
 def test_a_png_with_two_headers_is_refused() -> None:

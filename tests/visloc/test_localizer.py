@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import Image
 
+from tests.turning import png, turned_camera, turned_pixels, turned_pose
 from visloc.archive import MapStore
 from visloc.errors import Conflict, InvalidInput, TooLarge
 from visloc.evaluation import pose_error
@@ -40,7 +39,7 @@ from visloc.types import (
 )
 
 OPTIONS = LocalizeOptions()
-UPRIGHT = LocalizeOptions(read_as=ReadAs.UPRIGHT)
+STORED = LocalizeOptions(read_as=ReadAs.STORED)
 
 
 class Query(Protocol):
@@ -77,19 +76,6 @@ def same_bits(a: Localized, b: Localized) -> bool:
             (a.inlier_points, b.inlier_points),
         )
     )
-
-
-def png(pixels: NDArray[np.integer], exif_orientation: int | None = None) -> bytes:
-    """Encode without loss."""
-    if pixels.dtype == np.uint16:  # Pillow has no 16-bit colour
-        return cv2.imencode(".png", pixels[..., ::-1])[1].tobytes()
-    image = Image.fromarray(pixels)
-    exif = Image.Exif()
-    if exif_orientation is not None:
-        exif[0x0112] = exif_orientation
-    buffer = io.BytesIO()
-    image.save(buffer, "PNG", exif=exif)
-    return buffer.getvalue()
 
 
 def test_every_query_is_localized_within_a_few_millimetres(
@@ -187,46 +173,53 @@ def test_a_camera_given_for_twice_the_size_gives_the_same_pose(
     assert same_bits(scaled, exact)
 
 
-def turned(query: Query, quarter_turns: int) -> tuple[NDArray[np.uint8], Camera, Pose]:
-    """The query as a camera turned about its axis stores it: pixels, camera, true pose.
-
-    Pixels go counterclockwise by quarter turns. One turn takes (u, v) to (v, width - u), and
-    the camera's axes (x, y) to (y, -x).
-    """
-    pixels, camera, pose = read_photo(query.image).rgb, query.camera, query.cam_from_world
-    quarter = Pose(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
-    for _ in range(quarter_turns):
-        fx, fy, cx, cy = camera.params
-        params = (fy, fx, cy, camera.width - cx)
-        camera = Camera("PINHOLE", camera.height, camera.width, params)
-        pixels, pose = np.rot90(pixels), quarter @ pose
-    return np.ascontiguousarray(pixels), camera, pose
-
-
-# EXIF: 6 asks to turn clockwise by a quarter, 3 by a half, 8 by three quarters.
-@pytest.mark.parametrize(("quarter_turns", "exif_orientation"), [(1, 6), (2, 3), (3, 8)])
-def test_a_photo_stored_turned_has_the_turned_pose_exactly(
-    localizer: Localizer, query: Query, quarter_turns: int, exif_orientation: int
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_photo_stored_turned_has_the_pose_of_the_turned_camera(
+    localizer: Localizer, query: Query, orientation: int
 ) -> None:
     straight = localized(localizer.localize(read_photo(query.image), query.camera, OPTIONS))
-    pixels, camera, truth = turned(query, quarter_turns)
-    photo = read_photo(png(pixels, exif_orientation))
-    assert photo.exif_orientation == exif_orientation
-    expected = truth @ query.cam_from_world.inverse() @ straight.cam_from_world
+    pixels = turned_pixels(read_photo(query.image).rgb, orientation)
+    camera = turned_camera(query.camera, orientation)
+    photo = read_photo(png(pixels, orientation))
+    assert photo.exif_orientation == orientation
 
-    # Read upright, it gives the keypoints of the photo that was not turned.
-    read_upright = localized(localizer.localize(photo, camera, UPRIGHT))
-    assert read_upright.evidence.read_as is ReadAs.UPRIGHT
-    assert read_upright.evidence.num_inliers == straight.evidence.num_inliers
-    assert pose_error(read_upright.cam_from_world, expected) < (1e-5, 1e-3)
-    assert read_upright.position_std == pytest.approx(straight.position_std, rel=1e-2)
+    # Features are those of the photo that was not turned, and so is all that follows.
+    answer = localized(localizer.localize(photo, camera, OPTIONS))
+    assert answer.evidence.read_as is ReadAs.UPRIGHT
+    assert answer.evidence.camera == camera
+    assert answer.evidence.num_inliers == straight.evidence.num_inliers
+    expected = turned_pose(straight.cam_from_world, orientation)
+    assert pose_error(answer.cam_from_world, expected) < (1e-5, 1e-3)
+    assert answer.position_std == pytest.approx(straight.position_std, rel=1e-2)
+    # Keypoints and pose are those of the stored pixels.
+    fx, fy, cx, cy = camera.params
+    x, y, z = answer.cam_from_world.apply(answer.inlier_points).T
+    seen = np.column_stack([fx * x / z + cx, fy * y / z + cy])
+    assert np.median(np.linalg.norm(seen - answer.inlier_keypoints, axis=1)) < 0.5
 
     # Read as stored, SIFT, which is rotation-invariant, gives nearly that.
-    as_stored = localized(localizer.localize(photo, camera, OPTIONS))
+    as_stored = localized(localizer.localize(photo, camera, STORED))
     assert as_stored.evidence.read_as is ReadAs.STORED
-    position_m, orientation_deg = pose_error(as_stored.cam_from_world, truth)
-    assert position_m < 0.005
-    assert orientation_deg < 0.15
+    truth = turned_pose(query.cam_from_world, orientation)
+    assert pose_error(as_stored.cam_from_world, truth) < (0.005, 0.15)
+
+
+def test_a_refusal_of_a_photo_that_was_read_on_its_side_says_so(
+    localizer: Localizer, query: Query
+) -> None:
+    photo = read_photo(png(turned_pixels(read_photo(query.image).rgb, 6), 6))
+    camera = turned_camera(query.camera, 6)
+    for limits in ({"min_inliers": 5000}, {"min_inliers": 700}, {"min_inlier_ratio": 0.99}):
+        options = LocalizeOptions(**limits)  # type: ignore[arg-type]
+        as_stored = replace(options, read_as=ReadAs.STORED)
+        message = refused(localizer.localize(photo, camera, as_stored)).message
+        assert "stored turned, EXIF orientation 6" in message
+        assert "read_as=upright" in message
+        assert "read_as" not in refused(localizer.localize(photo, camera, options)).message
+        straight = read_photo(query.image)
+        assert (
+            "read_as" not in refused(localizer.localize(straight, query.camera, as_stored)).message
+        )
 
 
 @pytest.mark.parametrize(
@@ -374,9 +367,9 @@ def test_a_camera_of_another_size_is_refused(localizer: Localizer, query: Query)
 def test_the_upright_camera_of_a_photo_stored_turned_is_refused_with_the_hint(
     localizer: Localizer, query: Query
 ) -> None:
-    pixels, _, _ = turned(query, 1)
+    photo = read_photo(png(turned_pixels(read_photo(query.image).rgb, 6), 6))
     with pytest.raises(InvalidInput, match=r"EXIF orientation 6.*stored pixels") as caught:
-        localizer.localize(read_photo(png(pixels, 6)), query.camera, UPRIGHT)
+        localizer.localize(photo, query.camera, OPTIONS)
     assert caught.value.code == "camera.size_mismatch"
 
 
@@ -669,6 +662,7 @@ def test_features_need_a_camera_and_have_no_orientation_to_be_read_in(
     with pytest.raises(InvalidInput) as caught:
         localizer.localize_features(features, None, OPTIONS)
     assert (caught.value.code, caught.value.field) == ("camera.required", "camera")
-    with pytest.raises(InvalidInput) as caught:
-        localizer.localize_features(features, query.camera, UPRIGHT)
-    assert caught.value.code == "options.read_as"
+    as_stored = localized(localizer.localize_features(features, query.camera, STORED))
+    answer = localized(localizer.localize_features(features, query.camera, OPTIONS))
+    assert same_bits(answer, as_stored)
+    assert (answer.evidence.exif_orientation, answer.evidence.read_as) == (1, ReadAs.STORED)

@@ -1,23 +1,24 @@
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import pytest
 
+from tests.turning import turned_pixels, turned_points
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.features.lightglue import SeenKeypoints
 from visloc.geometry import Camera, Pose
-from visloc.images import Photo, read_photo, upright
+from visloc.images import Photo, read_photo
 from visloc.localizer import Localizer
 from visloc.matching.correspondences import NUM_REMATCHED, mutual_nearest_neighbours
 from visloc.matching.products import in_eight_bits
-from visloc.types import Localized, LocalizeOptions, Matcher, ReadAs
+from visloc.types import Localized, LocalizeOptions, Matcher
 
 LIGHTGLUE = LocalizeOptions(matcher=Matcher.LIGHTGLUE)
 
@@ -85,17 +86,37 @@ def test_a_photo_that_is_read_upright_is_shown_upright(
     localizer: Localizer, network: NearestNeighbours, query: Query, orientation: int
 ) -> None:
     photo = read_photo(query.image)
-    undone_by = {6: 8, 8: 6}.get(orientation, orientation)
-    stored = upright(photo.rgb, undone_by)
-    assert np.array_equal(upright(stored, orientation), photo.rgb)
-    options = LocalizeOptions(matcher=Matcher.LIGHTGLUE, read_as=ReadAs.UPRIGHT)
-    localizer.look(Photo(stored, orientation), None, options)
+    stored = Photo(turned_pixels(photo.rgb, orientation), orientation)
+    localizer.look(stored, None, LIGHTGLUE)
     expected = localizer.look(photo, None, LIGHTGLUE)
     assert len(expected.matches.pixels) > 100
     turned, straight = network.shown[0][0], network.shown[-1][0]
     assert (turned.width, turned.height) == (straight.width, straight.height) == (256, 192)
     np.testing.assert_allclose(turned.keypoints, straight.keypoints, atol=1e-3)
     assert np.array_equal(turned.descriptors, straight.descriptors)
+
+
+def test_photos_of_a_map_are_shown_as_their_features_were_found(
+    localizer: Localizer, network: NearestNeighbours, query: Query
+) -> None:
+    photo = read_photo(query.image)
+    localizer.look(photo, None, LIGHTGLUE)
+    stored = [seen for _, seen in network.shown]
+    network.shown.clear()
+    opened = localizer.map
+    turned = tuple(replace(image, turn=6) for image in opened.images)
+    extractor = make_local_features("sift")
+    names: Any = {"sift": network}
+    of_turned = Localizer(replace(opened, images=turned), extractor, make_matcher=names.__getitem__)
+    of_turned.look(photo, None, LIGHTGLUE)
+
+    assert len(network.shown) == len(stored) > 0
+    for (_, seen), before in zip(network.shown, stored, strict=True):
+        assert (seen.width, seen.height) == (before.height, before.width)
+        np.testing.assert_allclose(
+            turned_points(seen.keypoints, (seen.width, seen.height), 6), before.keypoints, atol=1e-4
+        )
+        assert np.array_equal(seen.descriptors, before.descriptors)
 
 
 def test_a_map_whose_features_have_no_network_says_so(built_maps: Path, query: Query) -> None:

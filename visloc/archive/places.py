@@ -10,8 +10,13 @@ from numpy.typing import NDArray
 
 from visloc.archive.schema import Geodetic, World
 from visloc.archive.set_schema import SetWorld
-from visloc.geodesy import ecef_from_geodetic, geodetic_from_enu, ground_distance
-from visloc.geometry import Pose
+from visloc.geodesy import (
+    ecef_from_geodetic,
+    enu_from_ecef,
+    geodetic_from_enu,
+    ground_distance,
+)
+from visloc.geometry import Pose, Similarity
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +48,24 @@ def enu_of(points: NDArray[np.float64], geodetic: Geodetic) -> NDArray[np.float6
 def origin_of(geodetic: Geodetic) -> NDArray[np.float64]:
     """Return the anchor's geodetic position (3,), as ``visloc.geodesy`` has them."""
     return np.array([geodetic.latitude_deg, geodetic.longitude_deg, geodetic.altitude_m])
+
+
+def anchor_rms(world: World | SetWorld) -> float:
+    """Return how far the world may be off its place on Earth, in its unit; 0 when unknown."""
+    return (world.anchor and world.anchor.rms) or 0.0
+
+
+def similarity_on_earth(a: Geodetic, b: Geodetic) -> Similarity:
+    """Return a_from_b of two worlds whose places on Earth are known."""
+    axes_a, axes_b = enu_from_ecef(origin_of(a)), enu_from_ecef(origin_of(b))
+    apart = ecef_from_geodetic(np.stack([origin_of(a), origin_of(b)]))
+    enu_a_from_enu_b = Similarity(1.0, axes_a @ axes_b.T, axes_a @ (apart[1] - apart[0]))
+    return _enu_from_world(a).inverse() @ enu_a_from_enu_b @ _enu_from_world(b)
+
+
+def _enu_from_world(geodetic: Geodetic) -> Similarity:
+    pose = Pose.from_quaternion(geodetic.rotation_wxyz, geodetic.translation)
+    return Similarity(geodetic.scale, pose.rotation, pose.translation)
 
 
 def down_of(geodetic: Geodetic) -> NDArray[np.float64]:

@@ -22,7 +22,7 @@ from visloc.retrieval.fusion import LateFusion
 from visloc.types import Fingerprint, Fusion, check_fusion_weights
 
 FORMAT = "visloc-map"
-FORMAT_MAJOR, FORMAT_MINOR = 2, 1
+FORMAT_MAJOR, FORMAT_MINOR = 2, 2
 
 ID_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -266,11 +266,16 @@ class CamerasFile(Record):
 # A dataclass takes a fifth of the memory that a model takes: there may be 100 000.
 @dataclass(frozen=True, slots=True)
 class ImageRecord:
-    """One mapping photo; its pose is the same row of ``image_poses.npy``."""
+    """One mapping photo; its pose is the same row of ``image_poses.npy``.
+
+    ``turn`` is the EXIF orientation by which the photo was turned before features were found in
+    it. Its camera, pose and keypoints refer to the pixels as stored.
+    """
 
     name: str
     camera: str
     timestamp: int
+    turn: Annotated[int, Field(ge=1, le=8)] = 1
 
 
 class ImagesFile(Record):

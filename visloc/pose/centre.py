@@ -1,4 +1,4 @@
-"""A pose and its covariance, seen from the camera's centre or from another origin.
+"""A pose and its covariance, seen from the camera's centre, from another origin or frame.
 
 As in ``covariance``: R <- Exp(w) R, t <- t + dt; 6 x 6, w (rad) before dt.
 """
@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.geometry import Pose, cross_matrix
+from visloc.geometry import Pose, Similarity, cross_matrix
 
 
 def position_covariance(
@@ -40,6 +40,22 @@ def with_origin(
     jacobian = np.eye(6)
     jacobian[3:, :3] = cross_matrix(offset)
     return pose, jacobian @ covariance @ jacobian.T
+
+
+def moved_pose(
+    device_from_b: Pose, covariance: NDArray[np.float64], a_from_b: Similarity
+) -> tuple[Pose, NDArray[np.float64]]:
+    """Move a pose and its covariance (6, 6) to another frame and unit.
+
+    The translation t_a = scale t_b - R_a t, with R_a and t_a of the result and t of ``a_from_b``,
+    moves with that of b, and with the rotation as far as the origins lie apart.
+    """
+    pose = a_from_b.move(device_from_b)
+    jacobian = np.eye(6)
+    jacobian[3:, 3:] *= a_from_b.scale
+    jacobian[3:, :3] = cross_matrix(pose.rotation @ a_from_b.translation)
+    moved = jacobian @ covariance @ jacobian.T
+    return pose, (moved + moved.T) / 2
 
 
 def largest_std(pose: Pose, covariance: NDArray[np.float64]) -> float:

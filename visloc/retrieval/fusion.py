@@ -1,8 +1,9 @@
 """Late fusion: one score per mapping photo from its cosine similarities to the query.
 
-Section 3.2 of Humenberger et al. 2020. An operator takes similarities (m, n), one row per global
-descriptor, and positive weights (m,) whose sum is 1, and gives fused scores (n,). Scores order the
-photos of one query; they are no cosines, but for a single descriptor, whose cosines they are.
+Section 4.3 and appendix B of Humenberger et al. 2020. An operator takes similarities (m, n), one
+row per global descriptor, and positive weights (m,) whose sum is 1, and gives fused scores (n,).
+Scores order the photos of one query; they are no cosines, but for a single descriptor, whose
+cosines they are.
 
 Every operator is defined and finite for all cosines from -1 to 1, and no score falls when a
 similarity rises. Formulas that divide by similarities or take powers of them end where one is 0

@@ -1,9 +1,7 @@
-"""Which tiles are searched, in which order, and which of their answers is the set's."""
+"""Which tiles of a set are searched, and in which order."""
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,11 +12,11 @@ from visloc.archive import SetOutline
 from visloc.archive.places import circles_of
 from visloc.errors import InvalidInput, NotFound
 from visloc.geodesy import ground_distances
-from visloc.geometry import Pose, rotation_angle
-from visloc.pose.centre import largest_std, position_covariance
+from visloc.judge import inliers_of, measured_pose
+from visloc.pose.centre import largest_std
 from visloc.priors import HEIGHT_REACH, POSE_PRIOR_STDS, REACH, Priors
 from visloc.sets.frame import down_in_set
-from visloc.types import Answer, InstantAnswer, Localized, Reason, Refusal
+from visloc.types import Answer, InstantAnswer
 
 # Tiles that a query is searched in, at most.
 MAX_SEARCHED = 5
@@ -26,13 +24,6 @@ MAX_SEARCHED = 5
 _CLOSE_SCORE = 0.8
 # An answer of so many inliers needs no other tile.
 CLEAR_INLIERS = 100
-# Of the most inliers: answers of this share must agree with each other, or the answer is
-# ambiguous; of those of this share, the most certain counts.
-_RIVAL_SHARE, _SIMILAR_SHARE = 0.5, 0.8
-# Answers agree that are no further apart than what both leave open (three standard deviations),
-# and how well tiles are tied to each other: a tenth of how far their photos see, five degrees.
-STDS = 3.0
-TIE_REACH_SHARE, TIE_ANGLE = 0.1, math.radians(5.0)
 _NAMED = 5
 
 
@@ -47,19 +38,6 @@ class TileScore:
 
     tile: int
     score: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Found:
-    """What one tile answered.
-
-    Attributes:
-        tile: its row in the set.
-        answer: in the set's frame (``visloc.sets.frame.answer_in_set``).
-    """
-
-    tile: int
-    answer: Answer | InstantAnswer
 
 
 def tiles_near(
@@ -187,35 +165,7 @@ def plan(scores: Sequence[TileScore]) -> tuple[tuple[int, ...], tuple[int, ...]]
 
 def is_clear(answer: Answer | InstantAnswer) -> bool:
     """Tell whether no other tile needs to be searched: a pose of many inliers."""
-    return _pose(answer) is not None and inliers_of(answer) >= CLEAR_INLIERS
-
-
-def judge(outline: SetOutline, found: Sequence[Found]) -> int | Refusal:
-    """Choose the answer of a set among those of its tiles.
-
-    Of answers with a pose, the one with the most inliers counts, or one that has similarly many
-    and is more certain. Two places are reason to refuse, each of which explains half as much as
-    the best: guessing could put the device into the wrong building. All pairs are compared, since
-    an uncertain answer agrees with places that contradict each other.
-
-    Args:
-        outline: the set.
-        found: of the tiles that were searched, at least one.
-
-    Returns:
-        The row in ``found`` of the answer; when no tile gave a pose, of that which came furthest.
-        Or a refusal, ``ambiguous``.
-    """
-    localized = [row for row, one in enumerate(found) if _pose(one.answer) is not None]
-    if not localized:
-        return max(range(len(found)), key=lambda row: _progress(found[row].answer))
-    most = max(inliers_of(found[row].answer) for row in localized)
-    rivals = [row for row in localized if inliers_of(found[row].answer) >= _RIVAL_SHARE * most]
-    for a, b in itertools.combinations(rivals, 2):
-        if not _agree(outline, found[a], found[b]):
-            return _ambiguous(outline, found[a], found[b])
-    similar = [row for row in rivals if inliers_of(found[row].answer) >= _SIMILAR_SHARE * most]
-    return min(similar, key=lambda row: _spread(found[row].answer))
+    return measured_pose(answer) is not None and inliers_of(answer) >= CLEAR_INLIERS
 
 
 def _named(outline: SetOutline, names: Sequence[str]) -> NDArray[np.bool_]:
@@ -237,56 +187,3 @@ def _named(outline: SetOutline, names: Sequence[str]) -> NDArray[np.bool_]:
                 got=name,
             )
     return named
-
-
-def _pose(answer: Answer | InstantAnswer) -> tuple[Pose, NDArray[np.float64]] | None:
-    """The pose that an answer's own images measured, and its covariance."""
-    if isinstance(answer, Localized):
-        return answer.cam_from_world, answer.covariance
-    if isinstance(answer, InstantAnswer) and answer.pose is not None and answer.refusal is None:
-        return answer.pose.rig_from_world, answer.pose.covariance
-    return None
-
-
-def inliers_of(answer: Answer | InstantAnswer) -> int:
-    """Return the inliers of the best pose, accepted or not."""
-    if isinstance(answer, InstantAnswer):
-        return answer.num_inliers
-    return answer.evidence.num_inliers
-
-
-def _progress(answer: Answer | InstantAnswer) -> tuple[int, int]:
-    if isinstance(answer, InstantAnswer):
-        return answer.num_inliers, answer.num_correspondences
-    return answer.evidence.num_inliers, answer.evidence.num_correspondences
-
-
-def _spread(answer: Answer | InstantAnswer) -> float:
-    """Variance of the position, along all axes together."""
-    known = _pose(answer)
-    return math.inf if known is None else float(position_covariance(*known).trace())
-
-
-def _agree(outline: SetOutline, a: Found, b: Found) -> bool:
-    """Whether two poses are those of one place, seen from two tiles."""
-    known_a, known_b = _pose(a.answer), _pose(b.answer)
-    if known_a is None or known_b is None:
-        return False
-    floor = TIE_REACH_SHARE * float(outline.reaches[[a.tile, b.tile]].max())
-    (pose_a, covariance_a), (pose_b, covariance_b) = known_a, known_b
-    away = float(np.linalg.norm(pose_a.center - pose_b.center))
-    turned = rotation_angle(pose_a.rotation @ pose_b.rotation.T)
-    turn_std = math.sqrt(covariance_a[:3, :3].trace() + covariance_b[:3, :3].trace())
-    move_std = math.hypot(largest_std(*known_a), largest_std(*known_b))
-    return away <= floor + STDS * move_std and turned <= TIE_ANGLE + STDS * turn_std
-
-
-def _ambiguous(outline: SetOutline, a: Found, b: Found) -> Refusal:
-    ref_a, ref_b = (outline.tiles[one.tile].ref for one in (a, b))
-    count_a, count_b = (inliers_of(one.answer) for one in (a, b))
-    return Refusal(
-        "gate",
-        Reason.AMBIGUOUS,
-        f"{ref_a} and {ref_b} both explain it, at different places, with {count_a} and "
-        f"{count_b} inliers; say where it is (priors)",
-    )

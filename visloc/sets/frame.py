@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.errors import InvalidInput
-from visloc.geometry import Pose, Similarity, cross_matrix
-from visloc.pose.centre import position_covariance
+from visloc.geometry import Pose, Similarity
+from visloc.pose.centre import moved_pose, position_covariance
 from visloc.priors import HeightBand, PosePrior, PositionPrior, Priors
 from visloc.types import InstantAnswer, Localized, NotLocalized, RigPose
 
@@ -95,22 +95,6 @@ def priors_in_tile(
     if gravity is not None and gravity.world is not None:
         gravity = replace(gravity, world=tile_from_set.rotation @ gravity.world)
     return Priors(position=position, height=height, pose=pose, gravity=gravity)
-
-
-def moved_pose(
-    device_from_b: Pose, covariance: NDArray[np.float64], a_from_b: Similarity
-) -> tuple[Pose, NDArray[np.float64]]:
-    """Move a pose and its covariance (6, 6) to another frame and unit.
-
-    The translation t_a = scale t_b - R_a t, with R_a and t_a of the result and t of ``a_from_b``,
-    moves with that of b, and with the rotation as far as the origins lie apart.
-    """
-    pose = a_from_b.move(device_from_b)
-    jacobian = np.eye(6)
-    jacobian[3:, 3:] *= a_from_b.scale
-    jacobian[3:, :3] = cross_matrix(pose.rotation @ a_from_b.translation)
-    moved = jacobian @ covariance @ jacobian.T
-    return pose, (moved + moved.T) / 2
 
 
 def scaled_device(cam_from_rig: Pose, scale: float) -> Pose:

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from visloc.archive import SetOutline
 from visloc.geometry import Pose, rotation_angle
+from visloc.judge import STDS, TIE_ANGLE, TIE_REACH_SHARE
 from visloc.pose.centre import largest_std
 from visloc.pose.motion import default_motion_covariance
 from visloc.priors import PositionPrior
-from visloc.sets.choosing import STDS, TIE_ANGLE, TIE_REACH_SHARE
 from visloc.trajectory import Odometry
 
 # What no device exceeds of which no motion is known: a car on a country road.

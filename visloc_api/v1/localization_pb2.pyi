@@ -100,7 +100,9 @@ class LocalizeOptions(_message.Message):
     min_inlier_ratio: _builtins.float
     """0 to 1"""
     read_as: _builtins.str
-    """stored (default) or upright (by EXIF orientation)"""
+    """upright (default): features are found in the photo turned by its EXIF orientation; or stored.
+    Camera, keypoints and pose are those of the stored pixels either way.
+    """
     extraction: _builtins.str
     """effort to find features: fast, default or accurate"""
     fusion: _builtins.str
@@ -525,7 +527,7 @@ class LocalizeRequest(_message.Message):
     def options(self) -> Global___LocalizeOptions: ...
     @_builtins.property
     def maps(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
-        """instead of map: search all of these, the best answer counts"""
+        """instead of map: search all of these; ambiguous where two explain it"""
 
     @_builtins.property
     def priors(self) -> Global___Priors: ...
@@ -1109,6 +1111,10 @@ Global___CameraUsed: _TypeAlias = CameraUsed  # noqa: Y015
 
 @_typing.final
 class Orientation(_message.Message):
+    """How the photo was turned to find features. Camera, keypoints and pose are those of the stored
+    pixels, whatever this says.
+    """
+
     DESCRIPTOR: _descriptor.Descriptor
 
     EXIF_FIELD_NUMBER: _builtins.int
@@ -1116,7 +1122,7 @@ class Orientation(_message.Message):
     exif: _builtins.int
     """1 to 8 as stored in the photo, 1 when absent"""
     read_as: _builtins.str
-    """stored or upright: how features were found"""
+    """upright: by its EXIF orientation; stored: not at all, or features were sent"""
     def __init__(
         self,
         *,

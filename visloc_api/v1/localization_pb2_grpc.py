@@ -88,7 +88,7 @@ class LocalizationServicer:
         that waited for it. With odometry it waits until instants max_gap_s later, or 30 more, have
         come, also when its own photos localize it, because its neighbours may contradict it. One that
         is not localized waits as long for an instant that is; with several maps, all wait for the
-        first that is. So a client that waits for each answer before it sends the next instant must
+        first that one map alone explains. So a client that waits for each answer before it sends the next instant must
         send max_gap_s 0, and one map.
 
         When an instant is refused, those before it are answered first; then the status comes.

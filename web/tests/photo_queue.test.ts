@@ -13,12 +13,6 @@ const MAP = { id: "kitchen", version: "7", current: true } as MapInfo;
 const ANSWER = { status: "not_localized", debug: null } as LocalizeResponse;
 const wish = (): Wish => ({ map: MAP, camera: null, options: {} });
 const photo = (...bytes: number[]): Blob => new Blob([new Uint8Array(bytes)]);
-// A JPEG of 640 x 480 that is stored turned (EXIF orientation 6).
-const TURNED = photo(
-  ...[0xff, 0xd8, 0xff, 0xe1, 0, 30, 0x45, 0x78, 0x69, 0x66, 0, 0],
-  ...[0x4d, 0x4d, 0, 42, 0, 0, 0, 8, 0, 1, 0x01, 0x12, 0, 3, 0, 0, 0, 1, 0, 6, 0, 0],
-  ...[0xff, 0xc0, 0, 17, 8, 1, 0xe0, 2, 0x80, 3],
-);
 
 function refusal(status: number, wait: number | null): ServiceError {
   const { problem } = ownError("some.code", "Refused", "the detail");
@@ -144,20 +138,6 @@ describe("photos", () => {
     await soon();
     expect(states(queue.entries)).toEqual(["failed"]);
     expect(calls).toEqual([]);
-  });
-
-  test("that are stored turned are read upright, unless something else was chosen", async () => {
-    const { queue, calls } = queueAt([]);
-    queue.add(TURNED, "a", wish);
-    queue.add(TURNED, "b", () => ({ ...wish(), options: { read_as: "stored", top_k: 5 } }));
-    queue.add(photo(1), "c", wish);
-    await until(() => queue.entries.every(({ state }) => state === "answered"));
-    expect(calls.map(({ options }) => options)).toEqual([
-      { read_as: "upright" },
-      { read_as: "stored", top_k: 5 },
-      {},
-    ]);
-    expect(queue.entries[0]!.wish!.options).toEqual({ read_as: "upright" }); // for the copied lines
   });
 
   test("can be asked about again", async () => {

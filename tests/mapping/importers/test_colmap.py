@@ -206,6 +206,32 @@ def test_photos_of_a_rig_frame_share_a_timestamp_and_have_their_own_poses(tmp_pa
         np.testing.assert_allclose(image.cam_from_world.translation, matrix[:, 3], atol=1e-14)
 
 
+ONE_IMAGE = "1 1 0 0 0 0 0 0 1 c/alone.jpg\n10.5 20.5 5\n"
+ONE_POINT = "5 1 2 3 10 20 30 0.5 1 0\n"
+
+
+@pytest.mark.parametrize("inside", ["sparse", "."])
+def test_of_several_models_the_one_with_most_photos_is_taken_and_the_others_told(
+    tmp_path: Path, inside: str
+) -> None:
+    small = {"images": ONE_IMAGE, "points3D": ONE_POINT}
+    write_text(tmp_path / inside / "0", **small)
+    write_text(tmp_path / inside / "1")
+    write_text(tmp_path / inside / "2", **small)
+    model = read(tmp_path)
+    assert len(model.images) == 3
+    (note,) = (note for note in model.notes if "largest" in note)
+    assert "holds 3 models" in note
+    assert "1 with 3 photos and 2 points, not: 0 with 1 photos and 1 points, 2 with" in note
+    (image,) = read(tmp_path / inside / "0").images
+    assert image.name == "c/alone.jpg"
+
+
+def test_a_single_model_needs_no_note(tmp_path: Path) -> None:
+    write_text(tmp_path / "sparse" / "1")
+    assert not any("largest" in note for note in read(tmp_path).notes)
+
+
 def test_photos_beside_the_model_are_found(tmp_path: Path) -> None:
     write_text(tmp_path / "project" / "sparse" / "0")
     (tmp_path / "project" / "images").mkdir()

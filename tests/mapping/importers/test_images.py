@@ -32,6 +32,7 @@ def write_photo(
     Image.new("RGB", size, "gray").save(path, exif=exif)
 
 
+HEIC = b"\0\0\0\x18ftypheic\0\0\0\0mif1heic"
 PHONE = {int(ExifTags.Base.Make): "Maker, Inc.", int(ExifTags.Base.Model): "One"}
 FOCAL = {int(ExifTags.Base.FocalLengthIn35mmFilm): 27}
 FOCAL_PX = 27 / 43.266615 * 80  # diagonals of 36 x 24 mm and 64 x 48 px
@@ -78,6 +79,18 @@ def test_photos_of_one_camera_share_a_sensor_with_the_focal_length_of_exif(tmp_p
     assert model.notes == ("1 of 4 photos do not tell their focal length",)
 
 
+def test_photos_of_a_phone_in_all_orientations_share_a_camera(tmp_path: Path) -> None:
+    for orientation in range(1, 9):
+        top = PHONE | {int(ExifTags.Base.Orientation): orientation}
+        write_photo(tmp_path / f"{orientation}.jpg", top=top, details=FOCAL)
+    model = read(tmp_path)
+    assert {image.sensor for image in model.images} == {"camera1"}
+    camera = model.sensors["camera1"].camera
+    assert camera is not None
+    assert (camera.width, camera.height) == (64, 48)  # of the stored pixels
+    assert camera.params == pytest.approx((FOCAL_PX, 32, 24, 0))
+
+
 def test_timestamps_are_ranks_by_the_time_of_exif(tmp_path: Path) -> None:
     write_photo(tmp_path / "a.jpg", details=taken("2024:05:06 07:08:10"))
     write_photo(tmp_path / "b.jpg", details=taken("2024:05:06 07:08:09", "75"))
@@ -121,18 +134,108 @@ def test_gps_that_is_no_place_is_left_out(tmp_path: Path, changes: dict[str, Any
     assert read(tmp_path).gnss == ()
 
 
-def test_what_cannot_be_read_is_left_out_with_a_note(tmp_path: Path) -> None:
-    write_photo(tmp_path / "good.jpg")
-    content = (tmp_path / "good.jpg").read_bytes()
-    (tmp_path / "cut.jpg").write_bytes(content[: len(content) // 4])
-    (tmp_path / "text.png").write_text("not a photo")
-    (tmp_path / "notes.txt").write_text("not looked at")
-    model = read(tmp_path)
+def test_every_file_is_used_or_left_out_with_its_reason(tmp_path: Path) -> None:
+    folder = tmp_path / "in"
+    write_photo(folder / "good.jpg")
+    content = (folder / "good.jpg").read_bytes()
+    others = {
+        "cut.jpg": content[: len(content) // 4],
+        "text.png": b"not a photo",
+        "notes.txt": b"not looked at",
+        "sub/a.HEIC": HEIC,
+        "sub/phone.jpg": HEIC,
+        "b.avif": b"\0\0\0\x1cftypavif\0\0\0\0mif1miafavif",
+        "walk.mp4": b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom",
+        "walk.MOV": b"\0\0\0\x14ftypqt  \0\0\0\0qt  ",
+        "anim.gif": b"GIF89a" + bytes(20),
+        "no_suffix": content,
+        "old.jpg_original": content,
+        ".DS_Store": b"x",
+        "Thumbs.db": b"x",
+        ".hidden.jpg": content,
+        "@eaDir/good.jpg": content,
+    }
+    for name, data in others.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(data)
+    model = read(folder)
     assert [image.name for image in model.images] == ["good.jpg"]
-    (note,) = (note for note in model.notes if "cannot be read" in note)
-    assert note.startswith("2 files")
-    assert "cut.jpg" in note
-    assert "text.png" in note
+    reasons = {name: reason for reason, names in model.left_out.items() for name in names}
+    told = others.keys() - {"@eaDir/good.jpg"} | {"@eaDir/"}
+    assert reasons.keys() == told
+    for name, part in {
+        "cut.jpg": "damaged or cut off",
+        "text.png": "not an image that is read here",
+        "notes.txt": "not photos",
+        "sub/a.HEIC": "HEIC photos are not read here; convert them to JPEG, such as with: heif-con",
+        "sub/phone.jpg": reasons["sub/a.HEIC"],
+        "b.avif": "AVIF photos",
+        "walk.mp4": "MP4 videos are not read here; take frames out of them, such as with: ffmpeg",
+        "walk.MOV": "MOV videos",
+        "anim.gif": "GIF pictures",
+        "no_suffix": "rename them",
+        "old.jpg_original": "rename them",
+        ".DS_Store": "of the operating system",
+        "@eaDir/": "of the operating system",
+    }.items():
+        assert part in reasons[name]
+
+
+def test_what_is_left_out_is_counted_in_notes_and_listed_beside_the_dataset(tmp_path: Path) -> None:
+    write_photo(tmp_path / "in" / "a.jpg")
+    for number in range(5):
+        (tmp_path / "in" / f"{number}.heic").write_bytes(HEIC)
+    (tmp_path / "in" / "line\nbreak.txt").write_text("x")
+    notes = import_dataset("images", tmp_path / "in", tmp_path / "out").notes
+    (note,) = (note for note in notes if "HEIC" in note)
+    assert note.startswith("5 left out (HEIC photos are not read here; ")
+    assert note.endswith("): 0.heic, 1.heic, 2.heic, ...")
+    listed = tmp_path / "out.left-out.txt"
+    assert any(note.endswith(str(listed)) for note in notes)
+    lines = [line.split("\t") for line in listed.read_text().splitlines()]
+    assert [name for name, _ in lines] == [*(f"{n}.heic" for n in range(5)), "'line\\nbreak.txt'"]
+
+
+def test_without_anything_left_out_there_is_no_list(tmp_path: Path) -> None:
+    write_photo(tmp_path / "in" / "a.jpg")
+    listed = tmp_path / "out.left-out.txt"
+    listed.write_text("of an earlier import")
+    notes = import_dataset("images", tmp_path / "in", tmp_path / "out").notes
+    assert not listed.exists()
+    assert not any("left out" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "part"),
+    [
+        ("walk.mp4", b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom", "take frames out of them"),
+        ("a.jpg", b"\xff\xd8\xff\xe0", "a map takes several photos"),
+        ("list.txt", b"a.jpg", "name the folder"),
+    ],
+)
+def test_a_file_instead_of_a_folder_says_what_to_do(
+    tmp_path: Path, name: str, data: bytes, part: str
+) -> None:
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(InvalidInput, match=part) as caught:
+        read(tmp_path / name)
+    assert (caught.value.code, caught.value.field) == ("import.folder", str(tmp_path / name))
+
+
+def test_a_folder_of_nothing_but_heic_says_what_to_do(tmp_path: Path) -> None:
+    for number in range(8):
+        (tmp_path / f"{number}.HEIC").write_bytes(HEIC)
+    with pytest.raises(DatasetError, match=r"8 left out .HEIC photos .* heif-convert") as caught:
+        read(tmp_path)
+    assert caught.value.code == "import.empty"
+
+
+def test_progress_is_told_photo_by_photo(tmp_path: Path) -> None:
+    for name in "abc":
+        write_photo(tmp_path / f"{name}.jpg")
+    told: list[tuple[int, int]] = []
+    read(tmp_path, progress=lambda done, total: told.append((done, total)))
+    assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
 
 
 def test_links_out_of_the_folder_are_not_followed(tmp_path: Path) -> None:
@@ -144,7 +247,10 @@ def test_links_out_of_the_folder_are_not_followed(tmp_path: Path) -> None:
     (tmp_path / "in" / "loop").symlink_to(tmp_path / "in")
     (tmp_path / "in" / "circle.jpg").symlink_to("circle.jpg")
     os.mkfifo(tmp_path / "in" / "pipe.jpg")
-    assert [image.name for image in read(tmp_path / "in").images] == ["a.jpg", "b.jpg"]
+    model = read(tmp_path / "in")
+    assert [image.name for image in model.images] == ["a.jpg", "b.jpg"]
+    left_out = sorted(name for names in model.left_out.values() for name in names)
+    assert left_out == ["c.jpg", "circle.jpg", "folder/", "loop/", "pipe.jpg"]
 
 
 def test_a_folder_without_photos_says_so(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 
 from mapping.importers import IMPORTERS, ImportedImage, ImportedModel, import_dataset, read_model
 from mapping.importers.dataset import write_imported
@@ -43,7 +44,7 @@ def photos(tmp_path: Path) -> Path:
     folder = tmp_path / "photos"
     (folder / "b").mkdir(parents=True)
     for name in ("a.jpg", "b/c.jpg", "a.png"):
-        (folder / name).write_bytes(b"not looked into")
+        Image.new("RGB", (64, 48)).save(folder / name)
     return folder
 
 
@@ -251,3 +252,43 @@ def test_a_folder_of_photos_that_is_none_is_refused(tmp_path: Path) -> None:
 def test_an_existing_output_is_refused_before_anything_is_read(tmp_path: Path) -> None:
     with pytest.raises(Conflict):
         import_dataset("colmap", tmp_path / "nowhere", tmp_path)
+
+
+def turned(path: Path, orientation: int) -> None:
+    """Write a photo of 48 x 64 pixels with an EXIF orientation."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    Image.new("RGB", (48, 64)).save(path, exif=exif)
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "b/c.jpg"])
+def test_a_photo_of_another_size_than_its_camera_is_refused(
+    model: ImportedModel, photos: Path, tmp_path: Path, name: str
+) -> None:
+    turned(photos / name, 1)
+    with pytest.raises(DatasetError, match="1 of 2 photos") as caught:
+        write_imported(model, tmp_path / "dataset")
+    error = caught.value
+    assert (error.code, error.field) == ("import.photo_size", str(photos / name))
+    assert error.expected == "64 x 48 pixels, as its camera cam"
+    assert error.got == "48 x 64 pixels"
+    assert not (tmp_path / "dataset").exists()
+
+
+@pytest.mark.parametrize("orientation", [5, 6, 7, 8])
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
+def test_a_photo_that_is_stored_turned_may_have_the_upright_size(
+    model: ImportedModel, photos: Path, tmp_path: Path, orientation: int, suffix: str
+) -> None:
+    turned(photos / f"turned.{suffix}", orientation)
+    own = replace(model, images=(*model.images, image(f"turned.{suffix}", 30)))
+    write_imported(own, tmp_path / "dataset")
+
+
+def test_a_photo_of_a_kind_that_is_not_read_is_refused_with_advice(
+    model: ImportedModel, photos: Path, tmp_path: Path
+) -> None:
+    (photos / "a.jpg").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic")
+    with pytest.raises(DatasetError, match="HEIC photos are not read here; convert") as caught:
+        write_imported(model, tmp_path / "dataset")
+    assert (caught.value.code, caught.value.field) == ("import.photo", str(photos / "a.jpg"))

@@ -220,18 +220,16 @@ MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
         (frame_with(transform_matrix=[]), "import.json", "frames[1].transform_matrix"),
         (frame_with(transform_matrix=[[1, 2], [3, 4]]), "import.json", "frames[1]"),
         (frame_with(transform_matrix=None), "import.json", "frames[1].transform_matrix"),
-        (frame_with(file_path="../1.jpg"), "import.name", "frames[1].file_path"),
-        (frame_with(file_path="/etc/passwd"), "import.name", "frames[1].file_path"),
-        (frame_with(file_path="a,b.jpg"), "import.name", "frames[1].file_path"),
+        (frame_with(file_path="a,b.jpg"), "import.photo_name", "frames[1].file_path"),
         (frame_with(file_path=7), "import.json", "frames[1].file_path"),
-        (frame_with(depth_file_path="../1.png"), "import.name", "frames[1].depth_file_path"),
+        (frame_with(depth_file_path=""), "import.photo_name", "frames[1].depth_file_path"),
         (frame_with(fl_x=-5), "camera.param_value", "frames[1]"),
         (frame_with(fl_x=True), "import.json", "frames[1].fl_x"),
         (frame_with(w=0), "import.json", "frames[1].w"),
         (frame_with(w=64.5), "import.json", "frames[1].w"),
         (frame_with(k4=0.1), "import.json", "frames[1]"),
         (frame_with(camera_model="EQUIRECTANGULAR"), "camera.model", "frames[1].camera_model"),
-        (frame_with(file_path="images/0.jpg"), "import.duplicate_image", "images/0.jpg"),
+        (frame_with(file_path="images/0.jpg"), "import.photo_name", "images/0.jpg"),
         (top_with(fl_x=None), "import.json", "frames[0]"),
         (top_with(w=None), "import.json", "frames[0]"),
         (top_with(frames=None), "import.json", "'frames'"),
@@ -250,6 +248,63 @@ def test_what_cannot_be_used_is_named_with_its_frame(
         import_dataset("nerfstudio", folder, tmp_path / "out")
     assert caught.value.code == code
     assert named in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (SCALED, "scaled by 2;"),
+        (MIRRORED, "mirrored"),
+        ((2 * np.array(MIRRORED)).tolist(), "mirrored"),
+        (np.diag([1.0, 1.0, 1.2, 1.0]).tolist(), "not a rotation"),
+        (np.zeros((3, 4)).tolist(), "not a rotation"),
+    ],
+)
+def test_a_pose_that_is_none_says_why(
+    tmp_path: Path, matrix: list[list[float]], message: str
+) -> None:
+    if len(matrix) == 4:
+        matrix[3] = [0, 0, 0, 1]
+    with pytest.raises(DatasetError, match=message) as caught:
+        read(write(tmp_path, frame_with(transform_matrix=matrix)(TOP)))
+    determinant = np.linalg.det(np.array(matrix)[:3, :3])
+    assert f"determinant {determinant:.6g}" in str(caught.value.got)
+
+
+@pytest.mark.parametrize(
+    "style", ["images\\f0.jpg", "C:\\rec\\f0.jpg", "/gone/f0.jpg", "../f0.jpg"]
+)
+def test_names_of_other_systems_and_folders_find_their_photos(tmp_path: Path, style: str) -> None:
+    where = "images" if style.startswith("images") else "."
+    (tmp_path / where).mkdir(exist_ok=True)
+    Image.new("RGB", (64, 48)).save(tmp_path / where / "f0.jpg")
+    model = read(write(tmp_path, TOP | {"frames": [FRAME | {"file_path": style}]}))
+    assert model.photos is not None
+    assert (model.photos / model.images[0].name).is_file()
+
+
+def test_an_absolute_name_below_the_folder_is_that_photo(tmp_path: Path) -> None:
+    frame = FRAME | {
+        "file_path": str(tmp_path / "images" / "0.jpg"),
+        "depth_file_path": str(tmp_path / "depth" / "0.png"),
+    }
+    (tmp_path / "depth").mkdir()
+    Image.new("I;16", (32, 24)).save(tmp_path / "depth" / "0.png")
+    (image,) = read(write(tmp_path, TOP | {"frames": [frame]})).images
+    assert (image.name, image.depth) == ("images/0.jpg", "depth/0.png")
+
+
+def test_downscaled_photos_are_refused_before_any_work(tmp_path: Path) -> None:
+    folder = write(tmp_path / "in", TOP | {"frames": [FRAME]})
+    (folder / "images").mkdir()
+    Image.new("RGB", (32, 24)).save(folder / "images" / "0.jpg")
+    with pytest.raises(DatasetError, match="--photos") as caught:
+        import_dataset("nerfstudio", folder, tmp_path / "out")
+    error = caught.value
+    assert (error.code, error.field) == ("import.photo_size", str(folder / "images" / "0.jpg"))
+    assert "64 x 48" in str(error.expected)
+    assert error.got == "32 x 24 pixels"
     assert not (tmp_path / "out").exists()
 
 

@@ -311,4 +311,4 @@ def test_of_several_models_the_largest_is_taken(shared_data: Path, aachen_photos
 
     assert [image.name for image in model.images] == ["db/1045.jpg", "db/4446.jpg"]
     assert len(model.points) == 3
-    assert "not: 1 photos and 2 points" in model.notes[0]
+    assert "not: model 1 with 1 photos and 2 points" in model.notes[0]

@@ -226,7 +226,7 @@ def test_the_largest_reconstruction_is_taken(tmp_path: Path) -> None:
     model = read(write(tmp_path, small, reconstruction()))
 
     assert [image.name for image in model.images] == ["a.jpg", "b.jpg"]
-    assert any("2 reconstructions" in note for note in model.notes)
+    assert any("not: reconstruction 0 with 1 photos" in note for note in model.notes)
 
 
 def test_angle_axis_and_translation_are_those_of_the_camera(tmp_path: Path) -> None:

@@ -176,6 +176,20 @@ def edit_manifest(**changes: object) -> Callable[[Path], None]:
     return edit
 
 
+def edit_images(folder: Path, turn: object) -> None:
+    """Say how the photos were turned, or leave it out."""
+    path = folder / "images.json"
+    images = json.loads(path.read_text())
+    for image in images["images"]:
+        image["turn"] = turn
+        if turn is None:
+            del image["turn"]
+    path.write_text(json.dumps(images))
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["files"]["images.json"]["size"] = path.stat().st_size
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
 def escape(folder: Path) -> None:
     manifest = json.loads((folder / "manifest.json").read_text())
     manifest["files"]["../../etc/passwd"] = manifest["files"]["landmarks.npy"]
@@ -230,13 +244,27 @@ def test_a_newer_minor_format_with_unknown_fields_opens(folder: Path) -> None:
     assert open_map(folder).manifest.format_version == "2.9"
 
 
+@pytest.mark.parametrize("turn", [None, 6])
+def test_photos_of_formats_before_2_2_were_not_turned(folder: Path, turn: int | None) -> None:
+    edit_images(folder, turn)
+    assert [image.turn for image in open_map(folder).images] == [turn or 1] * 3
+
+
+@pytest.mark.parametrize("turn", [0, 9, "6h"])
+def test_a_turn_that_is_none_is_refused(folder: Path, turn: object) -> None:
+    edit_images(folder, turn)
+    with pytest.raises(MapCorrupt) as caught:
+        open_map(folder)
+    assert caught.value.code == "map.json"
+
+
 def test_programs_that_know_formats_1_call_this_one_newer(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("visloc.archive.checks.FORMAT_MAJOR", 1)
     with pytest.raises(MapCorrupt, match="newer visloc; upgrade") as caught:
         open_map(folder)
-    assert (caught.value.code, caught.value.got) == ("map.format_version", "2.1")
+    assert (caught.value.code, caught.value.got) == ("map.format_version", "2.2")
 
 
 @pytest.mark.parametrize(
@@ -317,7 +345,7 @@ def test_a_map_of_ready_made_features_with_colours_and_anchor_reads_back(tmp_pat
     folder = write_content(tmp_path / "incoming", make_ready_made_content())
     MapStore(tmp_path / "maps").publish(folder, "room", "v1")
     opened = MapStore(tmp_path / "maps").open("room")
-    assert opened.manifest.format_version == "2.1"
+    assert opened.manifest.format_version == "2.2"
     assert opened.manifest.world.anchor == ANCHOR
     assert opened.manifest.local_features.fingerprint.name == "kapture:D2-Net"
     assert opened.colors is not None

@@ -2,44 +2,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
+from tests.visloc.answers import localized, of_rig, refused
 from visloc.archive import Anchor, Geodetic, SetOutline
 from visloc.errors import InvalidInput, NotFound
 from visloc.geodesy import geodetic_from_enu
-from visloc.geometry import Camera, Pose
-from visloc.pose.centre import position_covariance
+from visloc.geometry import Pose
 from visloc.priors import NO_PRIORS, GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
 from visloc.sets.choosing import (
-    Found,
     allowed_tiles,
     is_clear,
-    judge,
     nearest_tile,
     plan,
     tiles_near,
 )
 from visloc.sets.coarse import TileScore
-from visloc.trajectory import PoseSource
-from visloc.types import (
-    CameraSource,
-    Evidence,
-    ImageAnswer,
-    InstantAnswer,
-    Localized,
-    NotLocalized,
-    ReadAs,
-    Reason,
-    Refusal,
-    RigPose,
-)
 
 MakeOutline = Callable[..., SetOutline]
-CAMERA = Camera("PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
 # Two floors of a house and a house 100 away.
 HOUSES = [
     ((0, 0, 1), (10, 10, 2)),
@@ -47,48 +29,6 @@ HOUSES = [
     ((100, 0, 1), (110, 10, 2)),
 ]
 DOWN = (0.0, 0.0, -1.0)
-
-
-def localized(inliers: int, center: Any = (0, 0, 0), turn: float = 0.0, std: float = 0.01) -> Any:
-    rotation = Rotation.from_rotvec([0, 0, turn]).as_matrix()
-    pose = Pose(rotation, -rotation @ np.asarray(center, dtype=np.float64))
-    # Of the centre, as large in all directions.
-    covariance = np.diag([1e-8] * 3 + [std**2] * 3)
-    evidence = Evidence(
-        CAMERA,
-        CameraSource.GIVEN,
-        1,
-        ReadAs.STORED,
-        num_correspondences=2 * inliers,
-        num_inliers=inliers,
-    )
-    spread = np.sqrt(np.diag(position_covariance(pose, covariance)))
-    return Localized(
-        evidence,
-        pose,
-        covariance,
-        spread,
-        np.full(3, 1e-4),
-        np.zeros((0, 2), np.float32),
-        np.zeros((0, 3)),
-    )
-
-
-def refused(inliers: int) -> NotLocalized:
-    return NotLocalized(localized(inliers).evidence, "gate", Reason.TOO_FEW_INLIERS, "few")
-
-
-def of_rig(inliers: int, center: Any = (0, 0, 0)) -> InstantAnswer:
-    one = localized(inliers, center)
-    rig = RigPose(
-        one.cam_from_world,
-        one.covariance,
-        one.position_std,
-        one.orientation_std,
-        PoseSource.ESTIMATED,
-    )
-    image = ImageAnswer("cam", Pose.identity(), one.evidence, None)
-    return InstantAnswer(0, (image,), rig, None, {})
 
 
 # Which tiles
@@ -242,80 +182,3 @@ def test_an_answer_is_clear_with_many_inliers() -> None:
     assert is_clear(of_rig(150))
     assert not is_clear(localized(99))
     assert not is_clear(refused(500))
-
-
-# Which answer
-
-
-def test_most_inliers_win(outline: MakeOutline) -> None:
-    found = [Found(0, localized(40)), Found(1, localized(200)), Found(2, refused(300))]
-
-    assert judge(outline(HOUSES), found) == 1
-
-
-def test_of_similar_answers_that_agree_the_more_certain_one_counts(outline: MakeOutline) -> None:
-    found = [
-        Found(0, localized(200, std=0.05)),
-        Found(1, localized(170, (0.1, 0, 0), std=0.01)),
-        Found(2, localized(120, (0.1, 0, 0), std=0.001)),
-    ]
-
-    assert judge(outline(HOUSES), found) == 1
-
-
-@pytest.mark.parametrize("make", [localized, of_rig])
-def test_two_places_that_explain_it_are_refused(
-    outline: MakeOutline, make: Callable[..., Any]
-) -> None:
-    found = [Found(0, make(200)), Found(2, make(100, (100, 0, 0)))]
-
-    answer = judge(outline(HOUSES), found)
-
-    assert isinstance(answer, Refusal)
-    assert answer.reason is Reason.AMBIGUOUS
-    assert "tile-0@v1" in answer.message
-    assert "tile-2@v1" in answer.message
-
-
-def test_a_rival_of_few_inliers_is_no_reason_to_refuse(outline: MakeOutline) -> None:
-    found = [Found(2, localized(99, (100, 0, 0))), Found(0, localized(200))]
-
-    assert judge(outline(HOUSES), found) == 1
-
-
-def test_the_same_position_the_other_way_round_is_another_place(outline: MakeOutline) -> None:
-    found = [Found(0, localized(200)), Found(1, localized(190, turn=np.pi))]
-
-    assert isinstance(judge(outline(HOUSES), found), Refusal)
-
-
-def test_how_well_tiles_are_tied_is_no_contradiction(outline: MakeOutline) -> None:
-    # A tenth of how far photos see: 0.3.
-    near = [Found(0, localized(200)), Found(1, localized(190, (0.25, 0, 0), np.radians(3)))]
-    far = [Found(0, localized(200)), Found(1, localized(190, (0.5, 0, 0)))]
-    unsure = [Found(0, localized(200)), Found(1, localized(190, (0.5, 0, 0), std=0.2))]
-
-    assert judge(outline(HOUSES), near) == 0
-    assert isinstance(judge(outline(HOUSES), far), Refusal)
-    assert judge(outline(HOUSES), unsure) == 0
-
-
-@pytest.mark.parametrize("best", [{"inliers": 100, "std": 0.3}, {"inliers": 170, "std": 2.0}])
-def test_places_that_only_an_uncertain_answer_agrees_with_are_refused(
-    outline: MakeOutline, best: dict[str, Any]
-) -> None:
-    apart = [
-        Found(1, localized(90, (1.1, 0, 0), std=0.01)),
-        Found(2, localized(89, (-1.1, 0, 0), std=0.02)),
-    ]
-    together = [Found(0, localized(**best)), *apart]
-
-    for found in (apart, together, together[::-1]):
-        answer = judge(outline(HOUSES), found)
-        assert isinstance(answer, Refusal)
-        assert answer.reason is Reason.AMBIGUOUS
-    assert judge(outline(HOUSES), together[:2]) == (1 if best["inliers"] == 100 else 0)
-
-
-def test_without_a_pose_the_answer_that_came_furthest_counts(outline: MakeOutline) -> None:
-    assert judge(outline(HOUSES), [Found(0, refused(5)), Found(1, refused(25))]) == 1

@@ -89,7 +89,8 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
   });
 
   const chooser = element("input", { id: "photo-files", type: "file", multiple: true });
-  chooser.accept = "image/*";
+  // What the service reads. Offered only these, phones hand out their HEIC photos as JPEG.
+  chooser.accept = "image/jpeg,image/png,image/webp,image/tiff,image/bmp";
   chooser.classList.add("unseen");
   chooser.addEventListener("change", () => {
     add([...(chooser.files ?? [])].map((file) => ({ photo: file, name: file.name })));

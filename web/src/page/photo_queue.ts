@@ -9,7 +9,6 @@ import {
   type MapInfo,
   type Service,
 } from "../api";
-import { jpegHeader } from "./jpeg_header";
 import { pause } from "./live_loop";
 import { busySeconds } from "./patience";
 import type { Question } from "./snippets";
@@ -155,12 +154,7 @@ async function read(entry: Entry) {
     });
   }
   entry.photo = new Blob([bytes], { type: entry.photo.type });
-  const header = await jpegHeader(entry.photo);
-  // Learned features do not know what lies on its side; who wants it so chooses it.
-  if (header !== null && header.orientation !== 1) {
-    entry.wish = { ...wish, options: { read_as: "upright", ...wish.options } };
-  }
-  const { map, camera, options } = entry.wish!;
+  const { map, camera, options } = wish;
   return { map: mapRef(map), image: entry.photo, name, camera, options, debug: true };
 }
 

@@ -67,9 +67,9 @@ export const ADVICE: Readonly<Record<string, Advice>> = {
     tries: ["Check what is known before (the priors).", "Leave it out."],
   },
   ambiguous: {
-    meaning: "Two places far apart explain the photo about equally well.",
+    meaning: "Two places explain the photo about equally well.",
     tries: [
-      "Say where the camera is (the priors), or ask the right map of the set alone.",
+      "Say where the camera is (the priors), or ask the right map alone.",
       "Choose a photo that shows more of the scene.",
     ],
   },

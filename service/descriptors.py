@@ -1,0 +1,48 @@
+"""File descriptors: enough of them for the connections, or fewer connections."""
+
+from __future__ import annotations
+
+import logging
+import resource
+
+from service.settings import ServiceSettings, SettingsError
+
+logger = logging.getLogger(__name__)
+
+# Connections of the port for metrics: a scraper or two.
+METRICS_CONNECTIONS = 32
+# Libraries, logs, keys, maps, uploads, the store and its connections, and what few connections
+# there are beyond a limit until they are closed.
+_OWN = 192
+# Pipes to and from a worker process.
+_PER_WORKER = 16
+
+
+def fit_connections(settings: ServiceSettings) -> ServiceSettings:
+    """Raise the soft limit of open files as needed, or lower ``max_connections``.
+
+    HTTP and gRPC have ``max_connections`` each. Call this before any process is started that
+    shall inherit the limit.
+
+    Raises:
+        SettingsError: when the hard limit leaves none for connections.
+    """
+    own = _OWN + _PER_WORKER * settings.workers + METRICS_CONNECTIONS
+    needed = own + 2 * settings.max_connections
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    available = needed if hard == resource.RLIM_INFINITY else min(hard, needed)
+    if soft != resource.RLIM_INFINITY and soft < available:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (available, hard))
+        logger.info("limit of open files raised from %d to %d", soft, available)
+    fitting = (available - own) // 2
+    if fitting < 1:
+        raise SettingsError(
+            f"{hard} open files are allowed (ulimit -Hn), {own + 2} are the least that is needed"
+        )
+    if fitting >= settings.max_connections:
+        return settings
+    logger.warning(
+        "max_connections is %d instead of %d: %d open files are allowed (ulimit -Hn), %d needed",
+        *(fitting, settings.max_connections, hard, needed),
+    )
+    return settings.model_copy(update={"max_connections": fitting})
