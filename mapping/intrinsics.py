@@ -26,11 +26,11 @@ from visloc.kapture import Sensor
 MAX_MOVE = 0.1
 # A focal length is determined if a change by this share ...
 STEP = 0.05
-# ... raises the reprojection errors by so many pixels. A lens that does not quite fit its model
-# and a rolling shutter leave about a tenth of a pixel that no number of matches averages out: with
-# less than that, they decide where the focal length goes. Flat ground from straight above measured
-# 0.03 px, facades and rooms 0.1 to 0.7.
-MIN_RISE_PX = 0.1
+# ... raises the reprojection errors by this share of the longer side of the photo, a tenth of a
+# pixel of 1600. A lens that does not quite fit its model and a rolling shutter leave about that
+# much, which no number of matches averages out: with less, they decide where the focal length goes.
+# Flat ground from straight above measured 0.03 px of 1600, facades and rooms 0.1 to 0.7.
+MIN_RISE = 0.1 / 1600
 # Focal lengths of the longer side of the photo: 9 to 360 mm on 35 mm film.
 _FOCAL_RANGE = (0.25, 10.0)
 # Distance of a ray from the axis, of what it would be without distortion.
@@ -145,7 +145,7 @@ def doubt_of(
     focal = float(camera.mean_focal_length())
     if rise_px is None:
         return Doubt("implausible", focal)
-    if rise_px < MIN_RISE_PX:
+    if rise_px < MIN_RISE * max(camera.width, camera.height):
         return Doubt("undetermined", focal)
     if prior_px is not None and abs(focal / prior_px - 1) > MAX_MOVE:
         return Doubt("moved", focal)
