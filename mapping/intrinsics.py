@@ -29,7 +29,7 @@ STEP = 0.05
 # ... raises the reprojection errors by this share of the longer side of the photo, a tenth of a
 # pixel of 1600. A lens that does not quite fit its model and a rolling shutter leave about that
 # much, which no number of matches averages out: with less, they decide where the focal length goes.
-# Flat ground from straight above measured 0.03 px of 1600, facades and rooms 0.1 to 0.7.
+# Flat ground from straight above measured 0.03 px of 1600, facades, rooms and courtyards 0.15 to 1.
 MIN_RISE = 0.1 / 1600
 # Focal lengths of the longer side of the photo: 9 to 360 mm on 35 mm film.
 _FOCAL_RANGE = (0.25, 10.0)
