@@ -332,6 +332,7 @@ def _model_key(
                 photo.record.sensor_id,
                 photo.record.timestamp,
                 *camera_values(photo.camera),
+                photo.camera_known,
                 *(() if settings.estimate_poses else pose_values(photo.pose)),
             ]
             for photo in photos
