@@ -201,13 +201,16 @@ def reconstruct(
         def first_pair() -> None:
             nonlocal placed
             placed = 2
-            progress(placed, len(photos))
+            tell()
 
         def one_more() -> None:
             nonlocal placed
+            placed += 1
+            tell()
+
+        def tell() -> None:
             # Not yet all: what follows the last photo takes long too.
-            placed = min(placed + 1, len(photos) - 1)
-            progress(placed, len(photos))
+            progress(min(placed, len(photos) - 1), len(photos))
 
         def solve(doubts: Mapping[str, Doubt]) -> pycolmap.Reconstruction:
             left_out = doubts.keys() - known
