@@ -58,7 +58,8 @@ class Doubt:
         reason: ``implausible``: no lens has them. ``undetermined``: the photos fit other focal
             lengths as well. ``moved``: too far from the prior. ``unsettled``: not in doubt itself,
             but as often as some cameras were kept, others came in doubt.
-        focal_length_px: what refinement made of it; may be negative or not finite.
+        focal_length_px: what refinement made of it; may be negative or not finite, and is NaN for
+            an unsettled one that was in no photo of the last model that refined.
     """
 
     reason: Reason

@@ -11,6 +11,7 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
+from mapping import triangulation
 from mapping.intrinsics import CameraOrigin, Doubt, is_plausible, notes_on, origin_of
 from mapping.matching import Matches
 from mapping.triangulation import (
@@ -232,6 +233,15 @@ def test_of_several_cameras_only_the_photos_of_nonsense_are_left_out(tmp_path: P
     assert model.doubts.keys() == {"odd"}
 
 
+def test_the_first_pair_of_two_photos_is_not_yet_all(tmp_path: Path) -> None:
+    points, poses = around_an_object()
+    photos, shown = taken(points, poses[:4:3], camera(FOCAL), camera(FOCAL))
+    told: list[tuple[int, int]] = []
+    reconstruct(photos, {}, matched(shown), CONFIG, (), tmp_path, lambda *done: told.append(done))
+    assert told
+    assert set(told) == {(1, 2)}
+
+
 def test_the_same_photos_give_the_same_bits(tmp_path: Path) -> None:
     # So many that pycolmap would otherwise add up their errors in several threads.
     points = np.random.default_rng(0).uniform(-2.5, 2.5, (3300, 3))
@@ -241,6 +251,42 @@ def test_the_same_photos_give_the_same_bits(tmp_path: Path) -> None:
         reconstruct(photos, {}, matched(shown), CONFIG, (), tmp_path, quiet) for _ in range(2)
     ]
     assert np.array_equal(models[0].points, models[1].points)
+
+
+def test_cameras_that_come_in_doubt_one_after_another_are_solved_so_often(tmp_path: Path) -> None:
+    # Six cameras with a prior, two without. Each model has photos of one of them that is not in
+    # doubt yet, and determines nothing; of those without a prior it makes what no lens has.
+    points, poses = around_an_object()
+    photos, shown = [], []
+    for number, pose in enumerate(poses):
+        prior = camera(FOCAL) if number < 6 else None
+        taken_here, shown_here = taken(points, [pose], camera(FOCAL), prior, f"{number}")
+        photos += taken_here
+        shown += shown_here
+    asked: list[set[str]] = []
+    with triangulation._database(photos, {}, matched(shown), tmp_path) as (_, scene):
+
+        def solve(doubts: dict[str, Doubt]) -> pycolmap.Reconstruction:
+            asked.append(set(doubts))
+            model = scene.with_poses(photos)
+            left = [
+                image
+                for image, p in zip(scene.images, photos, strict=True)
+                if p.sensor not in doubts
+            ]
+            for image in scene.images:
+                if not left or image.image_id != left[0].image_id:
+                    model.deregister_frame(image.frame_id)
+            for sensor in ("6", "7"):
+                model.camera(scene.camera_ids[sensor]).params = NONSENSE.params
+            return model
+
+        _, doubts = triangulation._believed(solve, scene, photos, set(scene.cameras), poses=True)
+    with_prior = {"0", "1", "2", "3", "4", "5"}
+    assert [len(doubted) for doubted in asked] == [0, 1, 2, 6, 7, 8]
+    assert asked[3] == with_prior
+    reasons = [doubts[f"{number}"].reason for number in range(8)]
+    assert reasons == ["undetermined"] * 3 + ["unsettled"] * 3 + ["implausible"] * 2
 
 
 @pytest.mark.parametrize(
