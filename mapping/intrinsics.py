@@ -57,7 +57,7 @@ class Doubt:
     Attributes:
         reason: ``implausible``: no lens has them. ``undetermined``: the photos fit other focal
             lengths as well. ``moved``: too far from the prior. ``unsettled``: not in doubt itself,
-            but as often as some cameras were kept, others came in doubt.
+            but each time some cameras were kept, others came in doubt.
         focal_length_px: what refinement made of it; may be negative or not finite, and is NaN for
             an unsettled one that was in no photo of the last model that refined.
     """
@@ -180,8 +180,8 @@ _WHY: Mapping[Reason, str] = {
     "undetermined": "the photos fit other focal lengths almost as well. That is so for photos that "
     "look straight down at flat ground, along a straight path, or from one place",
     "moved": f"refinement moved it by more than {MAX_MOVE:.0%}",
-    "unsettled": "as often as the focal length of some cameras was kept, refinement moved others "
-    "too far",
+    "unsettled": "each time some cameras were kept, others came in doubt, so in the end none was "
+    "refined",
 }
 _CALIBRATE = "give a calibration in sensors.txt of the dataset"
 _ADVICE: Mapping[Reason, str] = {
