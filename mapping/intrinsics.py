@@ -183,7 +183,12 @@ _WHY: Mapping[Reason, str] = {
     "unsettled": "each time some cameras were kept, others came in doubt, so in the end none was "
     "refined",
 }
-_CALIBRATE = "give a calibration in sensors.txt of the dataset"
+# `mapping import images --map` leaves no dataset to write it into.
+_IN_SENSORS = (
+    "in sensors.txt of the dataset (import photos with --output first, see "
+    "docs/mapping.md#refined-cameras)"
+)
+_CALIBRATE = f"give a calibration {_IN_SENSORS}"
 _ADVICE: Mapping[Reason, str] = {
     "implausible": f"If these photos matter, {_CALIBRATE}",
     "undetermined": "Sizes and heights in the map are as good as this value. To have it refined, "
@@ -245,8 +250,8 @@ def no_lens(doubts: Mapping[str, Doubt], photos: Mapping[str, Sequence[str]]) ->
         "the camera that was estimated for these photos is one that no lens has, so no map can "
         "be made of them",
         field=_some(names),
-        expected="photos with a focal length in EXIF, a camera in sensors.txt of the dataset, or "
-        "more photos that overlap, from more places",
+        expected="photos with a focal length in EXIF, more photos that overlap, from more places, "
+        f"or a camera {_IN_SENSORS}",
         got=f"a focal length of {_some(focal)}, with its distortion",
     )
 

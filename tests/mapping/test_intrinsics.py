@@ -214,6 +214,7 @@ def test_photos_of_a_camera_that_no_lens_has_are_refused_by_name(tmp_path: Path)
     assert caught.value.code == "sfm.camera"
     assert caught.value.field == "cam/0.jpg, cam/1.jpg, cam/2.jpg, ..."
     assert "no lens has" in caught.value.message
+    assert "import photos with --output first" in str(caught.value.expected)
 
 
 def test_with_a_prior_a_camera_that_no_lens_has_stays_at_it(tmp_path: Path) -> None:
@@ -328,5 +329,7 @@ def test_notes_name_cameras_values_and_what_to_do() -> None:
     assert "1 camera of 2 photos" in undetermined
     assert "700.0 px of the dataset, 805.0 px by the photos (+15.0%)" in moved
     assert "d.jpg" in left_out
+    for note in (undetermined, moved, left_out):
+        assert "import photos with --output first" in note
     for origin in origins.values():
         assert CameraOrigin.model_validate(origin.model_dump()) == origin
