@@ -26,11 +26,11 @@ from visloc.kapture import Sensor
 MAX_MOVE = 0.1
 # A focal length is determined if a change by this share ...
 STEP = 0.05
-# ... raises the reprojection errors by so many pixels. A lens that does not quite fit its model
-# and a rolling shutter leave about a tenth of a pixel that no number of matches averages out: with
-# less than that, they decide where the focal length goes. Flat ground from straight above measured
-# 0.03 px, facades and rooms 0.1 to 0.7.
-MIN_RISE_PX = 0.1
+# ... raises the reprojection errors by this share of the longer side of the photo, a tenth of a
+# pixel of 1600. A lens that does not quite fit its model and a rolling shutter leave about that
+# much, which no number of matches averages out: with less, they decide where the focal length goes.
+# Flat ground from straight above measured 0.03 px of 1600, facades, rooms and courtyards 0.15 to 1.
+MIN_RISE = 0.1 / 1600
 # Focal lengths of the longer side of the photo: 9 to 360 mm on 35 mm film.
 _FOCAL_RANGE = (0.25, 10.0)
 # Distance of a ray from the axis, of what it would be without distortion.
@@ -57,8 +57,9 @@ class Doubt:
     Attributes:
         reason: ``implausible``: no lens has them. ``undetermined``: the photos fit other focal
             lengths as well. ``moved``: too far from the prior. ``unsettled``: not in doubt itself,
-            but as often as some cameras were kept, others came in doubt.
-        focal_length_px: what refinement made of it; may be negative or not finite.
+            but each time some cameras were kept, others came in doubt.
+        focal_length_px: what refinement made of it; may be negative or not finite, and is NaN for
+            an unsettled one that was in no photo of the last model that refined.
     """
 
     reason: Reason
@@ -145,7 +146,7 @@ def doubt_of(
     focal = float(camera.mean_focal_length())
     if rise_px is None:
         return Doubt("implausible", focal)
-    if rise_px < MIN_RISE_PX:
+    if rise_px < MIN_RISE * max(camera.width, camera.height):
         return Doubt("undetermined", focal)
     if prior_px is not None and abs(focal / prior_px - 1) > MAX_MOVE:
         return Doubt("moved", focal)
@@ -177,16 +178,21 @@ def notes_on(origins: Mapping[str, CameraOrigin], photos: Mapping[str, Sequence[
 _WHY: Mapping[Reason, str] = {
     "implausible": "refinement gave a camera that no lens has",
     "undetermined": "the photos fit other focal lengths almost as well. That is so for photos that "
-    "look straight down at flat ground, and for photos taken from one place",
+    "look straight down at flat ground, along a straight path, or from one place",
     "moved": f"refinement moved it by more than {MAX_MOVE:.0%}",
-    "unsettled": "as often as the focal length of some cameras was kept, refinement moved others "
-    "too far",
+    "unsettled": "each time some cameras were kept, others came in doubt, so in the end none was "
+    "refined",
 }
-_CALIBRATE = "give a calibration in sensors.txt of the dataset"
+# `mapping import images --map` leaves no dataset to write it into.
+_IN_SENSORS = (
+    "in sensors.txt of the dataset (import photos with --output first, see "
+    "docs/mapping.md#refined-cameras)"
+)
+_CALIBRATE = f"give a calibration {_IN_SENSORS}"
 _ADVICE: Mapping[Reason, str] = {
     "implausible": f"If these photos matter, {_CALIBRATE}",
     "undetermined": "Sizes and heights in the map are as good as this value. To have it refined, "
-    f"take some oblique photos too; or {_CALIBRATE}",
+    f"take some photos in other directions too, such as oblique ones; or {_CALIBRATE}",
     "moved": f"If the value is wrong, which bends the map, {_CALIBRATE}",
     "unsettled": f"If these photos matter, {_CALIBRATE}",
 }
@@ -212,7 +218,7 @@ def _note_on_estimated(
     return (
         f"nothing tells the focal length for {_count(doubted, photos)}, and {_WHY[reason]}. "
         f"{_cases(doubted)}. Sizes and heights in the map may be far off. Use photos with a focal "
-        f"length in EXIF, take some oblique photos too, or {_CALIBRATE}"
+        f"length in EXIF, take some in other directions too, such as oblique ones, or {_CALIBRATE}"
     )
 
 
@@ -244,8 +250,8 @@ def no_lens(doubts: Mapping[str, Doubt], photos: Mapping[str, Sequence[str]]) ->
         "the camera that was estimated for these photos is one that no lens has, so no map can "
         "be made of them",
         field=_some(names),
-        expected="photos with a focal length in EXIF, a camera in sensors.txt of the dataset, or "
-        "more photos that overlap, from more places",
+        expected="photos with a focal length in EXIF, more photos that overlap, from more places, "
+        f"or a camera {_IN_SENSORS}",
         got=f"a focal length of {_some(focal)}, with its distortion",
     )
 

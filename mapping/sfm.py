@@ -39,7 +39,7 @@ from visloc.geometry import Camera, Pose, Similarity
 from visloc.kapture import Dataset, read_reconstruction
 
 # Raised when the code of the stage changes what comes out.
-_MODEL_REVISION = 2
+_MODEL_REVISION = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,6 +332,7 @@ def _model_key(
                 photo.record.sensor_id,
                 photo.record.timestamp,
                 *camera_values(photo.camera),
+                photo.camera_known,
                 *(() if settings.estimate_poses else pose_values(photo.pose)),
             ]
             for photo in photos

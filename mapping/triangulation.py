@@ -38,8 +38,7 @@ T = TypeVar("T")
 REFINABLE = ("poses", "points", "intrinsics")
 # Scale of the robust loss in bundle adjustment.
 _LOSS_SCALE_PX = 1.0
-# After each that puts cameras in doubt, all is solved again; after the last, no camera is refined
-# that has a prior.
+# After so many models that put cameras in doubt, no camera that has a prior is refined any more.
 _MAX_JUDGEMENTS = 3
 
 
@@ -201,13 +200,16 @@ def reconstruct(
         def first_pair() -> None:
             nonlocal placed
             placed = 2
-            progress(placed, len(photos))
+            tell()
 
         def one_more() -> None:
             nonlocal placed
+            placed += 1
+            tell()
+
+        def tell() -> None:
             # Not yet all: what follows the last photo takes long too.
-            placed = min(placed + 1, len(photos) - 1)
-            progress(placed, len(photos))
+            progress(min(placed, len(photos) - 1), len(photos))
 
         def solve(doubts: Mapping[str, Doubt]) -> pycolmap.Reconstruction:
             left_out = doubts.keys() - known
@@ -259,6 +261,10 @@ def _believed(
 ) -> tuple[pycolmap.Reconstruction, dict[str, Doubt]]:
     """Solve, and solve again without refining the cameras that are in doubt.
 
+    After ``_MAX_JUDGEMENTS`` such rounds all sensors that have a prior stay at it. From then on,
+    each round leaves out at least one sensor without a prior. So ``solve`` is called at most
+    ``_MAX_JUDGEMENTS`` + 1 times, and once more for each sensor without a prior.
+
     Args:
         solve: makes a model; of the sensors that it is given, those with a prior stay at it, and
             photos of the others are left out.
@@ -301,9 +307,11 @@ def _believed(
         judgements += 1
         doubts |= again
         if judgements == _MAX_JUDGEMENTS:
+            focal = {s: float(model.camera(c).mean_focal_length()) for c, s in free.items()}
+            # Those without a photo in this model too: they may have one in the next.
             doubts |= {
-                sensor: Doubt("unsettled", float(model.camera(camera_id).mean_focal_length()))
-                for camera_id, sensor in free.items()
+                sensor: Doubt("unsettled", focal.get(sensor, math.nan))
+                for sensor in refined
                 if sensor not in doubts and priors[sensor] is not None
             }
 

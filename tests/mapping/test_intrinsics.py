@@ -11,6 +11,7 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
+from mapping import triangulation
 from mapping.intrinsics import CameraOrigin, Doubt, is_plausible, notes_on, origin_of
 from mapping.matching import Matches
 from mapping.triangulation import (
@@ -100,10 +101,10 @@ def quiet(_done: int, _total: int) -> None:
     pass
 
 
-def above_flat_ground() -> tuple[NDArray[np.float64], list[Pose]]:
+def above_flat_ground(relief: float = 0.2) -> tuple[NDArray[np.float64], list[Pose]]:
     """A drone 40 m above a beach, in three lines, held level within two degrees."""
     random = np.random.default_rng(0)
-    points = np.column_stack([random.uniform(-60, 60, (1500, 2)), random.normal(0, 0.2, 1500)])
+    points = np.column_stack([random.uniform(-60, 60, (1500, 2)), random.normal(0, relief, 1500)])
     poses = []
     for line in range(3):
         for step in range(4):
@@ -155,6 +156,19 @@ def test_flat_ground_from_above_leaves_the_focal_length_as_it_was(tmp_path: Path
     assert np.median(heights) == pytest.approx(1.04 * 40, rel=0.01)
 
 
+def test_the_verdict_is_the_same_in_small_and_large_photos(tmp_path: Path) -> None:
+    photos, shown = taken(*above_flat_ground(relief=1.0), camera(FOCAL), camera(FOCAL))
+    for scale in (1, 4):  # the errors rise by 0.04 and 0.15 px
+        width, height = scale * WIDTH, scale * HEIGHT
+        prior = Camera("SIMPLE_RADIAL", width, height, (scale * FOCAL, width / 2, height / 2, 0.0))
+        scaled = [
+            replace(photo, camera=prior, keypoints=photo.keypoints * np.float32(scale))
+            for photo in photos
+        ]
+        model = reconstruct(scaled, {}, matched(shown), CONFIG, ("intrinsics",), tmp_path, quiet)
+        assert model.doubts["cam"].reason == "undetermined"
+
+
 def test_without_a_prior_flat_ground_gives_a_map_and_a_doubt(tmp_path: Path) -> None:
     model = solved(above_flat_ground(), None, tmp_path)
     assert model.doubts["cam"].reason == "undetermined"
@@ -200,6 +214,7 @@ def test_photos_of_a_camera_that_no_lens_has_are_refused_by_name(tmp_path: Path)
     assert caught.value.code == "sfm.camera"
     assert caught.value.field == "cam/0.jpg, cam/1.jpg, cam/2.jpg, ..."
     assert "no lens has" in caught.value.message
+    assert "import photos with --output first" in str(caught.value.expected)
 
 
 def test_with_a_prior_a_camera_that_no_lens_has_stays_at_it(tmp_path: Path) -> None:
@@ -219,6 +234,15 @@ def test_of_several_cameras_only_the_photos_of_nonsense_are_left_out(tmp_path: P
     assert model.doubts.keys() == {"odd"}
 
 
+def test_the_first_pair_of_two_photos_is_not_yet_all(tmp_path: Path) -> None:
+    points, poses = around_an_object()
+    photos, shown = taken(points, poses[:4:3], camera(FOCAL), camera(FOCAL))
+    told: list[tuple[int, int]] = []
+    reconstruct(photos, {}, matched(shown), CONFIG, (), tmp_path, lambda *done: told.append(done))
+    assert told
+    assert set(told) == {(1, 2)}
+
+
 def test_the_same_photos_give_the_same_bits(tmp_path: Path) -> None:
     # So many that pycolmap would otherwise add up their errors in several threads.
     points = np.random.default_rng(0).uniform(-2.5, 2.5, (3300, 3))
@@ -228,6 +252,42 @@ def test_the_same_photos_give_the_same_bits(tmp_path: Path) -> None:
         reconstruct(photos, {}, matched(shown), CONFIG, (), tmp_path, quiet) for _ in range(2)
     ]
     assert np.array_equal(models[0].points, models[1].points)
+
+
+def test_cameras_that_come_in_doubt_one_after_another_are_solved_so_often(tmp_path: Path) -> None:
+    # Six cameras with a prior, two without. Each model has photos of one of them that is not in
+    # doubt yet, and determines nothing; of those without a prior it makes what no lens has.
+    points, poses = around_an_object()
+    photos, shown = [], []
+    for number, pose in enumerate(poses):
+        prior = camera(FOCAL) if number < 6 else None
+        taken_here, shown_here = taken(points, [pose], camera(FOCAL), prior, f"{number}")
+        photos += taken_here
+        shown += shown_here
+    asked: list[set[str]] = []
+    with triangulation._database(photos, {}, matched(shown), tmp_path) as (_, scene):
+
+        def solve(doubts: dict[str, Doubt]) -> pycolmap.Reconstruction:
+            asked.append(set(doubts))
+            model = scene.with_poses(photos)
+            left = [
+                image
+                for image, p in zip(scene.images, photos, strict=True)
+                if p.sensor not in doubts
+            ]
+            for image in scene.images:
+                if not left or image.image_id != left[0].image_id:
+                    model.deregister_frame(image.frame_id)
+            for sensor in ("6", "7"):
+                model.camera(scene.camera_ids[sensor]).params = NONSENSE.params
+            return model
+
+        _, doubts = triangulation._believed(solve, scene, photos, set(scene.cameras), poses=True)
+    with_prior = {"0", "1", "2", "3", "4", "5"}
+    assert [len(doubted) for doubted in asked] == [0, 1, 2, 6, 7, 8]
+    assert asked[3] == with_prior
+    reasons = [doubts[f"{number}"].reason for number in range(8)]
+    assert reasons == ["undetermined"] * 3 + ["unsettled"] * 3 + ["implausible"] * 2
 
 
 @pytest.mark.parametrize(
@@ -265,9 +325,11 @@ def test_notes_name_cameras_values_and_what_to_do() -> None:
     photos = {"drone": ["a", "b"], "cam": ["c"], "old": ["d.jpg"], "fine": ["e"]}
     undetermined, moved, left_out = notes_on(origins, photos)
     assert "848.6 px of EXIF, 1083.7 px by the photos (+27.7%)" in undetermined
-    assert "oblique photos" in undetermined
+    assert "such as oblique ones" in undetermined
     assert "1 camera of 2 photos" in undetermined
     assert "700.0 px of the dataset, 805.0 px by the photos (+15.0%)" in moved
     assert "d.jpg" in left_out
+    for note in (undetermined, moved, left_out):
+        assert "import photos with --output first" in note
     for origin in origins.values():
         assert CameraOrigin.model_validate(origin.model_dump()) == origin
