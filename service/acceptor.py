@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
 import math
 import socket
@@ -14,6 +15,9 @@ from typing import Any
 
 logger = logging.getLogger(__name__)
 
+# accept() fails so when the system has nothing left for any connection. Its other errors are those
+# of one connection that waited.
+_SHORTAGES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 # Accepted in one turn of the event loop, so that requests have their turn in a flood.
 _BATCH = 64
 # A new connection is not closed for the next before it had this long to send a request; a flood
@@ -47,12 +51,16 @@ class Connection(asyncio.Protocol, ABC):
 class OpenConnections:
     """The open connections of a port: at most ``limit``, and the longest idle goes first.
 
+    Attributes:
+        limit: of connections.
+
     A connection is in use from the end of a request's head to the end of its answer. Before and
     after, it is idle, and is closed when a new one needs its place.
     """
 
     def __init__(self, limit: int) -> None:
-        self._limit = limit
+        self.limit = limit
+        self._reserve = min(max(1, limit // 10), limit - 1)
         self._open: set[Connection] = set()
         self._idle: dict[Connection, float] = {}  # since when, the longest idle first
 
@@ -61,8 +69,8 @@ class OpenConnections:
 
     @property
     def is_busy(self) -> bool:
-        """Whether all are in use but the last tenth, which is for health and metrics."""
-        return len(self._open) - len(self._idle) > self._limit - self._limit // 10
+        """Whether all are in use but the last tenth, or one, which is for health and metrics."""
+        return len(self._open) - len(self._idle) > self.limit - self._reserve
 
     def add(self, connection: Connection) -> None:
         """Count a new connection."""
@@ -87,7 +95,7 @@ class OpenConnections:
         Returns:
             After how many seconds there is room: 0 for now, infinity when all are in use.
         """
-        if len(self._open) < self._limit:
+        if len(self._open) < self.limit:
             return 0.0
         idlest = self._idlest()
         if idlest is None:
@@ -105,6 +113,12 @@ class OpenConnections:
             if idlest is None:
                 return
             self._close(idlest)
+
+    def close_unopened(self) -> None:
+        """Close the connections whose handshake of TLS has not ended."""
+        for each in list(self._open):
+            if each.opening is not None and not each.opening.done():
+                self._close(each)
 
     def _idlest(self) -> Connection | None:
         return next((each for each in self._idle if not each.is_sending), None)
@@ -151,7 +165,7 @@ class Acceptor:
 
     def close(self) -> None:
         """Take in who has connected already, and nobody else."""
-        self._accept()
+        self._take(self._connections.limit)
         for timer in (self._pausing, self._episode):
             if timer is not None:
                 timer.cancel()
@@ -164,31 +178,39 @@ class Acceptor:
         self._loop.add_reader(self._listener, self._accept)
         self._accept()
 
-    def _pause(self, seconds: float) -> None:
-        self._loop.remove_reader(self._listener)
-        self._pausing = self._loop.call_later(seconds, self._resume)
-
     def _accept(self) -> None:
-        for _ in range(_BATCH):
+        pause_s = self._take(_BATCH)
+        if pause_s > 0:
+            self._loop.remove_reader(self._listener)
+            self._pausing = self._loop.call_later(pause_s, self._resume)
+
+    def _take(self, most: int) -> float:
+        """Accept so many that have connected, or fewer.
+
+        Returns:
+            After how many seconds to try again: 0 for when somebody connects.
+        """
+        for _ in range(most):
             try:
                 accepted = self._accepted or self._listener.accept()[0]
-            except (BlockingIOError, InterruptedError, ConnectionAbortedError):
-                return
-            except OSError as error:  # of descriptors or of memory
+            except BlockingIOError:
+                return 0.0
+            except OSError as error:
+                if error.errno not in _SHORTAGES:
+                    continue
                 self._note_shortage(error)
                 self._connections.close_idle(_BATCH)
-                self._pause(_RETRY_S)
-                return
+                return _RETRY_S
             wait_s = self._connections.make_room()
             if 0 < wait_s < math.inf:
                 self._accepted = accepted
-                self._pause(wait_s)
-                return
+                return wait_s
             self._accepted = None
             if wait_s == 0:
                 self._open(accepted)
             else:
                 accepted.close()
+        return 0.0
 
     def _open(self, accepted: socket.socket) -> None:
         connection = self._make()

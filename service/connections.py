@@ -40,6 +40,8 @@ def http_protocol(grace_s: float, connections: OpenConnections) -> type[H11Proto
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
+            # Writing pauses while a single byte waits. TLS pauses from the bound, not beyond it.
+            transport.set_write_buffer_limits(high=int(self.scheme == "https"), low=0)
             self._watch(first=True)
 
         def data_received(self, data: bytes) -> None:

@@ -14,6 +14,8 @@ METRICS_CONNECTIONS = 32
 # Libraries, logs, keys, maps, uploads, the store and its connections, and what few connections
 # there are beyond a limit until they are closed.
 _OWN = 192
+# Fewer connections than these are no service.
+_LEAST_CONNECTIONS = 10
 # Pipes to and from a worker process.
 _PER_WORKER = 16
 
@@ -25,7 +27,7 @@ def fit_connections(settings: ServiceSettings) -> ServiceSettings:
     shall inherit the limit.
 
     Raises:
-        SettingsError: when the hard limit leaves none for connections.
+        SettingsError: when the hard limit leaves next to none for connections.
     """
     own = _OWN + _PER_WORKER * settings.workers + METRICS_CONNECTIONS
     needed = own + 2 * settings.max_connections
@@ -35,9 +37,11 @@ def fit_connections(settings: ServiceSettings) -> ServiceSettings:
         resource.setrlimit(resource.RLIMIT_NOFILE, (available, hard))
         logger.info("limit of open files raised from %d to %d", soft, available)
     fitting = (available - own) // 2
-    if fitting < 1:
+    least = min(_LEAST_CONNECTIONS, settings.max_connections)
+    if fitting < least:
         raise SettingsError(
-            f"{hard} open files are allowed (ulimit -Hn), {own + 2} are the least that is needed"
+            f"{hard} open files are allowed (ulimit -Hn), {own + 2 * least} are the least that is"
+            " needed"
         )
     if fitting >= settings.max_connections:
         return settings

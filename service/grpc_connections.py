@@ -10,13 +10,16 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from ipaddress import IPv6Address, ip_address
+from time import monotonic
 from urllib.parse import unquote
 
 # A client's address and port: which of our connections it is.
 Peer = tuple[str, int]
 
-# How often the connections are counted.
+# How often the connections are counted, and how long that rests after it took a while: for so many
+# times that while.
 _PERIOD_S = 0.1
+_REST = 10
 _DESCRIPTORS = "/dev/fd"
 
 
@@ -62,10 +65,13 @@ class GrpcConnections:
 
     async def watch(self, port: int) -> None:
         """Count the connections of a port and close idle ones, for ever."""
+        took_s = 0.0
         while True:
-            await asyncio.sleep(_PERIOD_S)
+            await asyncio.sleep(max(_PERIOD_S, _REST * took_s))
+            started = monotonic()
             with suppress(OSError):  # no descriptor is left to list the others with
                 self.close_idle(port)
+            took_s = monotonic() - started
 
     def close_idle(self, port: int) -> None:
         """Close the connections that are idle longest, if too few places are free."""

@@ -206,6 +206,7 @@ class _HttpServer(uvicorn.Server):
                 log_config=None,
                 log_level="warning",
                 access_log=False,
+                ws="none",
                 proxy_headers=False,  # whoever is on this machine could make them up
                 http=http_protocol(grace_s, connections),
                 **tls,
@@ -228,6 +229,7 @@ class _HttpServer(uvicorn.Server):
         del sockets
         self._acceptor.close()
         await asyncio.sleep(_LAST_WORDS_S)
+        self._open.close_unopened()  # of which uvicorn knows nothing
         await super().shutdown()
 
     @contextmanager

@@ -99,7 +99,8 @@ class ServiceSettings(BaseModel):
     """photos that may wait for a worker; beyond it a request is refused"""
     max_connections: Count = 1000
     """connections that HTTP and gRPC each have open at once, and calls of gRPC; for one more, the
-    longest idle is closed. Lowered where the system allows too few open files"""
+    longest idle is closed, by gRPC from three quarters on. Lowered where the system allows too few
+    open files"""
     max_buffered_bytes: Count = 512 * 2**20
     """bytes of requests held while they arrive; beyond it a request is refused"""
     request_timeout_s: Seconds = 60.0

@@ -217,16 +217,73 @@ def test_a_new_connection_has_time_to_send_a_request() -> None:
     assert connections.make_room() == float("inf")
 
 
+def test_a_small_limit_has_a_place_for_health_too() -> None:
+    connections = OpenConnections(3)
+    for _ in range(2):
+        talk = Talk()
+        connections.add(talk)
+        connections.note(talk, in_use=True)
+    assert not connections.is_busy
+    talk = Talk()
+    connections.add(talk)
+    connections.note(talk, in_use=True)
+    assert connections.is_busy
+
+
 class Listener(socket.socket):
-    """A socket that cannot accept for want of descriptors, the first times."""
+    """A socket that cannot accept, the first times."""
 
     failures = 3
+    error = OSError(errno.EMFILE, "Too many open files")
 
     def accept(self) -> tuple[socket.socket, Any]:
         if self.failures:
             self.failures -= 1
-            raise OSError(errno.EMFILE, "Too many open files")
+            raise self.error
         return super().accept()
+
+
+def test_an_error_of_one_connection_is_not_that_of_the_next(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    connections, old, new = OpenConnections(10), Talk(), Talk()
+    connections.add(old)
+
+    async def run() -> None:
+        with Listener() as listener:
+            listener.error = OSError(errno.EHOSTUNREACH, "No route to host")
+            listener.bind(("127.0.0.1", 0))
+            listener.listen()
+            acceptor = Acceptor(listener, connections, lambda: new, None, 1.0)
+            with socket.create_connection(listener.getsockname()):
+                await asyncio.wait_for(new.was_made.wait(), 10)
+            acceptor.close()
+            new.abandon()
+
+    asyncio.run(run())
+    assert not old.was_closed
+    assert not caplog.records
+
+
+def test_at_the_end_all_are_taken_in_who_have_connected() -> None:
+    connections, made = OpenConnections(300), []
+
+    def make() -> Talk:
+        made.append(Talk())
+        return made[-1]
+
+    async def run() -> None:
+        with socket.create_server(("127.0.0.1", 0), backlog=256) as listener, ExitStack() as stack:
+            acceptor = Acceptor(listener, connections, make, None, 1.0)
+            for _ in range(150):  # more than one turn of the event loop takes
+                stack.enter_context(socket.create_connection(listener.getsockname()))
+            acceptor.close()
+            await asyncio.gather(*(asyncio.wait_for(each.was_made.wait(), 10) for each in made))
+            for each in made:
+                each.abandon()
+
+    asyncio.run(run())
+    assert len(made) == 150
 
 
 def test_without_descriptors_it_waits_closes_idle_ones_and_says_so_once(

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import asyncio
 import socket
 import threading
 import time
@@ -15,8 +16,9 @@ from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
+from uvicorn.server import ServerState
 
-from service.acceptor import OpenConnections
+from service.acceptor import Acceptor, OpenConnections
 from service.connections import SLOWEST_BYTES_PER_S, Arrivals, arrivals_of, http_protocol
 from service.responses import problem_response
 from visloc.errors import VislocError
@@ -40,6 +42,10 @@ async def refuse(_: Request) -> Response:
 
 async def long(_: Request) -> Response:
     return Response(b"x" * 20_000_000)
+
+
+async def small(_: Request) -> Response:
+    return Response(b"x" * 30_000)
 
 
 @pytest.fixture(scope="module")
@@ -264,6 +270,37 @@ def test_an_answer_that_is_not_taken_is_given_up(
         connection.sendall(b"GET /long HTTP/1.1\r\nHost: localhost\r\n\r\n")
         time.sleep(3 * GRACE_S)
         assert len(answer_of(connection)) < 20_000_000
+
+
+def test_what_is_left_of_small_answers_is_given_up_too() -> None:
+    """Less waits than what asyncio itself takes for a buffer that is full."""
+    connections = OpenConnections(10)
+    config = uvicorn.Config(
+        Starlette(routes=[Route("/small", small)]),
+        log_level="critical",
+        http=http_protocol(GRACE_S, connections),
+    )
+    config.load()
+
+    def make() -> Any:
+        return config.http_protocol_class(  # type: ignore[call-arg]
+            config=config, server_state=ServerState(), app_state={}
+        )
+
+    async def run() -> None:
+        with socket.create_server(("127.0.0.1", 0)) as listener, socket.socket() as client:
+            acceptor = Acceptor(listener, connections, make, None, GRACE_S)
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+            client.connect(listener.getsockname())
+            async with asyncio.timeout(20):
+                while not (opened := list(connections._open)) or not opened[0].is_sending:
+                    client.send(b"GET /small HTTP/1.1\r\nHost: localhost\r\n\r\n")
+                    await asyncio.sleep(0.002)
+                while len(connections):
+                    await asyncio.sleep(0.01)
+            acceptor.close()
+
+    asyncio.run(run())
 
 
 def test_an_answer_that_is_taken_slowly_comes_whole(server: tuple[int, Arrivals]) -> None:
