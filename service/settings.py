@@ -41,8 +41,9 @@ Names = Annotated[tuple[str, ...], BeforeValidator(_names_of)]
 REQUEST_OVERHEAD_BYTES = 64 * 1024
 # Largest message with a piece of a packed map: 1 MiB, and a little around it.
 PIECE_BYTES = 2**20 + 64 * 1024
-# Room in a sequence for the numbers of one photo: camera, sensor, its share of the instant's.
-VALUES_PER_IMAGE = 32
+# Room in a sequence for the numbers of one photo: its camera, a pinhole, and its share of the
+# instant's.
+VALUES_PER_IMAGE = 16
 
 
 class SettingsError(ValueError):
