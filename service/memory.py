@@ -53,9 +53,10 @@ def memory_limit(cgroup: Path = Path("/sys/fs/cgroup"), proc: Path = Path("/proc
 async def give_back_memory() -> None:
     """Return freed memory to the system, for ever. Where the C library is not glibc, do nothing.
 
-    glibc keeps what large requests leave behind in an arena for each thread that parsed one. What is
-    free at the end of an arena goes back when it is freed, once the threshold for that is fixed:
-    otherwise it grows with the largest request. Gaps go back when glibc is asked, every few seconds.
+    glibc keeps what large requests leave behind, in an arena for each thread that parsed one.
+    Memory at the end of an arena goes back when it is freed, if the threshold for that is fixed;
+    by itself the threshold grows with the largest request. Gaps within an arena go back when glibc
+    is asked, every few seconds.
     """
     libc = ctypes.CDLL(None)
     if not hasattr(libc, "malloc_trim"):

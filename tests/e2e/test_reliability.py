@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.reliability.checks import Check
+from benchmarks.reliability.heavy_requests import heavy_photos
 from benchmarks.reliability.kills import kill_service, kill_workers
 from benchmarks.reliability.maps import SampleMaps, make_maps
 from benchmarks.reliability.refusals import refusals
@@ -50,6 +51,10 @@ def test_a_killed_service_comes_back_with_all_that_was_published(
 def test_slow_clients_do_not_slow_down_others(maps: SampleMaps, tmp_path: Path) -> None:
     checks = asyncio.run(slow_clients(maps, tmp_path, connections=200, seconds=6, rounds=1))
     assert broken(checks) == []
+
+
+def test_photos_that_take_long_keep_no_worker(maps: SampleMaps, tmp_path: Path) -> None:
+    assert broken(heavy_photos(maps, tmp_path, deadline_s=0.05)) == []
 
 
 def test_refused_requests_read_and_write_nothing(maps: SampleMaps, tmp_path: Path) -> None:
