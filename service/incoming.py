@@ -88,8 +88,11 @@ class IncomingMessage(BaseModel):
         except ValidationError as refused:
             refusal = refusal_of(refused.errors(include_url=False)[0], cls.path)
         # Out of there, so that it does not hold what it comes from: pydantic's errors hold all
-        # that was sent.
-        raise refusal
+        # that was sent. Nor may it and this frame hold each other.
+        try:
+            raise refusal
+        finally:
+            del refusal
 
 
 def check_json_values(text: str | bytes, max_values: int, field: str = "") -> None:

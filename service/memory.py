@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 _GIVE_BACK_EVERY_S = 5.0
+_M_TRIM_THRESHOLD = -1  # malloc.h
+_KEPT_BYTES = 2**20
 _KINDS = {"RssAnon": "anonymous", "RssFile": "file"}
 
 
@@ -49,15 +51,20 @@ def memory_limit(cgroup: Path = Path("/sys/fs/cgroup"), proc: Path = Path("/proc
 
 
 async def give_back_memory() -> None:
-    """Return freed memory to the system every few seconds, for ever.
+    """Return freed memory to the system, for ever. Where the C library is not glibc, do nothing.
 
-    The C library's allocator keeps what large requests leave behind, in an arena for each thread
-    that parsed one. Where it is not glibc's, this returns at once.
+    glibc keeps what large requests leave behind, in an arena for each thread that parsed one.
+    Memory at the end of an arena goes back when it is freed, if the threshold for that is fixed;
+    by itself the threshold grows with the largest request. Gaps within an arena go back when glibc
+    is asked, every few seconds.
     """
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    while trim is not None:
+    libc = ctypes.CDLL(None)
+    if not hasattr(libc, "malloc_trim"):
+        return
+    libc.mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
+    while True:
         await asyncio.sleep(_GIVE_BACK_EVERY_S)
-        await asyncio.to_thread(trim, 0)
+        await asyncio.to_thread(libc.malloc_trim, 0)
 
 
 def _lines_of(path: Path) -> list[str]:

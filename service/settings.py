@@ -41,9 +41,9 @@ Names = Annotated[tuple[str, ...], BeforeValidator(_names_of)]
 REQUEST_OVERHEAD_BYTES = 64 * 1024
 # Largest message with a piece of a packed map: 1 MiB, and a little around it.
 PIECE_BYTES = 2**20 + 64 * 1024
-# Room in a sequence for the numbers of one photo, its camera and sensor, and for those of an
-# instant: odometry with its covariance, and a pose prior.
-VALUES_PER_IMAGE, VALUES_PER_INSTANT = 32, 150
+# Room in a sequence for the numbers of one photo: its camera, a pinhole, and its share of the
+# instant's. An instant of few photos needs more: odometry with its covariance, and a pose prior.
+VALUES_PER_IMAGE, LEAST_PER_INSTANT = 16, 150
 
 
 class SettingsError(ValueError):
@@ -152,7 +152,7 @@ class ServiceSettings(BaseModel):
     @property
     def max_sequence_values(self) -> int:
         """Values in the JSON of a sequence: each takes about a microsecond and 100 bytes."""
-        per_instant = VALUES_PER_IMAGE * (self.max_rig_images + 1) + VALUES_PER_INSTANT
+        per_instant = max(LEAST_PER_INSTANT, VALUES_PER_IMAGE * (self.max_rig_images + 1))
         return max(MAX_INSTANT_VALUES, per_instant * (self.max_instants + 1))
 
 

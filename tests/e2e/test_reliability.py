@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.reliability.checks import Check
+from benchmarks.reliability.heavy_requests import heavy_photos
 from benchmarks.reliability.idle_connections import idle_connections
 from benchmarks.reliability.kills import kill_service, kill_workers
 from benchmarks.reliability.maps import SampleMaps, make_maps
@@ -55,6 +56,10 @@ def test_slow_clients_do_not_slow_down_others(maps: SampleMaps, tmp_path: Path) 
 
 def test_idle_connections_shut_nobody_out(maps: SampleMaps, tmp_path: Path) -> None:
     assert broken(asyncio.run(idle_connections(maps.folder, tmp_path, connections=1500))) == []
+
+
+def test_photos_that_take_long_keep_no_worker(maps: SampleMaps, tmp_path: Path) -> None:
+    assert broken(heavy_photos(maps, tmp_path, deadline_s=0.05)) == []
 
 
 def test_refused_requests_read_and_write_nothing(maps: SampleMaps, tmp_path: Path) -> None:

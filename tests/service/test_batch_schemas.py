@@ -109,12 +109,15 @@ def test_a_rig_of_as_many_cameras_and_images_as_there_may_be_is_read() -> None:
     LocalizeRigRequest.read_json(json.dumps(message), limits, MAX_INSTANT_VALUES)
 
 
-def test_a_sequence_of_as_many_instants_and_images_as_there_may_be_has_room() -> None:
+@pytest.mark.parametrize(("cameras", "camera"), [(16, None), (8, CAMERA), (1, FULL_CAMERA)])
+def test_a_sequence_of_as_many_instants_as_there_may_be_has_room(
+    cameras: int, camera: object
+) -> None:
     settings = ServiceSettings(maps_dir="maps")
-    images = [image(str(i), camera=FULL_CAMERA) for i in range(settings.max_rig_images)]
+    given = {} if camera is None else {"camera": camera}
     instant = {
         "timestamp": 1,
-        "images": images,
+        "images": [image(str(i), **given) for i in range(cameras)],
         "odometry": {"rig_from_odometry": IDENTITY, "covariance": MATRIX},
         "priors": {"pose": {"device_from_world": IDENTITY, "covariance": MATRIX}},
     }

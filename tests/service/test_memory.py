@@ -59,7 +59,8 @@ def test_freed_memory_is_given_back_again_and_again(monkeypatch: pytest.MonkeyPa
             if given == 3:
                 loop.call_soon_threadsafe(third.set)
 
-        monkeypatch.setattr(ctypes, "CDLL", lambda _: SimpleNamespace(malloc_trim=trim))
+        libc = SimpleNamespace(malloc_trim=trim, mallopt=lambda *_: None)
+        monkeypatch.setattr(ctypes, "CDLL", lambda _: libc)
         monkeypatch.setattr("service.memory._GIVE_BACK_EVERY_S", 0.0)
         giving = asyncio.create_task(give_back_memory())
         await asyncio.wait_for(third.wait(), 10)

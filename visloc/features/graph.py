@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-import os
 import importlib.metadata
 import json
+import os
 import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
