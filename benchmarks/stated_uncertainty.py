@@ -3,8 +3,8 @@
     python -m benchmarks.stated_uncertainty MAPS_DIR MAP QUERIES [--weights-dir DIR]
 
 QUERIES is a kapture dataset with poses in the frame of the map. Every photo is localized in process
-with its camera. Prints the median of the position error over the stated standard deviation (the norm
-of ``position_std``), and the share of true positions inside the stated 95 % ellipsoid.
+with its camera. Prints the median of the position error over the stated standard deviation (the
+norm of ``position_std``), and the share of true positions inside the stated 95 % ellipsoid.
 """
 
 from __future__ import annotations
