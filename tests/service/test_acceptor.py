@@ -9,6 +9,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -138,6 +139,17 @@ def test_when_all_are_in_use_only_health_and_metrics_are_answered(
             assert status(each) == 422
 
 
+def answers(stub: Any) -> bool:
+    """Whether health is told; a connection may meet the moment in which all places are taken."""
+    try:
+        stub.Check(health_pb2.HealthCheckRequest(), timeout=10)
+    except grpc.RpcError as error:
+        if error.code() is not grpc.StatusCode.UNAVAILABLE:
+            raise
+        return False
+    return True
+
+
 def test_idle_connections_of_grpc_leave_room_for_calls(serve: Any, tmp_path: Path) -> None:
     with (
         serve(tmp_path, load=False, max_connections=LIMIT) as doors,
@@ -152,8 +164,7 @@ def test_idle_connections_of_grpc_leave_room_for_calls(serve: Any, tmp_path: Pat
         for _ in range(3):
             options = [("grpc.use_local_subchannel_pool", 1)]
             with grpc.insecure_channel(f"127.0.0.1:{port}", options) as channel:
-                stub = health_pb2_grpc.HealthStub(channel)
-                stub.Check(health_pb2.HealthCheckRequest(), timeout=10)
+                wait_until(partial(answers, health_pb2_grpc.HealthStub(channel)))
         assert watch.is_active()
         watch.cancel()
 
