@@ -31,10 +31,11 @@ from visloc.features import make_local_features
 from visloc.geodesy import geodetic_from_enu
 from visloc.geometry import Pose, Similarity
 from visloc.images import read_photo_file
+from visloc.judge import TIE_REACH_SHARE, Candidate, Tie, judge
 from visloc.kapture import read_dataset
 from visloc.localizer import Localizer
 from visloc.priors import NO_PRIORS, HeightBand, PositionPrior, Priors
-from visloc.sets.choosing import Found, allowed_tiles, judge, plan
+from visloc.sets.choosing import allowed_tiles, plan
 from visloc.sets.coarse import rank_tiles
 from visloc.sets.frame import answer_in_set, priors_in_tile
 from visloc.types import Localized, LocalizeOptions, Reason, Refusal
@@ -283,8 +284,9 @@ def localize_in(store: MapStore, set_id: str, photo: Any, camera: Any, priors: P
             LocalizeOptions(),
             priors_in_tile(priors, set_from_tile, opened.gravity),
         )
-        found.append(Found(row, answer_in_set(answer, set_from_tile)))
-    chosen = judge(opened, found)
+        found.append(Candidate(tile.ref, answer_in_set(answer, set_from_tile)))
+    tie = Tie(Similarity.identity(), TIE_REACH_SHARE * float(opened.reaches.max()))
+    chosen = judge(found, lambda *_: tie)
     return chosen if isinstance(chosen, Refusal) else found[chosen]
 
 
@@ -347,7 +349,7 @@ def test_one_place_in_two_tiles_apart_is_refused(store: MapStore, hall_sample: P
     assert refusal.reason is Reason.AMBIGUOUS
     # A prior settles it.
     known = localize_in(store, "twins", photo, camera, Priors(maps=("twin",)))
-    assert known.tile == 1
+    assert known.ref.startswith("twin@")
     assert pose_error(known.answer.cam_from_world, BESIDE.move(truth))[0] < 0.1
 
 

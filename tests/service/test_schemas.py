@@ -349,18 +349,18 @@ def test_json_of_very_many_values_is_refused_before_it_is_parsed(text: str) -> N
     with pytest.raises(TooLarge) as caught:
         LocalizeRequest.read_json(text)
 
-    assert (caught.value.code, caught.value.expected) == ("request.too_large", "at most 10000")
+    assert (caught.value.code, caught.value.expected) == ("request.too_large", "at most 11000")
 
 
 @pytest.mark.parametrize("as_text", [str, str.encode])
 @pytest.mark.parametrize("inside", ["1,", "[],", '{"a":0},', "[" * 100 + "]" * 100 + ","])
 def test_values_are_counted_by_commas_and_brackets(as_text: Any, inside: str) -> None:
-    text = '{"map": "room", "maps": [' + inside * 10_000 + "1]}"
+    text = '{"map": "room", "maps": [' + inside * 11_000 + "1]}"
 
     with pytest.raises(TooLarge) as caught:
         LocalizeRequest.read_json(as_text(text))
 
-    counted = 3 + 10_000 * sum(map(inside.count, ",[{"))
+    counted = 3 + 11_000 * sum(map(inside.count, ",[{"))
     assert (caught.value.code, caught.value.got) == ("request.too_large", str(counted))
 
 
