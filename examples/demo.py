@@ -168,7 +168,8 @@ def by_hand() -> None:
     query = read_dataset(DATASET / "query")
     camera = query.sensors[query.images[0].sensor_id].camera
     assert camera is not None
-    words = [camera.model, camera.width, camera.height, *camera.params]
+    params = [f"{value:g}" for value in camera.params]
+    words = [camera.model, camera.width, camera.height, *params]
     say(
         "\nTry it by hand:\n"
         f"  {COMMANDS}/visloc-service --maps-dir {MAPS} &\n"

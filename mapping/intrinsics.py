@@ -67,7 +67,7 @@ class Doubt:
 
 
 class CameraOrigin(BaseModel):
-    """Where the focal length of a map's camera comes from, as the manifest has it.
+    """The source of a camera's focal length, as the manifest stores it.
 
     Attributes:
         source: ``exif``, ``given`` (by the dataset), or ``estimated``: from the photos alone.

@@ -99,7 +99,7 @@ def origins_record(a: Map, b: Map, images: Sequence[ImageRecord]) -> dict[str, J
 
 
 def _origin(settings: Mapping[str, JsonValue], camera: str) -> CameraOrigin | None:
-    """What the manifest says of a camera; None where its focal length may be anything."""
+    """Return what the manifest says of a camera; None when it does not tell its source."""
     refine, recorded = settings.get("refine"), settings.get(CAMERAS)
     if isinstance(recorded, Mapping):
         try:

@@ -150,7 +150,7 @@ def landmarks_from_matches(
 def _origins(
     dataset: Dataset, photos: Sequence[MappingPhoto], model: SparseModel
 ) -> dict[str, CameraOrigin]:
-    """Where the focal lengths of the photos' cameras come from, by sensor."""
+    """Return the source of each camera's focal length, by sensor."""
     return {
         sensor: origin_of(dataset.sensors[sensor], model.doubts.get(sensor))
         for sensor in _names_by_sensor(photos)
@@ -160,7 +160,7 @@ def _origins(
 def _origins_record(
     origins: Mapping[str, CameraOrigin], settings: SfmSettings
 ) -> dict[str, JsonValue]:
-    """What the manifest says of them; nothing where all cameras are those of the dataset."""
+    """Return what the manifest stores of them; nothing when no camera was refined or estimated."""
     if not (settings.estimate_poses or "intrinsics" in settings.refine):
         return {}
     return {CAMERAS: {sensor: one.model_dump() for sensor, one in origins.items()}}

@@ -41,8 +41,6 @@ def main() -> None:
     # other at full speed, on the cores that those need.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(settings.max_image_pixels))
-    # Of a JPEG within a TIFF, as visloc.images allows the largest JPEG.
-    os.environ.setdefault("LIBTIFF_JPEG_MAX_ALLOWED_SCAN_NUMBER", "20")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # damaged photos are answered, not logged
     # The fork server loads the same libraries as this process, at the same time.
     context = get_context("forkserver")

@@ -93,7 +93,7 @@ class OpenConnections:
         """Close the longest idle connection at the limit.
 
         Returns:
-            After how many seconds there is room: 0 for now, infinity when all are in use.
+            Seconds until there is room: 0 when there is room now, infinity when all are in use.
         """
         if len(self._open) < self.limit:
             return 0.0

@@ -326,7 +326,7 @@ def in_set(found: AnyLocalization, outline: SetOutline, tile: TileRecord) -> Any
         map_version=outline.manifest.version,
         geodetic=outline.geodetic,
         tile=tile.ref,
-        reach=moved.scale * found.reach,
+        reach=tile.reach,
         anchor_rms=anchor_rms(outline.manifest.world),
     )
     if isinstance(found, InstantLocalization):

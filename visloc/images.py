@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import re
 import struct
 import zlib
@@ -55,6 +56,8 @@ _PLAUSIBLE_FOCAL = (0.25, 50.0)
 _MAX_SCANS = 100
 # The largest photo may have so many. Photos with fewer pixels may have more, up to _MAX_SCANS.
 _MAX_SCANS_OF_LARGEST = 20
+# libtiff counts the scans of a JPEG within a TIFF itself, and reads its limit when it decodes.
+os.environ.setdefault("LIBTIFF_JPEG_MAX_ALLOWED_SCAN_NUMBER", f"{_MAX_SCANS_OF_LARGEST}")
 # Segments of a JPEG or chunks of a PNG. 20 MiB of image data in the usual pieces are 2 600 chunks.
 _MAX_PARTS = 100_000
 # JPEG markers that begin a segment with a length, and the end of the image (ITU T.81, table B.1).

@@ -128,6 +128,7 @@ class Localizer:
 
     def warm_up(self) -> None:
         """Run once on noise, so that the first query does not pay for the first use."""
+        _ = self.geometry.reach  # computed once; answers carry it
         random = np.random.default_rng(0)
         if self._takes_photos(self.map.fusion):
             noise = random.integers(0, 255, (480, 640, 3), dtype=np.uint8)

@@ -46,7 +46,7 @@ IMPORTERS: Mapping[str, tuple[str, str]] = {
 
 
 def _untold(_stage: str, _done: int, _total: int) -> None:
-    """What is told to nobody."""
+    """Show no progress."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -427,6 +427,28 @@ def test_the_largest_photos_may_have_fewer_scans() -> None:
     assert (error.code, error.got) == ("image.too_complex", "21 scans")
 
 
+def jpeg_in_tiff(jpeg: bytes, width: int, height: int) -> bytes:
+    """A TIFF of one strip with compression 7 (JPEG), in colour (YCbCr)."""
+    bits = 8 + 2 + 12 * 10 + 4  # behind the header and the directory
+    fields = [
+        *((256, 4, 1, width), (257, 4, 1, height), (258, 3, 3, bits), (259, 3, 1, 7)),
+        *((262, 3, 1, 6), (273, 4, 1, bits + 6), (277, 3, 1, 3), (278, 4, 1, height)),
+        *((279, 4, 1, len(jpeg)), (530, 3, 2, 2 | 2 << 16)),
+    ]
+    directory = b"".join(struct.pack("<HHII", *field) for field in fields)
+    return (
+        (b"II*\0" + struct.pack("<IH", 8, len(fields)) + directory + bytes(4))
+        + struct.pack("<HHH", 8, 8, 8)
+        + jpeg
+    )
+
+
+def test_a_jpeg_within_a_tiff_has_no_more_scans_than_the_largest_photo() -> None:
+    assert read_photo(jpeg_in_tiff(progressive(times=8), 48, 32)).width == 48
+
+    assert refusal(jpeg_in_tiff(progressive(times=40), 48, 32)).code == "image.undecodable"
+
+
 @pytest.mark.parametrize("mode", ["L", "RGB", "CMYK"])
 def test_what_encoders_write_is_far_from_too_many_scans(mode: str) -> None:
     image = Image.fromarray(texture()).convert(mode)
