@@ -46,7 +46,8 @@ def _video(name: str) -> FileKind:
     return FileKind(
         name,
         f"{name} videos",
-        "take frames out of them, such as with: ffmpeg -i VIDEO -vf fps=2 -q:v 2 FOLDER/%05d.jpg",
+        "take frames out of them, into a folder that exists, such as with: "
+        "ffmpeg -i VIDEO -vf fps=2 -q:v 2 FOLDER/%05d.jpg",
     )
 
 

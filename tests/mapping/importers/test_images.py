@@ -170,7 +170,7 @@ def test_every_file_is_used_or_left_out_with_its_reason(tmp_path: Path) -> None:
         "sub/a.HEIC": "HEIC photos are not read here; convert them to JPEG, such as with: heif-con",
         "sub/phone.jpg": reasons["sub/a.HEIC"],
         "b.avif": "AVIF photos",
-        "walk.mp4": "MP4 videos are not read here; take frames out of them, such as with: ffmpeg",
+        "walk.mp4": "MP4 videos are not read here; take frames out of them, into a folder that",
         "walk.MOV": "MOV videos",
         "anim.gif": "GIF pictures",
         "no_suffix": "rename them",
