@@ -94,9 +94,10 @@ async def _withstood(siege: Siege, maps_dir: Path, log: Path) -> list[Check]:
     slowest = max(each for seconds in found for each in seconds if each < inf)
     # gRPC itself refuses what comes in the moment in which all its places are taken.
     least = {name: PROBES - (siege.api == "gRPC" and name == "gRPC health") for name in probes}
+    but = "" if siege.api == "HTTP" else f" (gRPC health: {least['gRPC health']})"
     return [
         Check(
-            f"{siege}: {PROBES} probes in {PROBED_S:g} s are answered within {LIMIT_S:g} s",
+            f"{siege}: {PROBES} probes in {PROBED_S:g} s are answered within {LIMIT_S:g} s{but}",
             ", ".join(f"{name} {count}" for name, count in answered.items())
             + f"; slowest {slowest:.2f} s; {open_files} open files"
             + (f"; {besiegers.closed} were closed" if siege.renewed else ""),
