@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncGenerator, Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from time import monotonic, sleep
 from typing import TypeVar
 
 from starlette.datastructures import Headers, UploadFile
@@ -30,11 +31,49 @@ _CHUNK_BYTES = 64 * 1024
 _FILES = {"image": "photo.jpg", "features": "photo.json"}
 _FORM = "multipart/form-data"
 _KINDS = (_FORM, "application/json")
-# Parses the JSON of batches, one after the other: parsing keeps Python's lock, for half a second
-# for the largest sequence, and the event loop gets its turn between two of them.
-_BATCHES = ThreadPoolExecutor(1, thread_name_prefix="batches")
-
 JobT = TypeVar("JobT")
+
+
+class _BatchParser:
+    """Parses the JSON of batches in a thread, one after the other.
+
+    Parsing keeps Python's lock, for some tenths of a second for the largest sequence. An answer to
+    anybody else takes several turns of the event loop, each of which would wait for one more
+    batch. So the thread rests after each for as long as it took.
+    """
+
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="batches")
+        self._rests_until = 0.0
+
+    async def parse(
+        self,
+        to_job: Callable[[str | bytes, Mapping[str, bytes]], JobT],
+        text: str | bytes,
+        files: Mapping[str, bytes],
+    ) -> JobT:
+        """Make the job of a batch; errors are those of ``to_job``."""
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._thread, self._parsed, to_job, text, files)
+
+    def _parsed(
+        self,
+        to_job: Callable[[str | bytes, Mapping[str, bytes]], JobT],
+        text: str | bytes,
+        files: Mapping[str, bytes],
+    ) -> JobT:
+        started = monotonic()
+        if started < self._rests_until:
+            sleep(self._rests_until - started)
+            started = monotonic()
+        try:
+            return to_job(text, files)
+        finally:
+            ended = monotonic()
+            self._rests_until = ended + (ended - started)
+
+
+_BATCHES = _BatchParser()
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,8 +215,7 @@ async def _read_batch(
     is_form = checked_media_type(request, _KINDS) == _FORM
     async with arrivals_of(request).body(request, settings.max_batch_bytes) as body:
         text, files = await asyncio.to_thread(from_form, body) if is_form else (body, {})
-        loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(_BATCHES, to_job, text, files)
+        return await _BATCHES.parse(to_job, text, files)
 
 
 async def _read(
