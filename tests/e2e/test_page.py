@@ -270,7 +270,10 @@ def test_a_photo_of_another_place_is_refused_in_words_with_what_to_try(
     for words in ("I do not know", "Gate", seen["answer"]["refusal"]["message"], "What to try"):
         assert words in seen["shown"]
     assert "elsewhere.jpg" in seen["announced"]
-    assert seen["view"] == seen["before"]
+    # The view stays. Drawing computes it anew from angles, which may change the last bit.
+    assert seen["view"].keys() == seen["before"].keys()
+    for name, before in seen["before"].items():
+        assert seen["view"][name] == pytest.approx(before, abs=1e-9)
 
 
 def test_names_are_text_whatever_they_hold(browser: Browser, query: Query) -> None:
