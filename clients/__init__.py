@@ -34,7 +34,7 @@ from clients.wire.types import (
     VersionInfo,
 )
 from visloc.priors import GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
-from visloc.sequences.filling import PoseSource
+from visloc.types import PoseSource
 
 __all__ = [
     "Anchor",

@@ -341,3 +341,39 @@ def _quaternion_from_matrix(r: NDArray[np.float64]) -> NDArray[np.float64]:
         q[1 + k] = r[k, i] + r[i, k]
     q /= np.linalg.norm(q)
     return -q if q[0] < 0 else q
+
+
+def center_covariance(
+    device_from_world: Pose, covariance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the covariance (6, 6) of (w, dc) from that of (w, dt).
+
+    dc is the shift of the centre c = -R^T t in the world: R <- Exp(w) R and t <- t + dt move it by
+    -R^T (dt + [t] w), with [t] the matrix of the cross product.
+    """
+    inverse = -device_from_world.rotation.T
+    jacobian = np.eye(6)
+    jacobian[3:, :3] = inverse @ cross_matrix(device_from_world.translation)
+    jacobian[3:, 3:] = inverse
+    return propagated(jacobian, covariance)
+
+
+def covariance_from_center(
+    device_from_world: Pose, covariance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the covariance (6, 6) of (w, dt) from that of (w, dc).
+
+    The inverse of ``center_covariance``.
+    """
+    jacobian = np.eye(6)
+    jacobian[3:, :3] = -cross_matrix(device_from_world.translation)
+    jacobian[3:, 3:] = -device_from_world.rotation
+    return propagated(jacobian, covariance)
+
+
+def propagated(
+    jacobian: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the covariance (m, m) of J x from that (n, n) of x, with J (m, n), symmetric."""
+    product = jacobian @ covariance @ jacobian.T
+    return np.asarray((product + product.T) / 2)

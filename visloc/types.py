@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from visloc.errors import InvalidInput, VislocError
 from visloc.geometry import Camera, Pose
-from visloc.sequences.filling import PoseSource
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,6 +68,16 @@ class QueryFeatures:
     keypoints: NDArray[np.generic]
     descriptors: NDArray[np.generic]
     global_descriptors: Mapping[str, NDArray[np.generic]] = field(default_factory=dict)
+
+
+class PoseSource(StrEnum):
+    """The evidence for a pose."""
+
+    ESTIMATED = "estimated"  # the images of this camera or rig, at this instant
+    RIG = "rig"  # another camera of the rig at the same instant
+    MOTION = "motion"  # images of other instants, through the relative motion that was given
+    INTERPOLATED = "interpolated"  # the instants before and after
+    NEAREST = "nearest"  # the nearest instant
 
 
 class CameraSource(StrEnum):

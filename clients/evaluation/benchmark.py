@@ -23,7 +23,8 @@ from visloc.evaluation import (
     pose_error,
     recall,
 )
-from visloc.sequences.filling import PoseSource, TracedPose
+from visloc.sequences.filling import TracedPose
+from visloc.types import PoseSource
 
 _ERROR_PERCENTILES = {"p50": 50, "p75": 75, "p90": 90, "max": 100}
 

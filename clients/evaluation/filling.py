@@ -8,8 +8,9 @@ from clients.wire.answers import parse_pose, parse_result
 from clients.wire.requests import JsonObject
 from clients.wire.rigs import ImageResult, InstantResult, Rig
 from clients.wire.types import LocalizeResult, PoseEstimate
-from visloc.geometry import Pose
-from visloc.sequences.filling import PoseSource, TracedPose, center_covariance, fill_rig
+from visloc.geometry import Pose, center_covariance
+from visloc.sequences.filling import TracedPose, fill_rig
+from visloc.types import PoseSource
 
 
 def measured(pose: PoseEstimate, num_inliers: int) -> TracedPose:

@@ -16,7 +16,8 @@ from clients.evaluation.running import Outcome
 from clients.wire.answers import parse_pose
 from clients.wire.types import PoseEstimate
 from visloc.errors import DatasetError, InvalidInput
-from visloc.sequences.filling import PoseSource, TracedPose
+from visloc.sequences.filling import TracedPose
+from visloc.types import PoseSource
 
 _LOCALIZED, _NOT_LOCALIZED, _ERROR, _FILLED = "localized", "not_localized", "error", "filled"
 # Errors that say nothing about the photo: it may be answered when it is asked about again.

@@ -33,7 +33,7 @@ from clients.wire.types import (
 )
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
-from visloc.sequences.filling import PoseSource
+from visloc.types import PoseSource
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")

@@ -15,7 +15,7 @@ from clients.wire.types import CameraUsed, MapVersion, Orientation, Refusal, Ret
 from visloc.errors import VislocError
 from visloc.geometry import Camera, Pose
 from visloc.priors import Priors
-from visloc.sequences.filling import PoseSource
+from visloc.types import PoseSource
 
 
 @dataclass(frozen=True, slots=True, eq=False)

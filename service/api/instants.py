@@ -21,7 +21,7 @@ from service.api.geometry import Transform
 from service.api.geopose import GeoPose, GeoPoseYpr, geoposes_to_words
 from service.values import InstantLocalization
 from visloc.errors import VislocError
-from visloc.sequences.filling import PoseSource
+from visloc.types import PoseSource
 
 # A sequence has thousands of images, and each may have been matched against a thousand photos.
 MAX_RETRIEVED = 20

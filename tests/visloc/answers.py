@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from visloc.geometry import Camera, Pose
 from visloc.pose.centre import position_covariance
-from visloc.sequences.filling import PoseSource
 from visloc.types import (
     CameraSource,
     Evidence,
@@ -17,6 +16,7 @@ from visloc.types import (
     InstantAnswer,
     Localized,
     NotLocalized,
+    PoseSource,
     ReadAs,
     Reason,
     RigPose,

@@ -20,7 +20,6 @@ from visloc.pose.generalized import (
 )
 from visloc.pose.views import MatchedView
 from visloc.priors import Priors
-from visloc.sequences.filling import PoseSource
 from visloc.timing import timed
 from visloc.types import (
     DEFAULT_PRESET,
@@ -29,6 +28,7 @@ from visloc.types import (
     ImageAnswer,
     InstantAnswer,
     LocalizeOptions,
+    PoseSource,
     ReadAs,
     Reason,
     Refusal,

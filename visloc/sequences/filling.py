@@ -18,7 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.errors import InvalidInput
-from visloc.geometry import Pose, cross_matrix, rotation_angle
+from visloc.geometry import (
+    Pose,
+    center_covariance,
+    covariance_from_center,
+    propagated,
+    rotation_angle,
+)
+from visloc.types import PoseSource
 
 # Unix times of 2001-01-01 and of 2100-01-01, seconds: which timestamps can be told by their size.
 _FIRST_UNIX_S, _LAST_UNIX_S = 978_307_200, 4_102_444_800
@@ -44,16 +51,6 @@ _UNKNOWN_ANGLE_STD = math.pi / math.sqrt(3.0)
 
 # The longest gap between measured instants that may be asked to be filled, seconds.
 MAX_GAP_S = 60.0
-
-
-class PoseSource(StrEnum):
-    """What a pose rests on."""
-
-    ESTIMATED = "estimated"  # the images of this camera or rig, at this instant
-    RIG = "rig"  # another camera of the rig at the same instant
-    MOTION = "motion"  # images of other instants, through the relative motion that was given
-    INTERPOLATED = "interpolated"  # the instants before and after
-    NEAREST = "nearest"  # the nearest instant
 
 
 class TimeUnit(StrEnum):
@@ -208,31 +205,6 @@ def interpolate_pose(a: Pose, b: Pose, share: float) -> Pose:
     return Pose(rotation, -rotation @ (start + share * (b.center - start)))
 
 
-def center_covariance(
-    device_from_world: Pose, covariance: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Covariance (6, 6) of (w, dc) from that of (w, dt).
-
-    dc is the shift of the centre c = -R^T t in the world: R <- Exp(w) R and t <- t + dt move it by
-    -R^T (dt + [t] w), with [t] the matrix of the cross product.
-    """
-    inverse = -device_from_world.rotation.T
-    jacobian = np.eye(6)
-    jacobian[3:, :3] = inverse @ cross_matrix(device_from_world.translation)
-    jacobian[3:, 3:] = inverse
-    return _propagated(jacobian, covariance)
-
-
-def covariance_from_center(
-    device_from_world: Pose, covariance: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Covariance (6, 6) of (w, dt) from that of (w, dc): the inverse of ``center_covariance``."""
-    jacobian = np.eye(6)
-    jacobian[3:, :3] = -cross_matrix(device_from_world.translation)
-    jacobian[3:, 3:] = -device_from_world.rotation
-    return _propagated(jacobian, covariance)
-
-
 def _carried(giver: TracedPose, cam_from_giver: Pose) -> TracedPose:
     """The pose of a camera that sits rigidly beside one whose pose is known."""
     pose = cam_from_giver @ giver.pose
@@ -243,7 +215,7 @@ def _carried(giver: TracedPose, cam_from_giver: Pose) -> TracedPose:
     calibration = _independent(
         _RIG_ORIENTATION_STD, _RIG_POSITION_STD_M + _RIG_POSITION_STD_PER_M * lever_m
     )
-    covariance = _propagated(jacobian, giver.covariance) + covariance_from_center(pose, calibration)
+    covariance = propagated(jacobian, giver.covariance) + covariance_from_center(pose, calibration)
     return TracedPose(pose, covariance, PoseSource.RIG)
 
 
@@ -351,7 +323,7 @@ def _seen_from(device_from_world: Pose, other: TracedPose) -> NDArray[np.float64
     """Covariance of (w, dc) of another pose, with w in this device's axes."""
     jacobian = np.eye(6)
     jacobian[:3, :3] = device_from_world.rotation @ other.pose.rotation.T
-    return _propagated(jacobian, center_covariance(other.pose, other.covariance))
+    return propagated(jacobian, center_covariance(other.pose, other.covariance))
 
 
 def _independent(orientation_std: float, position_std: float) -> NDArray[np.float64]:
@@ -364,10 +336,3 @@ def _wider(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64
     units = np.outer(scale, scale)
     excess, axes = np.linalg.eigh((b - a) / units)
     return np.asarray(a + units * ((axes * np.maximum(excess, 0.0)) @ axes.T))
-
-
-def _propagated(
-    jacobian: NDArray[np.float64], covariance: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    product = jacobian @ covariance @ jacobian.T
-    return np.asarray((product + product.T) / 2)

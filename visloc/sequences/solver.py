@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.errors import InvalidInput
-from visloc.geometry import rotation_angle
+from visloc.geometry import center_covariance, covariance_from_center, rotation_angle
 from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.solving import (
     SeenImage,
@@ -30,19 +30,10 @@ from visloc.localization.solving import (
 from visloc.pose.centre import with_origin
 from visloc.pose.motion import RelativeMotion, default_motion_covariance, link_from_motion
 from visloc.priors import Priors
-from visloc.sequences.filling import (
-    MAX_GAP_S,
-    Odometry,
-    PoseSource,
-    TimeUnit,
-    TracedPose,
-    center_covariance,
-    covariance_from_center,
-    fill_sequence,
-)
+from visloc.sequences.filling import MAX_GAP_S, Odometry, TimeUnit, TracedPose, fill_sequence
 from visloc.sequences.window import WindowInstant, WindowPose, solve_window
 from visloc.timing import timed
-from visloc.types import InstantAnswer, LocalizeOptions, Reason, Refusal, RigPose
+from visloc.types import InstantAnswer, LocalizeOptions, PoseSource, Reason, Refusal, RigPose
 
 # At most so many instants wait, and as many answered ones are remembered, however long the gap
 # may be: what is further away in a fast sequence adds little and costs time.

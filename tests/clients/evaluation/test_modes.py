@@ -18,7 +18,8 @@ from clients.wire.types import MapInfo, RigInfo
 from visloc.errors import DatasetError, InvalidInput, NotFound, VislocError
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose
-from visloc.sequences.filling import PoseSource, TimeUnit, TracedPose
+from visloc.sequences.filling import TimeUnit, TracedPose
+from visloc.types import PoseSource
 
 Dataset = Callable[..., Path]
 HERE, LOST, BROKEN = None, b"refuse", b"broken"

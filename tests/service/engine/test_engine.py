@@ -45,8 +45,8 @@ from visloc.geometry import Camera, Pose
 from visloc.images import ImageLimits
 from visloc.kapture import read_dataset
 from visloc.priors import NO_PRIORS, GravityPrior, PositionPrior, Priors
-from visloc.sequences.filling import Odometry, PoseSource, TimeUnit
-from visloc.types import Localized, LocalizeOptions, Reason
+from visloc.sequences.filling import Odometry, TimeUnit
+from visloc.types import Localized, LocalizeOptions, PoseSource, Reason
 
 T = TypeVar("T")
 

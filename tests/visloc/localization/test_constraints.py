@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
-from visloc.geometry import Camera, Pose
+from visloc.geometry import Camera, Pose, covariance_from_center
 from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.localizer import Localizer
 from visloc.pose.colmap import normalized_rays, project
@@ -29,7 +29,6 @@ from visloc.priors import (
     check_covariance,
 )
 from visloc.retrieval.rows import GlobalRows
-from visloc.sequences.filling import covariance_from_center
 from visloc.types import Answer, Localized, LocalizeOptions, NotLocalized, QueryFeatures, Reason
 
 TURNED = Pose(Rotation.from_rotvec([0.3, -1.2, 0.4]).as_matrix(), np.array([1.0, -2.0, 0.5]))

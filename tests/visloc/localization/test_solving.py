@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
-from visloc.geometry import Camera, Pose
+from visloc.geometry import Camera, Pose, center_covariance
 from visloc.localization.solving import Matches, Solved, registration_for, solve_instant
 from visloc.pose.centre import with_origin
 from visloc.pose.colmap import normalized_rays
@@ -21,8 +21,7 @@ from visloc.priors import (
     PositionPrior,
     Priors,
 )
-from visloc.sequences.filling import PoseSource, center_covariance
-from visloc.types import LocalizeOptions, Reason, Refusal
+from visloc.types import LocalizeOptions, PoseSource, Reason, Refusal
 
 OPTIONS = LocalizeOptions()
 TRUTH = Pose(Rotation.from_rotvec([0.3, -1.2, 0.4]).as_matrix(), np.array([1.0, -2.0, 0.5]))

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
-from visloc.geometry import CAMERA_MODELS, Camera, Pose
+from visloc.geometry import CAMERA_MODELS, Camera, Pose, center_covariance
 from visloc.localization.solving import SeenImage, Solved, solve_instant
 from visloc.pose.colmap import normalized_rays
 from visloc.pose.generalized import (
@@ -21,7 +21,6 @@ from visloc.pose.generalized import (
 )
 from visloc.pose.views import MatchedView
 from visloc.priors import GravityPrior, Priors
-from visloc.sequences.filling import center_covariance
 from visloc.types import CameraSource, LocalizeOptions, Reason, Solver
 
 CAMERA = Camera("PINHOLE", 640, 480, (500.0, 510.0, 322.0, 239.0))

@@ -14,19 +14,17 @@ from numpy.typing import NDArray
 
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
-from visloc.geometry import Pose, rotation_angle
+from visloc.geometry import Pose, center_covariance, covariance_from_center, rotation_angle
 from visloc.kapture import read_dataset
 from visloc.sequences.filling import (
-    PoseSource,
     TimeUnit,
     TracedPose,
-    center_covariance,
-    covariance_from_center,
     fill_rig,
     fill_sequence,
     guess_time_unit,
     interpolate_pose,
 )
+from visloc.types import PoseSource
 
 # The 99.73 % (3 sigma) quantile of the chi-square distribution with 6 degrees of freedom.
 THREE_SIGMA_OF_SIX = 20.06

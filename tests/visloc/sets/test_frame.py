@@ -14,7 +14,6 @@ from visloc.localization.constraints import Constraints
 from visloc.pose.centre import moved_pose, position_covariance
 from visloc.pose.distance import mahalanobis2
 from visloc.priors import NO_PRIORS, GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
-from visloc.sequences.filling import PoseSource
 from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
 from visloc.types import (
     CameraSource,
@@ -23,6 +22,7 @@ from visloc.types import (
     InstantAnswer,
     Localized,
     NotLocalized,
+    PoseSource,
     ReadAs,
     Reason,
     RigPose,
