@@ -33,17 +33,22 @@ SET_ID = "places"
 
 @dataclass(frozen=True)
 class Place:
-    """A map, how it is built, and what it is asked about."""
+    """A map: how it is built, the queries, and the options of ``localize batch``."""
 
     mapping: str
     query: str
     build: tuple[str, ...]
     modes: tuple[str, ...] = ("single",)
+    batch: tuple[str, ...] = ()
 
 
 PLACES = {
     "redkitchen": Place(
-        "redkitchen/mapping", "redkitchen/query", ("--method", "rgbd"), ("single", "seq")
+        "redkitchen/mapping",
+        "redkitchen/query",
+        build=("--method", "rgbd"),
+        modes=("single", "seq"),
+        batch=("--time-unit", "ms"),
     ),
     "castle": Place("castle/mapping", "castle/query", ("--method", "sfm")),
     "kitti_curve": Place(
@@ -103,6 +108,7 @@ def ask(maps_dir: Path, answers: Path) -> None:
                     run(
                         *("localize", "batch", DATA / PLACES[queries].query, "--map", asked),
                         *("--server", url, "--mode", mode, "--output", folder),
+                        *PLACES[queries].batch,
                     )
                     lines = Path(folder, "results.jsonl").read_text(encoding="utf-8").splitlines()
                 kept = sorted(json.dumps(stable(json.loads(line))) for line in lines)
