@@ -29,7 +29,7 @@ from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
-from visloc.localizer import FeatureCache, Localizer
+from visloc.localization.localizer import FeatureCache, Localizer
 from visloc.matching.correspondences import Correspondences, settled
 from visloc.pose.colmap import project
 from visloc.pose.generalized import refine_generalized_pose

@@ -26,7 +26,7 @@ import typer
 
 from benchmarks.generated_tiles import generated_model
 from visloc.archive import Map, MapStore
-from visloc.features.whitening import WHITENING_MAX_DIMS
+from visloc.features.descriptors.whitening import WHITENING_MAX_DIMS
 from visloc.kapture import read_dataset
 from visloc.sets.coarse import BITS, describe
 

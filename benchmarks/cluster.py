@@ -21,9 +21,9 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from mapping.build import BuildSettings, build_map
-from mapping.costs import Costs
-from mapping.display import print_costs
+from mapping.build.build import BuildSettings, build_map
+from mapping.cli.display import print_costs
+from mapping.cluster.stage_timings import Costs
 from visloc.archive import open_map
 from visloc.features import DEFAULT_LOCAL_FEATURES
 from visloc.kapture import read_dataset, write_dataset

@@ -27,19 +27,19 @@ import typer
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
-from mapping.build import BuildSettings, build_map
+from mapping.build.build import BuildSettings, build_map
+from mapping.build.stages import WorkFolder
+from mapping.cluster.workers import Workers
 from mapping.report.held_out import hold_out
 from mapping.report.model import CoverageModel, Within, learn, tolerance_of
 from mapping.report.viewpoints import Viewpoints
-from mapping.stages import WorkFolder
-from mapping.workers import Workers
 from visloc.archive import Map, MapStore
 from visloc.evaluation import pose_error
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import Dataset, FileRecord, Sensor, read_dataset, write_dataset
-from visloc.localizer import Localizer
+from visloc.localization.localizer import Localizer
 from visloc.synthetic.render import render_depth, render_photo
 from visloc.synthetic.scene import ROOM_SIZE_M, Scene, make_room
 from visloc.types import Localized, LocalizeOptions

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.tile_similarities import NAMES, quantiles
-from visloc.features.whitening import unit_rows
+from visloc.features.descriptors.whitening import unit_rows
 from visloc.sets.coarse import CoarseModel, described, random_planes
 
 SIMILARITIES = Path(__file__).parent / "tile_similarities.json"

@@ -26,8 +26,8 @@ from visloc.archive import (
     pose_row,
     write_map,
 )
-from visloc.features.vlad import VOCABULARY_SIZE
-from visloc.features.whitening import WHITENING_MAX_DIMS
+from visloc.features.descriptors.vlad import VOCABULARY_SIZE
+from visloc.features.descriptors.whitening import WHITENING_MAX_DIMS
 from visloc.geometry import Pose
 
 PITCH_M = 10.0

@@ -20,7 +20,7 @@ from benchmarks.large_map import GLOBAL_NOISE
 from visloc.archive import Map, open_map
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose
-from visloc.localizer import Localizer
+from visloc.localization.localizer import Localizer
 from visloc.matching.products import start_threads
 from visloc.retrieval.index import retrieve
 from visloc.types import Localized, LocalizeOptions, QueryFeatures

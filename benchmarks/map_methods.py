@@ -19,14 +19,14 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from mapping.build import BuildSettings, build_map
-from mapping.sfm import SfmSettings
+from mapping.build.build import BuildSettings, build_map
+from mapping.methods.sfm import SfmSettings
 from visloc.archive import Map, open_map
 from visloc.evaluation import pose_error
 from visloc.features import DEFAULT_LOCAL_FEATURES, make_global_descriptor, make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
-from visloc.localizer import Localizer
+from visloc.localization.localizer import Localizer
 from visloc.types import Localized, LocalizeOptions
 
 # Stages that depend on the way; features and global descriptors do not.

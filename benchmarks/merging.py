@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from mapping.build import BuildSettings, build_map
-from mapping.merging import merge_maps
-from mapping.progress import StageProgress
-from mapping.pruning.accuracy import of_queries
-from mapping.pruning.command import accuracy_rows
+from mapping.build.build import BuildSettings, build_map
+from mapping.cli.progress import StageProgress
+from mapping.cli.prune import accuracy_rows
+from mapping.maps.merging import merge_maps
+from mapping.maps.pruning.accuracy import of_queries
 from visloc.archive import Map, MapStore
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Similarity, rotation_angle

@@ -22,18 +22,18 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-import mapping.matching
-from clients.queries import read_queries
-from clients.sending import FeatureReader
-from mapping.build import BuildSettings, build_map
-from mapping.features import ReadyMadeFeatures
-from mapping.photos import MappingPhoto
-from mapping.sfm import SfmSettings
+import mapping.methods.matching
+from clients.evaluation.queries import read_queries
+from clients.evaluation.sending import FeatureReader
+from mapping.build.build import BuildSettings, build_map
+from mapping.build.features import ReadyMadeFeatures
+from mapping.build.photos import MappingPhoto
+from mapping.methods.sfm import SfmSettings
 from visloc.archive import Map, open_map
 from visloc.evaluation import pose_error
 from visloc.geometry import PixelOrigin
 from visloc.kapture import open_features, open_local_features
-from visloc.localizer import Localizer
+from visloc.localization.localizer import Localizer
 from visloc.types import LocalFeatures, Localized, LocalizeOptions, QueryFeatures
 
 LOCAL, GLOBAL = "r2d2_500", "AP-GeM-LM18"
@@ -97,8 +97,8 @@ def matched_as_floats() -> Iterator[None]:
         return mutual, best[mutual], similarity[mutual, best[mutual]]
 
     with (
-        patch.object(mapping.matching, "in_eight_bits", lambda descriptors: descriptors),
-        patch.object(mapping.matching, "mutual_nearest_neighbours", nearest),
+        patch.object(mapping.methods.matching, "in_eight_bits", lambda descriptors: descriptors),
+        patch.object(mapping.methods.matching, "mutual_nearest_neighbours", nearest),
     ):
         yield
 

@@ -9,7 +9,7 @@ shared. A landmark is shared when, under the query's true pose,
 
 - it projects into the query's image, from in front;
 - the rays to it from both camera centres differ by at most 60 degrees, beyond which local features
-  do not match (as in ``mapping.pairing.frustum``);
+  do not match (as in ``mapping.methods.pairing.frustum``);
 - neither centre is more than twice as far from it as the other: scale changes beyond are matched
   by luck;
 - nothing is seen to hide it: fewer than 3 landmarks of the map that project into the same cell of
@@ -41,11 +41,11 @@ from numpy.typing import NDArray
 
 from visloc.archive import Map, MapStore
 from visloc.features import make_global_descriptor, make_local_features
-from visloc.features.readymade import is_ready_made
+from visloc.features.local.readymade import is_ready_made
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
-from visloc.localizer import FeatureCache, Localizer
+from visloc.localization.localizer import FeatureCache, Localizer
 from visloc.pose.colmap import project
 from visloc.retrieval.fusion import FUSION_OPERATORS, LateFusion
 from visloc.retrieval.index import retrieve

@@ -27,11 +27,18 @@ from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Camera, Pose
 from visloc.images import ImageLimits, read_photo
 from visloc.kapture import Dataset, read_dataset
-from visloc.localizer import Localizer
+from visloc.localization.localizer import Localizer
+from visloc.localization.solving import Look, SeenImage
 from visloc.priors import NO_PRIORS
-from visloc.sequence import SeenInstant, SequenceSolver
-from visloc.solving import Look, SeenImage
-from visloc.trajectory import Odometry, PoseSource, TimeUnit, TracedPose, fill_rig, interpolate_pose
+from visloc.sequences.filling import (
+    Odometry,
+    PoseSource,
+    TimeUnit,
+    TracedPose,
+    fill_rig,
+    interpolate_pose,
+)
+from visloc.sequences.solver import SeenInstant, SequenceSolver
 from visloc.types import InstantAnswer, LocalizeOptions
 
 Pixels = NDArray[np.uint8]

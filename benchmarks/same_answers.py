@@ -54,8 +54,9 @@ PLACES = {
     "kitti_curve": Place(
         "kitti_curve/mapping",
         "kitti_curve/query",
-        ("--method", "sfm"),
-        ("single", "rig", "seq", "rig+seq", "gp3p"),
+        build=("--method", "sfm"),
+        modes=("single", "rig", "seq", "rig+seq", "gp3p"),
+        batch=("--time-unit", "ms"),
     ),
     "gardenspoint": Place("gardenspoint/mapping", "gardenspoint/query", ("--method", "sfm")),
     "ie_tower": Place(

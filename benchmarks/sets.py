@@ -21,11 +21,11 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from mapping.sets import publish_set
-from service.engine import Engine
-from service.jobs import Localization, LocalizeJob
-from service.metrics import Metrics
-from service.worker import WorkerSettings
+from mapping.maps.sets import publish_set
+from service.engine.engine import Engine
+from service.telemetry.metrics import Metrics
+from service.values import Localization, LocalizeJob
+from service.workers.process import WorkerSettings
 from visloc.archive import MapStore
 from visloc.geometry import Similarity
 from visloc.images import ImageLimits

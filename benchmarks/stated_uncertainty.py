@@ -20,7 +20,7 @@ from visloc.archive import MapStore
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
-from visloc.localizer import Localizer
+from visloc.localization.localizer import Localizer
 from visloc.pose.centre import position_covariance
 from visloc.types import Localized, LocalizeOptions
 

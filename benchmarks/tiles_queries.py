@@ -16,7 +16,7 @@ import typer
 from numpy.typing import NDArray
 
 from visloc.archive import MapSet, open_set
-from visloc.features.whitening import unit_rows
+from visloc.features.descriptors.whitening import unit_rows
 from visloc.priors import PositionPrior, Priors
 from visloc.sets.choosing import MAX_SEARCHED, allowed_tiles, plan
 from visloc.sets.coarse import rank_tiles, ranked

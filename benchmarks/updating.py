@@ -25,8 +25,8 @@ import numpy as np
 import typer
 
 from benchmarks.map_methods import BINS, Stopwatch, measure
-from mapping.build import BuildSettings, build_map
-from mapping.updating import UpdateSettings, update_map
+from mapping.build.build import BuildSettings, build_map
+from mapping.maps.updating import UpdateSettings, update_map
 from visloc.archive import Map, open_map
 from visloc.errors import Conflict
 from visloc.evaluation import pose_error

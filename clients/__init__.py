@@ -1,9 +1,9 @@
 """Clients of the localization service: synchronous and asynchronous, over HTTP and gRPC."""
 
 from clients.client import AsyncClient, Client
-from clients.features import Features
-from clients.geopose import GeoPose, GeoPoseYpr
-from clients.rigs import (
+from clients.wire.features import Features
+from clients.wire.geopose import GeoPose, GeoPoseYpr
+from clients.wire.rigs import (
     ImageResult,
     Instant,
     InstantResult,
@@ -13,7 +13,7 @@ from clients.rigs import (
     RigPose,
     RigSensor,
 )
-from clients.types import (
+from clients.wire.types import (
     Anchor,
     CameraUsed,
     Debug,
@@ -34,7 +34,7 @@ from clients.types import (
     VersionInfo,
 )
 from visloc.priors import GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
-from visloc.trajectory import PoseSource
+from visloc.sequences.filling import PoseSource
 
 __all__ = [
     "Anchor",

@@ -1,5 +1,5 @@
 """``python -m clients`` is the ``localize`` command."""
 
-from clients.cli import main
+from clients.cli.main import main
 
 main()

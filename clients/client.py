@@ -20,13 +20,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
 
-from clients import answers
-from clients.connection import checked_connection
 from clients.errors import not_understood
-from clients.features import PhotoOrFeatures
-from clients.grpc import AsyncGrpcTransport, GrpcTransport
-from clients.http import AsyncHttpTransport, HttpTransport
-from clients.requests import (
+from clients.transport.connection import checked_connection
+from clients.transport.grpc import AsyncGrpcTransport, GrpcTransport
+from clients.transport.http import AsyncHttpTransport, HttpTransport
+from clients.transport.uploads import OnProgress, Upload, upload_request
+from clients.wire import answers
+from clients.wire.features import PhotoOrFeatures
+from clients.wire.requests import (
     CheckReady,
     DeleteVersion,
     GetServer,
@@ -40,7 +41,7 @@ from clients.requests import (
     get_map_request,
     localize_request,
 )
-from clients.rig_requests import (
+from clients.wire.rig_requests import (
     AnyRequest,
     SentInstant,
     SequenceStart,
@@ -49,9 +50,8 @@ from clients.rig_requests import (
     sent_instant,
     sequence_start,
 )
-from clients.rigs import Instant, InstantResult, Rig, RigImage
-from clients.types import LocalizeOptions, LocalizeResult, MapInfo, Near, ServerInfo
-from clients.uploads import OnProgress, Upload, upload_request
+from clients.wire.rigs import Instant, InstantResult, Rig, RigImage
+from clients.wire.types import LocalizeOptions, LocalizeResult, MapInfo, Near, ServerInfo
 from visloc.geometry import Camera
 from visloc.priors import Priors
 

@@ -17,7 +17,7 @@ from visloc import Camera
 from visloc.archive import MapStore
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.images import read_photo_file
-from visloc.localizer import Localizer
+from visloc.localization.localizer import Localizer
 from visloc.types import Localized, LocalizeOptions
 
 

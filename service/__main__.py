@@ -11,9 +11,9 @@ from multiprocessing import forkserver, get_context
 from typing import TYPE_CHECKING
 
 from service.descriptors import fit_connections
-from service.logs import configure_logging
-from service.memory import give_back_memory
 from service.settings import ServiceSettings, SettingsError, read_settings
+from service.telemetry.logs import configure_logging
+from service.telemetry.process_memory import give_back_memory
 
 if TYPE_CHECKING:
     from service.server import Server
@@ -44,7 +44,7 @@ def main() -> None:
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # damaged photos are answered, not logged
     # The fork server loads the same libraries as this process, at the same time.
     context = get_context("forkserver")
-    context.set_forkserver_preload(["service.fork_server"])
+    context.set_forkserver_preload(["service.workers.forkserver"])
     forkserver.ensure_running()
     try:
         asyncio.run(_serve(settings))

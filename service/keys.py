@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from service.key_file import (
+from service.security.key_file import (
     NAME_RULE,
     Key,
     Scope,

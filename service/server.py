@@ -12,21 +12,21 @@ from typing import Any
 import uvicorn
 from starlette.applications import Starlette
 
-from service.acceptor import Acceptor, OpenConnections
-from service.access import open_access
-from service.connections import Arrivals, http_protocol
 from service.descriptors import METRICS_CONNECTIONS
-from service.engine import Engine
-from service.grpc import GrpcServer
-from service.http import create_app
-from service.metrics import Metrics, ServiceState
-from service.metrics_http import metrics_app
-from service.observation import Observer
+from service.engine.engine import Engine
+from service.engine.stores import open_store
+from service.grpc.localization import GrpcServer
+from service.http.acceptor import Acceptor, OpenConnections
+from service.http.app import create_app
+from service.http.slow_clients import Arrivals, http_protocol
+from service.security.access import open_access
+from service.security.tls import TlsConfig, check_tls, tls_config
 from service.settings import ServiceSettings, SettingsError
-from service.stores import open_store
-from service.tls import TlsConfig, check_tls, tls_config
-from service.tracing import open_spans
-from service.worker import WorkerSettings
+from service.telemetry.metrics import Metrics, ServiceState
+from service.telemetry.metrics_port import metrics_app
+from service.telemetry.observer import Observer
+from service.telemetry.tracing import open_spans
+from service.workers.process import WorkerSettings
 from visloc.types import Inference
 
 # When it stops: so long a request may be on its way over a connection that is open already. It is

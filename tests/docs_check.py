@@ -129,7 +129,7 @@ class Rule:
 
 
 _HOURS = "minutes to hours over ../shared/data"
-_PLACES = "needs maps of several places; tests/mapping/test_sets.py"
+_PLACES = "needs maps of several places; tests/mapping/maps/test_sets.py"
 # The first that matches counts.
 RULES = (
     Rule(Tier.ELSEWHERE, r"", r"(TAG=\d+ )?docker ", "a Docker daemon; tests/test_deploy.py"),
@@ -140,7 +140,12 @@ RULES = (
     Rule(Tier.PARSED, r"", r"([A-Z]+=\S+ |[A-Z]+=\".*\" )?make ", "a target of its own"),
     Rule(Tier.PARSED, r"examples/plugin", r"", "needs it installed; tests/examples/test_plugin.py"),
     Rule(Tier.PARSED, r"map-sets", r"mapping (set|split)", _PLACES),
-    Rule(Tier.PARSED, r"mapping\.md", r".* --method model", "tests/mapping/test_known_model.py"),
+    Rule(
+        Tier.PARSED,
+        r"mapping\.md",
+        r".* --method model",
+        "tests/mapping/methods/test_known_model.py",
+    ),
     Rule(
         Tier.PARSED,
         r"mapping\.md",
@@ -241,13 +246,13 @@ def _parse_typer(app: typer.Typer, arguments: Sequence[str]) -> None:
 
 
 def _parse_mapping(arguments: Sequence[str]) -> None:
-    from mapping.cli import app
+    from mapping.cli.main import app
 
     _parse_typer(app, arguments)
 
 
 def _parse_localize(arguments: Sequence[str]) -> None:
-    from clients.cli import app
+    from clients.cli.main import app
 
     _parse_typer(app, arguments)
 

@@ -19,9 +19,9 @@ import pytest
 import yaml
 
 from benchmarks.reliability.service_process import free_port
-from service.metrics import Metrics, ServiceState
+from service.engine.uploads import MAX_UPLOADS
 from service.settings import ServiceSettings, read_settings
-from service.uploads import MAX_UPLOADS
+from service.telemetry.metrics import Metrics, ServiceState
 
 ROOT = Path(__file__).resolve().parents[1]
 KUBERNETES = ROOT / "deploy" / "kubernetes"

@@ -13,8 +13,8 @@ from training.checkpoint import State
 from training.files import write_tensors
 from training.network import ARCHITECTURES
 from visloc.errors import InvalidInput
-from visloc.features.convolution import fold_batch_norm
-from visloc.features.r2d2 import Convolution, FoldedNetwork, pack_folded
+from visloc.features.backends.convolution import fold_batch_norm
+from visloc.features.networks.r2d2.model import Convolution, FoldedNetwork, pack_folded
 
 LICENCE = "BSD-3-Clause"
 _LARGEST_HALF = 65504.0

@@ -1,6 +1,7 @@
 """The network while it learns: batch norms on their own, heads at full resolution.
 
-The table of layers is that of ``visloc.features.r2d2``; what is learned here folds into what is
+The table of layers is that of ``visloc.features.networks.r2d2.model``; what is learned here folds
+into what is
 loaded there (``training.export``).
 """
 
@@ -13,7 +14,14 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from training.interpolation import weighted_squares
-from visloc.features.r2d2 import DESCRIPTOR_DIM, FAST_R2D2, MEAN, R2D2, STD, Architecture
+from visloc.features.networks.r2d2.model import (
+    DESCRIPTOR_DIM,
+    FAST_R2D2,
+    MEAN,
+    R2D2,
+    STD,
+    Architecture,
+)
 
 ARCHITECTURES = {each.name: each for each in (R2D2, FAST_R2D2)}
 _BASE_WIDTH = 32

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from visloc.errors import InvalidInput, VislocError
 from visloc.geometry import Camera, Pose
-from visloc.trajectory import PoseSource
+from visloc.sequences.filling import PoseSource
 
 
 @dataclass(frozen=True, slots=True, eq=False)

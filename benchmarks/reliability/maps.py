@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mapping.build import BuildSettings, build_map
-from mapping.packing import write_packed
-from mapping.rgbd import DepthSettings
+from mapping.build.build import BuildSettings, build_map
+from mapping.maps.packing import write_packed
+from mapping.methods.rgbd import DepthSettings
 from mapping.sample import write_sample
 from visloc.archive import MapStore, verify_map
 from visloc.geometry import Camera, Pose

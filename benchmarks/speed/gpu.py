@@ -16,7 +16,7 @@ from visloc.archive import open_map
 from visloc.features import make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
-from visloc.localizer import Localizer
+from visloc.localization.localizer import Localizer
 from visloc.types import Inference, LocalizeOptions
 
 _SIZES = ((640, 480), (1024, 768), (1600, 1200))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from visloc.features.graph import import_openvino
+from visloc.features.backends.openvino import import_openvino
 
 # What each rate is of, in the order of the table.
 RATES: Mapping[str, str] = {

@@ -10,7 +10,7 @@ from typing import Any
 
 from benchmarks.speed.dataset import Bench, read_errors
 from benchmarks.speed.steps import say
-from mapping.export_features import export_features
+from mapping.maps.export_features import export_features
 from visloc.errors import Conflict
 from visloc.types import Inference
 

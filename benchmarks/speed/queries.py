@@ -16,7 +16,7 @@ from visloc.evaluation import pose_error
 from visloc.features import LocalFeatureExtractor, make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import Dataset, FileRecord, read_dataset
-from visloc.localizer import Localizer
+from visloc.localization.localizer import Localizer
 from visloc.types import Extraction, Inference, Localized, LocalizeOptions
 
 _ALL_KEYPOINTS = 10**6

@@ -13,12 +13,12 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 
-from mapping.costs import Progress
+from mapping.build.outputs import refuse_existing
+from mapping.build.stages import exclusive
+from mapping.cli.progress import one_step
+from mapping.cluster.stage_timings import Progress
 from mapping.importers.dataset import write_imported
 from mapping.importers.model import ImportedImage, ImportedModel
-from mapping.outputs import refuse_existing
-from mapping.progress import one_step
-from mapping.stages import exclusive
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput
 

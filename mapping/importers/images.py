@@ -17,7 +17,7 @@ from PIL import ExifTags, Image
 
 from mapping.importers.left_out import notes_on
 from mapping.importers.model import ImportedImage, ImportedModel
-from mapping.intrinsics import FROM_EXIF
+from mapping.methods.intrinsics import FROM_EXIF
 from visloc.errors import DatasetError, InvalidInput, NotFound, TooLarge
 from visloc.file_kinds import HEAD_BYTES, FileKind, file_kind
 from visloc.geometry import Camera

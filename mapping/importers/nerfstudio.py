@@ -15,12 +15,12 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.depth import DEFAULT_DEPTH_SCALE
 from mapping.importers.dataset import depth_sensor_id
 from mapping.importers.json_fields import JsonValue, read_json
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.photo_names import photo_names, photo_size
 from mapping.importers.tracks import rotation_from_matrix
+from mapping.methods.depth import DEFAULT_DEPTH_SCALE
 from visloc.errors import DatasetError, InvalidInput
 from visloc.geometry import MAX_IMAGE_SIDE, Camera, Pose
 from visloc.kapture import Sensor

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mapping.anchor import scale_doubt
+from mapping.frames.anchor import scale_doubt
 from mapping.importers.json_fields import JsonValue, read_json
 from mapping.importers.largest import ModelSize, largest_model
 from mapping.importers.model import ImportedImage, ImportedModel
@@ -55,7 +55,7 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
 
     Features are taken from ``features/NAME.features.npz`` if all photos have them; else the
     observations in ``tracks.csv`` become the keypoints. Photos' GPS positions become GNSS fixes,
-    and the world counts as metric when they tell its scale (``mapping.anchor.scale_doubt``).
+    and the world counts as metric when they tell its scale (``mapping.frames.anchor.scale_doubt``).
 
     Args:
         path: the dataset's folder, or its ``reconstruction.json``.

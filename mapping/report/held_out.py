@@ -16,20 +16,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.build.stages import Item, WorkFolder, key_of
+from mapping.cluster.workers import Workers
+from mapping.maps.stored_queries import match_stored, solve_stored
 from mapping.report.viewpoints import Viewpoints
-from mapping.stages import Item, WorkFolder, key_of
-from mapping.stored_queries import match_stored, solve_stored
-from mapping.workers import Workers
 from visloc import __version__
 from visloc.archive import Map, open_map
-from visloc.constraints import MapGeometry
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose
+from visloc.localization.constraints import MapGeometry
+from visloc.localization.solving import registration_for
 from visloc.matching.correspondences import Correspondences
 from visloc.pose.reprojection import reprojection_errors
 from visloc.pose.views import MatchedView
 from visloc.retrieval.index import retrieve
-from visloc.solving import registration_for
 from visloc.types import LocalizeOptions
 
 _REVISION = 1
@@ -185,7 +185,7 @@ def too_seldom_seen(opened: Map, seen: NDArray[np.integer]) -> NDArray[np.int64]
 def _match(
     opened: Map, image: int, left_out: NDArray[np.int64], options: LocalizeOptions
 ) -> Correspondences:
-    """What a photo's features show of a map without some photos, as ``visloc.localizer`` does."""
+    """Match a photo's features with a map without some of its photos, as the localizer does."""
     remaining = np.ones(len(opened.images))
     remaining[left_out] = 0.0
     rows = opened.global_descriptors

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from visloc.archive import Map
-from visloc.constraints import MapGeometry
 from visloc.geometry import Pose
+from visloc.localization.constraints import MapGeometry
 
 _LEAST_REACH = 1e-9  # of a map whose photos see nothing
 

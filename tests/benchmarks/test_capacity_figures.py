@@ -10,8 +10,8 @@ import pytest
 from rich.console import Console
 
 from benchmarks.capacity import Capacity, City, Costs, Machine, capacity, cell, stage_costs
-from mapping.costs import Spent, StageCost
-from mapping.display import print_costs
+from mapping.cli.display import print_costs
+from mapping.cluster.stage_timings import Spent, StageCost
 
 COSTS = Costs(
     build_core_s={"local_features": 1.5, "matching": 0.5},

@@ -13,8 +13,8 @@ import grpc
 import pytest
 
 from clients import AsyncClient, Client, Instant, RigImage
-from clients.cli import main
-from clients.connection import Connection
+from clients.cli.main import main
+from clients.transport.connection import Connection
 from visloc.errors import (
     Forbidden,
     InvalidInput,

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from clients import AsyncClient, Client, Features, LocalizeOptions
-from clients.features import ARRAY_DTYPES
-from service import schemas
+from clients.wire.features import ARRAY_DTYPES
+from service import api as schemas
 from visloc.errors import InvalidInput, NotFound, Overloaded, TooLarge, Unavailable, VislocError
 from visloc.geometry import Camera
 

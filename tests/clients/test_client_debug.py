@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from clients import AsyncClient, Client
-from clients.cli import main
+from clients.cli.main import main
 from visloc.errors import Unavailable
 
 

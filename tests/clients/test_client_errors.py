@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from clients import AsyncClient, Client
-from clients.answers import parse_answer, parse_result
+from clients.wire.answers import parse_answer, parse_result
 from visloc.errors import Conflict, InvalidInput, NotFound, Overloaded, TooLarge, Unavailable
 
 Serve = Callable[..., str]

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from clients import AsyncClient, Client, Instant, Odometry, PoseSource, RigImage, RigSensor
-from clients.cli import main
+from clients.cli.main import main
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapping.build import BuildSettings, build_map
-from mapping.sfm import SfmSettings
+from mapping.build.build import BuildSettings, build_map
+from mapping.methods.sfm import SfmSettings
 from visloc.archive import open_map
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
-from visloc.localizer import Localizer
+from visloc.localization.localizer import Localizer
 from visloc.types import Answer, Localized, LocalizeOptions
 
 

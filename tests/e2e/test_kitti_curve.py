@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapping.build import BuildSettings, build_map
+from mapping.build.build import BuildSettings, build_map
 from visloc.archive import open_map
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.geometry import Pose
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
-from visloc.localizer import Localizer
-from visloc.solving import SeenImage
+from visloc.localization.localizer import Localizer
+from visloc.localization.solving import SeenImage
 from visloc.types import LocalizeOptions
 
 pytestmark = pytest.mark.slow  # building and looking take minutes

@@ -319,7 +319,7 @@ def test_a_version_published_while_it_runs_is_served_and_sigterm_ends_it_with_0(
 
             built = subprocess.run(
                 [
-                    *(sys.executable, "-m", "mapping.cli", "build", str(sample / "mapping")),
+                    *(sys.executable, "-m", "mapping.cli.main", "build", str(sample / "mapping")),
                     *("--map=room", f"--maps-dir={maps_dir}", "--local-features=sift"),
                     *("--voxel-size=0.02", "--force"),
                 ],

@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from mapping.report.command import write_report
+from mapping.cli.report import write_report
 from visloc.archive import MapStore
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapping.build import BuildSettings, build_map
+from mapping.build.build import BuildSettings, build_map
 from visloc.archive import open_map
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
 from visloc.images import Photo, read_photo_file
 from visloc.kapture import Dataset, read_dataset
-from visloc.localizer import Localizer
+from visloc.localization.localizer import Localizer
 from visloc.types import Localized, LocalizeOptions, NotLocalized
 
 OPTIONS = LocalizeOptions()

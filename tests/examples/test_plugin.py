@@ -16,9 +16,9 @@ PLUGIN = Path(__file__).parents[2] / "examples" / "plugin"
 LOCALIZE = """
 import ctypes, sys
 from pathlib import Path
-from service.jobs import LocalizeJob
-from service.vision import Vision
-from service.worker import MapFolder, WorkerSettings
+from service.values import LocalizeJob
+from service.workers.vision import Vision
+from service.workers.process import MapFolder, WorkerSettings
 from visloc.archive import MapStore
 from visloc.kapture import read_dataset
 from visloc.types import LocalizeOptions
@@ -64,7 +64,7 @@ def test_a_map_of_an_installed_plugin_is_built_and_localized_in(
     write_sample(sample, images=12, size=(320, 240))
     features = "--local-features example-orb --global-features example-thumbnail"
     build = f"build {sample}/mapping --map room --maps-dir {maps_dir} {features} --workers 2"
-    built = python(installed, "-m", "mapping.cli", *build.split())
+    built = python(installed, "-m", "mapping.cli.main", *build.split())
     assert built.returncode == 0, built.stderr
 
     localized = python(installed, "-c", LOCALIZE, str(maps_dir), str(sample / "query"))
@@ -76,7 +76,7 @@ def test_a_map_of_an_installed_plugin_is_built_and_localized_in(
     exported = tmp_path / "exported"
     export = f"export-features {sample}/query --output {exported} --map room --maps-dir {maps_dir}"
     done = python(
-        installed, "-m", "mapping.cli", *export.split(), "--local-features", "example-orb"
+        installed, "-m", "mapping.cli.main", *export.split(), "--local-features", "example-orb"
     )
     assert done.returncode == 0, done.stderr
     kinds = exported / "reconstruction"
@@ -85,6 +85,6 @@ def test_a_map_of_an_installed_plugin_is_built_and_localized_in(
 
 
 def test_names_of_installed_plugins_are_offered(installed: Path) -> None:
-    said = python(installed, "-m", "mapping.cli", "build", "--help").stdout
+    said = python(installed, "-m", "mapping.cli.main", "build", "--help").stdout
     assert "example-orb" in said
     assert "example-thumbnail" in said

@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from service.grpc_requests import localize_job_of, rig_job_of
-from service.jobs import LocalizeJob, RigJob
-from service.schemas import BatchLimits, LocalizeRequest, LocalizeRigRequest
+from service.api import BatchLimits, LocalizeRequest, LocalizeRigRequest
+from service.grpc.messages import localize_job_of, rig_job_of
+from service.values import LocalizeJob, RigJob
 from tests.fuzz.target import holds, refusal
 from tests.fuzz.tiny_map import GLOBAL_DIM, LOCAL_DIM, write_tiny_map
 from visloc.archive import open_map
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera
-from visloc.query_features import checked_global_descriptors, checked_local_features
+from visloc.localization.query_features import checked_global_descriptors, checked_local_features
 from visloc.types import QueryFeatures
 from visloc_api.v1 import localization_pb2 as pb2
 

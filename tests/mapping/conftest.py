@@ -16,7 +16,7 @@ from moto.server import ThreadedMotoServer
 from numpy.typing import NDArray
 from s3fs import S3FileSystem
 
-from mapping.build import BuildSettings, build_map
+from mapping.build.build import BuildSettings, build_map
 from mapping.sample import write_sample
 from visloc.archive import Map, MapStore
 from visloc.evaluation import pose_error
@@ -24,7 +24,7 @@ from visloc.features import make_local_features
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset, write_dataset
-from visloc.localizer import Localizer
+from visloc.localization.localizer import Localizer
 from visloc.types import Localized, LocalizeOptions
 
 

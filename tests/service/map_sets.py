@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from clients import Instant, RigImage
-from mapping.build import BuildSettings, build_map
+from mapping.build.build import BuildSettings, build_map
+from mapping.maps.sets import publish_set
 from mapping.sample import write_sample
-from mapping.sets import publish_set
 from visloc.archive import MapStore
 from visloc.geometry import Similarity
 from visloc.kapture import read_dataset

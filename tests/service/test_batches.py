@@ -17,7 +17,7 @@ from google.protobuf.json_format import MessageToDict, ParseDict
 from google.rpc.error_details_pb2 import ErrorInfo
 from grpc_status import rpc_status
 
-from service.request_bodies import EXAMPLE_RIG_REQUEST, EXAMPLE_SEQUENCE_REQUEST
+from service.http.openapi.request_bodies import EXAMPLE_RIG_REQUEST, EXAMPLE_SEQUENCE_REQUEST
 from visloc.geometry import Camera, Pose, rotation_angle
 from visloc.kapture import Dataset, read_dataset
 from visloc_api.v1 import localization_pb2 as pb2

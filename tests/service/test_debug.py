@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.grpc_envelope import message_of
-from service.jobs import Localization, MatchPicture
-from service.schemas import LocalizeRequest, LocalizeResponse
+from service.api import LocalizeRequest, LocalizeResponse
+from service.grpc.envelope import message_of
+from service.values import Localization, MatchPicture
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera
 from visloc.types import CameraSource, Evidence, NotLocalized, ReadAs, Reason

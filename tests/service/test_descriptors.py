@@ -9,7 +9,7 @@ import pytest
 PROGRAM = """
 import resource, sys
 from service.descriptors import fit_connections
-from service.logs import configure_logging
+from service.telemetry.logs import configure_logging
 from service.settings import ServiceSettings, SettingsError
 settings = ServiceSettings(max_connections=1000)
 configure_logging(settings)

@@ -18,11 +18,11 @@ from google.rpc.error_details_pb2 import ErrorInfo
 from grpc_status import rpc_status
 from numpy.typing import NDArray
 
-from service.request_bodies import EXAMPLE_FEATURES_REQUEST
-from service.schemas import Array, LocalizeRequest
+from service.api import Array, LocalizeRequest
+from service.http.openapi.request_bodies import EXAMPLE_FEATURES_REQUEST
 from visloc.archive import Map, MapStore
 from visloc.features import make_global_descriptor, make_local_features
-from visloc.features.readymade import MAX_READY_MADE_KEYPOINTS
+from visloc.features.local.readymade import MAX_READY_MADE_KEYPOINTS
 from visloc.geometry import Camera, Pose, rotation_angle
 from visloc.images import read_photo
 from visloc.types import QueryFeatures

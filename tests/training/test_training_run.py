@@ -21,7 +21,7 @@ from training.run import LOG_NAME, Trainer, learning_rate, resume, train
 from training.settings import PRESETS, Settings
 from training.validation import features_of, validate, validation_pairs
 from visloc.errors import InvalidInput
-from visloc.features.r2d2 import R2D2Extractor, load_faster2d2
+from visloc.features.networks.r2d2.model import R2D2Extractor, load_faster2d2
 from visloc.images import read_photo_file
 from visloc.synthetic.papers import art_poster
 from visloc.types import Inference

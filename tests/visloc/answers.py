@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from visloc.geometry import Camera, Pose
 from visloc.pose.centre import position_covariance
-from visloc.trajectory import PoseSource
+from visloc.sequences.filling import PoseSource
 from visloc.types import (
     CameraSource,
     Evidence,

@@ -12,9 +12,9 @@ import pytest
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from visloc.constraints import MapGeometry
     from visloc.geometry import Camera, Pose
-    from visloc.solving import Matches, SeenImage
+    from visloc.localization.constraints import MapGeometry
+    from visloc.localization.solving import Matches, SeenImage
 
 DOWN = np.array([0.0, 0.0, -1.0])
 
@@ -42,7 +42,7 @@ class Place:
 
     def geometry_of(self, centers: Any) -> MapGeometry:
         """That of a map with photos at these centres, relative to the origin."""
-        from visloc.constraints import MapGeometry
+        from visloc.localization.constraints import MapGeometry
 
         local = np.asarray(centers, dtype=np.float64).reshape(-1, 3)
         identity = np.tile([1.0, 0.0, 0.0, 0.0], (len(local), 1))
@@ -66,8 +66,8 @@ class Place:
         self, cam_from_local: Pose, right: int, wrong: int = 0, *, seed: int = 0, noise: float = 0.5
     ) -> Matches:
         """Correspondences of one image, the right ones first."""
+        from visloc.localization.solving import Matches
         from visloc.pose.colmap import normalized_rays
-        from visloc.solving import Matches
 
         rng = np.random.default_rng(seed)
         pixels = rng.uniform([5, 5], [635, 475], (right + wrong, 2))
@@ -88,7 +88,7 @@ class Place:
         """An image with these correspondences; None: one that could not be read."""
         from visloc.errors import InvalidInput
         from visloc.geometry import Pose
-        from visloc.solving import Look, Matches, SeenImage
+        from visloc.localization.solving import Look, Matches, SeenImage
         from visloc.types import CameraSource, Evidence, ReadAs
 
         sits = Pose.identity() if cam_from_rig is None else cam_from_rig

@@ -13,7 +13,7 @@ from typing import cast
 
 from visloc.errors import InvalidInput
 from visloc.features.base import Fingerprint, GlobalDescriptor, LocalFeatureExtractor
-from visloc.features.image_descriptor import ImageDescriptor
+from visloc.features.descriptors.image_descriptor import ImageDescriptor
 from visloc.features.plugins import (
     GLOBAL_FEATURES_GROUP,
     LOCAL_FEATURES_GROUP,
@@ -41,21 +41,21 @@ __all__ = [
 # name -> module and function, which takes the folder with weights or None, how networks are
 # computed, and with how many threads.
 LOCAL_FEATURES: Mapping[str, tuple[str, str]] = {
-    "aliked": ("visloc.features.aliked", "load_aliked"),
-    "aliked-t16": ("visloc.features.aliked", "load_aliked_t16"),
-    "faster2d2": ("visloc.features.r2d2", "load_faster2d2"),
-    "r2d2": ("visloc.features.r2d2", "load_r2d2"),
-    "sift": ("visloc.features.sift", "load_sift"),
-    "xfeat": ("visloc.features.xfeat", "load_xfeat"),
+    "aliked": ("visloc.features.networks.aliked.model", "load_aliked"),
+    "aliked-t16": ("visloc.features.networks.aliked.model", "load_aliked_t16"),
+    "faster2d2": ("visloc.features.networks.r2d2.model", "load_faster2d2"),
+    "r2d2": ("visloc.features.networks.r2d2.model", "load_r2d2"),
+    "sift": ("visloc.features.local.sift", "load_sift"),
+    "xfeat": ("visloc.features.networks.xfeat.model", "load_xfeat"),
 }
 GLOBAL_FEATURES: Mapping[str, tuple[str, str]] = {
-    "apgem": ("visloc.features.apgem", "load_apgem"),
-    "convvlad": ("visloc.features.convvlad", "load_convvlad"),
-    "delg": ("visloc.features.delg", "load_delg"),
-    "densevlad": ("visloc.features.densevlad", "load_densevlad"),
-    "gem": ("visloc.features.gem", "load_gem"),
-    "localvlad": ("visloc.features.localvlad", "load_localvlad"),
-    "netvlad": ("visloc.features.netvlad", "load_netvlad"),
+    "apgem": ("visloc.features.descriptors.apgem", "load_apgem"),
+    "convvlad": ("visloc.features.descriptors.convvlad", "load_convvlad"),
+    "delg": ("visloc.features.descriptors.delg", "load_delg"),
+    "densevlad": ("visloc.features.descriptors.densevlad", "load_densevlad"),
+    "gem": ("visloc.features.descriptors.gem", "load_gem"),
+    "localvlad": ("visloc.features.descriptors.localvlad", "load_localvlad"),
+    "netvlad": ("visloc.features.descriptors.netvlad", "load_netvlad"),
 }
 # XFeat is free for any use and fast; R2D2's published weights are for research only.
 DEFAULT_LOCAL_FEATURES = "xfeat"

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from visloc.geometry import Pose
-from visloc.trajectory import center_covariance
+from visloc.sequences.filling import center_covariance
 
 # Poses of different photos disagree by this much for reasons that no covariance tells.
 _MAP_STD_RAD, _MAP_STD = math.radians(0.1), 0.01

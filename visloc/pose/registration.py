@@ -24,7 +24,7 @@ def register(
     P3P in LO-RANSAC, confidence 0.99999, 100 to 10 000 trials, then a Cauchy loss of 1 px over the
     inliers that RANSAC found, which stay what they are. The camera is taken as it is, as with
     ba_refine_focal_length = 0 of table 2 in Humenberger et al. 2020, so that a guess must not come
-    here (``visloc.solving`` refuses it). COLMAP also ends the search
+    here (``visloc.localization.solving`` refuses it). COLMAP also ends the search
     once a pose of the least share of inliers had been found; the gate refuses those anyway.
 
     Args:

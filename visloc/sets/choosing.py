@@ -12,7 +12,7 @@ from visloc.archive import SetOutline
 from visloc.archive.places import circles_of
 from visloc.errors import InvalidInput, NotFound
 from visloc.geodesy import ground_distances
-from visloc.judge import inliers_of, measured_pose
+from visloc.localization.judge import inliers_of, measured_pose
 from visloc.pose.centre import largest_std
 from visloc.priors import HEIGHT_REACH, POSE_PRIOR_STDS, REACH, Priors
 from visloc.sets.frame import down_in_set
@@ -69,7 +69,8 @@ def allowed_tiles(
 
     A tile is allowed when a photo of it may show what the device sees. As in one map, photos
     count that were taken within twice the distance that they see of a sphere, or within a quarter
-    of its height of a band (``visloc.constraints``). Of a tile, the box of its photos' centres is
+    of its height of a band (``visloc.localization.constraints``). Of a tile, the box of its photos'
+    centres is
     looked at.
 
     Args:

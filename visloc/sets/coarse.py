@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from visloc.archive import CoarseIndex, FingerprintRecord, Map, MapSet
 from visloc.errors import MapCorrupt
 from visloc.features import GlobalDescriptor, make_global_descriptor
-from visloc.features.vlad import KMEANS_MAX_WORDS, learn_words
-from visloc.features.whitening import WHITENING_MAX_PHOTOS, unit_rows
-from visloc.fingerprints import check_fingerprint
+from visloc.features.descriptors.vlad import KMEANS_MAX_WORDS, learn_words
+from visloc.features.descriptors.whitening import WHITENING_MAX_PHOTOS, unit_rows
+from visloc.localization.fingerprints import check_fingerprint
 from visloc.retrieval.rows import GlobalRows, in_8_bits
 from visloc.sets.choosing import TileScore
 from visloc.types import LocalFeatures

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from visloc.archive import SetOutline
 from visloc.geometry import Pose, rotation_angle
-from visloc.judge import STDS, TIE_ANGLE, TIE_REACH_SHARE
+from visloc.localization.judge import STDS, TIE_ANGLE, TIE_REACH_SHARE
 from visloc.pose.centre import largest_std
 from visloc.pose.motion import default_motion_covariance
 from visloc.priors import PositionPrior
-from visloc.trajectory import Odometry
+from visloc.sequences.filling import Odometry
 
 # What no device exceeds of which no motion is known: a car on a country road.
 _FASTEST = 30.0  # m/s

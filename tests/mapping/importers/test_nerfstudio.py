@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mapping.depth import DepthMatcher, photo_depth, read_depth
 from mapping.importers import import_dataset
 from mapping.importers.nerfstudio import read
+from mapping.methods.depth import DepthMatcher, photo_depth, read_depth
 from visloc.errors import DatasetError, VislocError
 from visloc.geometry import Camera
 from visloc.kapture import read_dataset

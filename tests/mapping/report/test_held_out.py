@@ -5,6 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
+from mapping.build.stages import WorkFolder
+from mapping.cluster.workers import Workers
 from mapping.report import held_out
 from mapping.report.held_out import (
     chosen_photos,
@@ -14,8 +16,6 @@ from mapping.report.held_out import (
     vanishing,
 )
 from mapping.report.viewpoints import Viewpoints
-from mapping.stages import WorkFolder
-from mapping.workers import Workers
 from visloc.types import LocalizeOptions
 
 

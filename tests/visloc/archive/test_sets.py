@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mapping.sets import publish_set
+from mapping.maps.sets import publish_set
 from visloc.archive import (
     MapSet,
     MapStore,

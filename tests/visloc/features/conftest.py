@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from visloc.errors import InvalidInput
-from visloc.features.inference import choose_inference
+from visloc.features.backends.choice import choose_inference
 from visloc.types import Inference
 
 

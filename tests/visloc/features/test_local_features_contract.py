@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from visloc.features.aliked import load_aliked, load_aliked_t16
 from visloc.features.base import LocalFeatureExtractor
-from visloc.features.r2d2 import load_faster2d2, load_r2d2
-from visloc.features.sift import load_sift
-from visloc.features.xfeat import load_xfeat
+from visloc.features.local.sift import load_sift
+from visloc.features.networks.aliked.model import load_aliked, load_aliked_t16
+from visloc.features.networks.r2d2.model import load_faster2d2, load_r2d2
+from visloc.features.networks.xfeat.model import load_xfeat
 from visloc.types import LocalFeatures
 
 LOADERS = {

@@ -13,7 +13,7 @@ from visloc.features import (
     make_global_descriptor,
     make_local_features,
 )
-from visloc.features.sift import SiftExtractor
+from visloc.features.local.sift import SiftExtractor
 from visloc.types import Inference
 
 Install = Callable[..., None]

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
 from visloc.geometry import CAMERA_MODELS, Camera, Pose
+from visloc.localization.solving import SeenImage, Solved, solve_instant
 from visloc.pose.colmap import normalized_rays
 from visloc.pose.generalized import (
     SOLVERS,
@@ -20,8 +21,7 @@ from visloc.pose.generalized import (
 )
 from visloc.pose.views import MatchedView
 from visloc.priors import GravityPrior, Priors
-from visloc.solving import SeenImage, Solved, solve_instant
-from visloc.trajectory import center_covariance
+from visloc.sequences.filling import center_covariance
 from visloc.types import CameraSource, LocalizeOptions, Reason, Solver
 
 CAMERA = Camera("PINHOLE", 640, 480, (500.0, 510.0, 322.0, 239.0))
@@ -447,7 +447,7 @@ def test_gravity_that_took_no_part_is_not_searched_without_again(
         calls.append(options)
         return estimate_generalized_pose(*arguments, **options)
 
-    monkeypatch.setattr("visloc.solving.estimate_generalized_pose", counted)
+    monkeypatch.setattr("visloc.localization.solving.estimate_generalized_pose", counted)
     image = hall.image(hall.matches(POSE, 150, 400, seed=7))
     priors = Priors(gravity=GravityPrior(POSE.rotation @ hall.down, np.radians(2.0)))
     for source, expected in ((CameraSource.GIVEN, 2), (CameraSource.GUESS, 1)):

@@ -8,14 +8,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from visloc.constraints import Constraints
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose, Similarity
+from visloc.localization.constraints import Constraints
 from visloc.pose.centre import moved_pose, position_covariance
 from visloc.pose.distance import mahalanobis2
 from visloc.priors import NO_PRIORS, GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
+from visloc.sequences.filling import PoseSource
 from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
-from visloc.trajectory import PoseSource
 from visloc.types import (
     CameraSource,
     Evidence,

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from visloc.archive import SetOutline
 from visloc.geometry import Pose
+from visloc.sequences.filling import Odometry
 from visloc.sets.handover import Track
-from visloc.trajectory import Odometry
 
 SURE = np.diag([1e-6] * 3 + [1e-4] * 3)
 REACH = 2.0  # tiles are tied to 0.2 of it

@@ -1,0 +1,176 @@
+"""The commands ``localize maps``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+    TransferSpeedColumn,
+)
+
+from clients.cli.connection_options import (
+    DEFAULT_SERVER,
+    ApiKeyFile,
+    Ca,
+    Server,
+    TimeoutS,
+    api_key_of,
+)
+from clients.cli.display import print_line
+from clients.cli.maps_display import print_map, print_maps
+from clients.cli.progress import EXIT_STOPPED
+from clients.client import DEFAULT_TIMEOUT_S, Client
+from clients.wire.requests import checked_version
+from clients.wire.types import Near
+from visloc.errors import InvalidInput, VislocError
+
+maps_app = typer.Typer(
+    help="See, publish, switch and remove the maps of a localization service.",
+    no_args_is_help=True,
+)
+_out = Console()
+_err = Console(stderr=True)
+
+Version = Annotated[str, typer.Argument(metavar="ID@VERSION", help="The map and its version.")]
+
+
+@maps_app.command("list")
+def list_maps(
+    near: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LAT,LON,RADIUS",
+            help="Only maps that are anchored to the Earth and reach into this circle: degrees "
+            "and metres, WGS84.",
+        ),
+    ] = None,
+    server: Server = DEFAULT_SERVER,
+    api_key_file: ApiKeyFile = None,
+    ca: Ca = None,
+    timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
+) -> None:
+    """List the maps, each in the version that is in use."""
+    circle = None if near is None else _near(near)
+    with Client(server, api_key=api_key_of(api_key_file), ca=ca, timeout_s=timeout_s) as client:
+        print_maps(_out, client.maps(circle))
+
+
+@maps_app.command()
+def show(
+    map_ref: Annotated[str, typer.Argument(metavar="ID", help="id, or id@version.")],
+    server: Server = DEFAULT_SERVER,
+    api_key_file: ApiKeyFile = None,
+    ca: Ca = None,
+    timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
+) -> None:
+    """Describe a map: features, extent, place on Earth, versions."""
+    with Client(server, api_key=api_key_of(api_key_file), ca=ca, timeout_s=timeout_s) as client:
+        print_map(_out, client.map(map_ref))
+
+
+@maps_app.command()
+def push(
+    packed: Annotated[Path, typer.Argument(metavar="FILE", help="A map as mapping pack wrote it.")],
+    server: Server = DEFAULT_SERVER,
+    api_key_file: ApiKeyFile = None,
+    ca: Ca = None,
+    timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
+) -> None:
+    """Publish a version of a map, under the names that it was built with.
+
+    It is verified byte by byte before anyone can see it, and is not in use until localize maps
+    use names it. When this is stopped, nothing is published.
+    """
+    with (
+        Client(server, api_key=api_key_of(api_key_file), ca=ca, timeout_s=timeout_s) as client,
+        _bar() as progress,
+    ):
+        try:
+            total = packed.stat().st_size if packed.is_file() else None
+            task = progress.add_task("sent", total=total)
+            info = client.upload_map(packed, on_progress=lambda sent: progress.advance(task, sent))
+        except KeyboardInterrupt:
+            progress.stop()
+            _err.print("stopped; nothing was published", highlight=False)
+            raise typer.Exit(EXIT_STOPPED) from None
+        except VislocError:
+            progress.stop()
+            raise
+    print_map(_out, info)
+    if not info.current:
+        print_line(_out, "next", f"localize maps use {info.ref}")
+
+
+@maps_app.command()
+def use(
+    version: Version,
+    server: Server = DEFAULT_SERVER,
+    api_key_file: ApiKeyFile = None,
+    ca: Ca = None,
+    timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
+) -> None:
+    """Put a version into use, a newer or an older one, without dropping a request.
+
+    Done when the service answers with it.
+    """
+    with Client(server, api_key=api_key_of(api_key_file), ca=ca, timeout_s=timeout_s) as client:
+        info = client.use_version(*_names(version))
+    print_line(_out, "in use", info.ref, "bold green")
+
+
+@maps_app.command()
+def remove(
+    version: Version,
+    server: Server = DEFAULT_SERVER,
+    api_key_file: ApiKeyFile = None,
+    ca: Ca = None,
+    timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
+) -> None:
+    """Delete a version that is not in use, or the last one of a map."""
+    map_id, name = _names(version)
+    with Client(server, api_key=api_key_of(api_key_file), ca=ca, timeout_s=timeout_s) as client:
+        client.delete_version(map_id, name)
+    print_line(_out, "removed", f"{map_id}@{name}")
+
+
+def _bar() -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=_err,
+    )
+
+
+def _names(version: str) -> tuple[str, str]:
+    map_id, at, name = version.partition("@")
+    if not at:
+        raise InvalidInput(
+            "map.id", "not a version of a map", field="map", expected="ID@VERSION", got=version
+        )
+    return checked_version(map_id, name)
+
+
+def _near(text: str) -> Near:
+    try:
+        latitude, longitude, radius = (float(number) for number in text.split(","))
+    except ValueError:
+        raise InvalidInput(
+            "near.syntax",  # as the server says it
+            "not a place",
+            field="near",
+            expected="latitude,longitude,radius in degrees and metres, such as 48.27,2.7,100",
+            got=text,
+        ) from None
+    return Near(latitude, longitude, radius)

@@ -1,0 +1,1 @@
+"""Many queries: batches, benchmarks, comparisons."""

@@ -1,0 +1,241 @@
+"""How accurate and how fast a server answers the queries of a dataset."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from clients.evaluation.filling import estimate_of, measured
+from clients.evaluation.modes import Mode
+from clients.evaluation.queries import Query
+from clients.evaluation.running import InstantOutcome, Outcome
+from clients.wire.types import MapInfo, ServerInfo
+from visloc.errors import InvalidInput
+from visloc.evaluation import (
+    Threshold,
+    median_errors_localized,
+    percentile,
+    pose_error,
+    recall,
+)
+from visloc.sequences.filling import PoseSource, TracedPose
+
+_ERROR_PERCENTILES = {"p50": 50, "p75": 75, "p90": 90, "max": 100}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """What was asked of the server, and how long it took.
+
+    Attributes:
+        outcomes: of all photos, in the order of the dataset.
+        latencies_s: of each answer, as the client saw it.
+        stage_seconds: of each answer, as the server says.
+        wall_s: from the first request to the last answer.
+        instants: what was asked about, when it was not single photos.
+    """
+
+    outcomes: tuple[Outcome, ...]
+    latencies_s: tuple[float, ...]
+    stage_seconds: tuple[Mapping[str, float], ...]
+    wall_s: float
+    instants: tuple[InstantOutcome, ...] | None = None
+
+    @staticmethod
+    def of_photos(outcomes: Sequence[Outcome], wall_s: float) -> Run:
+        """Make a run in which photos were asked about one by one."""
+        answered = [o for o in outcomes if o.result is not None]
+        return Run(
+            tuple(outcomes),
+            tuple(outcome.seconds for outcome in answered),
+            tuple(outcome.result.seconds for outcome in answered if outcome.result is not None),
+            wall_s,
+        )
+
+    @staticmethod
+    def of_instants(
+        instants: Sequence[InstantOutcome], photos: Sequence[Query], wall_s: float
+    ) -> Run:
+        """Make a run in which the photos of an instant were asked about together."""
+        by_name = {o.query.name: o for instant in instants for o in instant.photos}
+        answered = [instant for instant in instants if instant.has_answer]
+        stages = []
+        for instant in answered:
+            results = [o.result for o in instant.photos if o.result is not None]
+            stages += [result.seconds for result in results[:1]]  # the same of all its photos
+        return Run(
+            tuple(by_name[query.name] for query in photos),
+            tuple(instant.seconds for instant in answered),
+            tuple(stages),
+            wall_s,
+            tuple(instants),
+        )
+
+
+def parse_threshold(text: str) -> Threshold:
+    """Parse ``METRES/DEGREES`` such as ``0.25/2``.
+
+    Raises:
+        InvalidInput: ``evaluation.threshold``.
+    """
+    try:
+        position_m, orientation_deg = (float(part) for part in text.split("/"))
+        if math.isfinite(position_m) and math.isfinite(orientation_deg):
+            return Threshold(position_m, orientation_deg)
+    except (ValueError, InvalidInput):
+        pass
+    raise InvalidInput(
+        "evaluation.threshold",
+        "not a threshold",
+        field="threshold",
+        expected="METRES/DEGREES, neither negative, such as 0.25/2",
+        got=text,
+    )
+
+
+def make_report(
+    runs: Mapping[Mode, Run],
+    poses: Mapping[Mode, Sequence[TracedPose | None]],
+    thresholds: Sequence[Threshold],
+    server: ServerInfo,
+    map_info: MapInfo,
+) -> dict[str, Any]:
+    """Summarize a run as plain JSON; null where nothing can be said.
+
+    Recall is over all photos with a known pose, localized or not; the medians and percentiles are
+    over those that have a pose, localized or filled. Latencies are those of answers as the client
+    saw them. The seconds of a stage are the mean over the answers that reached it.
+
+    Args:
+        runs: by mode, in the order of the table; the first is described at the top as well.
+        poses: of all photos, filled as the mode does.
+        thresholds: of the recall.
+        server: that answered.
+        map_info: the map that was asked for.
+    """
+    modes = {mode.value: figures_of(run, poses[mode], thresholds) for mode, run in runs.items()}
+    first = next(iter(modes.values()))
+    return {
+        **{name: first[name] for name in _FIGURES_OF_THE_FIRST},
+        "server": {
+            "version": server.version,
+            "map": map_info.ref,
+            "features": {
+                "local": map_info.local_features,
+                "global": list(map_info.global_features),
+            },
+        },
+        "modes": modes,
+    }
+
+
+_FIGURES_OF_THE_FIRST = (
+    *("queries", "localized", "median_position_error_m", "median_orientation_error_deg"),
+    *("recall", "latency_s", "throughput_qps", "stage_seconds"),
+)
+
+
+def known_poses(run: Run) -> list[TracedPose | None]:
+    """Return what the answers themselves tell: measured poses, and those filled from a rig's."""
+    return [
+        o.filled
+        if o.result is None or o.result.pose is None
+        else measured(o.result.pose, o.result.inliers)
+        for o in run.outcomes
+    ]
+
+
+def figures_of(
+    run: Run, poses: Sequence[TracedPose | None], thresholds: Sequence[Threshold]
+) -> dict[str, Any]:
+    """Summarize one run, as ``make_report`` says."""
+    errors = pose_errors(run.outcomes, poses)
+    num_with_truth = sum(outcome.query.truth is not None for outcome in run.outcomes)
+    median_position_m, median_orientation_deg = median_errors_localized(errors)
+    sources = _sources(poses)
+    num_localized = sources.get(PoseSource.ESTIMATED.value, {}).get("poses", 0)
+    return {
+        "queries": len(poses),
+        "localized": num_localized,
+        "filled": sum(pose is not None for pose in poses) - num_localized,
+        "sources": sources,
+        "instants": None
+        if run.instants is None
+        else {"asked": len(run.instants), "localized": sum(i.localized for i in run.instants)},
+        "median_position_error_m": _finite(median_position_m),
+        "median_orientation_error_deg": _finite(median_orientation_deg),
+        "position_error_m": _error_percentiles([position for position, _ in errors]),
+        "orientation_error_deg": _error_percentiles([orientation for _, orientation in errors]),
+        "recall": _recall(errors, num_with_truth, thresholds),
+        "latency_s": {f"p{q}": _finite(percentile(run.latencies_s, q)) for q in (50, 90, 99)},
+        "throughput_qps": len(run.latencies_s) / run.wall_s if run.wall_s > 0 else None,
+        "stage_seconds": _mean_by_stage(run.stage_seconds),
+    }
+
+
+def pose_errors(
+    outcomes: Sequence[Outcome], poses: Sequence[TracedPose | None]
+) -> list[tuple[float, float]]:
+    """Return (metres, degrees) for each photo that has a pose and whose true pose is known."""
+    return [
+        pose_error(pose.pose, outcome.query.truth)
+        for outcome, pose in zip(outcomes, poses, strict=True)
+        if pose is not None and outcome.query.truth is not None
+    ]
+
+
+def _sources(poses: Sequence[TracedPose | None]) -> dict[str, dict[str, float]]:
+    """Count poses by what they rest on, with the median of how sure they are of the position."""
+    known = [pose for pose in poses if pose is not None]
+    stds = defaultdict(list)
+    for pose in known:
+        stds[pose.source].append(float(np.linalg.norm(estimate_of(pose).position_std)))
+    counts = Counter(pose.source for pose in known)
+    return {
+        source.value: {
+            "poses": counts[source],
+            "median_position_std_m": float(np.median(stds[source])),
+        }
+        for source in PoseSource
+        if counts[source]
+    }
+
+
+def _error_percentiles(values: Sequence[float]) -> dict[str, float] | None:
+    # Between two values where need be, so that p50 is the median above.
+    if not values:
+        return None
+    return {name: float(np.percentile(values, q)) for name, q in _ERROR_PERCENTILES.items()}
+
+
+def _recall(
+    errors: Sequence[tuple[float, float]], num_queries: int, thresholds: Sequence[Threshold]
+) -> list[dict[str, float]] | None:
+    if num_queries == 0:
+        return None
+    fractions = recall(errors, num_queries, thresholds)
+    return [
+        {
+            "max_position_error_m": threshold.max_position_error_m,
+            "max_orientation_error_deg": threshold.max_orientation_error_deg,
+            "fraction": fraction,
+        }
+        for threshold, fraction in zip(thresholds, fractions, strict=True)
+    ]
+
+
+def _mean_by_stage(answers: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    by_stage: dict[str, list[float]] = defaultdict(list)
+    for answer in answers:
+        for stage, seconds in answer.items():
+            by_stage[stage].append(seconds)
+    return {stage: math.fsum(values) / len(values) for stage, values in by_stage.items()}
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

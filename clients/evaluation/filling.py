@@ -1,0 +1,129 @@
+"""From answers to poses that can be filled, and from filled poses to what answers look like."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clients.wire.answers import parse_pose, parse_result
+from clients.wire.requests import JsonObject
+from clients.wire.rigs import ImageResult, InstantResult, Rig
+from clients.wire.types import LocalizeResult, PoseEstimate
+from visloc.geometry import Pose
+from visloc.sequences.filling import PoseSource, TracedPose, center_covariance, fill_rig
+
+
+def measured(pose: PoseEstimate, num_inliers: int) -> TracedPose:
+    """Return a pose that a photo gave."""
+    return TracedPose(pose.cam_from_world, pose.covariance, PoseSource.ESTIMATED, num_inliers)
+
+
+def pose_as_json(traced: TracedPose) -> JsonObject:
+    """Return a pose ``cam_from_world`` as the API has a PoseEstimate."""
+    pose = traced.pose
+    variances = np.diag(center_covariance(pose, traced.covariance))
+    stds = np.sqrt(np.maximum(variances, 0.0))
+    return {
+        "cam_from_world": {
+            "rotation_wxyz": pose.rotation_wxyz.tolist(),
+            "translation": pose.translation.tolist(),
+        },
+        "position": pose.center.tolist(),
+        "orientation": pose.inverse().rotation_wxyz.tolist(),
+        "covariance": traced.covariance.ravel().tolist(),
+        "position_std": stds[3:].tolist(),
+        "orientation_std_deg": np.degrees(stds[:3]).tolist(),
+    }
+
+
+def estimate_of(traced: TracedPose) -> PoseEstimate:
+    """Return a pose as if it had been received."""
+    return parse_pose(pose_as_json(traced))
+
+
+def photo_result(result: InstantResult, index: int) -> LocalizeResult:
+    """Return what the answer to an instant says of one of its photos, which could be used.
+
+    The pose is the rig's, seen from the camera, and none when the photo has no inlier of it: it
+    then rests on the other cameras. Correspondences, inliers and what was retrieved are the
+    photo's own; the seconds are those of the whole instant.
+
+    Raises:
+        KeyError, TypeError, ValueError, InvalidInput: for answers that contradict themselves.
+    """
+    image, raw = result.images[index], result.raw["images"][index]
+    pose, status, refusal = None, result.status, result.raw["refusal"]
+    if (traced := _measured_by(result, image)) is not None:
+        pose = pose_as_json(traced) | {"cam_from_world": raw["cam_from_world"]}
+    elif result.localized:
+        status = "not_localized"
+        refusal = {
+            "stage": "pose",
+            "reason": "no_inliers",
+            "message": "no match of this photo agrees with the pose of its rig",
+        }
+    return parse_result(
+        {
+            "request_id": result.request_id,
+            "status": status,
+            "pose": pose,
+            "refusal": refusal,
+            "keypoints": image.keypoints,
+            "correspondences": image.correspondences,
+            "inliers": image.inliers,
+            "inlier_ratio": image.inliers / max(image.correspondences, 1),
+            "retrieved": raw["retrieved"],
+            "camera": raw["camera"],
+            "orientation": raw["orientation"],
+            "map": result.raw["map"],
+            "seconds": result.raw["seconds"],
+        }
+    )
+
+
+def poses_from_rig(result: InstantResult, rig: Rig) -> dict[str, TracedPose]:
+    """Return the poses, by sensor, of cameras whose photos contributed nothing to their rig's.
+
+    They rest on the other cameras: of source RIG, and as wide as ``fill_rig`` makes them.
+
+    Args:
+        result: the answer to an instant.
+        rig: whose it is. Of one that the map knows, only the answer tells where the cameras sit.
+
+    Raises:
+        ValueError: for a pose that rests on no photo at all.
+    """
+    if not result.localized:
+        return {}
+    assert result.pose is not None
+    world_from_rig = result.pose.rig_from_world.inverse()
+    cam_from_rig: dict[str, Pose] = {
+        image.sensor: image.cam_from_world @ world_from_rig
+        for image in result.images
+        if image.cam_from_world is not None
+    }
+    if not isinstance(rig, str):
+        cam_from_rig = {name: sensor.cam_from_rig for name, sensor in rig.items()}
+    measured_by = {image.sensor: _measured_by(result, image) for image in result.images}
+    if not any(measured_by.values()):
+        raise ValueError("a pose with no inlier in any photo")
+    poses = fill_rig(dict.fromkeys(cam_from_rig) | measured_by, cam_from_rig)
+    return {
+        sensor: pose
+        for sensor, pose in poses.items()
+        if pose is not None and pose.source is PoseSource.RIG
+    }
+
+
+def _measured_by(result: InstantResult, image: ImageResult) -> TracedPose | None:
+    """Return the pose of a camera whose photo contributed to that of its rig."""
+    if not result.localized or image.error is not None or image.inliers == 0:
+        return None
+    assert result.pose is not None
+    if image.cam_from_world is None:
+        raise ValueError("a photo without a pose in an instant with one")
+    # (w, dt) of the rig arrive at the camera turned: R = R_c R_rig, t = R_c t_rig + t_c.
+    turn = np.zeros((6, 6))
+    cam_from_rig = image.cam_from_world.rotation @ result.pose.rig_from_world.rotation.T
+    turn[:3, :3] = turn[3:, 3:] = cam_from_rig
+    covariance = turn @ result.pose.covariance @ turn.T
+    return TracedPose(image.cam_from_world, covariance, PoseSource.ESTIMATED, image.inliers)

@@ -1,0 +1,186 @@
+"""What is made of the answers to the photos of a dataset: the paper's table.
+
+Humenberger et al. 2020, camera rigs and image sequences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+from clients.evaluation.instants import QueryInstant, instants_of_dataset, instants_of_map_rig
+from clients.evaluation.queries import Query, QuerySet
+from clients.wire.types import MapInfo
+from visloc.errors import DatasetError, InvalidInput
+from visloc.sequences.filling import TimeUnit, TracedPose, fill_rig, fill_sequence, guess_time_unit
+
+DEFAULT_MAX_GAP_S = 1.0
+
+
+class Mode(StrEnum):
+    """How the photos of a dataset are taken together."""
+
+    SINGLE = "single"  # each on its own
+    RIG = "rig"  # ... then from the best camera of the same rig and instant
+    SEQ = "seq"  # ... or from the instants before and after
+    RIG_SEQ = "rig+seq"  # ... or from both, in this order
+    GP3P = "gp3p"  # the photos of a rig and instant solve one pose, which fills those it ignores
+
+    @property
+    def fills_rigs(self) -> bool:
+        """Whether a camera gets the pose of another one."""
+        return self in (Mode.RIG, Mode.RIG_SEQ)
+
+    @property
+    def fills_sequences(self) -> bool:
+        """Whether an instant gets the pose of others."""
+        return self in (Mode.SEQ, Mode.RIG_SEQ)
+
+    @property
+    def fills(self) -> bool:
+        """Whether poses are filled from the answers; in gp3p the answers themselves fill."""
+        return self.fills_rigs or self.fills_sequences
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arrangement:
+    """How the photos of a dataset hang together, as far as the modes need it.
+
+    Attributes:
+        photos: all of them.
+        filled: the instants in which one camera's pose fills another's.
+        asked: the instants that are asked about as such.
+        time_unit: of the timestamps; None when no mode needs it.
+        max_gap_s: longest time between poses that others are filled from.
+    """
+
+    photos: tuple[Query, ...]
+    filled: tuple[QueryInstant, ...]
+    asked: tuple[QueryInstant, ...]
+    time_unit: TimeUnit | None
+    max_gap_s: float
+
+    def fill(self, mode: Mode, poses: Sequence[TracedPose | None]) -> list[TracedPose | None]:
+        """Fill the poses ``cam_from_world`` of all photos as the mode does."""
+        by_name = {query.name: pose for query, pose in zip(self.photos, poses, strict=True)}
+        if mode.fills_rigs:
+            for instant in self.filled:
+                _fill_instant(instant, by_name)
+        if mode.fills_sequences and self.time_unit is not None:
+            sequences: dict[str | None, list[Query]] = {}
+            for query in self.photos:
+                sequences.setdefault(query.sensor_id, []).append(query)
+            for taken_by_one in sequences.values():
+                _fill_sequence(taken_by_one, by_name, self.time_unit, self.max_gap_s)
+        return [by_name[query.name] for query in self.photos]
+
+
+def parse_modes(texts: Iterable[str]) -> list[Mode]:
+    """Parse words, or words with commas between; ``all`` is all of them. Nothing is ``single``.
+
+    Raises:
+        InvalidInput: ``mode.unknown``.
+    """
+    modes: list[Mode] = []
+    for word in (word for text in texts for word in text.split(",")):
+        if word == "all":
+            modes += Mode
+            continue
+        try:
+            modes.append(Mode(word))
+        except ValueError:
+            raise InvalidInput(
+                "mode.unknown",
+                "no such mode",
+                field="mode",
+                expected=f"one of {', '.join(Mode)}, all",
+                got=word,
+            ) from None
+    return list(dict.fromkeys(modes)) or [Mode.SINGLE]
+
+
+def arrange(
+    queries: QuerySet,
+    modes: Sequence[Mode],
+    info: MapInfo,
+    *,
+    rig_id: str | None = None,
+    time_unit: TimeUnit | None = None,
+    max_gap_s: float = DEFAULT_MAX_GAP_S,
+) -> Arrangement:
+    """Find out what the modes need to know about a dataset.
+
+    Args:
+        queries: the photos and the rigs.
+        modes: all that are wanted.
+        info: the map that is asked.
+        rig_id: a rig that the map knows, for ``gp3p``, instead of those of the dataset.
+        time_unit: of the timestamps; None to tell it by their size.
+        max_gap_s: longest time between poses that others are filled from.
+
+    Raises:
+        DatasetError: ``queries.no_rigs`` and others of ``clients.evaluation.instants``;
+            ``queries.no_timestamps``, ``queries.time_unit``.
+        NotFound: ``rig.unknown``.
+    """
+    filled: list[QueryInstant] = []
+    asked: list[QueryInstant] = []
+    if any(mode.fills_rigs for mode in modes):
+        filled = instants_of_dataset(queries)
+    if Mode.GP3P in modes:
+        asked = (
+            instants_of_dataset(
+                queries, or_else=", or one of cameras of a rig that the map knows, with --rig ID"
+            )
+            if rig_id is None
+            else instants_of_map_rig(queries, info, rig_id)
+        )
+    unit = None
+    if any(mode.fills_sequences for mode in modes):
+        unit = _time_unit(queries, time_unit)
+    return Arrangement(queries.photos, tuple(filled), tuple(asked), unit, max_gap_s)
+
+
+def _fill_instant(instant: QueryInstant, by_name: dict[str, TracedPose | None]) -> None:
+    assert not isinstance(instant.rig, str)  # of the dataset: it is known where the cameras sit
+    cam_from_rig = {sensor: known.cam_from_rig for sensor, known in instant.rig.items()}
+    names = {query.sensor: query.name for query in instant.photos}
+    poses = fill_rig({sensor: by_name[name] for sensor, name in names.items()}, cam_from_rig)
+    by_name.update({names[sensor]: pose for sensor, pose in poses.items()})
+
+
+def _fill_sequence(
+    photos: Sequence[Query],
+    by_name: dict[str, TracedPose | None],
+    unit: TimeUnit,
+    max_gap_s: float,
+) -> None:
+    in_time = sorted((query.timestamp or 0, query.name) for query in photos)
+    first = in_time[0][0]
+    # Counted from the first one while still whole numbers: as floats, Unix times lose digits.
+    times_s = [(timestamp - first) * unit.seconds for timestamp, _ in in_time]
+    poses = fill_sequence(times_s, [by_name[name] for _, name in in_time], max_gap_s)
+    by_name.update({name: pose for (_, name), pose in zip(in_time, poses, strict=True)})
+
+
+def _time_unit(queries: QuerySet, given: TimeUnit | None) -> TimeUnit:
+    timestamps = [query.timestamp for query in queries.photos if query.timestamp is not None]
+    if len(timestamps) < len(queries.photos):
+        raise DatasetError(
+            "queries.no_timestamps",
+            "it is not known when the photos were taken",
+            field=str(queries.source),
+            expected="a kapture folder",
+            got="a list of photos",
+        )
+    unit = given or guess_time_unit(timestamps)
+    if unit is None:
+        raise DatasetError(
+            "queries.time_unit",
+            "the unit of the timestamps cannot be told by their size",
+            field=str(queries.source / "sensors" / "records_camera.txt"),
+            expected=f"--time-unit {', '.join(TimeUnit)}",
+            got=f"timestamps from {min(timestamps)} to {max(timestamps)}",
+        )
+    return unit

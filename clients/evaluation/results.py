@@ -1,0 +1,231 @@
+"""Results on disk: ``results.jsonl``, poses, and files that are written whole or not."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+from urllib.parse import quote
+
+from clients.evaluation.filling import pose_as_json
+from clients.evaluation.running import Outcome
+from clients.wire.answers import parse_pose
+from clients.wire.types import PoseEstimate
+from visloc.errors import DatasetError, InvalidInput
+from visloc.sequences.filling import PoseSource, TracedPose
+
+_LOCALIZED, _NOT_LOCALIZED, _ERROR, _FILLED = "localized", "not_localized", "error", "filled"
+# Errors that say nothing about the photo: it may be answered when it is asked about again.
+_PASSING_CODES = ("server.internal", "server.timeout")
+_PASSING_KINDS = ("Unavailable", "Overloaded")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredResult:
+    """One line of ``results.jsonl``.
+
+    Attributes:
+        name: of the photo.
+        status: localized, not_localized or error; of a filled one, what it was before.
+        pose: when localized.
+        num_inliers: of the pose.
+        filled: the pose from other photos that the line has.
+        is_final: whether asking again is pointless; False for errors of the server.
+        offset: where the line begins in the file, bytes.
+        length: of the line with its end, bytes.
+    """
+
+    name: str
+    status: str
+    pose: PoseEstimate | None
+    num_inliers: int
+    filled: TracedPose | None
+    is_final: bool
+    offset: int
+    length: int
+
+
+def result_line(outcome: Outcome) -> str:
+    """Write an outcome as one line of JSON: the name, then the answer as received.
+
+    ``source`` tells what the pose rests on, null without one. A photo without an answer has
+    ``"status": "error"`` and an object ``error`` with kind, code, message, field, expected and
+    got. One that is filled has status filled, a ``pose``, and the rest as without it.
+    """
+    entry: dict[str, Any] = {"name": outcome.query.name}
+    if outcome.result is not None:
+        source = PoseSource.ESTIMATED.value if outcome.result.localized else None
+        entry |= {**outcome.result.raw, "source": source}
+    else:
+        error = outcome.error
+        assert error is not None
+        details = {
+            name: getattr(error, name) for name in ("code", "message", "field", "expected", "got")
+        }
+        entry |= {"status": _ERROR, "error": {"kind": type(error).__name__} | details}
+        entry["source"] = None
+    if outcome.filled is not None:
+        _fill(entry, outcome.filled)
+    return json.dumps(entry) + "\n"
+
+
+def drop_torn_line(path: Path) -> None:
+    """Cut off what a killed run left of its last line; a missing file stays missing."""
+    if not path.exists():
+        return
+    with path.open("r+b") as file:
+        size = file.seek(0, os.SEEK_END)
+        end = size
+        while end > 0:
+            start = max(0, end - 65536)
+            file.seek(start)
+            newline = file.read(end - start).rfind(b"\n")
+            if newline >= 0:
+                end = start + newline + 1
+                break
+            end = start
+        if end < size:
+            file.truncate(end)
+
+
+def read_results(path: Path) -> Iterator[StoredResult]:
+    """Read ``results.jsonl``; a missing file has no lines.
+
+    Raises:
+        DatasetError: ``results.line``, with file and line.
+    """
+    if not path.exists():
+        return
+    offset = 0
+    with path.open("rb") as file:
+        for number, line in enumerate(file, start=1):
+            try:
+                parsed = _parse_line(line)
+            except (KeyError, TypeError, ValueError, InvalidInput) as error:
+                raise DatasetError(
+                    "results.line",
+                    "not a result; begin again with --restart, or remove the line",
+                    field=f"{path}:{number}",
+                    got=str(error),
+                ) from error
+            yield StoredResult(*parsed, offset, len(line))
+            offset += len(line)
+
+
+def copy_lines(
+    source: Path,
+    results: Iterable[StoredResult],
+    target: Path,
+    filled: Mapping[str, TracedPose] | None = None,
+) -> None:
+    """Copy lines of ``source`` to ``target``, in the order given; they may be the same file.
+
+    Args:
+        source: what ``results`` were read from.
+        results: the lines.
+        target: written whole.
+        filled: poses from other photos, by the photo's name; other lines lose theirs, and lines
+            that have it already stay as they are.
+    """
+    filled = filled or {}
+    with source.open("rb") as file:
+
+        def lines() -> Iterator[bytes]:
+            for result in results:
+                file.seek(result.offset)
+                line = file.read(result.length)
+                pose = filled.get(result.name)
+                yield line if pose is result.filled else _refilled(line, pose)
+
+        write_whole(target, lines())
+
+
+def write_poses(path: Path, poses: Iterable[tuple[str, PoseEstimate]]) -> None:
+    """Write ``name qw qx qy qz tx ty tz`` lines of ``cam_from_world``, every digit as received.
+
+    Readers of this format split at blanks, so blanks in a name, and ``%``, are percent-encoded:
+    ``a b.jpg`` becomes ``a%20b.jpg``, and ``urllib.parse.unquote`` gives the name back.
+    """
+    write_whole(path, (_pose_line(name, pose).encode() for name, pose in poses))
+
+
+def write_whole(path: Path, parts: Iterable[bytes]) -> None:
+    """Write a file so that a reader sees the old one or the new one, never a half."""
+    unfinished = path.with_name(f".{path.name}.new")
+    with unfinished.open("wb") as file:
+        _write_and_sync(file, parts)
+    unfinished.replace(path)
+
+
+def check_can_be_written(paths: Sequence[Path]) -> None:
+    """Find out before a long run, not after it.
+
+    Raises:
+        InvalidInput: ``output.folder``.
+    """
+    for path in paths:
+        if path.is_dir() or not os.access(path.parent, os.W_OK):
+            raise InvalidInput(
+                "output.folder",
+                "cannot be written",
+                field=str(path),
+                expected="a file in an existing folder that is not write-protected",
+            )
+
+
+def _parse_line(
+    line: bytes,
+) -> tuple[str, str, PoseEstimate | None, int, TracedPose | None, bool]:
+    entry = json.loads(line)
+    name, status = entry["name"], entry["status"]
+    filled = None
+    if status == _FILLED:
+        status, other = _before_filling(entry), parse_pose(entry["pose"])
+        filled = TracedPose(other.cam_from_world, other.covariance, PoseSource(entry["source"]))
+    if not isinstance(name, str) or status not in (_LOCALIZED, _NOT_LOCALIZED, _ERROR):
+        raise ValueError(f"name {name!r}, status {status!r}")
+    pose, num_inliers = None, 0
+    if status == _LOCALIZED:
+        pose, num_inliers = parse_pose(entry["pose"]), int(entry["inliers"])
+    is_final = status != _ERROR or not (
+        entry["error"]["code"] in _PASSING_CODES or entry["error"]["kind"] in _PASSING_KINDS
+    )
+    return name, status, pose, num_inliers, filled, is_final
+
+
+def _before_filling(entry: Mapping[str, Any]) -> str:
+    return _ERROR if "error" in entry else _NOT_LOCALIZED
+
+
+def _refilled(line: bytes, pose: TracedPose | None) -> bytes:
+    """Write a pose from other photos into a line, or take it out; the rest stays as it is."""
+    entry = json.loads(line)
+    entry["status"], entry["source"] = _before_filling(entry), None
+    if "error" in entry:
+        entry.pop("pose", None)
+    else:
+        entry["pose"] = None
+    if pose is not None:
+        _fill(entry, pose)
+    return json.dumps(entry).encode() + b"\n"
+
+
+def _fill(entry: dict[str, Any], pose: TracedPose) -> None:
+    entry["status"], entry["source"] = _FILLED, pose.source.value
+    entry["pose"] = pose_as_json(pose)
+
+
+def _pose_line(name: str, pose: PoseEstimate) -> str:
+    numbers = (repr(value) for value in (*pose.rotation_wxyz, *pose.translation))
+    encoded = re.sub(r"[\s%]", lambda found: quote(found[0]), name)
+    return f"{encoded} {' '.join(numbers)}\n"
+
+
+def _write_and_sync(file: BinaryIO, parts: Iterable[bytes]) -> None:
+    file.writelines(parts)
+    file.flush()
+    os.fsync(file.fileno())

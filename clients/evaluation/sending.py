@@ -1,0 +1,126 @@
+"""What is sent of a query: the photo, or its ready-made features."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from clients.evaluation.queries import Query
+from clients.wire.features import Features
+from clients.wire.requests import read_image
+from clients.wire.types import MapInfo
+from visloc.errors import InvalidInput
+from visloc.geometry import PixelOrigin
+from visloc.kapture import (
+    READY_MADE_PREFIX,
+    FeatureSet,
+    open_features,
+    open_local_features,
+    read_local,
+)
+
+Reader = Callable[[Query], bytes | Features]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FeatureReader:
+    """Reads the ready-made features of a dataset's photos.
+
+    Attributes:
+        kind: what the map calls the local features.
+        keypoints: of the dataset.
+        descriptors: of these keypoints.
+        global_features: by what the map calls them.
+        origin: what the keypoints count from.
+    """
+
+    kind: str
+    keypoints: FeatureSet
+    descriptors: FeatureSet
+    global_features: dict[str, FeatureSet]
+    origin: PixelOrigin
+
+    def __call__(self, query: Query) -> Features:
+        """Read the features of one photo.
+
+        Raises:
+            InvalidInput: ``camera.required`` when the dataset does not know the camera.
+            DatasetError: ``kapture.*``, with the file that is missing or wrong.
+        """
+        if query.camera is None:
+            raise InvalidInput(
+                "camera.required",
+                "features cannot be localized without the camera that they were seen with",
+                field=query.name,
+                expected="its model, size and parameters in sensors.txt",
+            )
+        size = query.camera.width, query.camera.height
+        keypoints, descriptors = read_local(
+            self.keypoints, self.descriptors, query.name, size, self.origin
+        )
+        if descriptors.dtype != np.uint8:  # of what kapture has, only these can be sent as they are
+            descriptors = descriptors.astype(np.float32, copy=False)
+        return Features(
+            self.kind,
+            keypoints,
+            descriptors,
+            {
+                name: features.read(query.name)[0].astype(np.float32)
+                for name, features in self.global_features.items()
+            },
+        )
+
+
+def takes_features(info: MapInfo) -> bool:
+    """Whether a map has ready-made features, and so takes no photos."""
+    names = (info.local_features, *info.global_features)
+    return any(name.startswith(READY_MADE_PREFIX) for name in names)
+
+
+def choose_reader(
+    source: Path, info: MapInfo, features_dir: Path | None, origin: PixelOrigin
+) -> Reader:
+    """Return what reads of a query that which this map takes.
+
+    A map with ready-made features, local or global, takes features of the same types, from the
+    dataset or from ``features_dir``; any other takes photos. Local features that the server could
+    find itself are then read from the folder of their name, as ``mapping export-features``
+    writes them: photos and features do not go together in one request.
+
+    Raises:
+        InvalidInput: ``queries.no_features`` for a list of photos and a map that takes features;
+            ``queries.features_dir`` for a map that takes photos.
+        DatasetError: ``kapture.*`` when the dataset has no such features.
+    """
+    ready_made = [name for name in info.global_features if name.startswith(READY_MADE_PREFIX)]
+    if not takes_features(info):
+        if features_dir is not None:
+            raise InvalidInput(
+                "queries.features_dir",
+                f"map {info.ref} takes photos; ready-made features are of no use to it",
+                field="features_dir",
+                expected=f"a map with features {READY_MADE_PREFIX}TYPE",
+                got=", ".join((info.local_features, *info.global_features)),
+            )
+        return lambda query: read_image(query.path)
+    if not source.is_dir():
+        raise InvalidInput(
+            "queries.no_features",
+            f"map {info.ref} takes features, and a list of photos has none",
+            field=str(source),
+            expected=f"a kapture folder with {', '.join((info.local_features, *ready_made))}",
+        )
+    kind = info.local_features
+    keypoints, descriptors = open_local_features(
+        source, kind.removeprefix(READY_MADE_PREFIX), features_dir
+    )
+    global_features = {
+        name: open_features(
+            source, "global_features", name.removeprefix(READY_MADE_PREFIX), features_dir
+        )
+        for name in ready_made
+    }
+    return FeatureReader(kind, keypoints, descriptors, global_features, origin)

@@ -1,0 +1,84 @@
+"""How a server is reached: its address, the key for it, and whom to trust."""
+
+from __future__ import annotations
+
+import re
+import ssl
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from clients.wire.requests import checked_server
+from visloc.errors import InvalidInput
+
+_KEY = re.compile(r"[\x21-\x7e]{1,512}")
+
+
+@dataclass(frozen=True, slots=True)
+class Connection:
+    """What a transport has to know.
+
+    Attributes:
+        server: ``http://``, ``https://``, ``grpc://`` or ``grpcs://``, host and port.
+        timeout_s: longest wait for an answer, seconds.
+        api_key: sent with every request; never shown.
+        authorities: certificates in PEM that are trusted instead of the usual ones.
+    """
+
+    server: str
+    timeout_s: float
+    api_key: str | None = field(default=None, repr=False)
+    authorities: str | None = field(default=None, repr=False)
+
+    @property
+    def is_grpc(self) -> bool:
+        """Whether it speaks gRPC, not HTTP."""
+        return self.server.startswith(("grpc:", "grpcs:"))
+
+    @property
+    def is_encrypted(self) -> bool:
+        """Whether it speaks TLS."""
+        return self.server.startswith(("https:", "grpcs:"))
+
+
+def checked_connection(
+    server: str, timeout_s: float, api_key: str | None, ca: str | Path | None
+) -> Connection:
+    """Check what the caller of a client gave, and read the file of certificates.
+
+    Raises:
+        InvalidInput: ``server.url``, ``server.api_key``, ``server.ca``.
+    """
+    connection = Connection(checked_server(server), timeout_s, api_key, _authorities(ca))
+    if api_key is not None and not _KEY.fullmatch(api_key):
+        raise InvalidInput(  # without the key
+            "server.api_key",
+            "not an API key",
+            field="api_key",
+            expected="visible ASCII characters without spaces, as `python -m service.keys` prints",
+        )
+    if ca is not None and not connection.is_encrypted:
+        raise InvalidInput(
+            "server.ca",
+            "a certificate authority is of no use without TLS",
+            field="ca",
+            expected="https://host:port or grpcs://host:port",
+            got=server,
+        )
+    return connection
+
+
+def _authorities(ca: str | Path | None) -> str | None:
+    if ca is None:
+        return None
+    try:
+        text = Path(ca).read_text(encoding="ascii")
+        ssl.create_default_context(cadata=text)
+    except (OSError, ValueError) as error:  # SSLError is an OSError
+        raise InvalidInput(
+            "server.ca",
+            "no certificates can be read from it",
+            field=str(ca),
+            expected="a PEM file",
+            got=str(error),
+        ) from None
+    return text

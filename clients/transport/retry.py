@@ -1,0 +1,77 @@
+"""What clients do so that several servers behind a balancer are as good as one."""
+
+from __future__ import annotations
+
+import json
+
+import httpx
+
+from clients.transport.uploads import Upload
+from clients.wire.requests import DeleteVersion, GetMap, GetVersion, Localize, UseVersion
+from clients.wire.rig_requests import AnyRequest, LocalizeRig, SequenceStart
+from clients.wire.types import Near
+
+# Header of HTTP and metadata of gRPC. A balancer that chooses by it finds the map open.
+MAP_HEADER = "x-visloc-map"
+# Before a request is sent once more. Only once: what ended one server may end the next.
+RESEND_PAUSE_S = 0.1
+# How gRPC does the same, of itself. Its servers say INTERNAL where nothing is to be sent again.
+GRPC_OPTIONS = (
+    (
+        "grpc.service_config",
+        json.dumps(
+            {
+                "methodConfig": [
+                    {
+                        "name": [
+                            {"service": "visloc.v1.Localization", "method": method}
+                            for method in ("Localize", "LocalizeRig", "ListMaps", "GetMap")
+                        ]
+                        + [{"service": "visloc.v1.Maps", "method": "GetVersion"}],
+                        "retryPolicy": {
+                            "maxAttempts": 2,
+                            "initialBackoff": f"{RESEND_PAUSE_S}s",
+                            "maxBackoff": f"{RESEND_PAUSE_S}s",
+                            "backoffMultiplier": 1,
+                            "retryableStatusCodes": ["UNAVAILABLE"],
+                        },
+                    }
+                ]
+            }
+        ),
+    ),
+    # A larger request would not be kept to be sent again. The default is 256 KiB.
+    ("grpc.per_rpc_retry_buffer_size", 128 * 2**20),
+)
+
+
+def map_header(request: AnyRequest | SequenceStart | Upload) -> dict[str, str]:
+    """Return the header that names the map of a request, without its version; of several one."""
+    match request:
+        case Localize() | LocalizeRig() | SequenceStart():
+            maps = request.search.maps
+            if isinstance(maps, Near):
+                return {}
+            name = maps[0]
+        case GetMap():
+            name = request.map
+        case GetVersion() | UseVersion() | DeleteVersion() | Upload():
+            name = request.map_id
+        case _:
+            return {}
+    return {MAP_HEADER: name.partition("@")[0]}
+
+
+def may_resend(request: AnyRequest, got: httpx.Response | httpx.HTTPError) -> bool:
+    """Tell whether a request is to be sent once more over HTTP.
+
+    Only what changes nothing on the server, and only when the connection broke, a balancer says
+    so, or the server is being stopped: that is, when another server may answer.
+    """
+    if isinstance(request, UseVersion | DeleteVersion):
+        return False
+    if isinstance(got, httpx.Response):
+        if got.status_code == httpx.codes.SERVICE_UNAVAILABLE:
+            return b'"server.stopping"' in got.content
+        return got.status_code == httpx.codes.BAD_GATEWAY
+    return isinstance(got, httpx.NetworkError | httpx.RemoteProtocolError)

@@ -1,0 +1,241 @@
+"""What the ``mapping`` command shows of maps and imports."""
+
+from __future__ import annotations
+
+import math
+import resource
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from mapping.cluster.stage_timings import StageCost
+from mapping.frames.georeference import Georeference
+from mapping.frames.rig_calibration import OUTLIER_MULTIPLE, RigCalibration, Spread
+from mapping.importers import ImportSummary
+from mapping.maps.cameras import camera_lines, cameras_of
+from visloc.archive import Map
+from visloc.archive.schema import photo_file
+from visloc.retrieval.fusion import EQUAL_GHARM
+
+# More lines than anyone reads.
+_SHOWN_RESIDUALS = 20
+
+
+def summary_of(opened: Map) -> dict[str, Any]:
+    """Return what a map holds, for programs."""
+    manifest = opened.manifest.model_dump(exclude={"files"}, mode="json")
+    counts = manifest["counts"]
+    return {
+        **manifest,
+        "size_bytes": opened.size_bytes,
+        "bytes_per_observation": opened.size_bytes / counts["observations"],
+        "mean_track_length": float(opened.track_lengths.mean()),
+        "cameras": len(opened.cameras),
+        "focal_lengths": {name: asdict(one) for name, one in cameras_of(opened).items()},
+        "rigs": {rig: sorted(members) for rig, members in opened.rigs.items()},
+        # What a geodetic anchor tells of it is not in every manifest.
+        "gravity": None if opened.gravity is None else opened.gravity.tolist(),
+        "keeps": [
+            *(["photos"] if photo_file(0) in opened.manifest.files else []),
+            *(["colours"] if opened.colors is not None else []),
+        ],
+        "path": str(opened.path),
+    }
+
+
+def print_map(out: Console, opened: Map) -> None:
+    """Show what a map holds."""
+    summary = summary_of(opened)
+    counts, local = summary["counts"], summary["local_features"]
+    extent = summary["world"]["extent"]
+    sides = [high - low for low, high in zip(extent["min"], extent["max"], strict=True)]
+    table = Table(show_header=False, box=None, title=f"map {opened.ref}", title_justify="left")
+    rows = {
+        "photos": f"{counts['images']} by {summary['cameras']} cameras",
+        "cameras": "\n".join(camera_lines(opened)),
+        "rigs": "; ".join(f"{rig}: {', '.join(names)}" for rig, names in summary["rigs"].items())
+        or "none",
+        "landmarks": f"{counts['landmarks']}, seen by {summary['mean_track_length']:.1f} photos "
+        "in the mean",
+        "observations": f"{counts['observations']}",
+        "local features": f"{local['fingerprint']['name']}, {local['descriptor_dim']} dimensions, "
+        f"at most {local['max_keypoints']} per photo",
+        "computed with": local["computed_with"] or "not known",
+        "global features": ", ".join(
+            f"{g['fingerprint']['name']} ({g['dim']})" for g in summary["global_features"]
+        ),
+        **_retrieval(opened),
+        "extent": " x ".join(f"{side:.2f}" for side in sides)
+        + (" m" if summary["world"]["metric"] else " (not metric)"),
+        "world": _world(opened),
+        "gravity": "not known"
+        if opened.gravity is None
+        else f"down is ({', '.join(f'{value:.6g}' for value in opened.gravity)})",
+        "place": _place(opened),
+        "method": summary["method"]["name"],
+        "keeps": ", ".join(summary["keeps"]) or "neither photos nor colours",
+        "size": f"{summary['size_bytes'] / 2**20:.1f} MiB, "
+        f"{summary['bytes_per_observation']:.0f} bytes per observation",
+        "created": summary["created"],
+        "folder": summary["path"],
+    }
+    for name, value in rows.items():
+        table.add_row(name, escape(value))
+    out.print(table)
+    for note in summary["notes"]:
+        out.print(f"note: {note}", markup=False, soft_wrap=True)
+
+
+def _retrieval(opened: Map) -> dict[str, str]:
+    """How global features are fused, where the map was given another way than the usual."""
+    if opened.fusion == EQUAL_GHARM:
+        return {}
+    weights = opened.fusion.weights
+    counted = (
+        "equal weights"
+        if weights is None
+        else ", ".join(f"{name}={weight:g}" for name, weight in weights.items())
+    )
+    return {"fused by": f"{opened.fusion.operator}, {counted}"}
+
+
+def _world(opened: Map) -> str:
+    """Whether a unit is a metre, and what fixed the frame."""
+    world = opened.manifest.world
+    unit = "metric" if world.metric else "not metric"
+    if world.anchor is None:
+        return unit
+    anchor = world.anchor
+    fixed_by = {
+        "dataset": "the poses of the dataset",
+        "model": "the imported reconstruction",
+        "gnss": f"GNSS fixes of {anchor.images} photos",
+        "positions": f"known positions of {anchor.images} photos",
+        "correspondences": f"{anchor.images} given points" if anchor.images else "a given place",
+        "none": "nothing: the frame is arbitrary",
+    }[anchor.kind]
+    off = "" if anchor.rms is None else f", which agree within {anchor.rms:.2g} (RMS)"
+    return f"{unit}, fixed by {fixed_by}{off}"
+
+
+def _place(opened: Map) -> str:
+    place, geodetic = opened.place, opened.geodetic
+    if place is None or geodetic is None:
+        return "not anchored to the Earth"
+    scale = "" if geodetic.scale == 1 else f", {geodetic.scale:.6g} m per unit"
+    return (
+        f"latitude {place.latitude:.7f}, longitude {place.longitude:.7f}, "
+        f"within {place.radius:.0f} m{scale}"
+    )
+
+
+def print_georeference(out: Console, found: Georeference) -> None:
+    """Show how well what was known agrees with where a map was put."""
+    geodetic = found.anchor.geodetic
+    assert geodetic is not None  # what a georeference is
+    if found.names:
+        table = Table(box=None, title="metres from where it was said to be", title_justify="left")
+        for name in ("place", "east", "north", "up", ""):
+            table.add_column(name, justify="left" if name in ("place", "") else "right")
+        off = found.residuals_m
+        # The worst tell most.
+        order = sorted(range(len(off)), key=lambda row: -float((off[row] ** 2).sum()))
+        for row in order[:_SHOWN_RESIDUALS]:
+            numbers = (f"{value:.2f}" for value in off[row])
+            table.add_row(
+                escape(found.names[row]), *numbers, "" if found.agrees[row] else "left out"
+            )
+        out.print(table)
+        if len(order) > _SHOWN_RESIDUALS:
+            out.print(f"and {len(order) - _SHOWN_RESIDUALS} that are nearer", highlight=False)
+        rms = math.sqrt((off[found.agrees] ** 2).sum(axis=1).mean())
+        out.print(
+            f"{found.agrees.sum()} of {len(off)} agree, within {rms:.3g} m (RMS)",
+            highlight=False,
+        )
+    out.print(
+        f"place: latitude {geodetic.latitude_deg:.9f}, longitude {geodetic.longitude_deg:.9f}, "
+        f"altitude {geodetic.altitude_m:.3f} m; {geodetic.scale:.6g} m per unit",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def print_costs(out: Console, costs: Sequence[StageCost]) -> None:
+    """Show what each stage of a build cost."""
+    table = Table(box=None)
+    table.add_column("stage")
+    for name in ("items", "seconds", "CPU seconds", "MiB written"):
+        table.add_column(name, justify="right")
+    for cost in costs:
+        table.add_row(
+            escape(cost.stage),
+            "" if cost.items is None else str(cost.items),
+            f"{cost.wall_s:.1f}",
+            f"{cost.spent.cpu_s:.1f}",
+            f"{cost.spent.written_bytes / 2**20:.1f}",
+        )
+    out.print(table)
+
+
+def peak_memory_bytes() -> int:
+    """The largest of this process and its workers, each at its peak."""
+    kinds = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    return max(resource.getrusage(kind).ru_maxrss for kind in kinds) * 1024
+
+
+def print_import(out: Console, summary: ImportSummary) -> None:
+    """Show what an import brought."""
+    out.print(
+        f"{summary.images} photos by {summary.cameras} cameras, {summary.posed} with a pose, "
+        f"{summary.depth_maps} with depth, {summary.gnss} GNSS fixes; {summary.points} points, "
+        f"{summary.observations} observations"
+        + (", metric" if summary.metric else ", not known to be metric"),
+        highlight=False,
+        soft_wrap=True,
+    )
+    for note in summary.notes:
+        out.print(f"note: {note}", markup=False, soft_wrap=True)
+
+
+def print_rig(out: Console, calibration: RigCalibration) -> None:
+    """Show where the cameras of a rig are, and how well their instants agree."""
+    table = Table(
+        box=None,
+        title=f"rig {escape(calibration.rig)}, its frame is camera {escape(calibration.reference)}",
+        title_justify="left",
+    )
+    for name in ("camera", "through", "instants", "outliers", "degrees", "units", "position"):
+        table.add_column(name, justify="right" if name in ("instants", "outliers") else "left")
+    for name, camera in calibration.cameras.items():
+        position = " ".join(_figure(value) for value in camera.cam_from_rig.center)
+        if camera.relative is None or camera.relative_to is None:
+            table.add_row(escape(name), "", "", "", "", "", position)
+            continue
+        found = camera.relative
+        table.add_row(
+            *(escape(name), escape(camera.relative_to), str(found.instants), str(found.outliers)),
+            *(_deviation(found.rotation_deg), _deviation(found.position), position),
+        )
+    out.print(table)
+    out.print(
+        "degrees, units: deviation of the instants from the estimate, median / 90 %; "
+        f"outliers: instants {OUTLIER_MULTIPLE:g} times further off than the median",
+        soft_wrap=True,
+        highlight=False,
+    )
+    for note in calibration.notes:
+        out.print(f"note: {note}", markup=False, soft_wrap=True)
+
+
+def _deviation(spread: Spread) -> str:
+    return f"{_figure(spread.median)} / {_figure(spread.p90)}"
+
+
+def _figure(value: float) -> str:
+    """Four digits, and 0 for round-off."""
+    return f"{value:.4g}" if abs(value) > 1e-9 else "0"

@@ -1,0 +1,156 @@
+"""The command ``mapping prune``."""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from mapping.cli.options import MapsDirOption, WeightsDirOption
+from mapping.cli.progress import StageProgress
+from mapping.maps.pruning.accuracy import BINS, Accuracy, lost, of_queries
+from mapping.maps.pruning.job import Pruned, prune_map
+from visloc.archive import Map, MapStore
+from visloc.errors import InvalidInput
+from visloc.features import make_global_descriptor, make_local_features
+
+# More than this part of the queries, and than two of them, is more than noise.
+_NOISE_SHARE, _NOISE_QUERIES = 0.05, 2
+_UNITS = {"": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
+_SIZE = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?(%|[KMG]i?B|)", re.IGNORECASE)
+
+_out = Console()
+_err = Console(stderr=True)
+
+
+def prune(
+    map_id: Annotated[str, typer.Argument(metavar="MAP", help="Id of the map, or id@version.")],
+    max_bytes: Annotated[
+        str | None,
+        typer.Option(help="Most that the map may take, such as 200MB, or 50% of what it takes."),
+    ] = None,
+    max_landmarks: Annotated[
+        int | None, typer.Option(min=1, help="Or the most landmarks that it may have.")
+    ] = None,
+    queries: Annotated[
+        Path | None,
+        typer.Option(
+            help="A kapture folder of photos with poses in the map's frame, to measure accuracy "
+            "with; left out: photos of the map, localized without themselves."
+        ),
+    ] = None,
+    maps_dir: MapsDirOption = Path("maps"),
+    weights_dir: WeightsDirOption = None,
+) -> None:
+    """Make a map smaller: keep of each photo what localization needs most. A new version.
+
+    Prints the accuracy before and after. The version before stays.
+    """
+    if (max_bytes is None) == (max_landmarks is None):
+        raise InvalidInput(
+            "prune.goal",
+            "say how small",
+            field="--max-bytes",
+            expected="either --max-bytes or --max-landmarks",
+        )
+    store = MapStore(maps_dir)
+    opened = store.open(map_id)
+    with StageProgress(_err, if_stopped="nothing was published") as progress:
+        measure = None
+        if queries is not None:
+            local = opened.manifest.local_features.fingerprint.name
+            extractor = make_local_features(local, weights_dir)
+            make_descriptor = partial(make_global_descriptor, weights_dir=weights_dir)
+
+            def measure(before: Map, after: Map) -> tuple[Accuracy, Accuracy]:
+                told = partial(progress, "before and after")
+                assert queries is not None
+                first, second = of_queries(
+                    (before, after), queries, extractor, make_descriptor, told
+                )
+                return first, second
+
+        pruned = prune_map(
+            store,
+            opened.ref,  # a part of its size means nothing of another version
+            max_bytes=None if max_bytes is None else parse_size(max_bytes, opened.size_bytes),
+            max_landmarks=max_landmarks,
+            measure=measure,
+            progress=progress,
+        )
+    print_pruned(pruned, "queries" if queries is not None else "photos of the map")
+
+
+def parse_size(text: str, whole: int) -> int:
+    """Return how many bytes are meant by ``200MB``, ``1.5 GiB``, ``50%`` or a number.
+
+    Raises:
+        InvalidInput: ``prune.max_bytes``.
+    """
+    found = _SIZE.fullmatch(text.strip())
+    size = 0.0
+    if found is not None:
+        number, unit = float(found[1]), found[2].upper()
+        size = number / 100 * whole if unit == "%" else number * _UNITS[unit]
+    if size < 1:
+        raise InvalidInput(
+            "prune.max_bytes",
+            "not a size",
+            field="--max-bytes",
+            expected="such as 200MB, 1.5GB, 50% or 1000000",
+            got=text,
+        )
+    return int(size)
+
+
+def print_pruned(pruned: Pruned, asked: str) -> None:
+    """Show what became smaller, and what that did to the accuracy."""
+    before, after = pruned.before, pruned.after
+    metric = after.manifest.world.metric
+    say = partial(_out.print, markup=False, highlight=False, soft_wrap=True)
+    say(f"map {after.ref}")
+    table = Table(box=None)
+    for name in ("", "before", "after"):
+        table.add_column(name, justify="right" if name else "left")
+    rows = [
+        ("MB", *(f"{opened.size_bytes / 1e6:.1f}" for opened in (before, after))),
+        *(
+            (name, *(str(getattr(opened.manifest.counts, field)) for opened in (before, after)))
+            for name, field in (
+                ("photos", "images"),
+                ("landmarks", "landmarks"),
+                ("observations", "observations"),
+            )
+        ),
+        *accuracy_rows(pruned.accuracy, metric=metric),
+    ]
+    for row in rows:
+        table.add_row(*row)
+    _out.print(table, highlight=False)
+    first, second = pruned.accuracy
+    say(f"accuracy is that of {first.queries} {asked}")
+    worst = lost(first, second, metric=metric)
+    if worst > max(_NOISE_QUERIES, _NOISE_SHARE * first.queries):
+        say(
+            f"note: {worst} queries of {first.queries} were lost, which is more than chance; "
+            f"{before.ref} is kept"
+        )
+
+
+def accuracy_rows(accuracies: tuple[Accuracy, ...], *, metric: bool) -> list[tuple[str, ...]]:
+    """The rows of a table of accuracies: of each, how many within the bins, and the medians."""
+    rows = [("localized", *(f"{len(one.errors)} of {one.queries}" for one in accuracies))]
+    if metric:
+        for bin_ in BINS:
+            name = f"{bin_.max_position_error_m * 100:g} cm, {bin_.max_orientation_error_deg:g} deg"
+            rows.append((name, *(str(one.within(bin_)) for one in accuracies)))
+    medians = [one.medians for one in accuracies]
+    unit, factor = ("cm", 100.0) if metric else ("units", 1.0)
+    rows.append((f"median, {unit}", *(f"{factor * median[0]:.3g}" for median in medians)))
+    rows.append(("median, deg", *(f"{median[1]:.3g}" for median in medians)))
+    return rows

@@ -1,0 +1,261 @@
+"""The command ``mapping report``."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import shlex
+import shutil
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path, PurePath
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from mapping.build.stages import WorkFolder, exclusive
+from mapping.cli.options import MapArgument, MapsDirOption, is_map_folder, map_folder
+from mapping.cli.progress import StageProgress
+from mapping.cluster.workers import DEFAULT_WORKERS, Workers
+from mapping.report import make_report_data
+from mapping.report.data import UP_IS_A_GUESS, decimals_of
+from mapping.report.html import report_page
+from visloc.archive import Map, open_map
+from visloc.drawing.detail_levels import detail_order, packed_points
+from visloc.errors import Conflict
+from visloc_web import report_parts
+
+# Landmarks that the file carries: 3.2 MB, and as many as a picture of a screen can tell apart.
+MAX_POINTS = 150_000
+# More names than anyone reads in a terminal; the file has them all.
+_SHOWN_NAMES = 20
+
+_out = Console()
+_err = Console(stderr=True)
+
+
+def report(
+    map_ref: MapArgument,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            help="The HTML file to write, over one that is there; left out: ID-report.html here.",
+        ),
+    ] = None,
+    maps_dir: MapsDirOption = Path("maps"),
+    workers: Annotated[
+        int,
+        typer.Option(
+            min=1, max=256, help="Processes that localize; they do not change the report."
+        ),
+    ] = DEFAULT_WORKERS,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+) -> None:
+    """Tell where a map is weak: where, and looking which way, would a photo be localized?
+
+    Writes one HTML file that needs neither network nor server, and says the main points here.
+    Photos of the map are localized without themselves; no photo is needed for that.
+    """
+    opened = open_map(map_folder(map_ref, maps_dir))
+    target = Path(f"{opened.manifest.id}-report.html") if output is None else output
+    # Beside the report where the map is in no folder of maps.
+    work_dir = target.parent if is_map_folder(map_ref) else maps_dir
+    with StageProgress(_err) as progress:
+        data = write_report(
+            opened, target, work_dir, workers=workers, command=_typed(), progress=progress
+        )
+    summary = summary_of_report(data) | {"output": str(target)}
+    if as_json:
+        sys.stdout.write(json.dumps(summary, indent=2) + "\n")
+    else:
+        decimals = decimals_of(data["coverage"]["cell"] / 10)
+        _print_summary(summary, metric=opened.manifest.world.metric, decimals=decimals)
+
+
+def write_report(
+    opened: Map,
+    target: Path,
+    work_dir: Path,
+    *,
+    workers: int,
+    command: str,
+    progress: Callable[[str, int, int], None],
+) -> dict[str, Any]:
+    """Write the report of a map, whole or not at all, and return what it shows.
+
+    Finished runs are kept in ``work_dir`` until the report is written.
+
+    Args:
+        opened: the map.
+        target: the HTML file; one that exists is replaced.
+        work_dir: where work in progress is kept, in ``.report``.
+        workers: processes that localize.
+        command: how to make it again, for the reader.
+        progress: told the stage, how much is done, and how much there is.
+
+    Returns:
+        A ``ReportData`` as ``web/src/report/data.ts`` has it.
+
+    Raises:
+        Conflict: ``report.output`` or ``report.work`` if nothing can be written there;
+            ``report.running``.
+        Unavailable: ``page.not_built``.
+    """
+    # What can go wrong at the end is tried before the long work.
+    script, style = report_parts()
+    unfinished = _begun(target)
+    with ExitStack() as held:
+        held.callback(unfinished.unlink, missing_ok=True)
+        root = work_dir / ".report" / opened.manifest.id
+        try:
+            held.enter_context(exclusive(root.with_name(f"{root.name}.lock")))
+            root.mkdir(exist_ok=True)
+        except Conflict as error:
+            raise Conflict(
+                "report.running", "another report of this map is being made", field=str(root)
+            ) from error
+        except OSError as error:
+            raise Conflict(
+                "report.work",
+                "finished work cannot be kept in this folder; give one that can be written",
+                field=str(root.parent),
+                expected="a folder that can be written, of --maps-dir, or of --output for a map "
+                "that is given as a folder",
+                got=error.strerror,
+            ) from error
+        with Workers(workers) as pool:
+            data = make_report_data(
+                opened, WorkFolder(root), command=command, workers=pool, progress=progress
+            )
+        order = detail_order(opened.landmarks)
+        points = packed_points(opened, order, 0, MAX_POINTS)
+        data["points"] = base64.b64encode(points).decode("ascii")
+        unfinished.write_text(report_page(data, script, style), "utf-8")
+        unfinished.replace(target)
+        shutil.rmtree(root, ignore_errors=True)
+    return data
+
+
+def summary_of_report(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the main points of a report, for programs.
+
+    Each photo counts by the run that left out the fewest others. ``likely`` and ``unlikely`` are
+    the shares of places and directions with a chance of 90 % and more, and of less than 10 %.
+    ``cameras`` are in words. ``up`` is ``gravity``, or ``cameras`` where it was guessed from how
+    these were held.
+    """
+    within = data["coverage"]["within"]
+    kindest: dict[int, Mapping[str, Any]] = {}
+    for run in data["held_out"]:
+        known = kindest.get(run["image"])
+        if known is None or run["left_out"] < known["left_out"]:
+            kindest[run["image"]] = run
+    failed = [
+        data["images"][image]["name"]
+        for image, run in kindest.items()
+        if not run["localized"]
+        or run["position_error"] > within["position"]
+        or run["orientation_error_deg"] > within["orientation_deg"]
+    ]
+    chances = [chance for cell in data["coverage"]["cells"] for chance in cell["probability"]]
+    return {
+        "map": f"{data['map']['id']}@{data['map']['version']}",
+        "cameras": data["map"]["cameras"],
+        "up": data["up"]["source"],
+        "within": within,
+        "held_out": len(kindest),
+        "failed": failed,
+        "likely": sum(chance >= 0.9 for chance in chances) / len(chances) if chances else None,
+        "unlikely": sum(chance < 0.1 for chance in chances) / len(chances) if chances else None,
+        "weak_spots": data["coverage"]["weak_spots"],
+    }
+
+
+def _begun(target: Path) -> Path:
+    """Make the file, still empty, that is to take the place of the target.
+
+    Raises:
+        Conflict: ``report.output``.
+    """
+    unfinished = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    try:
+        if target.is_dir():
+            raise _no_output(target, "this is a folder", "there is a folder of this name")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        unfinished.touch()
+    except OSError as error:
+        raise _no_output(
+            target, "the report cannot be written there", str(error.strerror)
+        ) from error
+    return unfinished
+
+
+def _no_output(target: Path, message: str, why: str) -> Conflict:
+    return Conflict(
+        "report.output",
+        message,
+        field="--output",
+        expected="a file in a folder that can be written, such as room.html",
+        got=f"{target}: {why}",
+    )
+
+
+def _typed() -> str:
+    """The command as it was typed, for whoever gets the file: of paths their last parts only."""
+    options = ("--output=", "--maps-dir=")
+    words = []
+    for word in sys.argv[1:]:
+        option = next((option for option in options if word.startswith(option)), "")
+        value = word.removeprefix(option)
+        words.append(option + (PurePath(value).name or value))
+    return shlex.join(["mapping", *words])
+
+
+def _print_summary(summary: Mapping[str, Any], *, metric: bool, decimals: int) -> None:
+    def say(text: str) -> None:
+        _out.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    for line in summary["cameras"]:
+        say(f"cameras: {line}")
+    within, unit = summary["within"], " m" if metric else " units"
+    limits = f"within {within['position']:g}{unit} and {within['orientation_deg']:g} degrees"
+    failed = summary["failed"]
+    if summary["held_out"]:
+        localized = summary["held_out"] - len(failed)
+        say(f"photos localized without themselves, {limits}: {localized} of {summary['held_out']}")
+    for name in failed[:_SHOWN_NAMES]:
+        say(f"not localized: {name}")
+    if len(failed) > _SHOWN_NAMES:
+        say(f"and {len(failed) - _SHOWN_NAMES} more")
+    if summary["likely"] is not None:
+        say(
+            "places and directions where a photo has a chance of 90 % or more: "
+            f"{100 * summary['likely']:.0f} %; of less than 10 %: {100 * summary['unlikely']:.0f} %"
+        )
+    if summary["weak_spots"]:
+        table = Table(box=None, title="where to take more photos", title_justify="left")
+        for name in ("place", "looking", "chance", "why"):
+            table.add_column(name)
+        for spot in summary["weak_spots"]:
+            table.add_row(
+                ", ".join(f"{value:.{decimals}f}" for value in spot["position"]),
+                _clock(spot["direction_deg"]),
+                f"{100 * spot['probability']:.0f} %",
+                escape(spot["why"]),
+            )
+        _out.print(table, highlight=False)
+        say("looking: as a clock on the plan of the report, where 12 is up")
+    if summary["up"] != "gravity":
+        say(f"note: {UP_IS_A_GUESS}")
+    say(f"report: {summary['output']}")
+
+
+def _clock(heading_deg: float) -> str:
+    """Hour of a direction, 0 degrees being to the right."""
+    return f"{round((90 - heading_deg) % 360 / 30) % 12 or 12} o'clock"

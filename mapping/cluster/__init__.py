@@ -1,0 +1,1 @@
+"""Where the work of a build is done, and where its results lie."""

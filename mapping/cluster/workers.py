@@ -1,0 +1,201 @@
+"""Worker processes of this machine: the same task for many items, in any order."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from types import TracebackType
+from typing import TypeVar
+
+import cv2
+from threadpoolctl import threadpool_limits
+
+from mapping.cluster.stage_timings import Spent, spent_here
+from visloc.errors import Unavailable
+
+T = TypeVar("T")
+
+# Processes of a build unless told otherwise: more than this few machines have memory for.
+DEFAULT_WORKERS = min(os.cpu_count() or 1, 8)
+
+# Each library would otherwise start as many threads as there are processors, in every worker. They
+# read these when they are loaded; torch reads the first.
+ONE_THREAD = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENCV_FOR_THREADS_NUM": "1",
+}
+
+# Items that travel together: few, so that progress is seen, and all workers have work to the end.
+_MAX_BATCH, _MIN_BATCHES = 16, 200
+
+
+class Workers:
+    """Does work in ``count`` processes, which end with the ``with`` block; one means this process.
+
+    A single item is done in this process as well: Ctrl-C ends it at once, where it would wait for
+    another one, and it can tell how far it is. Every process uses one thread, so that their number
+    does not change what comes out.
+    Where a task of this process is the first to load torch, it uses all: for products of whole
+    numbers, which are the same with any number of threads.
+    """
+
+    def __init__(self, count: int) -> None:
+        # A forked child of a process that has used torch hangs.
+        spawn = multiprocessing.get_context("spawn")
+        self._pool = (
+            ProcessPoolExecutor(count, mp_context=spawn, initializer=_start_worker)
+            if count > 1
+            else None
+        )
+        self._spent = Spent()
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+
+    @property
+    def spent(self) -> Spent:
+        """What the other processes have used up for the items that are done."""
+        return self._spent
+
+    def run(
+        self, task: Callable[[T], object], items: Sequence[T], progress: Callable[[int, int], None]
+    ) -> None:
+        """Do the task for every item; tell the progress after each.
+
+        Raises:
+            Unavailable: ``build.worker_died``.
+            Exception: what the task raised first; waiting items are dropped.
+        """
+        progress(0, len(items))
+        if self._pool is None or len(items) == 1:
+            with one_thread_here():
+                for done, item in enumerate(items, 1):
+                    task(item)
+                    progress(done, len(items))
+            return
+        try:
+            with _one_thread_each(), _interrupted_later():
+                futures = [self._pool.submit(do_batch, task, batch) for batch in in_batches(items)]
+            done = 0
+            for future in as_completed(futures):
+                count, spent = future.result()
+                done += count
+                self._spent += spent
+                progress(done, len(items))
+        except BrokenProcessPool as error:
+            raise Unavailable(
+                "build.worker_died",
+                "a worker process ended: it was killed, or there was not enough memory; "
+                "finished work is kept, the same command resumes",
+                field="--workers",
+            ) from error
+
+    def run_one(
+        self,
+        task: Callable[[T, Callable[[int, int], None]], object],
+        item: T,
+        progress: Callable[[int, int], None],
+    ) -> None:
+        """Do one long task in this process; it tells the progress itself."""
+        with one_thread_here():
+            task(item, progress)
+
+
+def in_batches(items: Sequence[T]) -> list[Sequence[T]]:
+    """Return the items in batches: many share one journey of the task."""
+    size = max(1, min(_MAX_BATCH, len(items) // _MIN_BATCHES))
+    return [items[start : start + size] for start in range(0, len(items), size)]
+
+
+def do_batch(task: Callable[[T], object], items: Sequence[T]) -> tuple[int, Spent]:
+    """Do the task for the items in this process; return how many, and what that used up."""
+    before = spent_here()
+    for item in items:
+        task(item)
+    return len(items), spent_here() - before
+
+
+def _start_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A worker of a build that was killed would wait for work forever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+@contextmanager
+def _interrupted_later() -> Iterator[None]:
+    """Let Ctrl-C wait while processes start: half a start would end in a traceback.
+
+    The processes that start meanwhile never hear of it: it is the parent's to handle.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    caught: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: caught.append(number))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, before)
+    if caught:
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def one_thread_here() -> Iterator[None]:
+    """Compute as a worker does: results differ in the last bits with the number of threads."""
+    # A network that torch computes was made before, with torch. Without one it would take seconds
+    # to load for nothing; matching may load it later.
+    torch = sys.modules.get("torch")
+    before = cv2.getNumThreads(), torch.get_num_threads() if torch else 0
+    cv2.setNumThreads(1)
+    if torch:
+        torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1, user_api="blas"):  # of NumPy and SciPy
+            yield
+    finally:
+        cv2.setNumThreads(before[0])
+        if torch:
+            torch.set_num_threads(before[1])
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Processes that start meanwhile use one thread in libraries that read the environment."""
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(ONE_THREAD)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

@@ -1,0 +1,1 @@
+"""Maps that exist: edited, packed, exported, split, merged, pruned, updated."""

@@ -1,0 +1,151 @@
+"""Our features of a dataset in kapture's layout, so that other tools can run on them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mapping.build.photos import read_in_frame
+from visloc.archive import FingerprintRecord, Map
+from visloc.errors import Conflict
+from visloc.features import make_global_descriptor, make_local_features
+from visloc.kapture import (
+    Dataset,
+    read_dataset,
+    write_dataset,
+    write_global_features,
+    write_local_features,
+)
+from visloc.photo_features import extract_features
+from visloc.types import Inference, ReadAs
+
+
+def export_features(
+    dataset_root: Path,
+    output: Path,
+    *,
+    local_features: str,
+    weights_dir: Path | None,
+    inference: Inference,
+    max_keypoints: int,
+    global_from: Map | None,
+    progress: Callable[[str, int, int], None],
+) -> list[str]:
+    """Write a kapture of the same photos with keypoints, descriptors and global descriptors.
+
+    ``output`` gets the dataset's text files, a link to its photos, and
+    ``reconstruction/<kind>/<name>/``. Keypoints are x, y, scale in our pixel convention (the
+    centre of the first pixel is 0.5, as COLMAP has it). Finished photos are not done again.
+
+    Args:
+        dataset_root: kapture folder.
+        output: folder to make, or one that an earlier run with the same settings left.
+        local_features: a name of ``visloc.features.LOCAL_FEATURES``.
+        weights_dir: folder with network weights.
+        inference: how networks are computed.
+        max_keypoints: strongest keypoints kept per photo.
+        global_from: a map whose global descriptors are computed for the photos; its local
+            features must be the same and as many, since ``localvlad`` is made of them.
+        progress: told the stage, how much is done, and how much there is.
+
+    Returns:
+        The names of photos that are listed but absent; they have no features.
+
+    Raises:
+        Conflict: ``map.features`` when the map has other local features;
+            ``export.other_dataset`` or ``export.other_settings`` when ``output`` holds something
+            else.
+    """
+    dataset = read_dataset(dataset_root)
+    extractor = make_local_features(local_features, weights_dir, inference)
+    descriptors = {}
+    if global_from is not None:
+        built_with = global_from.manifest.local_features
+        if (built_with.fingerprint, built_with.max_keypoints) != (
+            FingerprintRecord.of(extractor.fingerprint),
+            max_keypoints,
+        ):
+            raise Conflict(
+                "map.features",
+                "the map was built with other local features",
+                field="--map",
+                expected=f"{local_features}, at most {max_keypoints} per photo",
+                got=f"{built_with.fingerprint.name}, at most {built_with.max_keypoints} per photo",
+            )
+        for features in global_from.manifest.global_features:
+            name = features.fingerprint.name
+            descriptor = make_global_descriptor(name, weights_dir, inference)
+            descriptors[name] = (descriptor, global_from.global_models[name])
+    _write_records(dataset, output)
+    reconstruction = output / "reconstruction"
+    settings = {
+        "local_features": FingerprintRecord.of(extractor.fingerprint).model_dump(),
+        "computed_with": extractor.computed_with,
+        "max_keypoints": max_keypoints,
+        "read_as": ReadAs.UPRIGHT,
+        "global_from": global_from and global_from.manifest.content_hash,
+    }
+    _claim(reconstruction / f"{local_features}.json", settings)
+    absent = []
+    for done, record in enumerate(dataset.images, 1):
+        if not dataset.has_file(record):
+            absent.append(record.path)
+            progress("features", done, len(dataset.images))
+            continue
+        last_written = [reconstruction / "descriptors" / local_features / f"{record.path}.desc"]
+        for name in descriptors:
+            last_written.append(reconstruction / "global_features" / name / f"{record.path}.gfeat")
+        if not all(path.is_file() for path in last_written):
+            size = dataset.sensors[record.sensor_id].image_size
+            assert size is not None  # every sensor of a photo has one
+            photo = read_in_frame(dataset.path_of(record), size, record.sensor_id)
+            local, rgb = extract_features(photo, extractor, max_keypoints=max_keypoints)
+            for name, (descriptor, model) in descriptors.items():
+                vector = descriptor.describe(rgb, local, model)
+                write_global_features(output, name, record.path, vector, name=name)
+            write_local_features(
+                output,
+                local_features,
+                record.path,
+                np.column_stack([local.keypoints, local.scales]),
+                local.descriptors,
+                name=local_features,
+            )
+        progress("features", done, len(dataset.images))
+    return absent
+
+
+def _claim(path: Path, settings: Mapping[str, object]) -> None:
+    """Note the settings beside the features, so that no other ones join them."""
+    text = json.dumps(settings, indent=1, sort_keys=True) + "\n"
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    elif path.read_text(encoding="utf-8") != text:
+        raise Conflict(
+            "export.other_settings",
+            "the folder holds features made with other settings; name another folder or remove it",
+            field=str(path),
+        )
+
+
+def _write_records(dataset: Dataset, output: Path) -> None:
+    """Write the dataset's text files and link its photos, unless an earlier run did."""
+    records = output / "sensors" / "records_data"
+    photos = (dataset.root / "sensors" / "records_data").resolve()
+    if not (records.is_symlink() or records.exists()):
+        records.parent.mkdir(parents=True, exist_ok=True)
+        records.symlink_to(photos)
+    if not (output / "sensors" / "sensors.txt").is_file():
+        write_dataset(replace(dataset, root=output))
+    if records.resolve() != photos or read_dataset(output).images != dataset.images:
+        raise Conflict(
+            "export.other_dataset",
+            "the folder holds another dataset; name another folder or remove it",
+            field=str(output),
+            expected=f"a new folder, or one that was made of {dataset.root}",
+        )

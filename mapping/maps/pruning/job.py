@@ -1,0 +1,146 @@
+"""The job of ``mapping prune``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+from mapping.build.publishing import link_photos, photo_files, write_content
+from mapping.build.stages import exclusive
+from mapping.maps.editing import content_of, selected
+from mapping.maps.pruning.accuracy import Accuracy, of_held_out_photos
+from mapping.maps.pruning.choosing import LEFT_OUT, Kept, choose, least, num_landmarks, size_with
+from visloc.archive import Map, MapContent, MapStore, open_map
+from visloc.archive.store import outdated
+from visloc.errors import Conflict, InvalidInput
+
+Measure = Callable[[Map, Map], tuple[Accuracy, Accuracy]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pruned:
+    """A smaller version of a map.
+
+    Attributes:
+        before: the version that it was made of.
+        after: the new version.
+        accuracy: before and after.
+    """
+
+    before: Map
+    after: Map
+    accuracy: tuple[Accuracy, Accuracy]
+
+
+def prune_map(
+    store: MapStore,
+    map_ref: str,
+    *,
+    max_bytes: int | None = None,
+    max_landmarks: int | None = None,
+    measure: Measure | None = None,
+    progress: Callable[[str, int, int], None],
+) -> Pruned:
+    """Publish a version of a map that is as large as it may be; the one before stays.
+
+    Args:
+        store: with the map.
+        map_ref: ``id``, or ``id@version`` of the version in use.
+        max_bytes: most that its files take, manifest aside; or None.
+        max_landmarks: most landmarks; or None.
+        measure: compares the accuracy of both versions; None: by photos of the map.
+        progress: told the stage, how much is done, and how much there is.
+
+    Raises:
+        InvalidInput: ``prune.too_small`` with the least that is possible.
+        Conflict: ``prune.small_already``; ``map.outdated``; ``build.running``.
+    """
+    before = store.open(map_ref)
+    map_id, named = before.manifest.id, before.manifest.version
+    with exclusive(store.root / ".work" / f"{map_id}.lock"):
+        if (current := store.current_version(map_id)) != named:
+            raise outdated(map_id, named, current)
+        progress("choosing", 0, 1)
+        kept = keep_within(before, max_bytes, max_landmarks)
+        progress("choosing", 1, 1)
+        content = selected(content_of(before), kept.images, observations=kept.observations)
+        content = _noted(before, content)
+        with store.incoming() as incoming:
+            pictures = photo_files(before)
+            link_photos(
+                incoming,
+                [path for path, stays in zip(pictures, kept.images, strict=True) if stays]
+                if pictures
+                else [],
+            )
+            version = write_content(incoming, content, map_id)
+            # Measured before anybody is served it.
+            after = open_map(incoming)
+            told = partial(progress, "before and after")
+            accuracy = (
+                of_held_out_photos(before, after, kept, told)
+                if measure is None
+                else measure(before, after)
+            )
+            folder = store.publish(incoming, map_id, version, based_on=named)
+        return Pruned(before, open_map(folder), accuracy)
+
+
+def keep_within(opened: Map, max_bytes: int | None, max_landmarks: int | None) -> Kept:
+    """Choose what stays of a map; errors as of ``prune_map``."""
+    size, count = opened.size_bytes, len(opened.landmarks)
+    if (max_bytes is None or size <= max_bytes) and (
+        max_landmarks is None or count <= max_landmarks
+    ):
+        raise Conflict(
+            "prune.small_already",
+            "the map is not larger than it may be",
+            field="--max-bytes" if max_landmarks is None else "--max-landmarks",
+            expected=f"less than {size} bytes" if max_landmarks is None else f"less than {count}",
+            got=max_bytes if max_landmarks is None else max_landmarks,
+        )
+
+    def fits(kept: Kept) -> bool:
+        if max_bytes is not None and size_with(opened, kept) > max_bytes:
+            return False
+        return max_landmarks is None or num_landmarks(opened, kept) <= max_landmarks
+
+    whole = max_bytes is None
+    kept = choose(opened, fits, whole_landmarks=whole)
+    if kept is not None:
+        return kept
+    smallest = least(opened, whole_landmarks=whole)
+    if max_bytes is not None and size_with(opened, smallest) > max_bytes:
+        fixed = sum(
+            entry.size
+            for name, entry in opened.manifest.files.items()
+            if name.endswith(".model.npz") or name == "cameras.json"
+        )
+        raise InvalidInput(
+            "prune.too_small",
+            f"no photo or landmark could be kept as it is needed: the models of the global "
+            f"features alone take {fixed} bytes, whatever is left out",
+            field="--max-bytes",
+            expected=f"at least {size_with(opened, smallest)}",
+            got=max_bytes,
+        )
+    raise InvalidInput(
+        "prune.too_small",
+        "the photos that cover the map would see too little to be localized by",
+        field="--max-landmarks",
+        expected=f"at least {num_landmarks(opened, smallest)}",
+        got=max_landmarks,
+    )
+
+
+def _noted(before: Map, content: MapContent) -> MapContent:
+    """Say in the map that it is a part, and of what."""
+    counts = before.manifest.counts
+    gone = [name for name in LEFT_OUT if name in before.manifest.files]
+    note = (
+        f"pruned from version {before.manifest.version}, which has {counts.images} photos, "
+        f"{counts.landmarks} landmarks and {counts.observations} observations"
+        + (f"; {' and '.join(gone)} left out" if gone else "")
+    )
+    return replace(content, notes=(*content.notes, note))

@@ -1,0 +1,85 @@
+"""Photos of a map as queries: what the map keeps of one is asked of a map, without any pixels.
+
+The same functions answer as online. Its own map may be asked, without it, or another one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.archive import Map
+from visloc.geometry import Pose
+from visloc.localization.constraints import MapGeometry
+from visloc.localization.solving import Look, Matches, SeenImage, Solved, solve_instant
+from visloc.matching.correspondences import Correspondences, match_landmarks
+from visloc.matching.products import EightBitRows
+from visloc.priors import NO_PRIORS
+from visloc.types import CameraSource, Evidence, LocalizeOptions, ReadAs
+
+
+def match_stored(
+    source: Map,
+    image: int,
+    target: Map,
+    photos: Iterable[int],
+    without: NDArray[np.integer] | None = None,
+) -> Correspondences:
+    """Match the features that a map keeps of a photo with what photos of a map see.
+
+    Args:
+        source: the map that keeps the photo.
+        image: its row there.
+        target: the map that is asked; may be the same.
+        photos: rows of its photos, most similar first.
+        without: (k,) landmarks that it is not to have; None for none.
+    """
+    scale = target.manifest.local_features.descriptor_scale
+
+    def observed(photo: int) -> tuple[NDArray[np.integer], EightBitRows]:
+        landmarks, descriptors = target.observations(photo)
+        if without is None:
+            return landmarks, EightBitRows(descriptors, scale)
+        there = ~np.isin(landmarks, without)
+        return landmarks[there], EightBitRows(descriptors[there], scale)
+
+    own_scale = source.manifest.local_features.descriptor_scale
+    return match_landmarks(
+        EightBitRows(source.observations(image)[1], own_scale),
+        [observed(int(photo)) for photo in photos],
+    )
+
+
+def solve_stored(
+    source: Map,
+    image: int,
+    target: Map,
+    geometry: MapGeometry,
+    matched: Correspondences,
+    options: LocalizeOptions,
+) -> Solved:
+    """Find the pose of a photo from its matches, relative to the origin of the map asked.
+
+    Args:
+        source: the map that keeps the photo.
+        image: its row there.
+        target: the map that is asked.
+        geometry: of it.
+        matched: what ``match_stored`` found.
+        options: thresholds and the seed.
+    """
+    pixels = source.keypoints(image)[matched.keypoints].astype(np.float64)
+    points = target.landmarks[matched.landmarks].astype(np.float64)
+    evidence = Evidence(
+        source.cameras[source.images[image].camera],
+        CameraSource.GIVEN,
+        1,
+        ReadAs.STORED,
+        num_keypoints=len(source.observations(image)[0]),
+        num_correspondences=len(matched),
+    )
+    look = Look(evidence, Matches(pixels, points), matched.landmarks, Matches.none())
+    seen = SeenImage("camera", Pose.identity(), look)
+    return solve_instant([seen], geometry, options, NO_PRIORS)

@@ -1,0 +1,406 @@
+"""The job: from a new capture to a new version of the map, stage by stage."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.build.colours import landmark_colours
+from mapping.build.features import LocalFeaturesSource, Progress
+from mapping.build.landmarks import MadeLandmarks
+from mapping.build.photos import MappingPhoto
+from mapping.build.previews import keep_photos
+from mapping.build.publishing import photo_files, publish_edited
+from mapping.build.stages import WorkFolder, exclusive
+from mapping.cli.options import map_folder
+from mapping.cluster.executors import Executor
+from mapping.cluster.workers import Workers
+from mapping.maps.editing import content_of, joined
+from mapping.maps.updating.capture import (
+    Capture,
+    collect_capture,
+    describe_capture,
+    open_map_features,
+    some,
+    where_localized,
+)
+from mapping.maps.updating.joining import landmarks_in_same_voxel, part_of_map, scaled_rigs
+from mapping.maps.updating.localizing import Placed, localize_photos
+from mapping.maps.updating.placing import (
+    Placement,
+    beside,
+    contradicted,
+    evenly,
+    place_capture,
+    refuse_elsewhere,
+)
+from mapping.maps.updating.settings import (
+    UpdateSettings,
+    check_settings,
+    method_for,
+    refuse_few,
+    refuse_strange_settings,
+)
+from mapping.methods.rgbd import (
+    DepthSettings,
+    landmarks_from_depth,
+    lift_keypoints,
+    refuse_without_depth,
+)
+from mapping.methods.sfm import SfmSettings, landmarks_from_matches
+from visloc.archive import Map, MapContent, MapStore, open_map
+from visloc.archive.schema import photo_file
+from visloc.archive.store import outdated
+from visloc.errors import Unavailable
+from visloc.evaluation import pose_error
+from visloc.geometry import Similarity
+from visloc.kapture import Dataset, read_dataset
+
+# Photos that are localized before the long work begins, to refuse what does not fit.
+_TRIED_FIRST = 8
+# Photos that the tie rests on, evenly spread.
+_TIED_BY = 16
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateRecord:
+    """What is known of an update; the manifest keeps it in ``updates`` of the method's settings.
+
+    Attributes:
+        capture: what it is called, or the name of its folder.
+        poses: a name of ``POSES``.
+        method: a name of ``METHODS``.
+        photos: that were added.
+        landmarks: that were added.
+        observations: that were added, of old and new landmarks.
+        tried: photos that were to be localized.
+        localized: those of them that were.
+        not_localized: how many of the others by reason.
+        tied: those whose own pose, moved, agrees with what they see of the map.
+        pixels: median distance between where these see landmarks and the projections.
+        position: median distance between where these were localized and their own pose, moved, in
+            units of the map.
+        orientation_deg: the same of directions.
+        scale: units of the map in one unit of the dataset.
+    """
+
+    capture: str
+    poses: str
+    method: str
+    photos: int
+    landmarks: int
+    observations: int
+    tried: int
+    localized: int
+    not_localized: dict[str, int]
+    tied: int
+    pixels: float
+    position: float
+    orientation_deg: float
+    scale: float
+
+
+@dataclass(frozen=True, slots=True)
+class Updated:
+    """What an update made.
+
+    Attributes:
+        folder: of the new version.
+        record: what its manifest says of the update.
+        notes: that the update added: what was left out, one sentence each.
+    """
+
+    folder: Path
+    record: UpdateRecord
+    notes: tuple[str, ...]
+
+
+def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
+    """Add a new capture to a map, as a new version, which becomes current.
+
+    Killed at any moment, the same call finds its finished work again; the version that was current
+    before stays so until the new one is complete and verified.
+
+    Raises:
+        Conflict: ``update.elsewhere`` for a capture that does not fit the map; ``update.photos``
+            when the map has photos of these names; ``map.outdated`` when another version is
+            current; ``map.features``; ``update.settings``; ``build.running``.
+        DatasetError, WeightsError, InvalidInput: with the file or the setting that is wrong.
+        Unavailable: ``storage.failed`` when the disk is full or broken.
+    """
+    check_settings(settings)
+    store = MapStore(settings.maps_dir)
+    opened = open_map(map_folder(settings.map_ref, settings.maps_dir))
+    map_id, version = opened.manifest.id, opened.manifest.version
+    method = method_for(settings, opened)
+    refuse_strange_settings(opened)
+    dataset = read_dataset(settings.dataset).with_pixels_from(settings.pixel_origin)
+    work_root = settings.maps_dir / ".work" / map_id
+    work = WorkFolder(work_root)
+    features = open_map_features(settings, opened, work)
+    try:
+        with exclusive(work_root.with_name(f"{map_id}.lock")):
+            if (current := store.current_version(map_id)) != version:
+                raise outdated(map_id, version, current)
+            with Workers(settings.workers) as workers:
+                job = _Job(settings, opened, dataset, features, method, work, workers, progress)
+                content, pictures, record, notes = job.run()
+            progress("archive", 0, 1)
+            folder = publish_edited(store, content, map_id, photos=pictures, based_on=version)
+            progress("archive", 1, 1)
+            shutil.rmtree(work_root, ignore_errors=True)
+    except OSError as error:
+        raise Unavailable(
+            "storage.failed",
+            f"reading or writing failed: {error.strerror or error}; "
+            "finished work is kept, the same command resumes",
+            field=str(error.filename or work_root),
+        ) from error
+    return Updated(folder, record, notes)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Job:
+    """One update, with all that its stages need."""
+
+    settings: UpdateSettings
+    opened: Map
+    dataset: Dataset
+    features: LocalFeaturesSource
+    method: str
+    work: WorkFolder
+    workers: Executor
+    progress: Progress
+
+    def run(self) -> tuple[MapContent, list[Path], UpdateRecord, tuple[str, ...]]:
+        """Return the updated map, its small pictures if it keeps such, the record, and notes."""
+        settings, by_depth = self.settings, self.method == "rgbd"
+        capture, notes = collect_capture(
+            settings,
+            self.opened,
+            self.dataset,
+            self.features,
+            with_depth=by_depth,
+            progress=self.progress,
+        )
+        count = len(capture.photos)
+        if not by_depth:
+            refuse_few(count)
+        rows = evenly(range(count), count if settings.poses == "localize" else _TIED_BY)
+        # What does not fit is refused before the long work begins.
+        first = self._described(capture.take(evenly(rows, _TRIED_FIRST)))
+        refuse_elsewhere(self.opened, self._localized(first))
+        if by_depth:
+            refuse_without_depth(self.dataset, capture.photos)
+        capture = self._described(capture)
+        tried = capture.take(rows)
+        placed = self._localized(tried)
+        placement = place_capture(
+            self.opened,
+            tried.photos,
+            placed,
+            settings.poses,
+            self._lifted if by_depth else None,
+            metric=settings.metric,
+        )
+        if settings.poses == "localize":
+            capture, absent = where_localized(tried, placed)
+            if absent:
+                notes.append(f"{len(absent)} of {count} photos found no place: {some(absent)}")
+        else:
+            known = dict(zip(rows, placed, strict=True))
+            capture, left_out = self._without_contradicted(
+                capture, known, placement.map_from_dataset
+            )
+            notes += left_out
+        return self._joined(capture, placement, notes)
+
+    def _without_contradicted(
+        self, capture: Capture, placed: dict[int, Placed], map_from_dataset: Similarity
+    ) -> tuple[Capture, list[str]]:
+        """The photos whose poses the map does not contradict, and notes on the others.
+
+        Who stands beside a contradicted photo is tried as well, and goes when the map cannot tell.
+        """
+        count = len(capture.photos)
+
+        def localized() -> list[int]:
+            return [row for row, one in placed.items() if one.localized]
+
+        wrong = contradicted(capture.photos, placed, map_from_dataset)
+        if not wrong:
+            return capture, []
+        more = [row for row in beside(wrong, localized(), count) if row not in placed]
+        placed = {**placed, **dict(zip(more, self._localized(capture.take(more)), strict=True))}
+        wrong = contradicted(capture.photos, placed, map_from_dataset)
+        doubtful = beside(wrong, localized(), count)
+        off = [
+            pose_error(map_from_dataset.move(capture.photos[row].pose), placed[row].cam_from_map)
+            for row in wrong
+        ]
+        distance, angle = np.median(off, axis=0)
+        unit = "m" if self.opened.manifest.world.metric else "units"
+        notes = [
+            f"{len(wrong)} of {count} photos left out, since the map localizes them {distance:.3g} "
+            f"{unit}, {angle:.3g} degrees from their own poses, in the median: "
+            f"{some([capture.names[row] for row in wrong])}"
+        ]
+        if doubtful:
+            notes.append(
+                f"{len(doubtful)} of {count} photos left out, since they are beside such, and not "
+                f"localized: {some([capture.names[row] for row in doubtful])}"
+            )
+        gone = {*wrong, *doubtful}
+        return capture.take([row for row in range(count) if row not in gone]), notes
+
+    def _lifted(
+        self, photo: MappingPhoto, pixels: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        keypoints, scale = pixels.astype(np.float32), self.settings.depth_scale
+        lifted = lift_keypoints(self.dataset, photo, keypoints, scale)
+        return lifted.rows, lifted.points
+
+    def _described(self, capture: Capture) -> Capture:
+        return describe_capture(
+            self.settings,
+            self.opened,
+            self.dataset,
+            self.features,
+            capture,
+            self.work,
+            self.workers,
+            self.progress,
+        )
+
+    def _localized(self, capture: Capture) -> list[Placed]:
+        return localize_photos(
+            self.opened,
+            self.work,
+            capture.photos,
+            self.features,
+            capture.described,
+            self.settings.weights_dir,
+            self.settings.inference,
+            self.workers,
+            self.progress,
+        )
+
+    def _joined(
+        self, capture: Capture, placement: Placement, notes: Sequence[str]
+    ) -> tuple[MapContent, list[Path], UpdateRecord, tuple[str, ...]]:
+        """Make landmarks of the photos, and join them to the map."""
+        if self.method == "sfm":
+            refuse_few(len(capture.photos))
+        content = content_of(self.opened)
+        map_from_dataset = placement.map_from_dataset
+        if self.settings.poses == "localize" and not (self.settings.metric and content.metric):
+            # Photos that are placed one by one do not tell how long a rig is in the map's unit.
+            dataset = replace(self.dataset, rigs={})
+        else:
+            dataset = scaled_rigs(self.dataset, map_from_dataset.scale)
+        made, same = self._landmarks(content, dataset, capture, map_from_dataset)
+        placed = [capture.photos[row] for row in made.photos]
+        if content.landmarks.colors is not None and made.landmarks.colors is None:
+            colours = landmark_colours(
+                self.work, placed, made.landmarks, self.workers, self.progress
+            )
+            made = replace(made, landmarks=replace(made.landmarks, colors=colours))
+        part = part_of_map(
+            content,
+            dataset,
+            capture.photos,
+            capture.names,
+            self.features,
+            capture.described,
+            made,
+            notes,
+        )
+        # Those of two captures are two, though they say the same.
+        part = replace(part, notes=tuple(f"{self._name}: {note}" for note in part.notes))
+        pictures = photo_files(self.opened)
+        if pictures:
+            folder = self.work.root / "small_photos"
+            keep_photos(self.work, folder, placed, self.workers, self.progress)
+            pictures += [folder / photo_file(row) for row in range(len(placed))]
+        whole = joined(content, part, same)
+        record = self._record(placement, content, whole)
+        before = content.settings.get("updates", [])
+        assert isinstance(before, list)
+        settings = {**content.settings, "updates": [*before, asdict(record)]}
+        return replace(whole, settings=settings), pictures, record, tuple(part.notes)
+
+    @property
+    def _name(self) -> str:
+        """What the capture is called."""
+        return self.settings.capture or self.settings.dataset.resolve().name
+
+    def _landmarks(
+        self,
+        content: MapContent,
+        dataset: Dataset,
+        capture: Capture,
+        map_from_dataset: Similarity,
+    ) -> tuple[MadeLandmarks, NDArray[np.int64] | None]:
+        """Landmarks of the new photos in the map's frame; which of them the map has already."""
+        if self.method == "sfm":
+            photos = [
+                replace(photo, cam_from_world=map_from_dataset.move(photo.pose))
+                for photo in capture.photos
+            ]
+            described = [
+                replace(one, descriptors=capture.described[one.fingerprint.name])
+                for one in content.global_features
+            ]
+            made = landmarks_from_matches(
+                self.work,
+                dataset,
+                photos,
+                self.features,
+                described,
+                SfmSettings(),
+                content.metric,
+                self.workers,
+                self.progress,
+            )
+            return made, None
+        of_map = content.settings.get("voxel_size")  # of maps by depth
+        usual = DepthSettings().voxel_size * map_from_dataset.scale
+        voxel_size = float(of_map) if isinstance(of_map, int | float) else usual
+        made = landmarks_from_depth(
+            self.work,
+            self.dataset,
+            capture.photos,
+            self.features,
+            DepthSettings(voxel_size, self.settings.depth_scale),
+            content.metric,
+            self.workers,
+            self.progress,
+            map_from_dataset,
+        )
+        centers = np.array([view.cam_from_world.center for view in made.views])
+        corner = np.round(centers.mean(axis=0))  # as merging has it
+        return made, landmarks_in_same_voxel(content.landmarks, made.landmarks, corner, voxel_size)
+
+    def _record(self, placement: Placement, before: MapContent, after: MapContent) -> UpdateRecord:
+        settings, old, new = self.settings, before.landmarks, after.landmarks
+        return UpdateRecord(
+            capture=self._name,
+            poses=settings.poses,
+            method=self.method,
+            photos=len(after.images) - len(before.images),
+            landmarks=len(new.points) - len(old.points),
+            observations=len(new.observed) - len(old.observed),
+            tried=placement.tried,
+            localized=placement.tried - sum(placement.not_localized.values()),
+            not_localized=placement.not_localized,
+            tied=placement.tied,
+            pixels=placement.pixels,
+            position=placement.position,
+            orientation_deg=placement.orientation_deg,
+            scale=placement.map_from_dataset.scale,
+        )

@@ -1,0 +1,161 @@
+"""Photos of a new capture, localized in the map that they are to join."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.build.features import LocalFeaturesSource, Progress, open_descriptor
+from mapping.build.photos import MappingPhoto
+from mapping.build.stages import Item, WorkFolder, key_of
+from mapping.cluster.executors import Executor
+from mapping.methods.matching import camera_values
+from visloc import __version__
+from visloc.archive import Map, open_map
+from visloc.geometry import Pose
+from visloc.localization.localizer import Localizer
+from visloc.types import Inference, Localized, LocalizeOptions, QueryFeatures
+
+# Raised when the code of the stage changes what comes out.
+_REVISION = 1
+# Strongest keypoints of a photo that are used: as many as of a query.
+_MAX_KEYPOINTS = 2500
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """Where a photo was localized.
+
+    Attributes:
+        reason: why it was not; "" when it was.
+        cam_from_map: pose; the identity without.
+        pixels: (n, 2) float64, where it sees landmarks.
+        points: (n, 3) float64 those landmarks, in the map's frame.
+    """
+
+    reason: str
+    cam_from_map: Pose
+    pixels: NDArray[np.float64]
+    points: NDArray[np.float64]
+
+    @property
+    def localized(self) -> bool:
+        """Whether the map gave a pose."""
+        return self.reason == ""
+
+
+def localize_photos(
+    opened: Map,
+    work: WorkFolder,
+    photos: Sequence[MappingPhoto],
+    features: LocalFeaturesSource,
+    described: Mapping[str, NDArray[np.float32]],
+    weights_dir: Path | None,
+    inference: Inference,
+    workers: Executor,
+    progress: Progress,
+) -> list[Placed]:
+    """Localize photos from the features that were found already, as queries are.
+
+    Args:
+        opened: the map.
+        work: keeps finished photos.
+        photos: with their cameras.
+        features: their local features, of the map's kind.
+        described: global descriptors (n, D) of these photos by name, as the map describes them.
+        weights_dir: folder with network weights.
+        inference: how networks are computed.
+        workers: where they are localized.
+        progress: told how far it is.
+    """
+    task = _LocalizeTask(
+        work, opened.path, opened.manifest.content_hash, features, weights_dir, inference
+    )
+    queries = [
+        _Query(photo, {name: rows[row] for name, rows in described.items()})
+        for row, photo in enumerate(photos)
+    ]
+    workers.run(task.localize, queries, partial(progress, "localized"))
+    return [_placed(work.read(task.key(query))) for query in queries]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Query:
+    photo: MappingPhoto
+    described: Mapping[str, NDArray[np.float32]]
+
+
+@dataclass(frozen=True, slots=True)
+class _LocalizeTask:
+    """What workers do for a photo."""
+
+    work: WorkFolder
+    folder: Path
+    content_hash: str
+    features: LocalFeaturesSource
+    weights_dir: Path | None
+    inference: Inference
+
+    def key(self, query: _Query) -> str:
+        return key_of(
+            "localized",
+            _REVISION,
+            version=__version__,
+            map=self.content_hash,
+            local=self.features.key(query.photo),
+            described={
+                name: hashlib.sha256(row.tobytes()).hexdigest()
+                for name, row in query.described.items()
+            },
+            camera=camera_values(query.photo.camera),
+        )
+
+    def localize(self, query: _Query) -> None:
+        key = self.key(query)
+        if not self.work.has(key):
+            self.work.get(key, partial(self._compute, query))
+
+    def _compute(self, query: _Query) -> Item:
+        localizer = _open_localizer(self.folder, self.weights_dir, self.inference)
+        found = self.features.read(query.photo)  # strongest first
+        features = QueryFeatures(
+            localizer.map.manifest.local_features.fingerprint.name,
+            found.keypoints[:_MAX_KEYPOINTS],
+            found.descriptors[:_MAX_KEYPOINTS],
+            query.described,
+        )
+        answer = localizer.localize_features(features, query.photo.camera, LocalizeOptions())
+        if not isinstance(answer, Localized):
+            return _item(str(answer.reason), Pose.identity(), np.empty((0, 2)), np.empty((0, 3)))
+        pixels = answer.inlier_keypoints.astype(np.float64)
+        return _item("", answer.cam_from_world, pixels, answer.inlier_points)
+
+
+def _item(
+    reason: str, pose: Pose, pixels: NDArray[np.float64], points: NDArray[np.float64]
+) -> Item:
+    return {
+        "reason": np.array(reason),
+        "rotation": pose.rotation,
+        "translation": pose.translation,
+        "pixels": pixels,
+        "points": points,
+    }
+
+
+def _placed(item: Item) -> Placed:
+    pose = Pose(item["rotation"], item["translation"])
+    return Placed(str(item["reason"]), pose, item["pixels"], item["points"])
+
+
+@cache
+def _open_localizer(folder: Path, weights_dir: Path | None, inference: Inference) -> Localizer:
+    """The localizer of this process; it takes features, so it needs no extractor."""
+    make_descriptor = partial(open_descriptor, weights_dir=weights_dir, inference=inference)
+    return Localizer(open_map(folder), None, make_descriptor)

@@ -1,0 +1,1 @@
+"""How landmarks are made: depth, matches, or a known model."""

@@ -1,0 +1,202 @@
+"""Landmarks from a reconstruction that the dataset brings along: an imported one.
+
+With the features that the reconstruction was made of, its points are the landmarks. Other features
+do not see its points: its photos are matched anew, with its poses, between the photos that it says
+see the same. Its points then stay in the map beside the landmarks, so that the map can be exported
+as the reconstruction that it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.build.features import LocalFeaturesSource, Progress, ReadyMadeFeatures
+from mapping.build.landmarks import (
+    MadeLandmarks,
+    Observations,
+    View,
+    assemble_landmarks,
+    triangulation_angles,
+)
+from mapping.build.photos import MappingPhoto
+from mapping.build.stages import WorkFolder
+from mapping.cluster.executors import Executor
+from mapping.methods.imported_points import ImportedPoints
+from mapping.methods.sfm import SfmSettings, landmarks_from_matches
+from visloc.archive import Anchor
+from visloc.errors import DatasetError
+from visloc.geometry import PixelOrigin
+from visloc.kapture import Dataset, FeatureSet, Reconstruction, open_features, read_reconstruction
+
+
+def landmarks_from_reconstruction(
+    work: WorkFolder,
+    dataset: Dataset,
+    photos: Sequence[MappingPhoto],
+    features: LocalFeaturesSource,
+    origin: PixelOrigin,
+    settings: SfmSettings,
+    metric: bool,
+    workers: Executor,
+    progress: Progress,
+) -> MadeLandmarks:
+    """Take the dataset's points as landmarks, or match its photos anew.
+
+    As landmarks the points are taken as they are: no threshold of reprojection error, angle or
+    number of observations is applied, since what made them had its own.
+
+    Args:
+        work: where finished work is kept.
+        dataset: it has points, observations and the keypoints that observe.
+        photos: with poses.
+        features: of the photos.
+        origin: what the dataset's keypoints count from.
+        settings: how photos are matched anew; the pairs are those that see the same points.
+        metric: whether a unit of the dataset's poses is a metre.
+        workers: who works.
+        progress: told how far it is.
+
+    Raises:
+        DatasetError: ``model.no_points``, ``kapture.index`` for an observation by a keypoint that
+            does not exist, and what reading raises.
+        InvalidInput: what matching raises.
+    """
+    known, keypoints = _read(dataset, features)
+    imported, notes = _imported_points(known, keypoints, photos, origin)
+    anchor = Anchor(kind="model", images=len(photos))
+    if not (
+        isinstance(features, ReadyMadeFeatures)
+        and features.keypoints.type_name == known.keypoints_type
+    ):
+        anew = replace(settings, pairs=("covisibility",), covisible_in=None, pairs_file=None)
+        made = landmarks_from_matches(
+            work, dataset, photos, features, (), anew, metric, workers, progress
+        )
+        return replace(made, anchor=anchor, imported=imported, notes=(*made.notes, *notes))
+    views = [View(photo.camera, photo.pose) for photo in photos]
+    observations = _observations(imported)
+    landmarks, rows = assemble_landmarks(
+        views,
+        imported.points,
+        observations,
+        angles_deg=triangulation_angles(views, imported.points, observations),
+        colors=imported.colors,
+    )
+    return MadeLandmarks(
+        photos=np.arange(len(photos)),
+        views=tuple(views),
+        landmarks=landmarks,
+        rows=tuple(rows),
+        settings={},
+        metric=metric,
+        anchor=anchor,
+        notes=notes,
+    )
+
+
+def refuse_without_points(dataset: Dataset) -> None:
+    """Refuse a dataset that does not even have the files.
+
+    Raises:
+        DatasetError: ``model.no_points``.
+    """
+    folder = dataset.root / "reconstruction"
+    if not all((folder / name).is_file() for name in ("points3d.txt", "observations.txt")):
+        raise _no_points(dataset)
+
+
+def _no_points(dataset: Dataset) -> DatasetError:
+    return DatasetError(
+        "model.no_points",
+        "the dataset has no points with observations",
+        field=str(dataset.root / "reconstruction" / "points3d.txt"),
+        expected="points3d.txt and observations.txt, as mapping import writes them; "
+        "without, use --method sfm",
+    )
+
+
+def _read(dataset: Dataset, features: LocalFeaturesSource) -> tuple[Reconstruction, FeatureSet]:
+    """The reconstruction, and the keypoints that see its points."""
+    known = read_reconstruction(dataset.root)
+    if known is None or known.keypoints_type is None or len(known.observations) == 0:
+        raise _no_points(dataset)
+    if (
+        isinstance(features, ReadyMadeFeatures)
+        and features.keypoints.type_name == known.keypoints_type
+    ):
+        return known, features.keypoints
+    return known, open_features(dataset.root, "keypoints", known.keypoints_type)
+
+
+def _imported_points(
+    known: Reconstruction,
+    keypoints: FeatureSet,
+    photos: Sequence[MappingPhoto],
+    origin: PixelOrigin,
+) -> tuple[ImportedPoints, tuple[str, ...]]:
+    """The reconstruction as far as these photos see it, in their order, and what was left out."""
+    row_of_name = {photo.name: row for row, photo in enumerate(photos)}
+    photo_of_image = np.array([row_of_name.get(name, -1) for name in known.images], dtype=np.int64)
+    pixels = [
+        (keypoints.read(photo.name)[:, :2] + origin.shift).astype(np.float32)
+        if keypoints.has(photo.name)
+        else np.empty((0, 2), dtype=np.float32)
+        for photo in photos
+    ]
+    observations = known.observations.copy()
+    observations[:, 1] = photo_of_image[known.observations[:, 1]]
+    observations = observations[observations[:, 1] >= 0]
+    readable = np.array([keypoints.has(photo.name) for photo in photos])[observations[:, 1]]
+    lost, observations = observations[~readable], observations[readable]
+    _check_rows(observations, np.array([len(one) for one in pixels]), keypoints, photos)
+    notes: tuple[str, ...] = ()
+    if len(lost):
+        blind = np.unique(lost[:, 1])
+        notes = (
+            f"{len(lost)} observations by {len(blind)} photos without a file of keypoints were "
+            f"left out (first {keypoints.label(photos[blind[0]].name)})",
+        )
+    imported = ImportedPoints(
+        points=known.points,
+        colors=known.colors,
+        keypoint_offsets=np.cumsum([0, *(len(one) for one in pixels)], dtype=np.int64),
+        keypoints=np.concatenate(pixels),
+        observations=observations,
+    )
+    return imported, notes
+
+
+def _check_rows(
+    observations: NDArray[np.int64],
+    counts: NDArray[np.int64],
+    keypoints: FeatureSet,
+    photos: Sequence[MappingPhoto],
+) -> None:
+    beyond = np.flatnonzero(observations[:, 2] >= counts[observations[:, 1]])
+    if len(beyond):
+        _, photo, row = observations[beyond[0]].tolist()
+        raise DatasetError(
+            "kapture.index",
+            f"reconstruction/observations.txt has a keypoint of {photos[photo].name} that is not "
+            "in this file",
+            field=keypoints.label(photos[photo].name),
+            expected=f"less than {counts[photo]}",
+            got=str(row),
+        )
+
+
+def _observations(imported: ImportedPoints) -> Observations:
+    """Every point once per photo: of several sightings in a photo the first counts."""
+    table: NDArray[np.int64] = imported.observations
+    order = np.lexsort((table[:, 2], table[:, 0], table[:, 1]))
+    table = table[order]
+    repeated = np.zeros(len(table), dtype=bool)
+    repeated[1:] = (np.diff(table[:, :2], axis=0) == 0).all(axis=1)
+    points, views, rows = table[~repeated].T
+    return Observations(
+        points, views, rows, imported.keypoints[imported.keypoint_offsets[views] + rows]
+    )

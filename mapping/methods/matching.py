@@ -1,0 +1,246 @@
+"""The matching stages: mutual nearest neighbours of paired photos, then geometric verification.
+
+With known poses a match must fit the epipolar geometry of the poses; without, pycolmap estimates
+the two-view geometry of the pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
+import pycolmap
+from numpy.typing import NDArray
+
+from mapping.build.features import LocalFeaturesSource, Progress
+from mapping.build.landmarks import View
+from mapping.build.photos import MappingPhoto
+from mapping.build.stages import Item, WorkFolder, key_of
+from mapping.cluster.executors import Executor
+from visloc.geometry import Camera, Pose
+from visloc.matching.correspondences import mutual_nearest_neighbours
+from visloc.matching.products import in_eight_bits
+from visloc.matching.verification import epipolar_errors
+from visloc.pose.colmap import colmap_camera, normalized_rays
+
+# Raised when the code of a stage here changes what comes out.
+_REVISION = {"matches": 2, "verified": 1}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matches:
+    """Verified matches of one pair of photos.
+
+    Attributes:
+        first: row of a photo.
+        second: row of a later photo.
+        rows: (k, 2) uint32 rows of their features.
+    """
+
+    first: int
+    second: int
+    rows: NDArray[np.uint32]
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """When a match of two photos is believed.
+
+    Attributes:
+        max_error_px: largest distance to the epipolar line, pixels.
+        min_matches: a pair with fewer verified matches has none.
+        poses_known: verify with the poses of the photos; else by two-view geometry.
+    """
+
+    max_error_px: float
+    min_matches: int
+    poses_known: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Partners:
+    """A photo and those that it is matched with."""
+
+    photo: MappingPhoto
+    partners: tuple[MappingPhoto, ...]
+
+
+def match_pairs(
+    work: WorkFolder,
+    photos: Sequence[MappingPhoto],
+    features: LocalFeaturesSource,
+    pairs: NDArray[np.int64],
+    verification: Verification,
+    workers: Executor,
+    progress: Progress,
+) -> tuple[list[Matches], str]:
+    """Match and verify pairs (m, 2) of photos.
+
+    Returns:
+        The pairs that have matches, and a name for all that went into them.
+    """
+    groups = []
+    for first in np.unique(pairs[:, 0]).tolist():
+        seconds = pairs[pairs[:, 0] == first, 1].tolist()
+        groups.append((first, seconds))
+    tasks = [
+        _Partners(photos[first], tuple(photos[second] for second in seconds))
+        for first, seconds in groups
+    ]
+    task = _MatchTask(work, features, verification)
+    workers.run(task.match, tasks, partial(progress, "matches"))
+    workers.run(task.verify, tasks, partial(progress, "verified"))
+    found = []
+    for (first, seconds), partners in zip(groups, tasks, strict=True):
+        item = work.read(task.verified_key(partners))
+        for order, second in enumerate(seconds):
+            rows = item["rows"][item["offsets"][order] : item["offsets"][order + 1]]
+            if len(rows):
+                found.append(Matches(first, second, rows))
+    keys = [task.verified_key(partners) for partners in tasks]
+    return found, key_of("all_matches", 1, keys=keys, groups=groups)
+
+
+@dataclass(frozen=True, slots=True)
+class _MatchTask:
+    """What workers do for a photo and its partners."""
+
+    work: WorkFolder
+    features: LocalFeaturesSource
+    verification: Verification
+
+    def matches_key(self, group: _Partners) -> str:
+        return key_of(
+            "matches",
+            _REVISION["matches"],
+            photo=self.features.key(group.photo),
+            partners=[self.features.key(partner) for partner in group.partners],
+        )
+
+    def verified_key(self, group: _Partners) -> str:
+        return key_of(
+            "verified",
+            _REVISION["verified"],
+            matches=self.matches_key(group),
+            max_error_px=self.verification.max_error_px,
+            min_matches=self.verification.min_matches,
+            poses_known=self.verification.poses_known,
+            views=[
+                [
+                    *camera_values(photo.camera),
+                    photo.camera_known,
+                    *(pose_values(photo.pose) if self.verification.poses_known else ()),
+                ]
+                for photo in (group.photo, *group.partners)
+            ],
+        )
+
+    def match(self, group: _Partners) -> None:
+        def compute() -> Item:
+            own = in_eight_bits(self.features.read(group.photo).descriptors)
+            found = []
+            for partner in group.partners:
+                theirs = in_eight_bits(self.features.read(partner).descriptors)
+                i, j, _ = mutual_nearest_neighbours(own, theirs)
+                found.append(np.column_stack([i, j]).astype(np.uint32))
+            return _item(found)
+
+        if not self.work.has(self.matches_key(group)):
+            self.work.get(self.matches_key(group), compute)
+
+    def verify(self, group: _Partners) -> None:
+        def compute() -> Item:
+            item = self.work.read(self.matches_key(group))
+            own = self.features.read(group.photo).keypoints
+            found = []
+            for order, partner in enumerate(group.partners):
+                rows = item["rows"][item["offsets"][order] : item["offsets"][order + 1]]
+                theirs = self.features.read(partner).keypoints
+                a, b = own[rows[:, 0]], theirs[rows[:, 1]]
+                good = self._verified(group.photo, partner, a, b)
+                kept = rows[good]
+                found.append(kept if len(kept) >= self.verification.min_matches else kept[:0])
+            return _item(found)
+
+        if not self.work.has(self.verified_key(group)):
+            self.work.get(self.verified_key(group), compute)
+
+    def _verified(
+        self,
+        a: MappingPhoto,
+        b: MappingPhoto,
+        pixels_a: NDArray[np.float32],
+        pixels_b: NDArray[np.float32],
+    ) -> NDArray[np.bool_]:
+        if self.verification.poses_known:
+            views = View(a.camera, a.pose), View(b.camera, b.pose)
+            return fits_poses(views, pixels_a, pixels_b, self.verification.max_error_px)
+        return _fits_two_views(a, b, pixels_a, pixels_b, self.verification)
+
+
+def fits_poses(
+    views: tuple[View, View],
+    pixels_a: NDArray[np.float32],
+    pixels_b: NDArray[np.float32],
+    max_error_px: float,
+) -> NDArray[np.bool_]:
+    """Tell which matched pixels (n, 2) fit the epipolar geometry of two known poses."""
+    a, b = views
+    errors = epipolar_errors(
+        normalized_rays(a.camera, pixels_a),
+        normalized_rays(b.camera, pixels_b),
+        b.cam_from_world @ a.cam_from_world.inverse(),
+    )
+    focal = max(a.camera.focal_length, b.camera.focal_length)
+    return np.asarray(errors * focal <= max_error_px)
+
+
+def _fits_two_views(
+    a: MappingPhoto,
+    b: MappingPhoto,
+    pixels_a: NDArray[np.float32],
+    pixels_b: NDArray[np.float32],
+    verification: Verification,
+) -> NDArray[np.bool_]:
+    count = len(pixels_a)
+    fits = np.zeros(count, dtype=bool)
+    if count == 0:
+        return fits
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.max_error, options.ransac.random_seed = verification.max_error_px, 0
+    options.min_num_inliers = verification.min_matches
+    every = np.repeat(np.arange(count, dtype=np.uint32)[:, None], 2, axis=1)
+    geometry = pycolmap.estimate_two_view_geometry(
+        _with_prior(a),
+        pixels_a.astype(np.float64),
+        _with_prior(b),
+        pixels_b.astype(np.float64),
+        every,
+        options,
+    )
+    fits[geometry.inlier_matches[:, 0]] = True
+    return fits
+
+
+def _with_prior(photo: MappingPhoto) -> pycolmap.Camera:
+    camera = colmap_camera(photo.camera)
+    camera.has_prior_focal_length = photo.camera_known
+    return camera
+
+
+def _item(found: list[NDArray[np.uint32]]) -> Item:
+    offsets = np.cumsum([0, *(len(rows) for rows in found)])
+    return {"offsets": offsets, "rows": np.concatenate([*found, np.empty((0, 2), np.uint32)])}
+
+
+def camera_values(camera: Camera) -> list[str | float]:
+    """All of a camera, as JSON values for a key."""
+    return [camera.model, camera.width, camera.height, *camera.params]
+
+
+def pose_values(pose: Pose) -> list[float]:
+    """All of a pose, as JSON values for a key."""
+    return [*pose.rotation.ravel().tolist(), *pose.translation.tolist()]

@@ -1,0 +1,256 @@
+"""Landmarks from depth: keypoints lifted to 3D and merged across photos in a voxel grid.
+
+The mapping strategy for RGB-D data of Humenberger et al. 2020, with a sub-pixel
+depth lookup, and with landmarks at the mean of what fell into their cell instead of at the first
+point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.build.features import LocalFeaturesSource, Progress
+from mapping.build.landmarks import MadeLandmarks, Observations, View, assemble_landmarks
+from mapping.build.photos import MappingPhoto
+from mapping.build.stages import Item, WorkFolder, key_of
+from mapping.cluster.executors import Executor
+from mapping.methods.depth import depth_at, photo_depth
+from mapping.methods.matching import camera_values, pose_values
+from visloc.archive import Anchor, Landmarks
+from visloc.errors import DatasetError, InvalidInput
+from visloc.geometry import Similarity
+from visloc.kapture import Dataset
+from visloc.pose.colmap import normalized_rays, project
+
+# Raised when the code of the stage changes what comes out.
+_LIFTED_REVISION = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiftedKeypoints:
+    """Keypoints of one photo that have a depth.
+
+    Attributes:
+        rows: (m,) int64 rows of the photo's features, strongest first.
+        pixels: (m, 2) float32 where the photo sees them.
+        points: (m, 3) float64 in the world.
+    """
+
+    rows: NDArray[np.int64]
+    pixels: NDArray[np.float32]
+    points: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class DepthSettings:
+    """How depth becomes landmarks.
+
+    Attributes:
+        voxel_size: edge in which lifted keypoints become one landmark, in metres.
+        depth_scale: metres per unit of 16-bit PNG depth.
+    """
+
+    voxel_size: float = 0.01
+    depth_scale: float = 0.001
+
+
+def landmarks_from_depth(
+    work: WorkFolder,
+    dataset: Dataset,
+    photos: Sequence[MappingPhoto],
+    features: LocalFeaturesSource,
+    settings: DepthSettings,
+    metric: bool,
+    workers: Executor,
+    progress: Progress,
+    world_from_dataset: Similarity | None = None,
+) -> MadeLandmarks:
+    """Lift the keypoints of all photos and merge them.
+
+    Args:
+        work: keeps finished photos.
+        dataset: what the photos are of.
+        photos: with poses in the dataset's frame, and depth in its unit.
+        features: of the photos.
+        settings: the voxel size is in the unit of the world.
+        metric: whether a unit of the world is a metre.
+        workers: who lifts.
+        progress: told how far it is.
+        world_from_dataset: where the dataset lies in the world; None: its frame is the world.
+
+    Raises:
+        DatasetError: what ``lift_keypoints`` raises.
+        InvalidInput: what ``merge_landmarks`` raises.
+    """
+    task = _LiftTask(work, dataset.without_records(), features, settings.depth_scale)
+    workers.run(task.lift, photos, partial(progress, "depth"))
+    progress("landmarks", 0, 1)
+    lifted = (LiftedKeypoints(**work.read(task.key(photo))) for photo in photos)
+    if world_from_dataset is not None:
+        move = world_from_dataset
+        lifted = (replace(one, points=move.apply(one.points)) for one in lifted)
+        photos = [replace(photo, cam_from_world=move.move(photo.pose)) for photo in photos]
+    landmarks, rows = merge_landmarks(photos, lifted, settings.voxel_size)
+    progress("landmarks", 1, 1)
+    return MadeLandmarks(
+        photos=np.arange(len(photos)),
+        views=tuple(View(photo.camera, photo.pose) for photo in photos),
+        landmarks=landmarks,
+        rows=tuple(rows),
+        settings=asdict(settings),
+        metric=metric,
+        anchor=Anchor(kind="dataset", images=len(photos)),
+    )
+
+
+def refuse_without_depth(dataset: Dataset, photos: Sequence[MappingPhoto]) -> None:
+    """Refuse photos of which none has a depth map.
+
+    Raises:
+        DatasetError: ``dataset.no_depth``.
+    """
+    if all(photo.depth is None for photo in photos):
+        raise DatasetError(
+            "dataset.no_depth",
+            "no photo has a depth map",
+            field=str(dataset.root / "sensors" / "records_depth.txt"),
+            expected="depth maps with the timestamps of the photos, of a sensor in their rig or "
+            "with poses of its own; see --depth-sensor. Without depth: --method sfm",
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _LiftTask:
+    """What workers do for a photo."""
+
+    work: WorkFolder
+    dataset: Dataset
+    features: LocalFeaturesSource
+    depth_scale: float
+
+    def key(self, photo: MappingPhoto) -> str:
+        return key_of(
+            "lifted",
+            _LIFTED_REVISION,
+            local=self.features.key(photo),
+            camera=camera_values(photo.camera),
+            pose=pose_values(photo.pose),
+            depth=photo.depth
+            and [
+                photo.depth_sha256,
+                *camera_values(photo.depth.camera),
+                *pose_values(photo.depth.cam_from_depth),
+            ],
+            depth_scale=self.depth_scale,
+        )
+
+    def lift(self, photo: MappingPhoto) -> None:
+        def compute() -> Item:
+            keypoints = self.features.read(photo).keypoints
+            return asdict(lift_keypoints(self.dataset, photo, keypoints, self.depth_scale))
+
+        self.work.get(self.key(photo), compute)
+
+
+def lift_keypoints(
+    dataset: Dataset, photo: MappingPhoto, keypoints: NDArray[np.float32], depth_scale: float
+) -> LiftedKeypoints:
+    """Give keypoints (n, 2) of a photo their place in the world, where its depth map allows.
+
+    Raises:
+        DatasetError: when the depth map is not what its sensor says.
+    """
+    if photo.depth is None:
+        rows = np.empty(0, dtype=np.int64)
+        return LiftedKeypoints(rows, keypoints[rows], np.empty((0, 3)))
+    depth, seen_by = photo_depth(dataset, photo.depth, photo.camera, depth_scale)
+    rays = normalized_rays(photo.camera, keypoints)
+    # Both cameras now share one centre and one orientation, not always size and focal length.
+    distance = depth_at(depth, project(seen_by, rays)).astype(np.float64)
+    rows = np.flatnonzero(np.isfinite(distance) & np.isfinite(rays).all(axis=1))
+    points = photo.pose.inverse().apply(rays[rows] * distance[rows, None])
+    return LiftedKeypoints(rows, keypoints[rows], points)
+
+
+def merge_landmarks(
+    photos: Sequence[MappingPhoto], lifted: Iterable[LiftedKeypoints], voxel_size: float
+) -> tuple[Landmarks, list[NDArray[np.int64]]]:
+    """Merge the lifted keypoints of all photos: one landmark per occupied voxel, at their mean.
+
+    Of several keypoints of one photo in a voxel (a corner found at several scales) the strongest
+    stays. It takes about 150 bytes of memory per keypoint.
+
+    Args:
+        photos: n photos.
+        lifted: of each photo, its lifted keypoints.
+        voxel_size: edge of a voxel in the unit of the world.
+
+    Returns:
+        The landmarks, and of each photo the rows of its features that observe them.
+
+    Raises:
+        InvalidInput: ``rgbd.no_landmarks`` or ``rgbd.voxel_size``.
+    """
+    points_of, pixels_of, rows_of = zip(
+        *((one.points, one.pixels, one.rows) for one in lifted), strict=True
+    )
+    seen_in = np.repeat(np.arange(len(rows_of)), [len(rows) for rows in rows_of])
+    # One after the other, so that little is there twice.
+    points = np.concatenate(points_of)
+    del points_of
+    pixels = np.concatenate(pixels_of)
+    del pixels_of
+    rows = np.concatenate(rows_of)
+    del rows_of
+    if len(points) == 0:
+        raise InvalidInput(
+            "rgbd.no_landmarks",
+            "no keypoint of any photo has a depth",
+            field="dataset",
+            expected="depth maps that go with the photos; see --depth-sensor and --depth-scale",
+        )
+    # Voxels are counted from near the photos, wherever in the world they are.
+    origin = np.round(np.mean([photo.pose.center for photo in photos], axis=0))
+    points -= origin
+    landmark, num_landmarks = _voxel_index(points, voxel_size)
+    # np.unique gives the first row of each pair, which is the strongest keypoint.
+    kept = np.sort(np.unique(landmark * len(photos) + seen_in, return_index=True)[1])
+    points, pixels, rows = points[kept], pixels[kept], rows[kept]
+    landmark, seen_in = landmark[kept], seen_in[kept]
+
+    tracks = np.bincount(landmark, minlength=num_landmarks)
+    mean = np.column_stack(
+        [np.bincount(landmark, points[:, axis], num_landmarks) / tracks for axis in range(3)]
+    )
+    mean += origin
+    del points, kept
+    views = [View(photo.camera, photo.pose) for photo in photos]
+    return assemble_landmarks(views, mean, Observations(landmark, seen_in, rows, pixels))
+
+
+def _voxel_index(points: NDArray[np.float64], voxel_size: float) -> tuple[NDArray[np.int64], int]:
+    """Number the occupied voxels in the order of their cells; return (rows, how many)."""
+    cells = points / voxel_size
+    np.floor(cells, out=cells)
+    cells -= cells.min(axis=0)
+    size = cells.max(axis=0) + 1.0
+    if np.prod(size) >= 2**62:
+        raise InvalidInput(
+            "rgbd.voxel_size",
+            "the voxel size is too small for the extent of the map",
+            field="--voxel-size",
+            expected=f"more for an extent of {', '.join(f'{s:g}' for s in size * voxel_size)}",
+            got=voxel_size,
+        )
+    flat = np.zeros(len(cells), dtype=np.int64)
+    for axis in range(3):
+        flat *= int(size[axis])
+        flat += cells[:, axis].astype(np.int64)
+    del cells
+    occupied, index = np.unique(flat, return_inverse=True)
+    return index.astype(np.int64), len(occupied)

@@ -1,0 +1,192 @@
+"""Photos, and what was found in them instead."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, FailFast, Field
+from pydantic.json_schema import WithJsonSchema
+from pydantic_core import PydanticCustomError
+
+import visloc.types
+from service.api.message import IncomingMessage, converted
+from visloc.errors import InvalidInput
+
+# What an array may be made of, little-endian where it has more than one byte.
+ARRAY_DTYPES: Mapping[str, np.dtype[Any]] = {
+    "float32": np.dtype("<f4"),
+    "float16": np.dtype("<f2"),
+    "uint8": np.dtype("u1"),
+    "int8": np.dtype("i1"),
+}
+MAX_GLOBAL_DESCRIPTORS = 32
+# Two such sides stay within what NumPy can count.
+_MAX_ARRAY_SIDE = 2**31 - 1
+
+
+def _bytes_from_base64(value: object) -> object:
+    if not isinstance(value, str):
+        return value
+    try:
+        return base64.b64decode(value, validate=True)
+    except (binascii.Error, ValueError) as error:  # ValueError: letters outside ASCII
+        raise InvalidInput(
+            "image.base64",
+            "not base64",
+            field="image",
+            expected="the encoded photo in standard base64",
+            got=str(error),
+        ) from None
+
+
+# An encoded photo, in JSON as base64.
+GivenImage = Annotated[
+    bytes | None,
+    converted(_bytes_from_base64),
+    WithJsonSchema({"type": "string", "contentEncoding": "base64"}),
+]
+
+
+def _array_bytes_from_base64(value: object) -> object:
+    if not isinstance(value, str):
+        return value
+    try:
+        return base64.b64decode(value, validate=True)
+    except (binascii.Error, ValueError):
+        raise PydanticCustomError("base64", "the array's bytes in standard base64") from None
+
+
+class Array(IncomingMessage):
+    """Numbers in little-endian order, the last index running fastest."""
+
+    dtype: Annotated[str, Field(description=f"one of {', '.join(ARRAY_DTYPES)}")]
+    shape: Annotated[
+        list[int], FailFast(), Field(description="rows and columns; of a single row its length")
+    ]
+    data: Annotated[
+        bytes,
+        BeforeValidator(_array_bytes_from_base64),
+        WithJsonSchema({"type": "string", "contentEncoding": "base64"}),
+        Field(description="as many bytes as dtype and shape say"),
+    ]
+
+    def to_core(self, field: str, ndim: int) -> NDArray[np.generic]:
+        """Return the array, without copying its bytes.
+
+        Raises:
+            InvalidInput: ``features.dtype``, ``features.shape`` or ``features.data``.
+        """
+        dtype = ARRAY_DTYPES.get(self.dtype)
+        if dtype is None:
+            raise InvalidInput(
+                "features.dtype",
+                "an array of these is not read here",
+                field=f"{field}.dtype",
+                expected=f"one of {', '.join(ARRAY_DTYPES)}",
+                got=self.dtype,
+            )
+        if len(self.shape) != ndim or not all(0 <= n <= _MAX_ARRAY_SIDE for n in self.shape):
+            raise InvalidInput(
+                "features.shape",
+                "not the shape of such an array",
+                field=f"{field}.shape",
+                expected="two numbers: rows, columns" if ndim == 2 else "one number: its length",
+                got=str(self.shape[:8]),
+            )
+        num_bytes = math.prod(self.shape) * dtype.itemsize
+        if len(self.data) != num_bytes:
+            raise InvalidInput(
+                "features.data",
+                "the array does not have the bytes that its dtype and shape say",
+                field=f"{field}.data",
+                expected=f"{num_bytes} bytes",
+                got=f"{len(self.data)} bytes",
+            )
+        return np.frombuffer(self.data, dtype).reshape(self.shape)
+
+
+def _few(value: object) -> object:
+    if isinstance(value, dict) and len(value) > MAX_GLOBAL_DESCRIPTORS:
+        raise InvalidInput(
+            "features.global_descriptors",
+            "too many global descriptors",
+            field="global_descriptors",
+            expected=f"at most {MAX_GLOBAL_DESCRIPTORS}, as the map has them",
+            got=len(value),
+        )
+    return value
+
+
+class Features(IncomingMessage):
+    """What was found in one photo. Descriptors may have any length: the server normalizes them."""
+
+    path: ClassVar[str] = "features."
+
+    kind: Annotated[str, Field(description="the map's local_features")]
+    keypoints: Annotated[
+        Array,
+        Field(
+            description="N x 2: x, y in pixels; the centre of the top-left pixel is (0.5, 0.5)",
+        ),
+    ]
+    descriptors: Annotated[Array, Field(description="N x D")]
+    global_descriptors: Annotated[
+        dict[str, Array],
+        converted(_few),
+        Field(
+            default_factory=dict,
+            description="by name in the map's global_features, one row each; one that is made of "
+            "local features (localvlad) may be left out",
+        ),
+    ]
+
+    def to_core(self) -> visloc.types.QueryFeatures:
+        """Return the features, their arrays checked for what they say of themselves.
+
+        Raises:
+            InvalidInput: ``features.dtype``, ``features.shape`` or ``features.data``.
+        """
+        return visloc.types.QueryFeatures(
+            self.kind,
+            self.keypoints.to_core("features.keypoints", 2),
+            self.descriptors.to_core("features.descriptors", 2),
+            {
+                name: row.to_core(f"features.global_descriptors.{name[:100]}", 1)
+                for name, row in self.global_descriptors.items()
+            },
+        )
+
+
+def _features_from_text(value: object) -> object:
+    return Features.read_json(value) if isinstance(value, str | bytes) else value
+
+
+# Features as an object, or as a file of a form.
+GivenFeatures = Annotated[Features | None, converted(_features_from_text)]
+
+
+def query_to_core(
+    image: bytes | None, features: Features | None
+) -> bytes | visloc.types.QueryFeatures:
+    """Return the one of both that there is.
+
+    Raises:
+        InvalidInput: ``request.query``, or a code of the features.
+    """
+    if image is not None and features is None:
+        return image
+    if features is not None and image is None:
+        return features.to_core()
+    raise InvalidInput(
+        "request.query",
+        "a request has a photo, or the features of one",
+        field="image",
+        expected="one of image, features",
+        got="neither" if image is None else "both",
+    )

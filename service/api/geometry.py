@@ -1,0 +1,134 @@
+"""Cameras and transforms, in requests and answers."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.json_schema import WithJsonSchema
+
+import visloc.geometry
+import visloc.priors
+from service.api.message import IncomingMessage, converted
+from visloc.errors import InvalidInput
+
+_CAMERA_TEXT = "PINHOLE,640,480,525,525,320,240"
+# How far the length of a quaternion may be from 1: it was written with three digits at least.
+_MAX_QUATERNION_ERROR = 1e-3
+# Further than any place; its square is still a number.
+_MAX_TRANSLATION = 1e15
+
+# One complaint is enough of a list with a million of them.
+Numbers = Annotated[list[float], Field(fail_fast=True)]
+
+
+class Camera(IncomingMessage):
+    """Intrinsics for the pixels as stored."""
+
+    path: ClassVar[str] = "camera."
+
+    model: Annotated[str, Field(description="COLMAP's name, such as PINHOLE")]
+    width: Annotated[int, Field(description="pixels")]
+    height: Annotated[int, Field(description="pixels")]
+    params: Annotated[
+        Numbers, Field(description="in COLMAP's order, pixels where they are lengths")
+    ]
+
+    def to_core(self) -> visloc.geometry.Camera:
+        """Return the camera, checked."""
+        return visloc.geometry.Camera(self.model, self.width, self.height, tuple(self.params))
+
+
+def _camera_from_text(value: object) -> object:
+    if not isinstance(value, str):
+        return value
+    if value.lstrip().startswith("{"):
+        return Camera.read_json(value)
+    camera = visloc.geometry.Camera.from_text(value)
+    return Camera(
+        model=camera.model,
+        width=camera.width,
+        height=camera.height,
+        params=list(camera.params),
+    )
+
+
+# A camera in any of the forms that it may be sent in.
+GivenCamera = Annotated[
+    Camera | None,
+    converted(_camera_from_text),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"$ref": "#/components/schemas/Camera"},
+                {"type": "string", "examples": [_CAMERA_TEXT]},
+                {"type": "null"},
+            ]
+        }
+    ),
+]
+
+
+class Transform(IncomingMessage):
+    """x_a = R x_b + t for a transform called a_from_b."""
+
+    rotation_wxyz: Annotated[Numbers, Field(description="unit quaternion, w >= 0")]
+    translation: Annotated[Numbers, Field(description="metres when the map is metric")]
+
+    @staticmethod
+    def from_core(pose: visloc.geometry.Pose) -> Transform:
+        """Say it in the API's words."""
+        return Transform(
+            rotation_wxyz=pose.rotation_wxyz.tolist(), translation=pose.translation.tolist()
+        )
+
+    def to_core(self, field: str, rotation_code: str = "pose.rotation") -> visloc.geometry.Pose:
+        """Return the transform, checked.
+
+        Args:
+            field: its name, for errors.
+            rotation_code: the code of an error of its rotation.
+
+        Raises:
+            InvalidInput: ``rotation_code`` for what is not a unit quaternion within 1e-3, as of a
+                transform with a scale; ``pose.translation`` for what is not three finite numbers
+                of any place.
+        """
+        length = math.hypot(*self.rotation_wxyz)
+        # NaN fails too.
+        if len(self.rotation_wxyz) != 4 or not abs(length - 1) <= _MAX_QUATERNION_ERROR:
+            raise InvalidInput(
+                rotation_code,
+                "not a rotation; a transform with a scale cannot be used",
+                field=f"{field}.rotation_wxyz",
+                expected=f"a quaternion w, x, y, z of length 1 within {_MAX_QUATERNION_ERROR}",
+                got=f"length {length:.6g}"
+                if len(self.rotation_wxyz) == 4
+                else f"{len(self.rotation_wxyz)} numbers",
+            )
+        far = [number for number in self.translation if not abs(number) <= _MAX_TRANSLATION]
+        if len(self.translation) != 3 or far:  # NaN is far too
+            raise InvalidInput(
+                "pose.translation",
+                "not a translation",
+                field=f"{field}.translation",
+                expected=f"three finite numbers, none beyond {_MAX_TRANSLATION:g}",
+                got=str(self.translation[:4]),
+            )
+        return visloc.geometry.Pose.from_quaternion(self.rotation_wxyz, self.translation)
+
+
+def covariance_to_core(numbers: list[float], field: str) -> NDArray[np.float64]:
+    """Return the covariance (6, 6) of a pose, checked.
+
+    Raises:
+        InvalidInput: ``pose.covariance``.
+    """
+    covariance = np.array(numbers, dtype=np.float64)
+    if covariance.shape == (36,):
+        covariance = covariance.reshape(6, 6)
+    visloc.priors.check_covariance(covariance, field)
+    return covariance

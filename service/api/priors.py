@@ -1,0 +1,143 @@
+"""What is known before any photo is looked at."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, ClassVar
+
+import numpy as np
+from pydantic import FailFast, Field
+
+import visloc.priors
+from service.api.geometry import Numbers, Transform, covariance_to_core
+from service.api.message import IncomingMessage, converted
+from visloc.archive.set_schema import MAX_TILES
+
+_GRAVITY_STD_DEG = 1.0
+
+
+class PositionPrior(IncomingMessage):
+    """The device is within a sphere."""
+
+    position: Annotated[Numbers, Field(description="x, y, z in the world")]
+    radius: Annotated[float, Field(description="in units of the world, positive")]
+
+    def to_core(self) -> visloc.priors.PositionPrior:
+        """Return the prior, checked."""
+        return visloc.priors.PositionPrior(np.array(self.position), self.radius)
+
+
+class HeightBand(IncomingMessage):
+    """The device is between two heights, measured along the world's up from its (0, 0, 0)."""
+
+    min: Annotated[float, Field(description="in units of the world")]
+    max: Annotated[float, Field(description="greater than min")]
+
+    def to_core(self) -> visloc.priors.HeightBand:
+        """Return the prior, checked."""
+        return visloc.priors.HeightBand(self.min, self.max)
+
+
+class PosePrior(IncomingMessage):
+    """The device is where it was, give or take."""
+
+    device_from_world: Annotated[
+        Transform, Field(description="of the camera, or of the rig when a rig is localized")
+    ]
+    covariance: Annotated[
+        Numbers,
+        Field(
+            description="6 x 6, row by row: rotation (rad), then translation, for "
+            "R <- Exp(w) R and t <- t + dt of device_from_world"
+        ),
+    ]
+
+    def to_core(self) -> visloc.priors.PosePrior:
+        """Return the prior, checked."""
+        return visloc.priors.PosePrior(
+            self.device_from_world.to_core("priors.pose.device_from_world"),
+            covariance_to_core(self.covariance, "priors.pose.covariance"),
+        )
+
+
+class GravityPrior(IncomingMessage):
+    """Which way is down."""
+
+    direction: Annotated[
+        Numbers,
+        Field(
+            description="x, y, z of a vector that points down, in the frame of the camera, or of "
+            "the rig when a rig is localized; of any length"
+        ),
+    ]
+    std_deg: Annotated[
+        float | None,
+        Field(
+            description="standard deviation of its angle, degrees: more than 0, at most 15; by "
+            f"default {_GRAVITY_STD_DEG:g}"
+        ),
+    ] = None
+    world: Annotated[
+        Numbers | None,
+        Field(
+            description="x, y, z of down in the world, for maps that do not know it; of another "
+            "map, within 5 degrees of what it knows"
+        ),
+    ] = None
+
+    def to_core(self) -> visloc.priors.GravityPrior:
+        """Return the prior, checked."""
+        std_deg = _GRAVITY_STD_DEG if self.std_deg is None else self.std_deg
+        return visloc.priors.GravityPrior(
+            np.array(self.direction),
+            math.radians(std_deg),
+            None if self.world is None else np.array(self.world),
+        )
+
+
+class Priors(IncomingMessage):
+    """What is known of the device. A pose that contradicts it is refused; none is bent by it."""
+
+    path: ClassVar[str] = "priors."
+
+    position: PositionPrior | None = None
+    height: HeightBand | None = None
+    pose: PosePrior | None = None
+    gravity: GravityPrior | None = None
+    maps: Annotated[
+        list[str] | None,
+        FailFast(),
+        Field(
+            max_length=MAX_TILES,
+            description="of a set of maps: the tiles that the device may be in, each id or "
+            "id@version",
+        ),
+    ] = None
+
+    def to_core(self) -> visloc.priors.Priors:
+        """Return the priors, checked.
+
+        Raises:
+            InvalidInput: ``priors...``, ``pose.rotation``, ``pose.translation`` or
+                ``pose.covariance``.
+        """
+        return visloc.priors.Priors(
+            position=None if self.position is None else self.position.to_core(),
+            height=None if self.height is None else self.height.to_core(),
+            pose=None if self.pose is None else self.pose.to_core(),
+            gravity=None if self.gravity is None else self.gravity.to_core(),
+            maps=None if self.maps is None else tuple(self.maps),
+        )
+
+
+def _priors_from_text(value: object) -> object:
+    return Priors.read_json(value) if isinstance(value, str) else value
+
+
+# Priors as an object, or as JSON in a field of a form.
+GivenPriors = Annotated[Priors | None, converted(_priors_from_text)]
+
+
+def priors_to_core(priors: Priors | None) -> visloc.priors.Priors:
+    """Return what is known, which may be nothing."""
+    return visloc.priors.NO_PRIORS if priors is None else priors.to_core()

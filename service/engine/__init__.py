@@ -1,0 +1,1 @@
+"""Maps served, work queued. Knows neither HTTP nor gRPC."""

@@ -1,0 +1,152 @@
+"""Packed maps that come in: written to disk as they come, verified, published."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, asynccontextmanager
+from functools import partial
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+from service.engine.stores import Store
+from visloc.archive.packed import unpack_map
+from visloc.archive.store import checked_name
+from visloc.errors import Conflict, InvalidInput, MapCorrupt, TooLarge
+
+# Uploads that are written or verified at once.
+MAX_UPLOADS = 4
+# What is taken from an upload before it is written to disk.
+_WRITE_BYTES = 4 * 2**20
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class Uploads:
+    """Takes versions of maps into a store; used from one event loop.
+
+    Args:
+        store: where they go.
+        max_bytes: largest packed map.
+    """
+
+    def __init__(self, store: Store, max_bytes: int) -> None:
+        self._store, self._max_bytes = store, max_bytes
+        # Verifying gigabytes takes minutes, in which all else that needs a thread goes on.
+        self._threads = ThreadPoolExecutor(MAX_UPLOADS, thread_name_prefix="upload")
+        self._running: set[str] = set()
+
+    async def publish(self, map_id: str, version: str, chunks: AsyncIterator[bytes]) -> None:
+        """Publish a packed map, verified byte by byte; it is not put into use.
+
+        Nothing is taken of one that cannot be published. Whatever happens, cancelling included,
+        its files are gone in the end, and either the whole version is there or nothing of it.
+
+        Raises:
+            Conflict: ``map.version_exists``, ``map.upload_runs``.
+            TooLarge: ``request.too_large``, ``packed.too_large``.
+            InvalidInput: ``map.id``, ``packed.*``, and what ``verify_map`` finds.
+            StorageFull: ``maps.storage_full``.
+            Forbidden: ``maps.read_only``.
+        """
+        ref = f"{checked_name(map_id, 'map')}@{checked_name(version, 'map version')}"
+        if version in await asyncio.to_thread(self._store.versions, map_id):
+            raise Conflict(
+                "map.version_exists",
+                "the version exists already; versions never change",
+                field="version",
+                expected="a version that is not there",
+                got=ref,
+            )
+        if ref in self._running:
+            raise Conflict(
+                "map.upload_runs",
+                "this version is being uploaded by another request",
+                field="version",
+                got=ref,
+            )
+        self._running.add(ref)
+        try:
+            async with self._incoming() as folder:
+                await self._write(folder / "packed", chunks)
+                await self._to_end(self._publish, folder, map_id, version)
+        finally:
+            self._running.discard(ref)
+
+    @asynccontextmanager
+    async def _incoming(self) -> AsyncIterator[Path]:
+        stack = ExitStack()
+        try:
+            yield await self._to_end(stack.enter_context, self._store.incoming())
+        except BaseException as error:
+            await self._to_end(stack.__exit__, type(error), error, error.__traceback__)
+            raise
+        await self._to_end(stack.close)
+
+    async def _write(self, path: Path, chunks: AsyncIterator[bytes]) -> None:
+        size, waiting = 0, bytearray()
+        with path.open("xb", buffering=0) as file:
+
+            async def flush() -> None:
+                data = memoryview(bytes(waiting))
+                waiting.clear()
+                while data:
+                    data = data[await self._to_end(file.write, data) :]
+
+            async for chunk in chunks:
+                size += len(chunk)
+                if size > self._max_bytes:
+                    raise TooLarge(
+                        "request.too_large",
+                        "the packed map has too many bytes",
+                        expected=f"at most {self._max_bytes} bytes",
+                        got="more",
+                    )
+                waiting += chunk
+                if len(waiting) >= _WRITE_BYTES:
+                    await flush()
+            await flush()
+
+    def _publish(self, folder: Path, map_id: str, version: str) -> None:
+        """Unpack, verify and publish; in a thread."""
+        packed, target = folder / "packed", folder / "map"
+        try:
+            manifest = unpack_map(packed, target, self._max_bytes)
+            packed.unlink()
+            if (manifest.id, manifest.version) != (map_id, version):
+                raise InvalidInput(
+                    "packed.renamed",
+                    "the packed map is another map or version",
+                    field="version",
+                    expected=f"{manifest.id}@{manifest.version}",
+                    got=f"{map_id}@{version}",
+                )
+            self._store.publish(target, map_id, version, make_current=False)
+        except MapCorrupt as error:
+            # Damaged before it came here; and the caller need not know where "here" is.
+            field = None if error.field is None else error.field.removeprefix(f"{target}/")
+            raise InvalidInput(
+                error.code, error.message, field=field, expected=error.expected, got=error.got
+            ) from error
+
+    async def _to_end(self, work: Callable[P, T], *given: P.args, **named: P.kwargs) -> T:
+        """Run in a thread, and wait for its end also when cancelled.
+
+        Or what it works on would be deleted under its hands.
+        """
+        loop = asyncio.get_running_loop()
+        task = loop.run_in_executor(self._threads, partial(work, *given, **named))
+        cancelled: asyncio.CancelledError | None = None
+        while not task.done():
+            try:
+                await asyncio.wait({task})
+            except asyncio.CancelledError as error:
+                cancelled = error
+        failure = task.exception()  # or it would be logged as never retrieved
+        if cancelled is not None:
+            raise cancelled
+        if failure is not None:
+            raise failure
+        return task.result()

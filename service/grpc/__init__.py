@@ -1,0 +1,1 @@
+"""The gRPC API: servicers and what all methods share."""

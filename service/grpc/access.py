@@ -1,0 +1,108 @@
+"""Access over gRPC."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import ExitStack
+from typing import Any
+
+import grpc
+
+from service.grpc.calls import Handler, behaviour_of, handler_like
+from service.grpc.envelope import Context, Envelope
+from service.http.access import tokens_of
+from service.security.access import NOTHING, Access, is_method, needed_over_grpc
+from service.security.key_file import Key
+from service.telemetry.logs import UNMATCHED
+from visloc.errors import Overloaded, TimedOut, VislocError
+
+# How long a call may stay open that needs no key (health). Its watchers ask again.
+_KEYLESS_S = 300.0
+
+
+class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
+    """Lets a call through or refuses it, before any of its messages is read.
+
+    Args:
+        access: decides.
+        envelope: answers what is refused.
+        max_keyless: calls that need no key and are open at once; who has a key must find a place.
+    """
+
+    def __init__(self, access: Access, envelope: Envelope, max_keyless: int) -> None:
+        self._access = access
+        self._envelope = envelope
+        self._max_keyless = max_keyless
+        self._keyless = 0
+
+    async def intercept_service(
+        self,
+        continuation: Callable[[grpc.HandlerCallDetails], Awaitable[Handler]],
+        handler_call_details: grpc.HandlerCallDetails,
+    ) -> Handler:
+        """Decide on one call."""
+        method = handler_call_details.method
+        metadata: list[tuple[str, str | bytes]] = list(
+            handler_call_details.invocation_metadata or ()
+        )
+
+        def sent(name: str) -> list[str]:
+            return [value for key, value in metadata if key == name and isinstance(value, str)]
+
+        try:
+            tokens = tokens_of(sent("authorization"), sent("x-api-key"))
+            key = self._access.key_of(tokens, needed_over_grpc(method))
+        except VislocError as error:
+            return self._refusal(error, method)
+        handler: Handler | None = await continuation(handler_call_details)
+        if handler is not None and needed_over_grpc(method) is NOTHING:
+            return self._few(handler, method)
+        if key is None or handler is None:
+            return handler  # type: ignore[return-value]  # None: gRPC says that there is none
+        return self._counted(handler, key, method)
+
+    def _few(self, handler: Handler, method: str) -> Handler:
+        behaviour = behaviour_of(handler)
+
+        async def serve(messages: AsyncIterator[Any], context: Context) -> Any:
+            if self._keyless >= self._max_keyless:
+                busy = Overloaded("server.busy", "too many calls without a key; try again shortly")
+                await self._envelope.refuse(_name(method), busy, context)
+            self._keyless += 1
+            try:
+                async with asyncio.timeout(_KEYLESS_S):
+                    return await behaviour(messages, context)
+            except TimeoutError:
+                over = TimedOut("server.deadline", "watching ends after a while; ask again")
+                await self._envelope.refuse(_name(method), over, context)
+            finally:
+                self._keyless -= 1
+
+        return handler_like(handler, serve)
+
+    def _counted(self, handler: Handler, key: Key, method: str) -> Handler:
+        behaviour = behaviour_of(handler)
+
+        async def serve(messages: AsyncIterator[Any], context: Context) -> Any:
+            with ExitStack() as stack:
+                try:
+                    stack.enter_context(self._access.place(key))
+                except Overloaded as error:
+                    await self._envelope.refuse(_name(method), error, context)
+                return await behaviour(messages, context)
+
+        return handler_like(handler, serve)
+
+    def _refusal(self, error: VislocError, method: str) -> Handler:
+        async def refuse(messages: AsyncIterator[Any], context: Context) -> None:
+            del messages  # they are not read
+            await self._envelope.refuse(_name(method), error, context)
+
+        made: Handler = grpc.stream_stream_rpc_method_handler(refuse)
+        return made
+
+
+def _name(method: str) -> str:
+    """Return the name of a method that is there, else one word for all others."""
+    return method.rpartition("/")[2] if is_method(method) else UNMATCHED

@@ -1,0 +1,155 @@
+"""What all methods of gRPC have in common: answers as messages, errors as statuses, the log."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import asynccontextmanager
+from typing import Any, TypeVar
+
+import grpc
+from google.protobuf.any_pb2 import Any as AnyMessage
+from google.protobuf.message import Message
+from google.rpc.error_details_pb2 import ErrorInfo
+from google.rpc.status_pb2 import Status
+from pydantic import BaseModel
+
+import visloc
+from service.errors import internal_error, request_id, statuses_of
+from service.telemetry.logs import RequestRecord
+from service.telemetry.observer import Observer
+from visloc.errors import VislocError
+
+logger = logging.getLogger(__name__)
+
+ERROR_DOMAIN = "visloc"
+# The server's version goes with every answer, as a header.
+VERSION_KEY = "visloc-version"
+# Details travel in a header, of which gRPC clients accept 8 kB by default.
+_MAX_DETAIL = 1000
+
+Context = grpc.aio.ServicerContext[Any, Any]
+MessageT = TypeVar("MessageT", bound=Message)
+
+
+def message_of(answer: BaseModel, message: MessageT) -> MessageT:
+    """Fill a message from the model with the same fields: HTTP and gRPC answer the same.
+
+    Straight from one to the other: by way of JSON, an answer with its matches takes several
+    times as long.
+    """
+    for name in type(answer).model_fields:
+        value = getattr(answer, name)
+        if isinstance(value, BaseModel):
+            part = getattr(message, name)
+            part.SetInParent()  # it is there, also when it is empty
+            message_of(value, part)
+        elif isinstance(value, Mapping):
+            _fill_map(getattr(message, name), value)
+        elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
+            _fill_list(getattr(message, name), value)
+        elif value is not None:
+            setattr(message, name, value)
+    return message
+
+
+def _fill_map(entries: Any, values: Mapping[str, Any]) -> None:
+    for name, value in values.items():
+        if isinstance(value, BaseModel):
+            message_of(value, entries[name])
+        else:
+            entries[name] = value
+
+
+def _fill_list(entries: Any, values: Sequence[Any]) -> None:
+    if values and isinstance(values[0], BaseModel):
+        for value in values:
+            message_of(value, entries.add())
+    else:
+        entries.extend(values)
+
+
+class Envelope:
+    """Turns errors into statuses with details, and takes note of every call.
+
+    Args:
+        observer: is told what becomes of it.
+    """
+
+    def __init__(self, observer: Observer) -> None:
+        self._observer = observer
+
+    @asynccontextmanager
+    async def __call__(
+        self, method: str, id_: str, context: Context, *, streams: bool = False
+    ) -> AsyncIterator[None]:
+        """Serve a call in the block.
+
+        The headers of a single answer go with it, not before: until something was answered, a
+        call that is cut off may be made again elsewhere, by the client's gRPC itself.
+
+        Args:
+            method: its name.
+            id_: of the request.
+            context: of the call.
+            streams: whether the block writes answers to the context.
+        """
+        caller = dict(context.invocation_metadata() or ()).get("traceparent")
+        traceparent = caller if isinstance(caller, str) else None
+        with self._observer.request("grpc", id_, route=method, traceparent=traceparent) as record:
+            record.status = grpc.StatusCode.CANCELLED.name
+            headers = [(VERSION_KEY, visloc.__version__)]
+            if record.trace is not None:
+                headers.append(("traceresponse", record.trace.traceparent))
+            try:
+                if streams:
+                    await context.send_initial_metadata(headers)
+                yield
+                if not streams:
+                    await context.send_initial_metadata(headers)
+                record.status = grpc.StatusCode.OK.name
+            except VislocError as error:
+                await self._refuse(error, id_, context, record)
+            except Exception:  # the last line of defence: gRPC would tell the caller what broke
+                logger.exception("request %s broke", id_)
+                await self._refuse(internal_error(), id_, context, record)
+
+    async def refuse(self, method: str, error: VislocError, context: Context) -> None:
+        """Answer a call with an error, before it is served."""
+        id_ = request_id(None)
+        with self._observer.request("grpc", id_, route=method) as record:
+            record.peer = context.peer()
+            await self._refuse(error, id_, context, record)
+
+    async def _refuse(
+        self, error: VislocError, id_: str, context: Context, record: RequestRecord
+    ) -> None:
+        self._observer.error(error)
+        record.status = statuses_of(error)[1].name
+        await _abort(error, id_, context)
+
+
+async def _abort(error: VislocError, id_: str, context: Context) -> None:
+    code = statuses_of(error)[1]
+    details = {
+        "kind": type(error).__name__,
+        "message": error.message,
+        "field": error.field,
+        "expected": error.expected,
+        "got": error.got,
+        "request_id": id_,
+    }
+    info = ErrorInfo(
+        reason=error.code,
+        domain=ERROR_DOMAIN,
+        metadata={
+            name: str(value)[:_MAX_DETAIL] for name, value in details.items() if value is not None
+        },
+    )
+    packed = AnyMessage()
+    packed.Pack(info)
+    text = str(error)[:_MAX_DETAIL]
+    status = Status(code=code.value[0], message=text, details=[packed])
+    await context.abort(
+        code, text, trailing_metadata=(("grpc-status-details-bin", status.SerializeToString()),)
+    )

@@ -1,0 +1,177 @@
+"""Messages of gRPC checked by the models of the API's words, as JSON is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from google.protobuf.message import Message
+
+from service.api import (
+    BatchLimits,
+    LocalizeRequest,
+    LocalizeRigRequest,
+    Parts,
+)
+from service.api import Instant as InstantWords
+from service.api import SequenceStart as SequenceStartWords
+from service.api.geopose import Near as NearWords
+from service.api.message import MAX_INSTANT_VALUES, check_num_values, inside
+from service.values import Instant, LocalizeJob, Near, RigJob, SequenceStart
+from visloc.errors import InvalidInput, TooLarge
+from visloc_api.v1 import localization_pb2 as pb2
+
+# A rig has one name in JSON.
+_RIG_NAMES = {"rig_id": "rig", "calibration": "rig"}
+# Lists and maps that may be left out: protobuf cannot tell that from an empty one.
+_OPTIONAL_LISTS = {
+    "visloc.v1.LocalizeRequest.maps",
+    "visloc.v1.LocalizeRigRequest.maps",
+    "visloc.v1.SequenceStart.maps",
+    "visloc.v1.LocalizeOptions.fusion_weights",
+    "visloc.v1.Priors.maps",
+    "visloc.v1.GravityPrior.world",
+    "visloc.v1.Odometry.covariance",
+}
+
+
+def near_of(request: pb2.ListMapsRequest) -> Near | None:
+    """Return the circle into which the maps must reach, if any.
+
+    Raises:
+        InvalidInput: ``near...``.
+    """
+    return NearWords.read(_plain(request.near)).to_core() if request.HasField("near") else None
+
+
+def localize_job_of(request: pb2.LocalizeRequest, max_bytes: int) -> LocalizeJob:
+    """Return the work of ``Localize``.
+
+    Raises:
+        TooLarge: ``request.too_large``; larger messages are for several photos.
+        InvalidInput: as ``LocalizeRequest`` raises.
+    """
+    size = request.ByteSize()
+    if size > max_bytes:
+        raise TooLarge(
+            "request.too_large",
+            "the request has too many bytes",
+            expected=f"at most {max_bytes} bytes",
+            got=f"{size} bytes",
+        )
+    return LocalizeRequest.read(_plain(request)).to_job()
+
+
+def rig_job_of(request: pb2.LocalizeRigRequest, limits: BatchLimits) -> RigJob:
+    """Return the work of ``LocalizeRig``.
+
+    Raises:
+        InvalidInput: as ``LocalizeRigRequest`` raises.
+    """
+    return LocalizeRigRequest.read(_plain(request), limits).to_job()
+
+
+def sequence_start_of(message: pb2.LocalizeSequenceRequest | None) -> SequenceStart:
+    """Return the start of a sequence.
+
+    Args:
+        message: the first of the stream; None when there was none.
+
+    Raises:
+        InvalidInput: ``sequence.message`` when it is no start, or as ``SequenceStart`` raises.
+    """
+    kind = None if message is None else message.WhichOneof("message")
+    if message is None or kind != "start":
+        raise _wrong_message("the first message", "start", kind)
+    return SequenceStartWords.read(_plain(message.start)).to_core()
+
+
+def instant_of(
+    message: pb2.LocalizeSequenceRequest, limits: BatchLimits, number: int, *, has_rig: bool
+) -> Instant:
+    """Return an instant of a sequence.
+
+    Args:
+        message: any but the first of the stream.
+        limits: on its images.
+        number: how many came before, for errors.
+        has_rig: whether the start named a rig.
+
+    Raises:
+        InvalidInput: ``sequence.message`` when it is no instant, or as ``Instant`` raises.
+    """
+    kind = message.WhichOneof("message")
+    if kind != "instant":
+        raise _wrong_message(f"message {number + 2}", "instant", kind)
+    with inside(f"instants[{number}]"):
+        words = InstantWords.read(_plain(message.instant), limits)
+        return words.to_core(Parts({}), has_rig=has_rig)
+
+
+def _wrong_message(name: str, expected: str, got: str | None) -> InvalidInput:
+    return InvalidInput(
+        "sequence.message",
+        f"{name} of the stream is not what it must be: first one start, then only instants",
+        field="message",
+        expected=expected,
+        got=got or "nothing",
+    )
+
+
+def _plain(message: Message) -> dict[str, Any]:
+    """Return a message's fields as JSON would have them; fields that are not there are left out.
+
+    Numbers, texts and lists without presence are there when they are zero or empty.
+
+    Raises:
+        TooLarge: ``request.too_large`` for too many values, before any is looked at.
+    """
+    check_num_values(_num_values(message, MAX_INSTANT_VALUES), MAX_INSTANT_VALUES)
+    return _plain_fields(message)
+
+
+def _num_values(message: Message, enough: int) -> int:
+    """Count the elements of lists and maps, of its parts too; stops once there are ``enough``."""
+    count = 0
+    for _, value in message.ListFields():
+        parts: Iterable[Any] = (value,)
+        if isinstance(value, Mapping):
+            count, parts = count + len(value), value.values()
+        elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
+            count, parts = count + len(value), value
+        for part in parts:
+            if count > enough:
+                return count
+            if not isinstance(part, Message):
+                break  # all are of one kind
+            count += _num_values(part, enough - count)
+    return count
+
+
+def _plain_fields(message: Message) -> dict[str, Any]:
+    plain = {
+        _RIG_NAMES.get(field.name, field.name): _plain_value(getattr(message, field.name))
+        for field in message.DESCRIPTOR.fields
+        if _is_there(message, field.name)
+    }
+    plain.pop("request_id", None)  # of the envelope
+    if ("maps" in plain or "near" in plain) and plain.get("map") == "":
+        del plain["map"]
+    return plain
+
+
+def _is_there(message: Message, name: str) -> bool:
+    field = message.DESCRIPTOR.fields_by_name[name]
+    if field.full_name in _OPTIONAL_LISTS:
+        return len(getattr(message, name)) > 0
+    return not field.has_presence or message.HasField(name)
+
+
+def _plain_value(value: Any) -> object:
+    if isinstance(value, Message):
+        return _plain_fields(value)
+    if isinstance(value, Mapping):
+        return {name: _plain_value(value[name]) for name in sorted(value)}
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [_plain_value(each) for each in value]
+    return value

@@ -1,0 +1,154 @@
+"""How HTTP answers: JSON, problems, lines as they come, and what happens when a client leaves."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncGenerator, Callable, Coroutine, Mapping
+from contextlib import aclosing
+from http import HTTPStatus
+from typing import Any, TypeVar
+
+from pydantic import BaseModel
+from starlette.requests import ClientDisconnect
+from starlette.responses import Response
+from starlette.types import Receive, Scope, Send
+
+from service.api import Problem
+from service.errors import RETRY_AFTER_S, internal_error, statuses_of
+from visloc.errors import Unavailable, VislocError
+
+logger = logging.getLogger(__name__)
+
+NDJSON = "application/x-ndjson"
+
+T = TypeVar("T")
+
+
+def json_response(message: BaseModel, status: int = 200) -> Response:
+    """Answer with a message."""
+    return Response(message.model_dump_json(), status, media_type="application/json")
+
+
+def problem_of(error: VislocError, id_: str, status: HTTPStatus | None = None) -> Problem:
+    """Say an error as problem details; the status is that of its kind unless given."""
+    status = status or statuses_of(error)[0]
+    return Problem(
+        title=status.phrase,
+        status=status,
+        detail=error.message,
+        code=error.code,
+        field=error.field,
+        expected=error.expected,
+        got=error.got,
+        kind=type(error).__name__,
+        request_id=id_,
+    )
+
+
+def problem_response(error: VislocError, id_: str, status: HTTPStatus | None = None) -> Response:
+    """Answer with an error."""
+    problem = problem_of(error, id_, status)
+    return Response(
+        problem.model_dump_json(),
+        problem.status,
+        {"Retry-After": str(RETRY_AFTER_S)} if isinstance(error, Unavailable) else None,
+        media_type="application/problem+json",
+    )
+
+
+async def while_connected(receive: Receive, work: Coroutine[Any, Any, T]) -> T:
+    """Do the work, or drop it when the client hangs up: nobody waits for its answer.
+
+    Raises:
+        ClientDisconnect: when the client hung up.
+    """
+
+    async def hang_up() -> None:
+        while (await receive())["type"] != "http.disconnect":
+            pass
+
+    working, leaving = asyncio.create_task(work), asyncio.create_task(hang_up())
+    try:
+        await asyncio.wait({working, leaving}, return_when=asyncio.FIRST_COMPLETED)
+        if not working.done():
+            raise ClientDisconnect
+        return working.result()
+    finally:
+        working.cancel()
+        leaving.cancel()
+        await asyncio.wait({working, leaving})  # what the work holds is free when this returns
+
+
+class Lines(Response):
+    """One line of JSON per answer, sent as soon as it is there.
+
+    The next answer is asked for when the client has taken those before. An error after the first
+    line becomes a last line ``{"problem": {...}}``. The client hanging up ends the work.
+
+    Args:
+        first: the first answer, so that an error before it is an ordinary problem.
+        others: the answers after it; closed at the end.
+        message: an answer in the API's words.
+        id_: the id of the request.
+        patience_s: longest time for the client to take a line; then it is gone for us.
+    """
+
+    def __init__(
+        self,
+        first: T,
+        others: AsyncGenerator[T],
+        message: Callable[[T], BaseModel],
+        id_: str,
+        patience_s: float,
+    ) -> None:
+        super().__init__(media_type=NDJSON)
+        del self.headers["content-length"]
+        self.headers["X-Accel-Buffering"] = "no"  # or nginx would keep the lines to itself
+        self._answers = _with_first(first, others)
+        self._message = message
+        self._id = id_
+        self._patience_s = patience_s
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the lines."""
+        del scope
+        await while_connected(receive, self._send_all(send))
+
+    async def _send_all(self, send: Send) -> None:
+        await send(
+            {
+                "type": "http.response.start",
+                "status": self.status_code,
+                "headers": self.raw_headers,
+            }
+        )
+        try:
+            async with aclosing(self._answers) as answers:
+                async for answer in answers:
+                    await self._send_line(send, self._message(answer).model_dump_json())
+        except VislocError as error:
+            await self._send_problem(send, error)
+        except Exception:  # the last line of defence, as for all requests
+            logger.exception("request %s broke", self._id)
+            await self._send_problem(send, internal_error())
+        await send({"type": "http.response.body", "body": b"", "more_body": False})
+
+    async def _send_problem(self, send: Send, error: VislocError) -> None:
+        problem = problem_of(error, self._id)
+        await self._send_line(send, f'{{"problem":{problem.model_dump_json()}}}')
+
+    async def _send_line(self, send: Send, text: str) -> None:
+        message: Mapping[str, Any] = {"body": text.encode() + b"\n", "more_body": True}
+        try:
+            async with asyncio.timeout(self._patience_s):
+                await send({"type": "http.response.body", **message})
+        except TimeoutError:
+            raise ClientDisconnect from None
+
+
+async def _with_first(first: T, others: AsyncGenerator[T]) -> AsyncGenerator[T]:
+    async with aclosing(others):
+        yield first
+        async for other in others:
+            yield other

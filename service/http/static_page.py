@@ -1,0 +1,110 @@
+"""The page at ``/``: the built files of ``web/``, read once and held."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from fastapi import FastAPI, Request, Response
+
+from service.http.cache_headers import ASK_ALWAYS, FOR_EVER, is_current, not_modified, takes_gzip
+from visloc.errors import NotFound, Unavailable
+from visloc_web import page_folder
+
+logger = logging.getLogger(__name__)
+
+INDEX = "index.html"
+# Stated, as what `mimetypes` says depends on the machine.
+_TYPES = {
+    ".css": "text/css; charset=utf-8",
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".json": "application/json",
+    ".map": "application/json",
+    ".png": "image/png",
+    ".svg": "image/svg+xml",
+    ".woff2": "font/woff2",
+}
+_COMPRESSED_ALREADY = (".png", ".woff2")
+# Nothing comes from other hosts, nothing runs that is written into the page, nobody frames it.
+_SAFE = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' blob:; media-src 'self' blob:; connect-src 'self'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Permissions-Policy": "camera=(self)",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+_READING = ["GET", "HEAD"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _File:
+    """A file of the page.
+
+    Attributes:
+        plain: its bytes.
+        compressed: the same as gzip; None where that is no gain.
+        content_type: with the encoding of text.
+        etag: of the bytes, without quotes.
+    """
+
+    plain: bytes
+    compressed: bytes | None
+    content_type: str
+    etag: str
+
+
+def add_page_routes(app: FastAPI) -> None:
+    """Serve the page; where it was not built, say so in the log and to whoever asks."""
+    try:
+        index, assets = _read(page_folder())
+    except Unavailable as error:
+        logger.warning("no page at /: %s", error)
+        index, assets = None, {}
+
+    @app.api_route("/", methods=_READING, include_in_schema=False)
+    async def page(request: Request) -> Response:
+        if index is None:
+            raise NotFound(
+                "page.not_built",
+                "this server has no page, as its files were not built; the API is here",
+                expected="GET /openapi.json, which describes the API",
+            )
+        return _answer(index, request, ASK_ALWAYS)
+
+    @app.api_route("/assets/{name}", methods=_READING, include_in_schema=False)
+    async def asset(request: Request, name: str) -> Response:
+        if name not in assets:
+            raise NotFound("http.not_found", "the page has no such file", got=name)
+        return _answer(assets[name], request, FOR_EVER)  # names tell the content
+
+
+def _read(folder: Path) -> tuple[_File, Mapping[str, _File]]:
+    """Read the index, and all else by name: what is asked for never becomes a path."""
+    assets = {path.name: _read_file(path) for path in sorted((folder / "assets").glob("*"))}
+    return _read_file(folder / INDEX), assets
+
+
+def _read_file(path: Path) -> _File:
+    plain = path.read_bytes()
+    packed = None if path.suffix in _COMPRESSED_ALREADY else gzip.compress(plain, mtime=0)
+    content_type = _TYPES.get(path.suffix, "application/octet-stream")
+    return _File(plain, packed, content_type, hashlib.sha256(plain).hexdigest()[:32])
+
+
+def _answer(file: _File, request: Request, cache_control: str) -> Response:
+    body, etag = file.plain, f'"{file.etag}"'
+    headers = _SAFE | {"Cache-Control": cache_control, "Vary": "Accept-Encoding"}
+    if file.compressed is not None and takes_gzip(request.headers):
+        body, etag = file.compressed, f'"{file.etag}-gzip"'
+        headers["Content-Encoding"] = "gzip"
+    headers["ETag"] = etag
+    if is_current(request.headers, etag):
+        return not_modified(headers)
+    return Response(body, headers=headers, media_type=file.content_type)

@@ -1,0 +1,284 @@
+"""Who may ask for what, and how often: the rules, for both doors."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from ipaddress import ip_address
+from time import monotonic
+
+from service.security.key_file import Key, Scope
+from service.security.key_ring import KeyRing
+from service.settings import ServiceSettings, SettingsError
+from service.telemetry.logs import note_key
+from visloc.errors import Forbidden, InvalidInput, Overloaded, Unauthenticated
+from visloc_api.v1 import localization_pb2 as pb2
+
+# What a request needs: a key with these scopes, or nothing at all. ANY_KEY is for what is not
+# there: only who has a key may find that out.
+Needed = frozenset[Scope] | None
+NOTHING: Needed = None
+ANY_KEY: Needed = frozenset()
+
+_PUBLIC_PATHS = frozenset({"/healthz", "/readyz", "/openapi.json"})
+_READING_METHODS = frozenset({"GET", "HEAD"})
+
+_LOCALIZATION, _MAPS = (
+    pb2.DESCRIPTOR.services_by_name[name].full_name for name in ("Localization", "Maps")
+)
+_SCOPES_OF_CALLS = {
+    **{
+        f"/{_LOCALIZATION}/{name}": Scope.LOCALIZE
+        for name in ("Localize", "LocalizeRig", "LocalizeSequence")
+    },
+    **{f"/{_LOCALIZATION}/{name}": Scope.READ for name in ("ListMaps", "GetMap")},
+    f"/{_MAPS}/GetVersion": Scope.READ,
+    **{f"/{_MAPS}/{name}": Scope.MANAGE for name in ("PutVersion", "DeleteVersion", "SetCurrent")},
+}
+
+_ASSET = re.compile(r"/assets/[^/]+")
+_ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-f:]+\](:\d{1,5})?")
+
+
+def needed_over_http(method: str, path: str, *, page: bool = False) -> Needed:
+    """Return what a request over HTTP needs.
+
+    Args:
+        method: of the request.
+        path: without %-escapes.
+        page: whether the files of our own page are served, which need nothing.
+    """
+    if path in _PUBLIC_PATHS or (page and _is_of_page(method, path)):
+        return NOTHING
+    match path.split("/")[1:2]:
+        case ["localize" | "geopose"]:
+            return frozenset({Scope.LOCALIZE})
+        case ["maps"]:
+            return frozenset({Scope.READ if method in _READING_METHODS else Scope.MANAGE})
+        case ["metrics"]:
+            return frozenset({Scope.READ})
+    return ANY_KEY
+
+
+def _is_of_page(method: str, path: str) -> bool:
+    if method not in _READING_METHODS:
+        return False
+    return path == "/" or _ASSET.fullmatch(path) is not None
+
+
+def needed_over_grpc(method: str) -> Needed:
+    """Return what a call needs, by the full name of its method."""
+    if method.startswith("/grpc.health.v1.Health/"):
+        return NOTHING
+    scope = _SCOPES_OF_CALLS.get(method)
+    return ANY_KEY if scope is None else frozenset({scope})
+
+
+def is_method(name: str) -> bool:
+    """Tell whether this is a method of the API: of gRPC's own services, health aside, none is."""
+    return name in _SCOPES_OF_CALLS
+
+
+@dataclass(slots=True)
+class _Use:
+    """What a key is used for now.
+
+    Attributes:
+        running: requests that are being served.
+        left: requests that may come at once; grows with time.
+        at: when ``left`` was true.
+    """
+
+    running: int
+    left: float
+    at: float
+
+
+class Access:
+    """Decides. For one event loop.
+
+    Args:
+        ring: the keys; None lets everyone on this machine do everything.
+        origins: of the web pages that may call; ``*`` for all, with keys only.
+        now: a clock, seconds.
+    """
+
+    def __init__(
+        self,
+        ring: KeyRing | None,
+        origins: Collection[str] = (),
+        *,
+        now: Callable[[], float] = monotonic,
+    ) -> None:
+        self._ring = ring
+        self.origins = frozenset(origins)
+        self._now = now
+        self._uses: dict[str, _Use] = {}
+
+    def check_page(self, scheme: str, host: str, origins: Collection[str]) -> None:
+        """Refuse requests that a web page makes its visitor's browser send.
+
+        Without keys, whoever can send requests from this machine may do everything, and any page
+        can, through a browser that runs here: to this address, or to a name of its own that it
+        makes point here.
+
+        Args:
+            scheme: ``http`` or ``https``.
+            host: what the request calls this server, with the port.
+            origins: what the browser says of the page, if it does.
+
+        Raises:
+            Forbidden: ``access.host``, ``access.origin``.
+        """
+        if self._ring is not None:
+            return
+        if not is_loopback(_without_port(host)):
+            raise Forbidden(
+                "access.host",
+                "a server without API keys answers to names of its own machine only",
+                field="Host",
+                expected="localhost, 127.0.0.1 or [::1]",
+                got=host[:100],
+            )
+        for origin in origins:
+            if origin not in self.origins and origin != f"{scheme}://{host}":
+                raise Forbidden(
+                    "access.origin",
+                    "a web page of another origin may not call this server",
+                    field="Origin",
+                    expected="an origin in the setting cors_origins",
+                    got=origin[:100],
+                )
+
+    def key_of(self, tokens: Collection[str], needed: Needed) -> Key | None:
+        """Return the key of a request, which the log names; None when none is needed.
+
+        Args:
+            tokens: what was sent as keys.
+            needed: what the request needs.
+
+        Raises:
+            Unauthenticated: ``access.key_missing``, ``access.key_unknown``.
+            Forbidden: ``access.scope``.
+        """
+        if self._ring is None or needed is None:
+            return None
+        if not tokens:
+            raise Unauthenticated(
+                "access.key_missing",
+                "this server answers to holders of an API key",
+                field="Authorization",
+                expected="Authorization: Bearer KEY, or X-API-Key: KEY",
+            )
+        key = self._ring.find(next(iter(tokens))) if len(set(tokens)) == 1 else None
+        if key is None:
+            raise Unauthenticated(
+                "access.key_unknown",
+                "this is no API key of this server, or no longer",
+                field="Authorization",
+                expected="one key, as the server's operator gave it",
+            )
+        note_key(key.name)
+        if not needed <= key.scopes:
+            raise Forbidden(
+                "access.scope",
+                "the API key is not good for this",
+                field="Authorization",
+                expected=f"a key with the scope {', '.join(sorted(needed))}",
+                got=f"one with {', '.join(sorted(key.scopes))}",
+            )
+        return key
+
+    @contextmanager
+    def place(self, key: Key | None) -> Iterator[None]:
+        """Count a request of a key while it is served.
+
+        Raises:
+            Overloaded: ``access.rate``, ``access.concurrency``.
+        """
+        if key is None:
+            yield
+            return
+        use = self._use_of(key)
+        if key.concurrency is not None and use.running >= key.concurrency:
+            raise Overloaded(
+                "access.concurrency",
+                "too many requests of this API key are being served; wait for one to end",
+                expected=f"at most {key.concurrency} at once",
+            )
+        if use.left < 1:
+            raise Overloaded(
+                "access.rate",
+                f"too many requests of this API key; try again in {self.wait_s(key)} s",
+                expected=f"at most {key.rate:g} per second",
+            )
+        use.left -= 1
+        use.running += 1
+        try:
+            yield
+        finally:
+            use.running -= 1
+
+    def wait_s(self, key: Key | None) -> int:
+        """Return after how many whole seconds, at least one, a key may be used again."""
+        if key is None or key.rate is None:
+            return 1
+        return max(1, math.ceil((1 - self._use_of(key).left) / key.rate))
+
+    def _use_of(self, key: Key) -> _Use:
+        """Return the use of a key, with what time has given back to it."""
+        now = self._now()
+        if key.rate is None or key.burst is None:
+            burst, rate = math.inf, 0.0
+        else:
+            burst, rate = float(key.burst), key.rate
+        use = self._uses.setdefault(key.id, _Use(0, burst, now))
+        use.left = min(burst, use.left + rate * (now - use.at))
+        use.at = now
+        return use
+
+
+def open_access(settings: ServiceSettings) -> Access:
+    """Make the rules of a service, or refuse settings that would leave it open.
+
+    Raises:
+        SettingsError: naming the setting.
+    """
+    for origin in settings.cors_origins:
+        if origin == "*" and settings.keys_file is None:
+            raise SettingsError(
+                "cors_origins: * lets every web page call the service, so that keys_file is needed"
+            )
+        if origin != "*" and not _ORIGIN.fullmatch(origin):
+            raise SettingsError(
+                f"cors_origins: {origin!r} is no origin such as https://maps.example.org"
+            )
+    if settings.keys_file is not None:
+        try:
+            return Access(KeyRing(settings.keys_file), settings.cors_origins)
+        except InvalidInput as error:
+            raise SettingsError(f"keys_file: {error}") from None
+    if not is_loopback(settings.host):
+        raise SettingsError(
+            f"keys_file: needed, because others can reach host {settings.host!r}; make one with "
+            "`python -m service.keys init`, or listen on 127.0.0.1 only"
+        )
+    return Access(None, settings.cors_origins)
+
+
+def is_loopback(host: str) -> bool:
+    """Tell whether a name or an address is one of this machine only."""
+    if host.lower() == "localhost":
+        return True
+    try:
+        return ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
+
+
+def _without_port(host: str) -> str:
+    name, separator, _ = host.partition("]")
+    return name + separator if separator else host.partition(":")[0]

@@ -1,0 +1,203 @@
+"""Log lines for people or for machines, and what is known of the request that they belong to.
+
+No image bytes and no keys are logged. No caller can forge a line: control characters are escaped,
+and the further lines of a traceback are marked.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import sys
+from collections.abc import Mapping
+from contextvars import ContextVar
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from service.telemetry.tracing import Stage, TraceContext
+
+# Answered, but by no route: such a path is the caller's words.
+UNMATCHED = "unmatched"
+
+
+@dataclass(slots=True)
+class RequestRecord:
+    """What becomes known of a request on its way; written to the log when it ends.
+
+    Attributes:
+        door: ``http`` or ``grpc``.
+        request_id: the caller's or ours; checked by ``wire.request_id``.
+        trace: where it stands in the caller's trace; None without a trace.
+        key: the name of the API key.
+        peer: the address that asks; logged only of those who are refused access.
+        route: the template of the path with its method, or the name of the gRPC method.
+        status: of the answer: ``200``, ``OK``; empty until there is one.
+        map: the id of the map that answered.
+        outcome: ``localized``, or why not; of several instants, that of the last.
+        instants: that were answered.
+        localized: how many of those were.
+        code: of the error that was answered.
+        failed: whether that error was the server's fault.
+        stages: of the work for a photo.
+    """
+
+    door: str
+    request_id: str
+    trace: TraceContext | None = None
+    key: str | None = None
+    peer: str | None = None
+    route: str = UNMATCHED
+    status: str = ""
+    map: str | None = None
+    outcome: str | None = None
+    instants: int = 0
+    localized: int = 0
+    code: str | None = None
+    failed: bool = False
+    stages: tuple[Stage, ...] = ()
+
+
+_request: ContextVar[RequestRecord | None] = ContextVar("request", default=None)
+_key: ContextVar[str | None] = ContextVar("key", default=None)
+
+
+def current_request() -> RequestRecord | None:
+    """Return the request that is being served here, None outside of any."""
+    return _request.get()
+
+
+def note_key(name: str) -> None:
+    """Say which API key the request came with, by its name."""
+    record = _request.get()
+    if record is None:
+        _key.set(name)  # gRPC's interceptors run first, in the task that then serves the call
+    else:
+        record.key = name
+
+
+def begin_request(record: RequestRecord) -> None:
+    """Make the record that of the task that runs, and of those that it starts."""
+    record.key = record.key or _key.get()
+    _key.set(None)
+    _request.set(record)
+
+
+def end_request() -> None:
+    """Belong to no request again."""
+    _request.set(None)
+
+
+class LogSettings(Protocol):
+    """What is logged and how; of the service and of its worker processes."""
+
+    @property
+    def log_level(self) -> str:
+        """Debug, info, warning or error."""
+
+    @property
+    def log_format(self) -> str:
+        """Text or json."""
+
+
+def configure_logging(settings: LogSettings) -> None:
+    """Log to stderr as the settings say: in ``main``, and first thing in every worker process.
+
+    Libraries are heard from WARNING on: what some of them say below it contains credentials.
+    """
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(JsonFormatter() if settings.log_format == "json" else TextFormatter())
+    level = logging.getLevelNamesMapping()[settings.log_level.upper()]
+    root = logging.getLogger()
+    for old in root.handlers[:]:
+        root.removeHandler(old)
+    root.addHandler(handler)
+    root.setLevel(max(level, logging.WARNING))
+    for name in ("service", "visloc"):
+        logging.getLogger(name).setLevel(level)
+    logging.getLogger("python_multipart").setLevel(logging.ERROR)  # malformed forms are answered
+    # It warns of every span that is dropped while its collector is away.
+    logging.getLogger("opentelemetry").setLevel(logging.ERROR)
+    logging.captureWarnings(True)
+
+
+class TextFormatter(logging.Formatter):
+    """One line per record: time, level, logger, message, then ``name=value`` of the request."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line, and the marked lines of a traceback."""
+        facts = " ".join(f"{name}={_word(value)}" for name, value in _facts_of(record).items())
+        line = " ".join(
+            (_time_of(record), record.levelname, record.name + ":", one_line(record.getMessage()))
+        )
+        trace = "".join(f"\n    | {one_line(part)}" for part in _traceback_of(self, record))
+        return _hidden(f"{line} {facts}".rstrip() + trace)
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object per line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the object."""
+        entry: dict[str, object] = {
+            "time": _time_of(record),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+            **_facts_of(record),
+        }
+        if traceback := _traceback_of(self, record):
+            entry["traceback"] = "\n".join(traceback)
+        return _hidden(json.dumps(entry, default=str))  # ASCII: nothing in it can break the line
+
+
+def one_line(text: str) -> str:
+    """Escape what ends a line, moves a terminal's cursor or turns the direction of writing."""
+    return _UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
+# Controls of ASCII and Latin-1, line and paragraph separators, marks of direction, surrogates.
+_UNPRINTABLE = re.compile(
+    r"[\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufeff]"
+)
+# An API key as `python -m service.keys` prints it. No line of ours has one; this is for the day
+# that a library puts a request's headers into an exception.
+_API_KEY = re.compile(r"(visloc_[A-Za-z0-9-]+_)[A-Za-z0-9_-]{32,}")
+
+
+def _hidden(text: str) -> str:
+    return _API_KEY.sub(r"\1***", text)
+
+
+def _word(value: object) -> str:
+    text = one_line(str(value))
+    return json.dumps(text) if not text or re.search(r'[\s"=]', text) else text
+
+
+def _time_of(record: logging.LogRecord) -> str:
+    moment = datetime.fromtimestamp(record.created, UTC)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def _traceback_of(formatter: logging.Formatter, record: logging.LogRecord) -> list[str]:
+    parts = []
+    if record.exc_info:
+        parts.append(formatter.formatException(record.exc_info))
+    if record.stack_info:
+        parts.append(record.stack_info)
+    return [line for part in parts for line in part.split("\n")]
+
+
+def _facts_of(record: logging.LogRecord) -> Mapping[str, object]:
+    """What the record was given as ``extra={"facts": ...}``, and the ids of its request."""
+    facts = dict(getattr(record, "facts", {}))
+    request = _request.get()
+    if request is not None:
+        facts["request_id"] = request.request_id
+        if request.trace is not None:
+            facts["trace_id"] = request.trace.trace_id
+        if request.key is not None:
+            facts["key"] = request.key
+    return facts

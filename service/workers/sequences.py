@@ -1,0 +1,206 @@
+"""One sequence on its way through the engine. Runs in worker processes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from service.api.message import inside
+from service.values import Instant, InstantLocalization, SequenceStart, check_order
+from service.workers.instants import Target, check_images, check_options, check_priors
+from service.workers.judging import judged
+from visloc.errors import InvalidInput, TooLarge
+from visloc.localization.solving import SeenImage, Solved
+from visloc.priors import Priors
+from visloc.sequences.filling import TimeUnit, guess_time_unit
+from visloc.sequences.solver import SeenInstant, SequenceSolver, check_max_gap, check_odometry
+from visloc.types import InstantAnswer, Reason, Refusal, RigPose
+
+
+class SequenceRun:
+    """Solves a sequence in each of its maps until one of them is settled on.
+
+    Args:
+        start: what all instants share.
+        targets: the maps.
+        max_images: of one instant.
+        max_instants: of the sequence.
+
+    Attributes:
+        targets: the maps that are still searched.
+
+    Raises:
+        InvalidInput: ``sequence.max_gap``, ``options.*``, ``priors.*``.
+    """
+
+    def __init__(
+        self, start: SequenceStart, targets: Sequence[Target], max_images: int, max_instants: int
+    ) -> None:
+        check_max_gap(start.max_gap_s)
+        check_options(targets, start.options)
+        check_priors(targets, start.priors)
+        self.targets = targets
+        self._start = start
+        self._max_images = max_images
+        self._max_instants = max_instants
+        self._last_checked: tuple[int, int] | None = None  # index, timestamp
+        self._solvers: list[SequenceSolver] = []
+        self._held: list[list[InstantAnswer]] = [[] for _ in targets]
+
+    def check(self, index: int, instant: Instant) -> Priors:
+        """Refuse an instant that cannot be solved, and return what is known of the rig there.
+
+        Instants are checked in order; to begin again with the first is fine.
+
+        Raises:
+            InvalidInput: ``sequence.*``, ``rig.*``, ``priors.*``, with the instant in the field.
+            TooLarge: ``sequence.too_many_instants``, ``rig.too_many_images``.
+        """
+        if index >= self._max_instants:
+            raise TooLarge(
+                "sequence.too_many_instants",
+                "too many instants in one sequence; send it in parts",
+                field="instants",
+                expected=f"at most {self._max_instants}",
+            )
+        with inside(f"instants[{index}]"):
+            before = self._last_checked
+            if before is not None and before[0] < index:
+                check_order(before[1], instant.timestamp)
+            self._last_checked = index, instant.timestamp
+            for target in self.targets:
+                rig = None if self._start.rig is None else target.rig
+                check_images(instant.images, rig, self._max_images, "images")
+                check_odometry(instant.odometry, metric=_is_metric(target))
+            if instant.priors is None:
+                return self._start.priors
+            check_priors(self.targets, instant.priors)
+            return instant.priors
+
+    def add(
+        self, instant: Instant, images: Sequence[tuple[SeenImage, ...]], priors: Priors
+    ) -> list[InstantAnswer]:
+        """Solve an instant; return the answers that are final now.
+
+        Args:
+            instant: the next one.
+            images: by target.
+            priors: what ``check`` returned.
+
+        Raises:
+            InvalidInput: ``sequence.time_unit`` when the first timestamp does not tell the unit.
+        """
+        if not self._solvers:
+            unit = self._start.time_unit or _guessed_unit(instant.timestamp)
+            self._solvers = [self._solver(target, unit) for target in self.targets]
+        assert self._last_checked is not None  # it was checked before
+        with inside(f"instants[{self._last_checked[0]}]"):
+            shown = [
+                SeenInstant(instant.timestamp, seen, instant.odometry, priors) for seen in images
+            ]
+            solved = [solver.solve(seen) for solver, seen in zip(self._solvers, shown, strict=True)]
+            settled, solved = self._judged(solved, priors)
+            for solver, held, seen, one in zip(
+                self._solvers, self._held, shown, solved, strict=True
+            ):
+                held += solver.take(seen, one)
+        if settled is not None:
+            self._keep(settled)
+        return self._released() if len(self.targets) == 1 else []
+
+    @property
+    def pose(self) -> RigPose | None:
+        """What its own images measured of the newest instant, in the map that was settled on.
+
+        None when they do not localize it, or while several maps are searched.
+        """
+        return self._solvers[0].newest if len(self._solvers) == 1 else None
+
+    def finish(self) -> list[InstantAnswer]:
+        """Return the answers that waited for instants which will not come.
+
+        Raises:
+            InvalidInput: ``sequence.empty`` when there was no instant.
+        """
+        if not self._solvers:
+            raise InvalidInput("sequence.empty", "there is no instant", field="instants")
+        for held, solver in zip(self._held, self._solvers, strict=True):
+            held += solver.finish()
+        # Motion may place instants that no image localizes; in several maps, it tells nothing.
+        placed = [
+            i for i, held in enumerate(self._held) if any(each.pose is not None for each in held)
+        ]
+        if len(self._held) > 1 and len(placed) > 1:
+            self._held = [[_unplaced(answer) for answer in held] for held in self._held]
+        self._keep(placed[0] if placed else 0)
+        return self._released()
+
+    def localization(self, answer: InstantAnswer) -> InstantLocalization:
+        """Return an answer of ``add`` or ``finish`` with the map that gave it."""
+        return self.targets[0].localization(answer, ypr=self._start.ypr)
+
+    def _judged(self, solved: list[Solved], priors: Priors) -> tuple[int | None, list[Solved]]:
+        """Say which map to settle on, if any, and what each map makes of an instant.
+
+        An instant that several maps explain counts in none of them.
+        """
+        if len(self.targets) == 1:
+            return None, solved
+        found = [
+            target.localization(one.answer, ypr=self._start.ypr)
+            for target, one in zip(self.targets, solved, strict=True)
+        ]
+        best, verdict = judged(found, priors)
+        if verdict.answer.pose is not None:
+            return best, solved
+        refusal = verdict.answer.refusal
+        if refusal is None or refusal.reason is not Reason.AMBIGUOUS:
+            return None, solved
+        return None, [one if one.pose is None else one.refused(refusal) for one in solved]
+
+    def _keep(self, index: int) -> None:
+        """Search only one of the maps from now on."""
+        self.targets = [self.targets[index]]
+        self._solvers = [self._solvers[index]]
+        self._held = [self._held[index]]
+
+    def _released(self) -> list[InstantAnswer]:
+        released, self._held[0] = self._held[0], []
+        return released
+
+    def _solver(self, target: Target, unit: TimeUnit) -> SequenceSolver:
+        return SequenceSolver(
+            target.localizer.geometry,
+            metric=_is_metric(target),
+            options=self._start.options,
+            time_unit=unit,
+            max_gap_s=self._start.max_gap_s,
+        )
+
+
+def _unplaced(answer: InstantAnswer) -> InstantAnswer:
+    """Take a pose back that another map contradicts."""
+    if answer.pose is None:
+        return answer
+    refusal = answer.refusal or Refusal(
+        "gate",
+        Reason.AMBIGUOUS,
+        "several of the maps explain the sequence; name one, or say where it is (priors)",
+    )
+    return replace(answer, pose=None, refusal=refusal)
+
+
+def _is_metric(target: Target) -> bool:
+    return target.localizer.map.manifest.world.metric
+
+
+def _guessed_unit(timestamp: int) -> TimeUnit:
+    unit = guess_time_unit([timestamp])
+    if unit is None:
+        raise InvalidInput(
+            "sequence.time_unit",
+            "the unit of the timestamps cannot be told by their size",
+            field="time_unit",
+            expected=f"one of {', '.join(TimeUnit)}",
+        )
+    return unit

@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from clients import GeoPose, GeoPoseYpr, Near
+from clients.transport.messages import localize_message, plain, rig_message, start_message
+from clients.wire.geopose import parse_geopose, parse_geopose_ypr
+from clients.wire.requests import checked_search, localize_request
+from clients.wire.rig_requests import rig_request, search_as_json, sequence_start
+from visloc.errors import InvalidInput
+
+POSITION = {"lat": 48.25, "lon": -122.1, "h": 90.5}
+PLACE = Near(48.25, -122, 150)
+
+
+def test_a_place_is_sent_instead_of_maps_and_angles_are_asked_for() -> None:
+    search = checked_search(PLACE, None, None, None, ypr=True)
+    said = {"near": {"latitude": 48.25, "longitude": -122.0, "radius": 150.0}, "ypr": True}
+    assert search_as_json(search) == said
+    messages: list[Any] = [
+        localize_message(localize_request(search, b"photo", None)),
+        rig_message(rig_request(search, "rig", ())),
+        start_message(sequence_start(search, None, None, None)).start,
+    ]
+    for message in messages:
+        sent = plain(message)
+        assert {name: sent[name] for name in said} == said
+        assert (sent["map"], sent["maps"]) == ("", [])
+
+
+def test_without_them_nothing_is_said_of_either() -> None:
+    search = checked_search("room", None, None, None)
+    assert search_as_json(search) == {"map": "room"}
+    sent = plain(localize_message(localize_request(search, b"photo", None)))
+    assert (sent["near"], sent["ypr"]) == (None, None)
+
+
+def test_a_place_is_made_of_numbers() -> None:
+    with pytest.raises(InvalidInput) as caught:
+        Near(48.0, float("nan"), 10.0)
+    assert caught.value.code == "near.longitude"
+
+
+def test_geoposes_keep_every_digit() -> None:
+    quaternion = {"x": 0.1, "y": -1 / 3, "z": 0.2, "w": 0.9}
+    found = parse_geopose({"position": POSITION, "quaternion": quaternion})
+    assert found == GeoPose(48.25, -122.1, 90.5, (0.1, -1 / 3, 0.2, 0.9))
+    angles = {"yaw": 30.0, "pitch": -1.5, "roll": 180.0}
+    assert parse_geopose_ypr({"position": POSITION, "angles": angles}) == GeoPoseYpr(
+        48.25, -122.1, 90.5, 30.0, -1.5, 180.0
+    )
+    assert parse_geopose(None) is None
+    assert parse_geopose_ypr(None) is None

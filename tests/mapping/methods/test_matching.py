@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mapping.build.landmarks import View
+from mapping.build.photos import MappingPhoto
+from mapping.build.stages import WorkFolder
+from mapping.cluster.workers import Workers
+from mapping.methods.matching import Verification, fits_poses, match_pairs
+from visloc.geometry import Camera, Pose
+from visloc.kapture import FileRecord
+from visloc.pose.colmap import project
+from visloc.types import Fingerprint, LocalFeatures
+
+CAMERA = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
+POINTS = np.random.default_rng(0).uniform([-2, -1.5, 4], [2, 1.5, 8], (60, 3))
+NUM_WRONG = 20
+
+
+class TrueFeatures:
+    """Keypoint k of every photo shows point k; the first 20 of odd photos are elsewhere."""
+
+    fingerprint = Fingerprint("true", 1, {})
+    descriptor_dim = 60
+    max_keypoints = 60
+
+    def key(self, photo: MappingPhoto) -> str:
+        return photo.name
+
+    def prepare(self, photo: MappingPhoto) -> None:
+        pass
+
+    def read(self, photo: MappingPhoto) -> LocalFeatures:
+        pose = pose_of(photo.record.timestamp)
+        pixels = project(CAMERA, pose.apply(POINTS)).astype(np.float32)
+        if photo.record.timestamp % 2:
+            pixels[:NUM_WRONG] = np.random.default_rng(1).uniform(0, 480, (NUM_WRONG, 2))
+        ones = np.ones(60, np.float32)
+        return LocalFeatures(pixels, np.eye(60, dtype=np.float32), ones, ones)
+
+
+def pose_of(number: int) -> Pose:
+    return Pose(np.eye(3), np.array([-0.3 * number, 0.05 * number, 0.0]))
+
+
+def make_photo(number: int) -> MappingPhoto:
+    record = FileRecord(number, "cam", f"{number}.jpg")
+    return MappingPhoto(record, Path(record.path), "", CAMERA, True, pose_of(number), None, None)
+
+
+def matched(root: Path, pairs: NDArray[np.int64], **changes: object) -> list[tuple[int, int, int]]:
+    values = {"max_error_px": 4.0, "min_matches": 15, "poses_known": True} | changes
+    found, _ = match_pairs(
+        WorkFolder(root),
+        [make_photo(number) for number in range(3)],
+        TrueFeatures(),
+        pairs,
+        Verification(**values),  # type: ignore[arg-type]
+        Workers(1),
+        lambda *_: None,
+    )
+    return [(pair.first, pair.second, len(pair.rows)) for pair in found]
+
+
+PAIRS = np.array([[0, 1], [0, 2], [1, 2]])
+
+
+@pytest.mark.parametrize("poses_known", [True, False])
+def test_wrong_matches_do_not_fit_and_right_ones_do(tmp_path: Path, poses_known: bool) -> None:
+    found = {(a, b): num for a, b, num in matched(tmp_path, PAIRS, poses_known=poses_known)}
+    assert found[0, 2] == 60
+    # A wrong one may lie on its line by chance.
+    assert 40 <= found[0, 1] <= 43
+    assert 40 <= found[1, 2] <= 43
+
+
+def test_a_pair_with_fewer_matches_than_are_asked_for_has_none(tmp_path: Path) -> None:
+    assert matched(tmp_path, PAIRS, min_matches=50) == [(0, 2, 60)]
+
+
+def test_no_pairs_have_no_matches(tmp_path: Path) -> None:
+    assert matched(tmp_path, np.empty((0, 2), dtype=np.int64)) == []
+
+
+def test_finished_matches_are_found_again(tmp_path: Path) -> None:
+    def items() -> dict[Path, int]:
+        return {path: path.stat().st_ino for path in tmp_path.rglob("*.npz")}
+
+    matched(tmp_path, PAIRS)
+    before = items()
+    assert len(before) == 4  # matches and verified, of two photos with partners
+    matched(tmp_path, PAIRS, max_error_px=1.0)
+    after = items()
+    assert after.items() >= before.items()
+    assert {path.parent.name for path in after.keys() - before.keys()} == {"verified"}
+
+
+def test_the_limit_is_in_pixels_of_the_photos() -> None:
+    views = View(CAMERA, pose_of(0)), View(CAMERA, Pose(np.eye(3), np.array([-1.0, 0.0, 0.0])))
+    # The epipolar lines of two cameras side by side are the rows.
+    at = np.array([[300.0, 200.0]] * 3, np.float32)
+    shifted = np.array([[250.0, 203.0], [250.0, 205.0], [350.0, 200.0]], np.float32)
+    fits = fits_poses(views, at, shifted, 4.0)
+    assert fits[:2].tolist() == [True, False]

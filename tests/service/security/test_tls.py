@@ -1,0 +1,250 @@
+from __future__ import annotations
+
+import asyncio
+import io
+import logging
+import ssl
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import httpx
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    KeySerializationEncryption,
+    NoEncryption,
+    PrivateFormat,
+)
+
+from clients import AsyncClient, Client
+from service.security.access import ANY_KEY, needed_over_http
+from service.security.key_file import Scope, edited_keys, new_key
+from service.security.tls import check_tls, grpc_credentials, tls_config
+from service.server import Server
+from service.settings import ServiceSettings, SettingsError
+from service.telemetry.logs import TextFormatter
+from visloc.errors import Forbidden, NotFound, Unauthenticated, Unavailable
+
+
+def make_certificate(
+    folder: Path, name: str = "server", encryption: KeySerializationEncryption | None = None
+) -> tuple[Path, Path]:
+    """Write a certificate of 127.0.0.1 and localhost, and its key."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "localhost")])
+    names = [x509.DNSName("localhost"), x509.IPAddress(ip_address("127.0.0.1"))]
+    now = datetime.now(UTC)
+    certificate = (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(subject)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - timedelta(days=1))
+        .not_valid_after(now + timedelta(days=1))
+        .add_extension(x509.SubjectAlternativeName(names), critical=False)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    paths = folder / f"{name}.pem", folder / f"{name}.key"
+    paths[0].write_bytes(certificate.public_bytes(Encoding.PEM))
+    paths[1].write_bytes(
+        key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, encryption or NoEncryption())
+    )
+    return paths
+
+
+def settings(certificate: Path | None, key: Path | None) -> ServiceSettings:
+    return ServiceSettings(tls_cert=certificate, tls_key=key)
+
+
+def test_without_a_certificate_nothing_is_encrypted() -> None:
+    check_tls(settings(None, None))
+    assert tls_config(settings(None, None)) == {}
+    assert grpc_credentials(settings(None, None)) is None
+
+
+def test_a_certificate_with_its_key_is_used(tmp_path: Path) -> None:
+    certificate, key = make_certificate(tmp_path)
+    given = settings(certificate, key)
+
+    check_tls(given)
+    assert tls_config(given) == {"ssl_certfile": str(certificate), "ssl_keyfile": str(key)}
+    assert grpc_credentials(given) is not None
+
+
+def test_one_without_the_other_is_refused_by_name(tmp_path: Path) -> None:
+    certificate, key = make_certificate(tmp_path)
+    with pytest.raises(SettingsError, match=r"^tls_key: tls_cert was given without it"):
+        check_tls(settings(certificate, None))
+    with pytest.raises(SettingsError, match=r"^tls_cert: tls_key was given without it"):
+        check_tls(settings(None, key))
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    certificate, key = make_certificate(tmp_path)
+    key.unlink()
+    with pytest.raises(SettingsError, match=r"^tls_key: .*server\.key cannot be read: No such"):
+        check_tls(settings(certificate, key))
+
+
+def test_files_that_are_no_pair_are_refused(tmp_path: Path) -> None:
+    certificate, key = make_certificate(tmp_path)
+    _, other_key = make_certificate(tmp_path, "other")
+    garbage = tmp_path / "garbage"
+    garbage.write_bytes(b"\x00garbage")
+    for pair in ((certificate, other_key), (certificate, garbage), (key, certificate)):
+        with pytest.raises(SettingsError, match=r"^tls_cert, tls_key: .* are not a certificate"):
+            check_tls(settings(*pair))
+
+
+def test_a_key_with_a_password_is_refused_and_asks_nobody(tmp_path: Path) -> None:
+    encryption = BestAvailableEncryption(b"secret")
+    with pytest.raises(SettingsError, match="not encrypted"):
+        check_tls(settings(*make_certificate(tmp_path, encryption=encryption)))
+
+
+def test_old_versions_of_tls_are_not_spoken() -> None:
+    assert ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).minimum_version >= ssl.TLSVersion.TLSv1_2
+
+
+# The service itself, with a certificate and keys, asked by its own clients
+
+
+class Guarded(NamedTuple):
+    http: str
+    grpc: str
+    ca: Path
+    keys: dict[Scope, str]
+
+    def client(self, door: str, scope: Scope) -> Client:
+        return Client(getattr(self, door), api_key=self.keys[scope], ca=self.ca)
+
+
+@pytest.fixture(scope="module")
+def guarded(
+    tmp_path_factory: pytest.TempPathFactory, serve: Callable[..., Any]
+) -> Iterator[Guarded]:
+    folder = tmp_path_factory.mktemp("guarded")
+    certificate, private_key = make_certificate(folder)
+    tokens = {}
+    with edited_keys(folder / "keys.json") as keys:
+        for scope in Scope:
+            key, tokens[scope] = new_key(scope.value, frozenset({scope}))
+            keys.append(key)
+    files = {"keys_file": folder / "keys.json", "tls_cert": certificate, "tls_key": private_key}
+    (folder / "maps").mkdir()
+    # What is asked here needs no worker.
+    with serve(folder / "maps", load=False, host="127.0.0.1", **files) as doors:
+        http_port, grpc_port = doors.server.http_port, doors.server.grpc_port
+        yield Guarded(
+            f"https://127.0.0.1:{http_port}", f"grpcs://localhost:{grpc_port}", certificate, tokens
+        )
+
+
+@pytest.mark.parametrize("door", ["http", "grpc"])
+def test_a_key_and_the_right_authority_open_the_door(guarded: Guarded, door: str) -> None:
+    with guarded.client(door, Scope.READ) as client:
+        assert client.maps() == []
+        assert client.server_info().version
+
+    async def ask() -> None:
+        url, key = getattr(guarded, door), guarded.keys[Scope.READ]
+        async with AsyncClient(url, api_key=key, ca=guarded.ca) as client:
+            assert await client.maps() == []
+
+    asyncio.run(ask())
+
+
+@pytest.mark.parametrize("door", ["http", "grpc"])
+def test_the_server_says_over_both_doors_why_it_refuses(guarded: Guarded, door: str) -> None:
+    url = getattr(guarded, door)
+    with Client(url, ca=guarded.ca) as client, pytest.raises(Unauthenticated) as missing:
+        client.maps()
+    assert missing.value.code == "access.key_missing"
+    with guarded.client(door, Scope.READ) as client:
+        for ask in (
+            lambda client=client: client.localize(b"photo", "room"),
+            lambda client=client: client.use_version("room", "1"),
+            lambda client=client: client.delete_version("room", "1"),
+        ):
+            with pytest.raises(Forbidden) as caught:
+                ask()
+            assert caught.value.code == "access.scope"
+    with guarded.client(door, Scope.LOCALIZE) as client, pytest.raises(Forbidden):
+        client.maps()
+    with guarded.client(door, Scope.MANAGE) as client:
+        with pytest.raises(NotFound):
+            client.delete_version("room", "1")
+        with pytest.raises(Forbidden):
+            client.map_version("room", "1")
+
+
+@pytest.mark.parametrize("door", ["http", "grpc"])
+def test_the_log_names_the_key_that_was_refused(guarded: Guarded, door: str) -> None:
+    log, written = logging.getLogger("service.security.access"), io.StringIO()
+    handler = logging.StreamHandler(written)
+    handler.setFormatter(TextFormatter())
+    log.addHandler(handler)
+    level = log.level
+    log.setLevel(logging.INFO)
+    try:
+        with guarded.client(door, Scope.LOCALIZE) as client, pytest.raises(Forbidden):
+            client.maps()
+        deadline = time.monotonic() + 20
+        while "code=access.scope" not in written.getvalue() and time.monotonic() < deadline:
+            time.sleep(0.01)  # the caller is answered first
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)
+    (line,) = written.getvalue().splitlines()
+    assert "code=access.scope" in line
+    assert "key=localize" in line
+
+
+@pytest.mark.parametrize("door", ["http", "grpc"])
+def test_a_server_that_the_client_does_not_trust_gets_no_key(
+    guarded: Guarded, door: str, tmp_path: Path
+) -> None:
+    other_ca, _ = make_certificate(tmp_path)
+    url, key = getattr(guarded, door), guarded.keys[Scope.READ]
+    with (
+        Client(url, api_key=key, ca=other_ca, timeout_s=5) as client,
+        pytest.raises(Unavailable) as caught,
+    ):
+        client.maps()
+    assert caught.value.code == "server.unreachable"
+
+
+def test_without_tls_nothing_is_answered(guarded: Guarded) -> None:
+    for url in (
+        guarded.http.replace("https", "http"),
+        guarded.grpc.replace("grpcs", "grpc"),
+    ):
+        with Client(url, timeout_s=5) as client, pytest.raises(Unavailable):
+            client.maps()
+
+
+def test_every_route_of_the_service_has_a_scope_of_its_own_or_is_open(guarded: Guarded) -> None:
+    with httpx.Client(
+        base_url=guarded.http, verify=ssl.create_default_context(cafile=guarded.ca)
+    ) as http:
+        paths = http.get("/openapi.json").json()["paths"]
+        assert http.get("/readyz").status_code == 503
+        assert http.get("/metrics").status_code == 401
+    routes = [(method.upper(), path) for path, methods in paths.items() for method in methods]
+    assert len(routes) > 10
+    assert [route for route in routes if needed_over_http(*route) == ANY_KEY] == []
+
+
+def test_a_service_that_would_be_open_to_others_does_not_start(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"^keys_file: needed"):
+        Server(ServiceSettings(maps_dir=str(tmp_path), host="0.0.0.0", http_port=0, grpc_port=0))

@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.visloc.answers import localized, of_rig, refused
+from visloc.geometry import Similarity
+from visloc.localization.judge import Candidate, Tie, judge
+from visloc.pose.centre import moved_pose
+from visloc.sets.frame import answer_in_set
+from visloc.types import Reason, Refusal
+
+SLACK = 0.3
+
+
+def one_frame(*_: int) -> Tie:
+    return Tie(Similarity.identity(), SLACK)
+
+
+def untied(*_: int) -> None:
+    return None
+
+
+def of(*answers: Any) -> list[Candidate]:
+    return [Candidate(f"map-{i}@v1", answer) for i, answer in enumerate(answers)]
+
+
+def test_most_inliers_win() -> None:
+    assert judge(of(localized(40), localized(200), refused(300)), one_frame) == 1
+
+
+def test_of_similar_answers_that_agree_the_more_certain_one_counts() -> None:
+    found = of(
+        localized(200, std=0.05),
+        localized(170, (0.1, 0, 0), std=0.01),
+        localized(120, (0.1, 0, 0), std=0.001),
+    )
+
+    assert judge(found, one_frame) == 1
+
+
+@pytest.mark.parametrize("make", [localized, of_rig])
+def test_two_places_that_explain_it_are_refused(make: Callable[..., Any]) -> None:
+    answer = judge(of(make(200), make(100, (100, 0, 0))), one_frame)
+
+    assert isinstance(answer, Refusal)
+    assert answer.reason is Reason.AMBIGUOUS
+    assert "map-0@v1 and map-1@v1" in answer.message
+    assert "at different places, with 200 and 100 inliers" in answer.message
+
+
+def test_a_rival_of_few_inliers_is_no_reason_to_refuse() -> None:
+    found = of(localized(99, (100, 0, 0)), localized(200))
+
+    assert judge(found, one_frame) == 1
+    assert judge(found, untied) == 1
+
+
+def test_the_same_position_the_other_way_round_is_another_place() -> None:
+    assert isinstance(judge(of(localized(200), localized(190, turn=np.pi)), one_frame), Refusal)
+
+
+def test_how_well_places_are_tied_is_no_contradiction() -> None:
+    near = of(localized(200), localized(190, (0.25, 0, 0), np.radians(3)))
+    far = of(localized(200), localized(190, (0.5, 0, 0)))
+    unsure = of(localized(200), localized(190, (0.5, 0, 0), std=0.2))
+
+    assert judge(near, one_frame) == 0
+    assert isinstance(judge(far, one_frame), Refusal)
+    assert judge(unsure, one_frame) == 0
+
+
+@pytest.mark.parametrize("best", [{"inliers": 100, "std": 0.3}, {"inliers": 170, "std": 2.0}])
+def test_places_that_only_an_uncertain_answer_agrees_with_are_refused(best: dict[str, Any]) -> None:
+    apart = [localized(90, (1.1, 0, 0), std=0.01), localized(89, (-1.1, 0, 0), std=0.02)]
+    together = [localized(**best), *apart]
+
+    for found in (apart, together, together[::-1]):
+        answer = judge(of(*found), one_frame)
+        assert isinstance(answer, Refusal)
+        assert answer.reason is Reason.AMBIGUOUS
+    assert judge(of(*together[:2]), one_frame) == (1 if best["inliers"] == 100 else 0)
+
+
+def test_places_that_nothing_ties_cannot_agree() -> None:
+    # Coordinates that are equal say nothing: both maps may begin at a lift of their own.
+    answer = judge(of(localized(200), localized(150)), untied)
+
+    assert isinstance(answer, Refusal)
+    assert answer.reason is Reason.AMBIGUOUS
+    assert "nothing says how they lie to each other" in answer.message
+
+
+def test_poses_are_compared_in_one_frame_and_unit() -> None:
+    turn = Rotation.from_euler("zyx", [40, -20, 10], degrees=True).as_matrix()
+    b_from_a = Similarity(2.5, turn, np.array([30.0, -4.0, 7.0]))
+    here = localized(200, (1.0, 2.0, 3.0), turn=0.4)
+    there = answer_in_set(localized(190, (1.2, 2.0, 3.0), turn=0.4), b_from_a)
+    elsewhere = answer_in_set(localized(190, (1.6, 2.0, 3.0), turn=0.4), b_from_a)
+
+    def tied(a: int, _: int) -> Tie:
+        return Tie(b_from_a.inverse() if a == 0 else b_from_a, SLACK if a == 0 else 2.5 * SLACK)
+
+    assert judge(of(here, there), tied) == 0
+    assert judge(of(there, here), lambda a, b: tied(b, a)) == 1
+    assert isinstance(judge(of(here, elsewhere), tied), Refusal)
+    back, covariance = moved_pose(there.cam_from_world, there.covariance, b_from_a.inverse())
+    assert np.allclose(back.center, (1.2, 2.0, 3.0))
+    assert np.allclose(covariance, localized(190, (1.2, 2.0, 3.0), turn=0.4).covariance)
+
+
+def test_a_set_that_could_not_decide_leaves_no_room_for_a_weaker_answer() -> None:
+    undecided = refused(300, Reason.AMBIGUOUS)
+
+    assert judge(of(localized(200), undecided), one_frame) == 1
+    assert judge(of(localized(601), undecided), one_frame) == 0
+
+
+def test_without_a_pose_the_answer_that_came_furthest_counts() -> None:
+    assert judge(of(refused(5), refused(25)), one_frame) == 1

@@ -1,0 +1,1 @@
+"""How networks are computed: torch or OpenVINO."""

@@ -1,0 +1,149 @@
+"""VLAD of RootSIFT on a dense grid at several scales: sees walls where keypoints see nothing.
+
+After Torii et al., "24/7 place recognition by view synthesis" (CVPR 2015): it lives through
+changes of light better than descriptors at keypoints. RootSIFT: Arandjelovic and Zisserman, "Three
+things everyone should know to improve object retrieval" (CVPR 2012).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.features.base import Fingerprint, GlobalDescriptor
+from visloc.features.descriptors.vlad import VLAD_PARAMETERS, VladDescriptor
+from visloc.types import Inference, LocalFeatures
+
+ORIENTATIONS = 8
+CELLS_PER_SIDE = 4
+# Width of a cell in pixels of the photo at its working size. Coarser ones than the 4 to 10 px of
+# the paper found more of the nearest views in three places, with a quarter of the words.
+CELL_SIZES_PX = (8, 12, 16)
+WORKING_SIZE_PX = 640
+# A cell is this wide in the photo shrunk for its scale; patches overlap by all but one cell.
+CELL_PX = 4
+SMOOTHING_SIGMA_PX = 0.7
+# Grey levels between the neighbours of a pixel, averaged over a patch: below, it is mere noise.
+MIN_CONTRAST = 1.0
+
+
+def load_densevlad(
+    _weights_dir: Path | None = None,
+    _inference: Inference = Inference.AUTO,
+    _threads: int | None = None,
+) -> GlobalDescriptor:
+    """Make the descriptor, which needs no weights."""
+    return DenseVlad()
+
+
+class DenseVlad(VladDescriptor):
+    """A photo's words are RootSIFT descriptors (128) of overlapping patches all over it."""
+
+    @property
+    def fingerprint(self) -> Fingerprint:
+        """Name and parameters."""
+        return Fingerprint(
+            "densevlad",
+            revision=1,
+            parameters={
+                "cell_sizes_px": ",".join(map(str, CELL_SIZES_PX)),
+                "working_size_px": WORKING_SIZE_PX,
+                "cell_px": CELL_PX,
+                "smoothing_sigma_px": SMOOTHING_SIGMA_PX,
+                "min_contrast": MIN_CONTRAST,
+                **VLAD_PARAMETERS,
+            },
+        )
+
+    @property
+    def needs_image(self) -> bool:
+        """True: its words lie on a grid, not at keypoints."""
+        return True
+
+    @property
+    def needs_local_features(self) -> bool:
+        """False: its words lie on a grid."""
+        return False
+
+    def words(
+        self,
+        rgb: NDArray[np.uint8],
+        local: LocalFeatures,  # noqa: ARG002 - words are taken everywhere, not at keypoints
+    ) -> NDArray[np.float32]:
+        """Return RootSIFT (n, 128) of the photo's patches that have contrast."""
+        return dense_root_sift(rgb)
+
+
+def dense_root_sift(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Describe a photo (H, W, 3) by RootSIFT rows (n, 128) of unit length.
+
+    The photo is shrunk to 640 px on its longer side (never enlarged), then, for each cell size,
+    further until a cell has 4 px. A patch has 4 x 4 cells and starts at every cell. Patches
+    without contrast are left out; a photo smaller than the smallest patch has none.
+
+    Columns: cell row, cell column, orientation of the gradient (0 to the right, then clockwise
+    in steps of 45 degrees, as y points down).
+    """
+    height, width = rgb.shape[:2]
+    if min(height, width) < min(CELL_SIZES_PX) * CELLS_PER_SIDE:
+        return np.zeros((0, CELLS_PER_SIDE**2 * ORIENTATIONS), np.float32)
+    grey = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    working_scale = min(1.0, WORKING_SIZE_PX / max(height, width))
+    return np.concatenate(
+        [_root_sift_at(grey, working_scale * CELL_PX / size) for size in CELL_SIZES_PX]
+    )
+
+
+def _root_sift_at(grey: NDArray[np.float32], scale: float) -> NDArray[np.float32]:
+    height, width = (max(1, round(side * scale)) for side in grey.shape)
+    shrunk = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+    cells = _cells(orientation_channels(shrunk.astype(np.float32, copy=False)))
+    rows, columns = (max(0, count - CELLS_PER_SIDE + 1) for count in cells.shape[:2])
+    patches = np.empty((rows, columns, CELLS_PER_SIDE, CELLS_PER_SIDE, ORIENTATIONS), np.float32)
+    for i in range(CELLS_PER_SIDE):
+        for j in range(CELLS_PER_SIDE):
+            patches[:, :, i, j] = cells[i : i + rows, j : j + columns]
+    words = patches.reshape(rows * columns, CELLS_PER_SIDE**2 * ORIENTATIONS)
+    # Summed over orientations, a cell is the mean length of its gradients.
+    total = words.sum(axis=1, keepdims=True)
+    contrasty = total[:, 0] >= MIN_CONTRAST * CELLS_PER_SIDE**2
+    distributions: NDArray[np.float32] = words[contrasty] / total[contrasty]
+    return np.sqrt(distributions)
+
+
+def orientation_channels(grey: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Spread the gradient of a grey image (H, W) over channels (H, W, 8) by its orientation.
+
+    The length of the gradient, as the difference of the neighbours on either side, is divided
+    linearly between the two nearest of the orientations 0, 45, ..., 315 degrees.
+    """
+    smooth = cv2.GaussianBlur(grey, (0, 0), SMOOTHING_SIGMA_PX)
+    length, angle = cv2.cartToPolar(
+        cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=1), cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=1)
+    )
+    position = angle.astype(np.float32, copy=False).ravel() * np.float32(ORIENTATIONS / (2 * np.pi))
+    floor = np.floor(position)
+    lower = floor.astype(np.intp)
+    length = length.astype(np.float32, copy=False).ravel()
+    above = length * (position - floor)
+    channels = np.zeros((grey.size, ORIENTATIONS), np.float32)
+    pixels = np.arange(grey.size)
+    channels[pixels, lower % ORIENTATIONS] = length - above
+    channels[pixels, (lower + 1) % ORIENTATIONS] = above
+    return channels.reshape(*grey.shape, ORIENTATIONS)
+
+
+def _cells(channels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Average channels (H, W, 8) in the cells of a grid: (H // 4, W // 4, 8).
+
+    A tent twice as wide as a cell: a pixel counts for the cells on both sides, by its distance
+    to their centres, so that a small shift changes little.
+    """
+    tent = np.convolve(np.ones(CELL_PX), np.ones(CELL_PX)).astype(np.float32) / CELL_PX**2
+    averaged = cv2.sepFilter2D(channels, cv2.CV_32F, tent, tent, borderType=cv2.BORDER_CONSTANT)
+    height, width = (side // CELL_PX * CELL_PX for side in channels.shape[:2])
+    centre = CELL_PX // 2
+    return averaged[centre:height:CELL_PX, centre:width:CELL_PX].astype(np.float32, copy=False)

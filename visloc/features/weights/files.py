@@ -1,0 +1,196 @@
+"""Network weights: where they come from, and whether a file holds the right ones.
+
+Published ones are neither shipped nor fetched: they come with a package, or whoever runs the
+software downloads them and says in which folder they lie. Some, R2D2's for one, are for
+non-commercial use. Our own of Fast-R2D2 (``training``, docs/models/fast-r2d2.md) are free to use,
+and lie beside this module.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from visloc.errors import WeightsError
+from visloc.features.weights.checkpoint import MAX_FILE_BYTES, Checkpoint, read_checkpoint
+
+Shapes = Mapping[str, tuple[int, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class PublishedWeights:
+    """A weights file that its authors publish.
+
+    Attributes:
+        file_name: as published, and as looked for in the weights folder.
+        network: the network it belongs to, for people.
+        source: where to download it.
+        licence: under which licence, with what it means.
+        sha256: of the file as published; None where no published file was at hand.
+        max_bytes: how large a file is read at most.
+    """
+
+    file_name: str
+    network: str
+    source: str
+    licence: str
+    sha256: str | None = None
+    max_bytes: int = MAX_FILE_BYTES
+
+
+def _of_r2d2(file_name: str, network: str, sha256: str) -> PublishedWeights:
+    return PublishedWeights(
+        file_name=file_name,
+        network=network,
+        source="folder models of https://github.com/naver/r2d2",
+        licence="CC BY-NC-SA 3.0: non-commercial use only",
+        sha256=sha256,
+    )
+
+
+R2D2_WASF_N16 = _of_r2d2(
+    "r2d2_WASF_N16.pt",
+    "R2D2",
+    "9ae90e02a9a133d100ca7aeaa32f4d4d7736a6dd222a530a25c8f7da5e508528",
+)
+FASTER2D2_WASF_N16 = _of_r2d2(
+    "faster2d2_WASF_N16.pt",
+    "Fast-R2D2",
+    "217daa3a166bfe9bf2b68c05c1607a09dd4d552ae1bbeda885479d504eefc14b",
+)
+
+
+# Our own weights that lie beside this module: sha256 of ``trained/NAME.safetensors`` by feature.
+SHIPPED: Mapping[str, str] = {
+    "faster2d2": "8cbe14c8c7764dc850e59f19b2bc952441d8cc8c0a4bc1654125b923bd38eed0",
+}
+_SHIPPED_FOLDER = Path(__file__).parent / "trained"
+
+
+def read_own_weights(feature: str, weights_dir: Path | None) -> Checkpoint | None:
+    """Read ``FEATURE.safetensors`` from the weights folder, or else what is shipped, if any is.
+
+    None too where the folder that was named is not there: whoever named it meant other weights.
+
+    Raises:
+        WeightsError: ``weights.altered`` if the shipped file is not the one that was shipped; and
+            those of ``read_checkpoint``.
+    """
+    file_name = f"{feature}.safetensors"
+    if weights_dir is not None and (weights_dir / file_name).is_file():
+        return read_checkpoint(weights_dir / file_name)
+    if feature not in SHIPPED or (weights_dir is not None and not weights_dir.is_dir()):
+        return None
+    checkpoint = read_checkpoint(_SHIPPED_FOLDER / file_name)
+    if checkpoint.sha256 != SHIPPED[feature]:
+        raise WeightsError(
+            "weights.altered",
+            "not the weights that this version was shipped with; install it anew",
+            field=str(checkpoint.path),
+            expected=f"sha256 {SHIPPED[feature]}",
+            got=checkpoint.sha256,
+        )
+    return checkpoint
+
+
+def read_weights(weights_dir: Path | None, published: PublishedWeights) -> Checkpoint:
+    """Read the named file from the weights folder.
+
+    A file with another sha256 than the published one is read as well, because people train
+    their own; its sha256 goes into the features' fingerprint, and ``check_shapes`` tells whether
+    the network fits.
+
+    Raises:
+        WeightsError: ``weights.missing`` with what to download, from where, under which licence,
+            and where to put it; and those of ``read_checkpoint``.
+    """
+    path = None if weights_dir is None else weights_dir / published.file_name
+    if path is None or not path.is_file():
+        raise WeightsError(
+            "weights.missing",
+            f"the weights of {published.network} are not part of this software: download "
+            f"{published.file_name} ({published.source}; licence {published.licence}), put it "
+            "into a folder and name the folder with --weights-dir or VISLOC_WEIGHTS_DIR",
+            field="weights_dir" if path is None else str(path),
+            expected=f"a folder with {published.file_name}",
+            got="no weights folder" if weights_dir is None else f"no such file in {weights_dir}",
+        )
+    return read_checkpoint(path, published.max_bytes)
+
+
+def find_weights(
+    file_name: str,
+    weights_dir: Path | None,
+    package: str,
+    folder: str,
+    *,
+    missing: str,
+    field: str,
+) -> Path:
+    """Look for a file in the weights folder, then in an installed package that carries it.
+
+    Args:
+        file_name: of the weights, as published.
+        weights_dir: the weights folder.
+        package: a package's name in Python; it is located, never imported.
+        folder: where the package has the file.
+        missing: what to tell people where there is no such file.
+        field: of the error.
+
+    Raises:
+        WeightsError: ``weights.missing``.
+    """
+    folders = [] if weights_dir is None else [weights_dir]
+    found = importlib.util.find_spec(package)
+    if found is not None:
+        folders += [Path(place) / folder for place in found.submodule_search_locations or ()]
+    for path in (each / file_name for each in folders):
+        if path.is_file():
+            return path
+    got = "no such package" if found is None else "a package without that file"
+    raise WeightsError(
+        "weights.missing",
+        missing,
+        field=field,
+        expected=f"the installed package {package} with {folder}/{file_name}",
+        got=got if weights_dir is None else f"{got}; no such file in {weights_dir} either",
+    )
+
+
+def check_shapes(checkpoint: Checkpoint, expected: Shapes, *, network: str, held: str) -> None:
+    """Make sure that a checkpoint has exactly the tensors of a network, all of them finite.
+
+    Args:
+        checkpoint: what was read.
+        expected: the shape of every tensor by name.
+        network: the network wanted, for the message.
+        held: what the file seems to hold instead, for the message.
+
+    Raises:
+        WeightsError: ``weights.network`` for tensors that are missing, surplus or of another
+            shape; ``weights.values`` for numbers that no network has.
+    """
+    found = {name: array.shape for name, array in checkpoint.tensors.items()}
+    if found != dict(expected):
+        wrong = sorted(set(found.items()) ^ set(expected.items()))
+        name = wrong[0][0]
+        raise WeightsError(
+            "weights.network",
+            f"not the weights of {network} but of {held}; first difference: {name}",
+            field=str(checkpoint.path),
+            expected=str(expected.get(name, "no such tensor")),
+            got=str(found.get(name, "no such tensor")),
+        )
+    for name, array in checkpoint.tensors.items():
+        negative = name.endswith("running_var") and bool((array < 0).any())
+        if negative or not np.isfinite(array).all():
+            raise WeightsError(
+                "weights.values",
+                f"the tensor {name} holds numbers that no network has",
+                field=str(checkpoint.path),
+                expected="finite numbers, variances not negative",
+            )

@@ -1,0 +1,491 @@
+"""Queries from pixels, or from features, to answer: the whole pipeline on one screen.
+
+A photo on its own is a rig of one camera: ``look`` tells what one image shows of the map, ``solve``
+finds one pose from all images of an instant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.archive import Map
+from visloc.errors import InvalidInput
+from visloc.features import GlobalDescriptor, LocalFeatureExtractor, make_global_descriptor
+from visloc.features.local.readymade import is_ready_made
+from visloc.features.networks.lightglue.model import make_lightglue
+from visloc.geometry import Camera, Pose
+from visloc.images import Photo
+from visloc.localization.constraints import Constraints, MapGeometry
+from visloc.localization.fingerprints import check_fingerprint
+from visloc.localization.query_camera import resolve_camera
+from visloc.localization.query_features import (
+    checked_global_descriptors,
+    checked_local_features,
+    max_sent_keypoints,
+)
+from visloc.localization.rematching import Rematching, seen_as_found
+from visloc.localization.solving import (
+    Look,
+    Matches,
+    SeenImage,
+    Solved,
+    check_solver,
+    solve_instant,
+)
+from visloc.matching.correspondences import CLEAR_RATIO, match_landmarks
+from visloc.matching.products import EightBitRows, in_eight_bits, start_threads
+from visloc.photo_features import extract_features
+from visloc.priors import NO_PRIORS, Priors
+from visloc.retrieval.fusion import LateFusion, chosen_fusion
+from visloc.retrieval.index import Retrieved, retrieve
+from visloc.timing import timed
+from visloc.types import (
+    Answer,
+    CameraSource,
+    Evidence,
+    Extraction,
+    LocalFeatures,
+    Localized,
+    LocalizeOptions,
+    Matcher,
+    NotLocalized,
+    QueryFeatures,
+    ReadAs,
+    Reason,
+    Refusal,
+    RetrievedImage,
+    Stage,
+)
+
+if TYPE_CHECKING:
+    from visloc.features.networks.lightglue.torch import LightGlue
+
+# For global descriptors that do not look at the photo.
+_NO_PIXELS = np.empty((0, 0, 3), np.uint8)
+# Strongest keypoints of a photo that are used; with the most effort as many as in the map's photos.
+_MOST_KEYPOINTS: Mapping[Extraction, int] = {Extraction.FAST: 1000, Extraction.DEFAULT: 2500}
+# Where priors narrow the search, photos elsewhere that would be among so many most similar ones are
+# asked too: they may show that the priors are wrong.
+_NUM_ELSEWHERE = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundFeatures:
+    """Local features of a photo, kept for the next map that asks for them.
+
+    Attributes:
+        local: with keypoints in the stored pixels.
+        max_keypoints: how many the extractor might have returned.
+        rgb: (height, width, 3) pixels that it looked at, upright where that was asked for.
+    """
+
+    local: LocalFeatures
+    max_keypoints: int
+    rgb: NDArray[np.uint8]
+
+
+# Of one photo, by what found them and how.
+FeatureCache = dict[tuple[LocalFeatureExtractor, ReadAs, Extraction], FoundFeatures]
+
+
+class Localizer:
+    """Localizes photos, or the features of photos, in one map. Safe to use from several threads.
+
+    Args:
+        opened: the map.
+        extractor: of its local features; None when only features are to be localized, as in maps
+            of ready-made features.
+        make_descriptor: of a global descriptor by name, for those that the map has.
+        make_matcher: of the network of ``Matcher.LIGHTGLUE`` by the name of local features, asked
+            by each query that wants it.
+
+    Raises:
+        Conflict: ``map.features`` when the map was built with other features than those at hand.
+    """
+
+    def __init__(
+        self,
+        opened: Map,
+        extractor: LocalFeatureExtractor | None,
+        make_descriptor: Callable[[str], GlobalDescriptor] = make_global_descriptor,
+        make_matcher: Callable[[str], LightGlue] = make_lightglue,
+    ) -> None:
+        self.map = opened
+        self._make_matcher = make_matcher
+        self._extractor = extractor
+        manifest = opened.manifest
+        if extractor is not None:
+            check_fingerprint(
+                manifest.local_features.fingerprint, extractor.fingerprint, opened.ref
+            )
+        self._descriptors: dict[str, GlobalDescriptor] = {}  # those that can be computed here
+        for record in manifest.global_features:
+            name = record.fingerprint.name
+            if not is_ready_made(name):
+                descriptor = make_descriptor(name)
+                check_fingerprint(record.fingerprint, descriptor.fingerprint, opened.ref)
+                self._descriptors[name] = descriptor
+        self.geometry = MapGeometry(opened)
+        start_threads()
+
+    def warm_up(self) -> None:
+        """Run once on noise, so that the first query does not pay for the first use."""
+        _ = self.geometry.reach  # computed once; answers carry it
+        random = np.random.default_rng(0)
+        if self._takes_photos(self.map.fusion):
+            noise = random.integers(0, 255, (480, 640, 3), dtype=np.uint8)
+            self.localize(Photo(noise), None, LocalizeOptions())
+            return
+        manifest = self.map.manifest
+        num_keypoints = min(1000, max_sent_keypoints(manifest))
+        features = QueryFeatures(
+            manifest.local_features.fingerprint.name,
+            random.uniform(0, 480, (num_keypoints, 2)),
+            random.normal(size=(num_keypoints, manifest.local_features.descriptor_dim)),
+            {g.fingerprint.name: random.normal(size=g.dim) for g in manifest.global_features},
+        )
+        camera = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
+        self.localize_features(features, camera, LocalizeOptions())
+
+    def check(self, options: LocalizeOptions, num_cameras: int = 1) -> None:
+        """Refuse options that do not fit the map, before anything is looked at.
+
+        Args:
+            options: of a query.
+            num_cameras: of the rig that is to be localized; 1 for a camera on its own.
+
+        Raises:
+            InvalidInput: ``options.fusion_weights`` of global descriptors that the map does not
+                have; ``options.matcher`` when there is none for its local features;
+                ``options.solver`` for a rig of several cameras with ``registration``.
+            WeightsError: when the weights of the matcher are not here, or damaged.
+        """
+        self._fusion(options)
+        check_solver(options, num_cameras)
+        if options.matcher is Matcher.LIGHTGLUE:
+            self._make_matcher(self.map.manifest.local_features.fingerprint.name)
+
+    def localize(
+        self,
+        photo: Photo,
+        camera: Camera | None,
+        options: LocalizeOptions,
+        priors: Priors = NO_PRIORS,
+        found: FeatureCache | None = None,
+    ) -> Answer:
+        """Estimate the pose of one photo.
+
+        Args:
+            photo: pixels as stored.
+            camera: its intrinsics, for the pixels as stored; None when unknown.
+            options: thresholds and the like.
+            priors: what is known of the camera.
+            found: features of this photo that localizers of other maps found, to be used again.
+
+        Raises:
+            InvalidInput: ``camera.size_mismatch``; ``features.required`` when features of the map
+                are not computed here; ``options.fusion_weights`` of global descriptors that it
+                does not have; ``priors.*`` that mean nothing in this map.
+        """
+        return self.solve_look(self.look(photo, camera, options, priors, found), options, priors)[0]
+
+    def localize_features(
+        self,
+        features: QueryFeatures,
+        camera: Camera | None,
+        options: LocalizeOptions,
+        priors: Priors = NO_PRIORS,
+    ) -> Answer:
+        """Estimate the pose of the photo whose features these are.
+
+        Args:
+            features: of the map's kind; with every global descriptor of the map that counts, but
+                for those that are made of local features, which are computed when not sent.
+            camera: the intrinsics of the photo that the keypoints are of.
+            options: thresholds and the like.
+            priors: what is known of the camera.
+
+        Raises:
+            InvalidInput: ``camera.required``, ``options.fusion_weights``, ``features.kind``,
+                ``features.keypoints``, ``features.descriptors``, ``features.global_descriptors``,
+                ``priors.*``.
+            TooLarge: ``features.too_many``.
+        """
+        look = self.look_at_features(features, camera, options, priors)
+        return self.solve_look(look, options, priors)[0]
+
+    def look(
+        self,
+        photo: Photo,
+        camera: Camera | None,
+        options: LocalizeOptions,
+        priors: Priors = NO_PRIORS,
+        found: FeatureCache | None = None,
+    ) -> Look:
+        """Find what one photo shows of the map; arguments and errors as of ``localize``."""
+        fusion = self._fusion(options)
+        if self._extractor is None or not self._takes_photos(fusion):
+            raise self._features_required(fusion)
+        constraints = Constraints(self.geometry, priors)
+        used, source = resolve_camera(photo, camera)
+        seconds: dict[str, float] = {}
+        evidence = Evidence(used, source, photo.exif_orientation, options.read_as, seconds=seconds)
+        with timed(seconds, "local_features"):
+            most = self.map.manifest.local_features.max_keypoints
+            local, rgb = find_features(photo, self._extractor, most, options, found)
+        return self._match(local, rgb, {}, evidence, seconds, options, fusion, constraints)
+
+    def look_at_features(
+        self,
+        features: QueryFeatures,
+        camera: Camera | None,
+        options: LocalizeOptions,
+        priors: Priors = NO_PRIORS,
+    ) -> Look:
+        """Find what features show of the map; arguments, errors as of ``localize_features``."""
+        if camera is None:
+            raise InvalidInput(
+                "camera.required",
+                "features cannot be localized without the camera that they were seen with",
+                field="camera",
+                expected="its model, size and parameters",
+            )
+        fusion = self._fusion(options)
+        constraints = Constraints(self.geometry, priors)
+        seconds: dict[str, float] = {}
+        evidence = Evidence(camera, CameraSource.GIVEN, 1, ReadAs.STORED, seconds=seconds)
+        optional = {name for name, d in self._descriptors.items() if not d.needs_image}
+        optional |= set(self.map.global_descriptors).difference(
+            fusion.counted(self.map.global_descriptors)
+        )
+        with timed(seconds, "local_features"):
+            local = checked_local_features(features, camera, self.map.manifest)
+            sent = checked_global_descriptors(features, self.map.manifest, optional)
+        return self._match(local, _NO_PIXELS, sent, evidence, seconds, options, fusion, constraints)
+
+    def solve(
+        self,
+        images: Sequence[SeenImage],
+        options: LocalizeOptions,
+        priors: Priors = NO_PRIORS,
+        timestamp: int | None = None,
+    ) -> Solved:
+        """Find one pose from all images of an instant, as ``solve_instant``."""
+        return solve_instant(images, self.geometry, options, priors, timestamp)
+
+    def solve_look(
+        self, look: Look, options: LocalizeOptions, priors: Priors = NO_PRIORS
+    ) -> tuple[Answer, NDArray[np.bool_]]:
+        """Find the pose of one photo that was looked at: a rig of one camera, in terms of it.
+
+        Args:
+            look: what the photo shows.
+            options: those that it was looked at with.
+            priors: what is known of the camera.
+
+        Returns:
+            The answer, and of the look's matches (n,) whether the best pose explains them, were
+            the pose accepted or not.
+        """
+        solved = self.solve([SeenImage("camera", Pose.identity(), look)], options, priors)
+        answer, pose = solved.answer, solved.answer.pose
+        none = np.zeros(len(look.matches.pixels), dtype=np.bool_)
+        inliers = solved.inliers[0] if solved.inliers else none
+        (image,) = answer.images
+        assert image.evidence is not None  # it was looked at
+        evidence = replace(image.evidence, seconds=answer.seconds)
+        if answer.refusal is not None or pose is None or solved.pose is None:
+            assert answer.refusal is not None  # without a pose there is a reason
+            refusal = answer.refusal
+            refused = NotLocalized(evidence, refusal.stage, refusal.reason, refusal.message)
+            return refused, inliers
+        localized = Localized(
+            evidence=evidence,
+            cam_from_world=pose.rig_from_world,
+            covariance=pose.covariance,
+            position_std=pose.position_std,
+            orientation_std=pose.orientation_std,
+            inlier_keypoints=look.matches.pixels[inliers].astype(np.float32),
+            inlier_points=look.matches.points[inliers] + self.geometry.origin,
+        )
+        return localized, inliers
+
+    def _match(
+        self,
+        local: LocalFeatures,
+        rgb: NDArray[np.uint8],
+        sent: Mapping[str, NDArray[np.float32]],
+        evidence: Evidence,
+        seconds: dict[str, float],
+        options: LocalizeOptions,
+        fusion: LateFusion,
+        constraints: Constraints,
+    ) -> Look:
+        """Match local features with the map; global descriptors not ``sent`` are computed."""
+        rematching = None
+        if options.matcher is Matcher.LIGHTGLUE:
+            network = self._make_matcher(self.map.manifest.local_features.fingerprint.name)
+            rematching = Rematching(network, self.map, seen_as_found(local, evidence))
+        evidence = replace(evidence, num_keypoints=len(local))
+        if len(local) == 0:
+            return _nothing(
+                evidence,
+                "features",
+                Reason.NO_KEYPOINTS,
+                "the photo shows nothing to hold on to: it is blank, dark, blurred or too small",
+            )
+        with timed(seconds, "global_features"):
+            query = {
+                name: sent[name] if name in sent else self._describe(name, rgb, local)
+                for name in fusion.counted(self.map.global_descriptors)
+            }
+        with timed(seconds, "retrieval"):
+            index, weights = self.map.global_descriptors, constraints.photo_weights
+            retrieved = retrieve(query, index, options.top_k, weights, fusion)
+            elsewhere = self._elsewhere(query, retrieved, weights, fusion)
+        if len(retrieved.images) == 0:
+            return _nothing(
+                evidence,
+                "retrieval",
+                Reason.NO_PHOTO_NEAR,
+                "the map has no photo where the priors say that this one was taken",
+            )
+        evidence = replace(evidence, retrieved=tuple(self._describe_retrieved(retrieved)))
+        with timed(seconds, "matching"):
+            matches, landmarks = self._match_photos(local, retrieved.images, options, rematching)
+            others, _ = self._match_photos(local, elsewhere, options, rematching)
+        evidence = replace(evidence, num_correspondences=len(matches.pixels))
+        return Look(evidence, matches, landmarks, others)
+
+    def _match_photos(
+        self,
+        local: LocalFeatures,
+        photos: NDArray[np.int64],
+        options: LocalizeOptions,
+        rematching: Rematching | None,
+    ) -> tuple[Matches, NDArray[np.int64]]:
+        """Match with the landmarks that photos of the map, most similar first, see; say which."""
+        scale = self.map.manifest.local_features.descriptor_scale
+        observed = (self.map.observations(int(photo)) for photo in photos)
+        pairs = match_landmarks(
+            in_eight_bits(local.descriptors),
+            ((landmarks, EightBitRows(rows, scale)) for landmarks, rows in observed),
+            CLEAR_RATIO if options.matcher is Matcher.RATIO else None,
+            None if rematching is None else lambda rank: rematching.match(int(photos[rank])),
+        )
+        matches = Matches(
+            local.keypoints[pairs.keypoints].astype(np.float64),
+            self.map.landmarks[pairs.landmarks].astype(np.float64),
+        )
+        return matches, pairs.landmarks
+
+    def _elsewhere(
+        self,
+        query: Mapping[str, NDArray[np.float32]],
+        retrieved: Retrieved,
+        weights: NDArray[np.float64] | None,
+        fusion: LateFusion,
+    ) -> NDArray[np.int64]:
+        """Photos that the priors exclude, though few others look as much like the query.
+
+        Where two floors look alike, which photo looks most like the query is chance: hence not only
+        those that look more like it than all others.
+        """
+        if weights is None:
+            return np.empty(0, dtype=np.int64)
+        excluded = np.asarray(weights == 0, dtype=np.float64)
+        others = retrieve(query, self.map.global_descriptors, _NUM_ELSEWHERE, excluded, fusion)
+        # Fused anew, together: scores that are ranks compare those only that were ranked together.
+        found, num = (retrieved.similarities, others.similarities), len(retrieved.images)
+        scores = fusion.scores({name: np.concatenate([f[name] for f in found]) for name in query})
+        best = np.sort(scores[:num])[::-1][:_NUM_ELSEWHERE]
+        close = scores[num:] > best.min(initial=np.inf)
+        return np.asarray(others.images[close])
+
+    def _describe(
+        self, name: str, rgb: NDArray[np.uint8], local: LocalFeatures
+    ) -> NDArray[np.float32]:
+        return self._descriptors[name].describe(rgb, local, self.map.global_models[name])
+
+    def _fusion(self, options: LocalizeOptions) -> LateFusion:
+        return chosen_fusion(options, self.map.fusion, self.map.global_descriptors)
+
+    def _takes_photos(self, fusion: LateFusion) -> bool:
+        """Whether all features of photos that count can be computed here."""
+        counted = fusion.counted(self.map.global_descriptors)
+        return self._extractor is not None and set(counted) <= set(self._descriptors)
+
+    def _features_required(self, fusion: LateFusion) -> InvalidInput:
+        kind = self.map.manifest.local_features.fingerprint.name
+        names = fusion.counted(self.map.global_descriptors)
+        return InvalidInput(
+            "features.required",
+            "the map's features are not computed here: send the features of the photo instead",
+            field="image",
+            expected=f"features of kind {kind}, with {', '.join(names)}",
+            got="a photo",
+        )
+
+    def _describe_retrieved(self, retrieved: Retrieved) -> Iterator[RetrievedImage]:
+        for rank, image in enumerate(retrieved.images):
+            yield RetrievedImage(
+                name=self.map.images[image].name,
+                score=float(retrieved.scores[rank]),
+                similarities={
+                    name: float(values[rank]) for name, values in retrieved.similarities.items()
+                },
+            )
+
+
+def _nothing(evidence: Evidence, stage: Stage, reason: Reason, message: str) -> Look:
+    refusal = Refusal(stage, reason, message)
+    return Look(evidence, Matches.none(), np.empty(0, np.int64), Matches.none(), refusal)
+
+
+def find_features(
+    photo: Photo,
+    extractor: LocalFeatureExtractor,
+    most: int,
+    options: LocalizeOptions,
+    found: FeatureCache | None = None,
+) -> tuple[LocalFeatures, NDArray[np.uint8]]:
+    """Find the local features of a photo, unless they were found before.
+
+    Args:
+        photo: pixels as stored.
+        extractor: finds them.
+        most: keypoints of a photo of the map.
+        options: how much effort goes into it, and in which orientation.
+        found: of this photo, what was found before; what is found now is added.
+
+    Returns:
+        Features with keypoints in the stored pixels, and the image they were found in.
+    """
+    most = min(most, _MOST_KEYPOINTS.get(options.extraction, most))
+    key = extractor, options.read_as, options.extraction
+    known = None if found is None else found.get(key)
+    if known is None or known.max_keypoints < most:
+        local, rgb = extract_features(
+            photo,
+            extractor,
+            max_keypoints=most,
+            read_as=options.read_as,
+            extraction=options.extraction,
+        )
+        known = FoundFeatures(local, most, rgb)
+        if found is not None:
+            found[key] = known
+    local = known.local if known.max_keypoints == most else _strongest(known.local, most)
+    return local, known.rgb
+
+
+def _strongest(local: LocalFeatures, most: int) -> LocalFeatures:
+    """Those that an extractor returns that may return so many: they come strongest first."""
+    return LocalFeatures(
+        local.keypoints[:most], local.descriptors[:most], local.scores[:most], local.scales[:most]
+    )

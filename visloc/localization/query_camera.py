@@ -1,0 +1,48 @@
+"""The intrinsics of a query: given, from EXIF, or guessed."""
+
+from __future__ import annotations
+
+from visloc.errors import InvalidInput
+from visloc.geometry import Camera
+from visloc.images import Photo
+from visloc.types import CameraSource
+
+# Focal length in units of the longer side when nothing is known: 45 degrees across, between a
+# phone's main camera (0.7 to 0.8) and a long lens. It is COLMAP's guess too.
+GUESSED_FOCAL = 1.2
+
+
+def resolve_camera(photo: Photo, given: Camera | None) -> tuple[Camera, CameraSource]:
+    """Choose the intrinsics of a photo: given, else EXIF's focal length, else a guess.
+
+    A camera given for another size of the same aspect is scaled to the photo. A guess is where the
+    search for the focal length of a photo on its own starts (``visloc.localization.solving``).
+
+    Raises:
+        InvalidInput: ``camera.size_mismatch``.
+    """
+    width, height = photo.width, photo.height
+    if given is None:
+        known = photo.focal_length_px is not None
+        focal = photo.focal_length_px or GUESSED_FOCAL * max(width, height)
+        camera = Camera("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
+        return camera, CameraSource.EXIF if known else CameraSource.GUESS
+    if (given.width, given.height) == (width, height):
+        return given, CameraSource.GIVEN
+    if given.has_aspect_of(width, height):
+        return given.scaled(width, height), CameraSource.GIVEN_SCALED
+    turned = photo.is_on_its_side and given.has_aspect_of(height, width)
+    raise InvalidInput(
+        "camera.size_mismatch",
+        "the camera is not for this photo"
+        + (
+            "; the photo is stored turned (EXIF orientation "
+            f"{photo.exif_orientation}), and the camera must be that of the stored pixels: send "
+            "that one, or turn the photo's pixels and leave the EXIF orientation out"
+            if turned
+            else ""
+        ),
+        field="camera",
+        expected=f"{width} x {height} or another size of the same aspect",
+        got=f"{given.width} x {given.height}",
+    )

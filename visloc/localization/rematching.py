@@ -1,0 +1,72 @@
+"""Matching a photo once more with those that it has most in common with, by a network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.archive import Map
+from visloc.features.networks.lightglue.model import SeenKeypoints
+from visloc.geometry import Camera
+from visloc.images import turn_of, upright_from_stored
+from visloc.matching.correspondences import Pairs
+from visloc.types import Evidence, LocalFeatures, ReadAs
+
+if TYPE_CHECKING:
+    from visloc.features.networks.lightglue.torch import LightGlue
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rematching:
+    """A photo and the network that compares it with photos of a map.
+
+    Attributes:
+        network: of the map's local features.
+        opened: the map.
+        seen: keypoints of the photo, as ``seen_as_found`` gives them.
+    """
+
+    network: LightGlue
+    opened: Map
+    seen: SeenKeypoints
+
+    def match(self, image: int) -> Pairs:
+        """Match with the landmarks that a photo of the map sees.
+
+        Returns:
+            Keypoints, landmarks, and the cosine similarities of their descriptors.
+        """
+        landmarks, rows = self.opened.observations(image)
+        record = self.opened.images[image]
+        scale = np.float32(self.opened.manifest.local_features.descriptor_scale)
+        theirs = _seen_upright(
+            self.opened.keypoints(image),
+            rows.astype(np.float32) * scale,
+            self.opened.cameras[record.camera],
+            record.turn,
+        )
+        i, j, _ = self.network.match(self.seen, theirs)
+        similarities = np.einsum("nd,nd->n", self.seen.descriptors[i], theirs.descriptors[j])
+        return i, landmarks[j].astype(np.int64), similarities
+
+
+def seen_as_found(local: LocalFeatures, evidence: Evidence) -> SeenKeypoints:
+    """Return the keypoints of a query where its descriptors were computed, in the upright photo."""
+    turn = turn_of(evidence.exif_orientation) if evidence.read_as is ReadAs.UPRIGHT else 1
+    return _seen_upright(local.keypoints, local.descriptors, evidence.camera, turn)
+
+
+def _seen_upright(
+    keypoints: NDArray[np.floating],
+    descriptors: NDArray[np.float32],
+    camera: Camera,
+    turn: int,
+) -> SeenKeypoints:
+    """Turn keypoints (N, 2) in stored pixels by an EXIF orientation."""
+    width, height = camera.width, camera.height
+    turned = upright_from_stored(keypoints, turn, width, height)
+    size = (height, width) if turn >= 5 else (width, height)
+    return SeenKeypoints(turned.astype(np.float32), descriptors, *size)

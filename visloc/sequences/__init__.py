@@ -1,0 +1,1 @@
+"""Instants in order: solved together, gaps filled."""

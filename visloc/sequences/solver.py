@@ -1,0 +1,401 @@
+"""A sequence of instants, answered in order as soon as each answer is final.
+
+An instant that its own images do not localize waits for its neighbours: with relative motion
+they are solved together (visloc.sequences.window), without it the gap is interpolated
+(visloc.sequences.filling). Both look at most ``max_gap_s`` ahead and back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.errors import InvalidInput
+from visloc.geometry import rotation_angle
+from visloc.localization.constraints import Constraints, MapGeometry
+from visloc.localization.solving import (
+    SeenImage,
+    Solved,
+    registration_for,
+    rig_pose,
+    solve_instant,
+    with_inliers,
+)
+from visloc.pose.centre import with_origin
+from visloc.pose.motion import RelativeMotion, default_motion_covariance, link_from_motion
+from visloc.priors import Priors
+from visloc.sequences.filling import (
+    MAX_GAP_S,
+    Odometry,
+    PoseSource,
+    TimeUnit,
+    TracedPose,
+    center_covariance,
+    covariance_from_center,
+    fill_sequence,
+)
+from visloc.sequences.window import WindowInstant, WindowPose, solve_window
+from visloc.timing import timed
+from visloc.types import InstantAnswer, LocalizeOptions, Reason, Refusal, RigPose
+
+# At most so many instants wait, and as many answered ones are remembered, however long the gap
+# may be: what is further away in a fast sequence adds little and costs time.
+MAX_WAITING = 30
+# Standard deviation, as a share of the way, of motion that no measured pose can contradict.
+_UNCHECKED_SHARE = 0.05
+# A window in which no instant has a pose of its own takes seconds to search; one in which nothing
+# was found is left alone until so many instants are new.
+_BLIND_REST = 10
+_CONTRADICTED = Refusal(
+    "gate",
+    Reason.CONTRADICTS_MOTION,
+    "the pose of its own images contradicts those of its neighbours and the motion between",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenInstant:
+    """An instant, its images looked at.
+
+    Attributes:
+        timestamp: greater than that of the instant before.
+        images: each of another camera of the rig; there may be none.
+        odometry: None when there is none.
+        priors: what is known of the rig.
+    """
+
+    timestamp: int
+    images: tuple[SeenImage, ...]
+    odometry: Odometry | None
+    priors: Priors
+
+
+class _Entry(NamedTuple):
+    seen: SeenInstant
+    solved: Solved  # on its own
+    ticks: int  # of the time unit, since the first instant
+
+
+class SequenceSolver:
+    """Takes instants one by one and gives back answers in order, each once it is final.
+
+    Args:
+        geometry: of the map.
+        metric: whether one unit of the map's world is a metre.
+        options: those that the images are looked at with.
+        time_unit: of the timestamps.
+        max_gap_s: longest time between measured instants across which gaps are filled; 0: none.
+
+    Raises:
+        InvalidInput: ``sequence.max_gap``.
+    """
+
+    def __init__(
+        self,
+        geometry: MapGeometry,
+        *,
+        metric: bool,
+        options: LocalizeOptions,
+        time_unit: TimeUnit,
+        max_gap_s: float,
+    ) -> None:
+        check_max_gap(max_gap_s)
+        self._geometry = geometry
+        self._metric = metric
+        self._options = options
+        self._tick_s = time_unit.seconds
+        self._max_gap_s = max_gap_s
+        # Whole ticks compare exactly; the difference of two times in seconds does not.
+        self._max_gap = math.floor(max_gap_s / time_unit.seconds * (1.0 + 1e-9))
+        self._first_timestamp: int | None = None
+        self._entries: list[_Entry] = []  # answered ones that still help, then those that wait
+        self._num_answered = 0
+        self._rest = 0  # instants to come before a window without any pose is searched again
+
+    @property
+    def newest(self) -> RigPose | None:
+        """What its own images measured of the newest instant; None when they do not localize it."""
+        return self._entries[-1].solved.answer.pose if self._entries else None
+
+    def add(self, seen: SeenInstant) -> list[InstantAnswer]:
+        """Take one more instant; return the answers that are final now.
+
+        Raises:
+            InvalidInput: as ``solve``.
+        """
+        return self.take(seen, self.solve(seen))
+
+    def solve(self, seen: SeenInstant) -> Solved:
+        """Solve an instant on its own.
+
+        Raises:
+            InvalidInput: ``sequence.odometry`` for a map that is not metric; ``priors.*`` that
+                mean nothing in the map.
+        """
+        check_odometry(seen.odometry, metric=self._metric)
+        return solve_instant(
+            seen.images, self._geometry, self._options, seen.priors, seen.timestamp
+        )
+
+    def take(self, seen: SeenInstant, solved: Solved) -> list[InstantAnswer]:
+        """Take one more instant that was solved; return the answers that are final now."""
+        if self._first_timestamp is None:
+            self._first_timestamp = seen.timestamp
+        ticks = seen.timestamp - self._first_timestamp
+        self._entries.append(_Entry(seen, solved, ticks))
+        self._rest = max(0, self._rest - 1)
+        return self._answer(ended=False)
+
+    def finish(self) -> list[InstantAnswer]:
+        """Return the answers that waited for instants which will not come."""
+        self._rest = 0
+        return self._answer(ended=True)
+
+    def _answer(self, *, ended: bool) -> list[InstantAnswer]:
+        stop = self._num_answered
+        while stop < len(self._entries) and (ended or self._is_final(stop)):
+            stop += 1
+        if stop == self._num_answered:
+            return []
+        answers = self._answers(range(self._num_answered, stop))
+        oldest = self._entries[min(stop, len(self._entries) - 1)].ticks - self._max_gap
+        first = max(0, stop - MAX_WAITING)
+        while first < stop and self._entries[first].ticks < oldest:
+            first += 1
+        del self._entries[:first]
+        self._num_answered = stop - first
+        return answers
+
+    def _is_final(self, index: int) -> bool:
+        """Whether nothing that may still come can change the answer to an instant that waits."""
+        entry, newest = self._entries[index], self._entries[-1]
+        if newest.ticks - entry.ticks >= self._max_gap or len(self._entries) - index > MAX_WAITING:
+            return True
+        if entry.seen.odometry is not None:
+            return False
+        return any(later.solved.pose is not None for later in self._entries[index:])
+
+    def _answers(self, indices: range) -> list[InstantAnswer]:
+        seconds: dict[str, float] = {}
+        with timed(seconds, "sequence"):
+            motions = self._motions()
+            answers = [entry.solved.answer for entry in self._entries]
+            linked = [
+                any(motion is not None for motion in motions[max(0, i - 1) : i + 1])
+                for i in range(len(self._entries))
+            ]
+            if any(linked):
+                answers = self._solved_jointly(motions, linked)
+            answers = self._filled(answers, linked)
+        share = seconds["sequence"] / len(indices)
+        return [
+            replace(answers[i], seconds={**answers[i].seconds, "sequence": share}) for i in indices
+        ]
+
+    def _motions(self) -> list[RelativeMotion | None]:
+        """Motion from each instant to the next; None where it is unknown or the gap too long."""
+        motions: list[RelativeMotion | None] = []
+        for before, after in pairwise(self._entries):
+            a, b = before.seen.odometry, after.seen.odometry
+            if a is None or b is None or after.ticks - before.ticks > self._max_gap:
+                motions.append(None)
+                continue
+            motion = b.rig_from_odometry @ a.rig_from_odometry.inverse()
+            covariance = default_motion_covariance(motion) if b.covariance is None else b.covariance
+            given = RelativeMotion(motion, covariance)
+            motions.append(given if link_from_motion(given) is not None else None)
+        return motions
+
+    def _solved_jointly(
+        self, motions: Sequence[RelativeMotion | None], linked: Sequence[bool]
+    ) -> list[InstantAnswer]:
+        """Solve all instants with their relative motion; those without keep their own answer."""
+        cameras = [view.camera for entry in self._entries for view in entry.solved.views]
+        registration = (
+            registration_for(self._options, cameras) if cameras else self._options.registration
+        )
+        blind = all(entry.solved.pose is None for entry in self._entries)
+        found: list[WindowPose | None] = [None] * len(self._entries)
+        if not blind or self._rest == 0:
+            found = solve_window(
+                [_window_instant(entry.solved) for entry in self._entries],
+                motions,
+                registration=registration,
+                seed=self._options.seed,
+            )
+            self._rest = _BLIND_REST if blind and not any(found) else 0
+        runs = np.cumsum([0, *(motion is None for motion in motions)])
+        answers = []
+        for i, (entry, pose) in enumerate(zip(self._entries, found, strict=True)):
+            alone = entry.solved.answer
+            if linked[i] and alone.pose is not None and (pose is None or not pose.measured):
+                alone = replace(alone, pose=None, refusal=_CONTRADICTED)
+            supported = [
+                j
+                for j, other in enumerate(found)
+                if other is not None and other.supported and runs[j] == runs[i]
+            ]
+            nearest = min(supported, key=lambda j: self._ticks_between(i, j), default=i)
+            if (
+                not linked[i]
+                or pose is None
+                or not supported
+                or self._ticks_between(i, nearest) > self._max_gap
+            ):
+                answers.append(_unfilled(alone) if linked[i] and supported else alone)
+                continue
+            covariance = pose.covariance
+            if not supported[0] <= i <= supported[-1]:
+                around = supported[:2] if i < supported[0] else supported[:-3:-1]
+                covariance = self._with_unchecked_motion(i, around, found)
+            source = PoseSource.ESTIMATED if pose.measured else PoseSource.MOTION
+            answers.append(
+                self._with_pose(
+                    replace(alone, images=with_inliers(alone.images, pose.inliers)),
+                    TracedPose(pose.rig_from_world, covariance, source),
+                    entry.seen.priors,
+                )
+            )
+        return answers
+
+    def _with_unchecked_motion(
+        self, i: int, around: Sequence[int], found: Sequence[WindowPose | None]
+    ) -> NDArray[np.float64]:
+        """The covariance of a pose beyond all supported ones, where nothing contradicts motion.
+
+        An error of its scale adds up along the way and is in no covariance that a tracker states;
+        and a tracker that stops, or jumps, is told from a rig that does only by its inertia.
+
+        Args:
+            i: the instant.
+            around: the nearest supported instant, and the next if there is one.
+            found: the poses of all.
+        """
+        pose = found[i]
+        assert pose is not None  # it hangs on the motion
+        (distance, angle), *earlier = [_way(found[a], found[b]) for a, b in pairwise([i, *around])]
+        stds = [_UNCHECKED_SHARE * angle, _UNCHECKED_SHARE * distance]
+        for before in earlier:
+            share = self._ticks_between(i, around[0]) / self._ticks_between(*around)
+            stds[0] = math.hypot(stds[0], angle - share * before[1])
+            stds[1] = math.hypot(stds[1], distance - share * before[0])
+        added = np.diag(np.repeat(np.square(stds), 3))
+        here = pose.rig_from_world
+        return covariance_from_center(here, center_covariance(here, pose.covariance) + added)
+
+    def _ticks_between(self, i: int, j: int) -> int:
+        return abs(self._entries[j].ticks - self._entries[i].ticks)
+
+    def _filled(
+        self, answers: Sequence[InstantAnswer], linked: Sequence[bool]
+    ) -> list[InstantAnswer]:
+        """Fill instants without a pose, of which no motion is known, from those around them."""
+        poses: list[TracedPose | None] = [
+            None
+            if answer.pose is None or answer.pose.source is not PoseSource.ESTIMATED
+            else self._traced(answer)
+            for answer in answers
+        ]
+        times_s = [entry.ticks * self._tick_s for entry in self._entries]
+        filled = fill_sequence(times_s, poses, self._max_gap_s)
+        return [
+            answer
+            if answer.pose is not None or is_linked or pose is None
+            else self._with_pose(answer, pose, entry.seen.priors)
+            for answer, pose, is_linked, entry in zip(
+                answers, filled, linked, self._entries, strict=True
+            )
+        ]
+
+    def _traced(self, answer: InstantAnswer) -> TracedPose:
+        """The pose of an answer, back in the map's own coordinates."""
+        assert answer.pose is not None  # the caller has looked
+        pose, covariance = with_origin(
+            answer.pose.rig_from_world, answer.pose.covariance, -self._geometry.origin
+        )
+        return TracedPose(pose, covariance, answer.pose.source, answer.num_inliers)
+
+    def _with_pose(self, answer: InstantAnswer, found: TracedPose, priors: Priors) -> InstantAnswer:
+        """Give an answer a pose, unless it contradicts the priors."""
+        constraints = Constraints(self._geometry, priors)
+        contradiction = constraints.contradiction(found.pose, found.covariance)
+        if contradiction is not None:
+            refusal = answer.refusal or Refusal(
+                "gate",
+                Reason.CONTRADICTS_PRIOR,
+                f"the best pose contradicts what is known: {contradiction}",
+            )
+            return replace(answer, pose=None, refusal=refusal)
+        pose = rig_pose(found.pose, found.covariance, self._geometry, found.source)
+        measured = found.source is PoseSource.ESTIMATED
+        return replace(answer, pose=pose, refusal=None if measured else answer.refusal)
+
+
+def check_max_gap(max_gap_s: float) -> None:
+    """Refuse a gap that cannot be filled.
+
+    Raises:
+        InvalidInput: ``sequence.max_gap``.
+    """
+    if not 0 <= max_gap_s <= MAX_GAP_S:  # NaN fails too
+        raise InvalidInput(
+            "sequence.max_gap",
+            "not usable",
+            field="max_gap_s",
+            expected=f"0 to {MAX_GAP_S:g} seconds",
+            got=max_gap_s,
+        )
+
+
+def check_odometry(odometry: Odometry | None, *, metric: bool) -> None:
+    """Refuse odometry that cannot be compared with a map.
+
+    Args:
+        odometry: of an instant; None when there is none.
+        metric: whether one unit of the map's world is a metre.
+
+    Raises:
+        InvalidInput: ``sequence.odometry``.
+    """
+    if odometry is not None and not metric:
+        raise InvalidInput(
+            "sequence.odometry",
+            "odometry is in metres, and this map's world has another unit",
+            field="odometry",
+            expected="a metric map, or a sequence without odometry",
+        )
+
+
+def _window_instant(solved: Solved) -> WindowInstant:
+    refusal = solved.answer.refusal
+    if refusal is not None and refusal.reason in (Reason.CONTRADICTS_PRIOR, Reason.AMBIGUOUS):
+        # Matches that lying priors allowed would pass together the gate that refused each alone;
+        # those that another map explains as well are no evidence of this one.
+        return WindowInstant((), None)
+    if any(view.focal_unknown for view in solved.views):
+        # A window takes cameras as they are: such pixels would fit a wrong pose.
+        return WindowInstant((), solved.pose)
+    return WindowInstant(solved.views, solved.pose)
+
+
+def _way(a: WindowPose | None, b: WindowPose | None) -> tuple[float, float]:
+    """Distance and angle (rad) between two poses."""
+    assert a is not None  # both are supported, or hang on the motion
+    assert b is not None
+    here, there = a.rig_from_world, b.rig_from_world
+    distance = float(np.linalg.norm(here.center - there.center))
+    return distance, rotation_angle(here.rotation @ there.rotation.T)
+
+
+def _unfilled(alone: InstantAnswer) -> InstantAnswer:
+    """Say why neighbours with poses, and the motion from them, did not give this instant one."""
+    if alone.pose is not None or alone.refusal is None:
+        return alone
+    more = "; the neighbours have poses, but the motion contradicts them or comes from too far"
+    return replace(alone, refusal=replace(alone.refusal, message=alone.refusal.message + more))
