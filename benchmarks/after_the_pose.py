@@ -29,7 +29,8 @@ from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
-from visloc.localization.localizer import FeatureCache, Localizer
+from visloc.localization.feature_cache import FeatureCache
+from visloc.localization.localizer import Localizer
 from visloc.matching.correspondences import Correspondences, settled
 from visloc.pose.colmap import project
 from visloc.pose.generalized import refine_generalized_pose
@@ -110,7 +111,7 @@ def measure(
     for record in dataset.images:
         found: FeatureCache = {}
         photo = read_photo_file(dataset.path_of(record))
-        look = localizer.look(photo, dataset.sensors[record.sensor_id].camera, options, found=found)
+        look = localizer.look(photo, dataset.sensors[record.sensor_id].camera, options, cache=found)
         answer, inliers = localizer.solve_look(look, options)
         truth = dataset.pose(record)
         if not isinstance(answer, Localized) or truth is None:

@@ -45,7 +45,8 @@ from visloc.features.local.readymade import is_ready_made
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
-from visloc.localization.localizer import FeatureCache, Localizer
+from visloc.localization.feature_cache import FeatureCache
+from visloc.localization.localizer import Localizer
 from visloc.pose.colmap import project
 from visloc.retrieval.fusion import FUSION_OPERATORS, LateFusion
 from visloc.retrieval.index import retrieve
@@ -166,7 +167,7 @@ def queries(
         # The local features that a query has in service; some descriptors are made of them.
         found: FeatureCache = {}
         photo = read_photo_file(dataset.path_of(record))
-        localizer.look(photo, camera, options, found=found)
+        localizer.look(photo, camera, options, cache=found)
         (features,) = found.values()
         yield Query(
             {

@@ -25,7 +25,7 @@ from visloc.archive import Map, open_map
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose
 from visloc.localization.constraints import MapGeometry
-from visloc.localization.solving import registration_for
+from visloc.localization.gates import registration_for
 from visloc.matching.correspondences import Correspondences
 from visloc.pose.reprojection import reprojection_errors
 from visloc.pose.views import MatchedView

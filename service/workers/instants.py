@@ -23,7 +23,8 @@ from visloc.errors import InvalidInput, NotFound, TooLarge
 from visloc.geometry import Pose
 from visloc.images import Photo
 from visloc.localization.constraints import Constraints
-from visloc.localization.localizer import FeatureCache, Localizer
+from visloc.localization.feature_cache import FeatureCache
+from visloc.localization.localizer import Localizer
 from visloc.localization.solving import Look, Matches, SeenImage
 from visloc.priors import Priors
 from visloc.types import InstantAnswer, LocalizeOptions, QueryFeatures, Reason, Refusal

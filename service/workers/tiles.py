@@ -20,8 +20,8 @@ from visloc.features.local.readymade import (
     to_local_features,
 )
 from visloc.images import ImageLimits, Photo, read_photo
+from visloc.localization.feature_cache import FeatureCache, find_features
 from visloc.localization.fingerprints import check_fingerprint
-from visloc.localization.localizer import FeatureCache, find_features
 from visloc.sets.choosing import TileScore
 from visloc.sets.coarse import rank_tiles
 from visloc.timing import timed

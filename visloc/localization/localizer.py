@@ -1,7 +1,7 @@
-"""Queries from pixels, or from features, to answer: the whole pipeline on one screen.
+"""Localize queries in one map, from pixels or from features to the answer.
 
-A photo on its own is a rig of one camera: ``look`` tells what one image shows of the map, ``solve``
-finds one pose from all images of an instant.
+``look`` matches one image with the map, ``solve`` finds one pose from all images of an instant. A
+photo on its own is a rig of one camera.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from visloc.features.networks.lightglue.model import make_lightglue
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo
 from visloc.localization.constraints import Constraints, MapGeometry
+from visloc.localization.feature_cache import FeatureCache, find_features
 from visloc.localization.fingerprints import check_fingerprint
 from visloc.localization.query_camera import resolve_camera
 from visloc.localization.query_features import (
@@ -39,7 +40,6 @@ from visloc.localization.solving import (
 )
 from visloc.matching.correspondences import CLEAR_RATIO, match_landmarks
 from visloc.matching.products import EightBitRows, in_eight_bits, start_threads
-from visloc.photo_features import extract_features
 from visloc.priors import NO_PRIORS, Priors
 from visloc.retrieval.fusion import LateFusion, chosen_fusion
 from visloc.retrieval.index import Retrieved, retrieve
@@ -48,7 +48,6 @@ from visloc.types import (
     Answer,
     CameraSource,
     Evidence,
-    Extraction,
     LocalFeatures,
     Localized,
     LocalizeOptions,
@@ -67,30 +66,27 @@ if TYPE_CHECKING:
 
 # For global descriptors that do not look at the photo.
 _NO_PIXELS = np.empty((0, 0, 3), np.uint8)
-# Strongest keypoints of a photo that are used; with the most effort as many as in the map's photos.
-_MOST_KEYPOINTS: Mapping[Extraction, int] = {Extraction.FAST: 1000, Extraction.DEFAULT: 2500}
 # Where priors narrow the search, photos elsewhere that would be among so many most similar ones are
 # asked too: they may show that the priors are wrong.
 _NUM_ELSEWHERE = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FoundFeatures:
-    """Local features of a photo, kept for the next map that asks for them.
+class _Features:
+    """The features of one query.
 
     Attributes:
         local: with keypoints in the stored pixels.
-        max_keypoints: how many the extractor might have returned.
-        rgb: (height, width, 3) pixels that it looked at, upright where that was asked for.
+        sent: global descriptors by name; those of the map that are missing are computed.
+        rgb: (height, width, 3) pixels for descriptors that look at them.
+        seconds: of ``evidence``, to be added to.
     """
 
     local: LocalFeatures
-    max_keypoints: int
+    sent: Mapping[str, NDArray[np.float32]]
     rgb: NDArray[np.uint8]
-
-
-# Of one photo, by what found them and how.
-FeatureCache = dict[tuple[LocalFeatureExtractor, ReadAs, Extraction], FoundFeatures]
+    evidence: Evidence
+    seconds: dict[str, float]
 
 
 class Localizer:
@@ -176,7 +172,7 @@ class Localizer:
         camera: Camera | None,
         options: LocalizeOptions,
         priors: Priors = NO_PRIORS,
-        found: FeatureCache | None = None,
+        cache: FeatureCache | None = None,
     ) -> Answer:
         """Estimate the pose of one photo.
 
@@ -185,14 +181,14 @@ class Localizer:
             camera: its intrinsics, for the pixels as stored; None when unknown.
             options: thresholds and the like.
             priors: what is known of the camera.
-            found: features of this photo that localizers of other maps found, to be used again.
+            cache: features of this photo that localizers of other maps found.
 
         Raises:
             InvalidInput: ``camera.size_mismatch``; ``features.required`` when features of the map
                 are not computed here; ``options.fusion_weights`` of global descriptors that it
                 does not have; ``priors.*`` that mean nothing in this map.
         """
-        return self.solve_look(self.look(photo, camera, options, priors, found), options, priors)[0]
+        return self.solve_look(self.look(photo, camera, options, priors, cache), options, priors)[0]
 
     def localize_features(
         self,
@@ -225,7 +221,7 @@ class Localizer:
         camera: Camera | None,
         options: LocalizeOptions,
         priors: Priors = NO_PRIORS,
-        found: FeatureCache | None = None,
+        cache: FeatureCache | None = None,
     ) -> Look:
         """Find what one photo shows of the map; arguments and errors as of ``localize``."""
         fusion = self._fusion(options)
@@ -237,8 +233,9 @@ class Localizer:
         evidence = Evidence(used, source, photo.exif_orientation, options.read_as, seconds=seconds)
         with timed(seconds, "local_features"):
             most = self.map.manifest.local_features.max_keypoints
-            local, rgb = find_features(photo, self._extractor, most, options, found)
-        return self._match(local, rgb, {}, evidence, seconds, options, fusion, constraints)
+            local, rgb = find_features(photo, self._extractor, most, options, cache)
+        found = _Features(local, {}, rgb, evidence, seconds)
+        return self._match(found, options, fusion, constraints)
 
     def look_at_features(
         self,
@@ -266,7 +263,8 @@ class Localizer:
         with timed(seconds, "local_features"):
             local = checked_local_features(features, camera, self.map.manifest)
             sent = checked_global_descriptors(features, self.map.manifest, optional)
-        return self._match(local, _NO_PIXELS, sent, evidence, seconds, options, fusion, constraints)
+        found = _Features(local, sent, _NO_PIXELS, evidence, seconds)
+        return self._match(found, options, fusion, constraints)
 
     def solve(
         self,
@@ -317,16 +315,13 @@ class Localizer:
 
     def _match(
         self,
-        local: LocalFeatures,
-        rgb: NDArray[np.uint8],
-        sent: Mapping[str, NDArray[np.float32]],
-        evidence: Evidence,
-        seconds: dict[str, float],
+        features: _Features,
         options: LocalizeOptions,
         fusion: LateFusion,
         constraints: Constraints,
     ) -> Look:
-        """Match local features with the map; global descriptors not ``sent`` are computed."""
+        """Retrieve mapping images and match the local features with their landmarks."""
+        local, evidence, seconds = features.local, features.evidence, features.seconds
         rematching = None
         if options.matcher is Matcher.LIGHTGLUE:
             network = self._make_matcher(self.map.manifest.local_features.fingerprint.name)
@@ -341,7 +336,7 @@ class Localizer:
             )
         with timed(seconds, "global_features"):
             query = {
-                name: sent[name] if name in sent else self._describe(name, rgb, local)
+                name: self._describe(name, features)
                 for name in fusion.counted(self.map.global_descriptors)
             }
         with timed(seconds, "retrieval"):
@@ -407,10 +402,11 @@ class Localizer:
         close = scores[num:] > best.min(initial=np.inf)
         return np.asarray(others.images[close])
 
-    def _describe(
-        self, name: str, rgb: NDArray[np.uint8], local: LocalFeatures
-    ) -> NDArray[np.float32]:
-        return self._descriptors[name].describe(rgb, local, self.map.global_models[name])
+    def _describe(self, name: str, features: _Features) -> NDArray[np.float32]:
+        if name in features.sent:
+            return features.sent[name]
+        descriptor, model = self._descriptors[name], self.map.global_models[name]
+        return descriptor.describe(features.rgb, features.local, model)
 
     def _fusion(self, options: LocalizeOptions) -> LateFusion:
         return chosen_fusion(options, self.map.fusion, self.map.global_descriptors)
@@ -445,47 +441,3 @@ class Localizer:
 def _nothing(evidence: Evidence, stage: Stage, reason: Reason, message: str) -> Look:
     refusal = Refusal(stage, reason, message)
     return Look(evidence, Matches.none(), np.empty(0, np.int64), Matches.none(), refusal)
-
-
-def find_features(
-    photo: Photo,
-    extractor: LocalFeatureExtractor,
-    most: int,
-    options: LocalizeOptions,
-    found: FeatureCache | None = None,
-) -> tuple[LocalFeatures, NDArray[np.uint8]]:
-    """Find the local features of a photo, unless they were found before.
-
-    Args:
-        photo: pixels as stored.
-        extractor: finds them.
-        most: keypoints of a photo of the map.
-        options: how much effort goes into it, and in which orientation.
-        found: of this photo, what was found before; what is found now is added.
-
-    Returns:
-        Features with keypoints in the stored pixels, and the image they were found in.
-    """
-    most = min(most, _MOST_KEYPOINTS.get(options.extraction, most))
-    key = extractor, options.read_as, options.extraction
-    known = None if found is None else found.get(key)
-    if known is None or known.max_keypoints < most:
-        local, rgb = extract_features(
-            photo,
-            extractor,
-            max_keypoints=most,
-            read_as=options.read_as,
-            extraction=options.extraction,
-        )
-        known = FoundFeatures(local, most, rgb)
-        if found is not None:
-            found[key] = known
-    local = known.local if known.max_keypoints == most else _strongest(known.local, most)
-    return local, known.rgb
-
-
-def _strongest(local: LocalFeatures, most: int) -> LocalFeatures:
-    """Those that an extractor returns that may return so many: they come strongest first."""
-    return LocalFeatures(
-        local.keypoints[:most], local.descriptors[:most], local.scores[:most], local.scales[:most]
-    )

@@ -11,18 +11,15 @@ from numpy.typing import NDArray
 from visloc.errors import InvalidInput, VislocError
 from visloc.geometry import Camera, Pose
 from visloc.localization.constraints import Constraints, MapGeometry
+from visloc.localization.gates import Problem, accepted, not_better_elsewhere
 from visloc.pose.centre import position_covariance, with_origin
-from visloc.pose.distance import mahalanobis2
 from visloc.pose.generalized import (
     GeneralizedPose,
-    estimate_generalized_pose,
-    refine_generalized_pose,
 )
 from visloc.pose.views import MatchedView
 from visloc.priors import Priors
 from visloc.timing import timed
 from visloc.types import (
-    DEFAULT_PRESET,
     CameraSource,
     Evidence,
     ImageAnswer,
@@ -32,22 +29,10 @@ from visloc.types import (
     ReadAs,
     Reason,
     Refusal,
-    RegistrationPreset,
     RigPose,
     Solver,
 )
 
-# The default max_error_px holds for photos of this longer side and more; for smaller ones it
-# shrinks with them. 12 px are so large a part of a photo of 256 px that poses by chance explain
-# up to 10 % of the matches.
-FULL_ERROR_FROM_PX = 640
-# A prior decides between two poses when the photo leaves them open: when the one that it allows
-# has at least this share of the inliers of the one that it forbids.
-_AMBIGUOUS_SHARE = 0.7
-# A pose with fewer inliers must be confirmed by two halves of the matches: their distance is
-# chi-square with six degrees of freedom, above this once in a thousand times.
-_SURE_INLIERS = 100
-_MAX_HALVES_MAHALANOBIS2 = 22.46
 # What becomes of a photo whose features were found on its side.
 _REASONS_OF_TURNED_PHOTOS = (
     *(Reason.TOO_FEW_MATCHES, Reason.NO_POSE, Reason.TOO_FEW_INLIERS, Reason.LOW_INLIER_RATIO),
@@ -165,10 +150,12 @@ def solve_instant(
     views = _views_of(images, [look.matches for look in looks], options)
     seconds = _summed([look.evidence.seconds for look in looks])
     with timed(seconds, "pose"):
-        found, refusal = _find_pose(images, views, options, constraints)
+        found, refusal = _find_pose(images, Problem(views, options, constraints))
         if refusal is None or refusal.reason is not Reason.CONTRADICTS_PRIOR:
             elsewhere = _views_of(images, [look.elsewhere for look in looks], options)
-            refusal = _better_elsewhere(elsewhere, found, options) or refusal
+            refusal = (
+                not_better_elsewhere(Problem(elsewhere, options, constraints), found) or refusal
+            )
         refusal = refusal and _with_turned_photos(refusal, looks)
     pose = None
     if refusal is None and found is not None and found.covariance is not None:
@@ -266,23 +253,10 @@ def rig_pose(
     )
 
 
-def registration_for(options: LocalizeOptions, cameras: Sequence[Camera]) -> RegistrationPreset:
-    """The thresholds for photos: the default's inlier distance shrinks with the smallest."""
-    registration = options.registration
-    if options.preset != DEFAULT_PRESET or options.max_error_px is not None:
-        return registration
-    smallest = min(max(camera.width, camera.height) for camera in cameras)
-    share = min(1.0, smallest / FULL_ERROR_FROM_PX)
-    return replace(registration, max_error_px=registration.max_error_px * share)
-
-
 def _find_pose(
-    images: Sequence[SeenImage],
-    views: Sequence[MatchedView],
-    options: LocalizeOptions,
-    constraints: Constraints,
+    images: Sequence[SeenImage], problem: Problem
 ) -> tuple[GeneralizedPose | None, Refusal | None]:
-    """Return the best pose, if any, and why it is not believed, if it is not."""
+    """Return the best pose or None, and the reason to refuse it or None."""
     looks = [image.look for image in images if image.look is not None]
     if not looks:
         why = "none of the images could be used" if images else "there is no image"
@@ -290,140 +264,26 @@ def _find_pose(
     refusals = [look.refusal for look in looks if look.refusal is not None]
     if len(refusals) == len(looks):
         return None, refusals[0]
-    registration = registration_for(options, [view.camera for view in views])
-    num_pairs = sum(len(view) for view in views)
+    needed, num_counted = problem.registration.min_inliers, problem.num_matches
     num_matches = sum(len(look.matches.pixels) for look in looks)
-    if num_matches < registration.min_inliers:
+    if num_matches < needed:
         return None, Refusal(
             "matching",
             Reason.TOO_FEW_MATCHES,
-            f"only {num_matches} keypoints match the map, {registration.min_inliers} are needed",
+            f"only {num_matches} keypoints match the map, {needed} are needed",
         )
-    if num_pairs < registration.min_inliers:
+    if num_counted < needed:
         return None, Refusal(
             "gate",
             Reason.UNCERTAIN_POSE,
-            f"{num_matches - num_pairs} of {num_matches} matches do not count: the focal length "
+            f"{num_matches - num_counted} of {num_matches} matches do not count: the focal length "
             "of their photo is a guess, and found only for a photo on its own, by a solver other "
             f"than {Solver.REGISTRATION}: send the camera",
         )
-    found = _estimate(views, registration, options, constraints)
-    if found is None:
+    best = problem.solve()
+    if best is None:
         return None, Refusal("pose", Reason.NO_POSE, "no camera pose explains the matches")
-    refusal = _gate(found, num_pairs, registration, constraints)
-    if refusal is not None and refusal.reason is Reason.CONTRADICTS_PRIOR:
-        other = _near_pose_prior(views, found, registration, options, constraints)
-        if other is not None and _gate(other, num_pairs, registration, constraints) is None:
-            found, refusal = other, None
-    if refusal is None and constraints.gravity is not None:
-        refusal = _better_without_gravity(views, found, registration, options)
-    if refusal is None:
-        refusal = _halves_disagree(views, found, registration, options, constraints)
-    return found, refusal
-
-
-def _estimate(
-    views: Sequence[MatchedView],
-    registration: RegistrationPreset,
-    options: LocalizeOptions,
-    constraints: Constraints,
-) -> GeneralizedPose | None:
-    return estimate_generalized_pose(
-        views,
-        max_error_px=registration.max_error_px,
-        seed=options.seed,
-        gravity=constraints.gravity,
-        solver=options.solver,
-    )
-
-
-def _gate(
-    found: GeneralizedPose,
-    num_pairs: int,
-    registration: RegistrationPreset,
-    constraints: Constraints,
-) -> Refusal | None:
-    """Why a pose is not believed, or None (docs/decisions/0002-refuse-instead-of-guess.md)."""
-    doubt = "is this photo of the mapped place?"
-    if constraints.narrow:
-        doubt = "only what the priors allow was searched: are they right?"
-    if found.num_inliers < registration.min_inliers:
-        return Refusal(
-            "gate",
-            Reason.TOO_FEW_INLIERS,
-            f"the best pose explains {found.num_inliers} matches, "
-            f"{registration.min_inliers} are needed; {doubt}",
-        )
-    if found.num_inliers / num_pairs < registration.min_inlier_ratio:
-        return Refusal(
-            "gate",
-            Reason.LOW_INLIER_RATIO,
-            f"the best pose explains {found.num_inliers / num_pairs:.1%} of the matches, "
-            f"{registration.min_inlier_ratio:.1%} are needed; {doubt}",
-        )
-    if found.covariance is None:
-        return Refusal(
-            "gate",
-            Reason.UNCERTAIN_POSE,
-            "the matched landmarks leave the pose undetermined: they lie in a line or a spot"
-            if found.camera is None
-            else "the matched landmarks, in a plane or a spot, leave focal length and distance "
-            "undetermined: send the camera",
-        )
-    contradiction = constraints.contradiction(found.rig_from_world, found.covariance)
-    if contradiction is not None:
-        return Refusal(
-            "gate",
-            Reason.CONTRADICTS_PRIOR,
-            f"the best pose contradicts what is known: {contradiction}",
-        )
-    return None
-
-
-def _halves_disagree(
-    views: Sequence[MatchedView],
-    found: GeneralizedPose,
-    registration: RegistrationPreset,
-    options: LocalizeOptions,
-    constraints: Constraints,
-) -> Refusal | None:
-    """Refuse a pose of few inliers when two halves of the matches give poses that differ.
-
-    Matches of a blurred photo agree within 12 pixels by the dozen and with a pose metres off, whose
-    covariance cannot know (docs/decisions/0012-halves-must-agree.md). With a focal length to find,
-    two halves agree too easily: such a pose is not believed.
-    """
-    if (
-        found.num_inliers >= _SURE_INLIERS
-        or options.preset != DEFAULT_PRESET
-        or options.min_inliers is not None
-    ):
-        return None
-    if found.camera is not None:
-        return Refusal(
-            "gate",
-            Reason.UNCERTAIN_POSE,
-            f"the best pose, with a focal length found together with it, explains only "
-            f"{found.num_inliers} matches, {_SURE_INLIERS} are needed: send the camera",
-        )
-    # Of two places that explain the photo, a pose prior may have decided for one.
-    views = constraints.near_pose_prior(views, registration.max_error_px) or views
-    random = np.random.default_rng(options.seed)
-    first = [random.permutation(len(view)) < len(view) // 2 for view in views]
-    halves = []
-    for masks in (first, [~mask for mask in first]):
-        half = [view.selected(mask) for view, mask in zip(views, masks, strict=True)]
-        pose = _estimate(half, registration, options, constraints)
-        if pose is not None and pose.covariance is not None:
-            halves.append((pose.rig_from_world, pose.covariance))
-    if len(halves) == 2 and mahalanobis2(*halves[0], *halves[1]) <= _MAX_HALVES_MAHALANOBIS2:
-        return None
-    return Refusal(
-        "gate",
-        Reason.UNCERTAIN_POSE,
-        f"the best pose explains only {found.num_inliers} matches, and two halves of the matches "
-        "give poses that contradict each other: the photo is blurred, or of another place",
-    )
+    return accepted(problem, best)
 
 
 def _with_turned_photos(refusal: Refusal, looks: Sequence[Look]) -> Refusal:
@@ -440,87 +300,6 @@ def _with_turned_photos(refusal: Refusal, looks: Sequence[Look]) -> Refusal:
     exif = ", ".join(map(str, orientations))
     hint = f"stored turned, EXIF orientation {exif}, and was read as stored: try read_as=upright"
     return replace(refusal, message=f"{refusal.message} (the photo is {hint})")
-
-
-def _near_pose_prior(
-    views: Sequence[MatchedView],
-    forbidden: GeneralizedPose,
-    registration: RegistrationPreset,
-    options: LocalizeOptions,
-    constraints: Constraints,
-) -> GeneralizedPose | None:
-    """Where the images leave the place open, return the pose that the pose prior decides for."""
-    near = constraints.near_pose_prior(views, registration.max_error_px)
-    if near is None:
-        return None
-    start = _estimate(near, registration, options, constraints)
-    if start is None:
-        return None
-    if start.camera is not None:
-        views = [replace(view, camera=start.camera) for view in views]
-    found = refine_generalized_pose(
-        views, start.rig_from_world, max_error_px=registration.max_error_px
-    )
-    if found is None or found.num_inliers < _AMBIGUOUS_SHARE * forbidden.num_inliers:
-        return None
-    return found
-
-
-def _better_without_gravity(
-    views: Sequence[MatchedView],
-    found: GeneralizedPose,
-    registration: RegistrationPreset,
-    options: LocalizeOptions,
-) -> Refusal | None:
-    """Refuse a pose that was only looked for upright when another explains the images better."""
-    if found.camera is not None:  # gravity took no part
-        return None
-    num_others = sum(len(view) for view in views) - found.num_inliers
-    if found.num_inliers >= _AMBIGUOUS_SHARE * num_others:  # it cannot
-        return None
-    other = estimate_generalized_pose(
-        views, max_error_px=registration.max_error_px, seed=options.seed, solver=options.solver
-    )
-    if other is None or found.num_inliers >= _AMBIGUOUS_SHARE * other.num_inliers:
-        return None
-    return Refusal(
-        "gate",
-        Reason.CONTRADICTS_PRIOR,
-        f"a pose that the prior gravity excludes explains {other.num_inliers} matches, the one "
-        f"that it allows {found.num_inliers}: the gravity is wrong, or the place looks alike twice",
-    )
-
-
-def _better_elsewhere(
-    elsewhere: Sequence[MatchedView],
-    found: GeneralizedPose | None,
-    options: LocalizeOptions,
-) -> Refusal | None:
-    """Refuse what priors allow when a pose that they forbid explains the images better."""
-    num_pairs = sum(len(view) for view in elsewhere)
-    if num_pairs < options.registration.min_inliers:
-        return None
-    registration = registration_for(options, [view.camera for view in elsewhere])
-    other = estimate_generalized_pose(
-        elsewhere,
-        max_error_px=registration.max_error_px,
-        seed=options.seed,
-        solver=options.solver,
-    )
-    num_inliers = 0 if found is None else found.num_inliers
-    if (
-        other is None
-        or other.num_inliers < registration.min_inliers
-        or other.num_inliers < registration.min_inlier_ratio * num_pairs
-        or num_inliers >= _AMBIGUOUS_SHARE * other.num_inliers
-    ):
-        return None
-    return Refusal(
-        "gate",
-        Reason.CONTRADICTS_PRIOR,
-        f"a place that the priors exclude explains {other.num_inliers} matches, the one that "
-        f"they allow {num_inliers}: the priors are wrong, or both places look alike",
-    )
 
 
 def _summed(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:

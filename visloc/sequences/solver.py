@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from visloc.errors import InvalidInput
 from visloc.geometry import center_covariance, covariance_from_center, rotation_angle
 from visloc.localization.constraints import Constraints, MapGeometry
+from visloc.localization.gates import contradicts_priors, registration_for
 from visloc.localization.solving import (
     SeenImage,
     Solved,
-    registration_for,
     rig_pose,
     solve_instant,
     with_inliers,
@@ -315,14 +315,9 @@ class SequenceSolver:
     def _with_pose(self, answer: InstantAnswer, found: TracedPose, priors: Priors) -> InstantAnswer:
         """Give an answer a pose, unless it contradicts the priors."""
         constraints = Constraints(self._geometry, priors)
-        contradiction = constraints.contradiction(found.pose, found.covariance)
+        contradiction = contradicts_priors(constraints, found.pose, found.covariance)
         if contradiction is not None:
-            refusal = answer.refusal or Refusal(
-                "gate",
-                Reason.CONTRADICTS_PRIOR,
-                f"the best pose contradicts what is known: {contradiction}",
-            )
-            return replace(answer, pose=None, refusal=refusal)
+            return replace(answer, pose=None, refusal=answer.refusal or contradiction)
         pose = rig_pose(found.pose, found.covariance, self._geometry, found.source)
         measured = found.source is PoseSource.ESTIMATED
         return replace(answer, pose=pose, refusal=None if measured else answer.refusal)

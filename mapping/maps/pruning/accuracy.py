@@ -21,7 +21,8 @@ from visloc.features import GlobalDescriptor, LocalFeatureExtractor
 from visloc.geometry import Pose
 from visloc.kapture import read_dataset
 from visloc.localization.constraints import MapGeometry
-from visloc.localization.localizer import FeatureCache, Localizer
+from visloc.localization.feature_cache import FeatureCache
+from visloc.localization.localizer import Localizer
 from visloc.retrieval.index import retrieve
 from visloc.types import Localized, LocalizeOptions
 
@@ -101,7 +102,7 @@ def of_queries(
         photo = read_in_frame(dataset.path_of(record), sensor.image_size, sensor.id)
         found = FeatureCache()
         for localizer, own in zip(localizers, errors, strict=True):
-            answer = localizer.localize(photo, sensor.camera, LocalizeOptions(), found=found)
+            answer = localizer.localize(photo, sensor.camera, LocalizeOptions(), cache=found)
             if isinstance(answer, Localized):
                 own.append(pose_error(answer.cam_from_world, truth))
     progress(len(records), len(records))

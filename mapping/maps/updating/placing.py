@@ -28,7 +28,7 @@ from visloc.archive import Map
 from visloc.errors import Conflict
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose, Similarity
-from visloc.localization.solving import registration_for
+from visloc.localization.gates import registration_for
 from visloc.pose.reprojection import reprojection_errors
 from visloc.pose.views import MatchedView
 from visloc.types import LocalizeOptions

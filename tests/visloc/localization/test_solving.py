@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose, center_covariance
-from visloc.localization.solving import Matches, Solved, registration_for, solve_instant
+from visloc.localization.gates import registration_for
+from visloc.localization.solving import Matches, Solved, solve_instant
 from visloc.pose.centre import with_origin
 from visloc.pose.colmap import normalized_rays
 from visloc.priors import (

@@ -1,0 +1,79 @@
+"""Local features of one query photo, found once for all maps that are asked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.features import LocalFeatureExtractor
+from visloc.images import Photo
+from visloc.photo_features import extract_features
+from visloc.types import Extraction, LocalFeatures, LocalizeOptions, ReadAs
+
+# Keypoints of a query that are used, strongest first. ACCURATE uses as many as the mapping images.
+_MOST_KEYPOINTS: Mapping[Extraction, int] = {Extraction.FAST: 1000, Extraction.DEFAULT: 2500}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundFeatures:
+    """Local features of a photo, kept for the next map that asks for them.
+
+    Attributes:
+        local: with keypoints in the stored pixels.
+        max_keypoints: how many the extractor might have returned.
+        rgb: (height, width, 3) pixels that it looked at, upright where that was asked for.
+    """
+
+    local: LocalFeatures
+    max_keypoints: int
+    rgb: NDArray[np.uint8]
+
+
+# Of one photo, by what found them and how.
+FeatureCache = dict[tuple[LocalFeatureExtractor, ReadAs, Extraction], FoundFeatures]
+
+
+def find_features(
+    photo: Photo,
+    extractor: LocalFeatureExtractor,
+    most: int,
+    options: LocalizeOptions,
+    found: FeatureCache | None = None,
+) -> tuple[LocalFeatures, NDArray[np.uint8]]:
+    """Find the local features of a photo, or take them from the cache.
+
+    Args:
+        photo: pixels as stored.
+        most: keypoints of a mapping image.
+        options: the effort and the orientation.
+        found: the cache of this photo; new features are added to it.
+
+    Returns:
+        Features with keypoints in the stored pixels, and the image they were found in.
+    """
+    most = min(most, _MOST_KEYPOINTS.get(options.extraction, most))
+    key = extractor, options.read_as, options.extraction
+    known = None if found is None else found.get(key)
+    if known is None or known.max_keypoints < most:
+        local, rgb = extract_features(
+            photo,
+            extractor,
+            max_keypoints=most,
+            read_as=options.read_as,
+            extraction=options.extraction,
+        )
+        known = FoundFeatures(local, most, rgb)
+        if found is not None:
+            found[key] = known
+    local = known.local if known.max_keypoints == most else _strongest(known.local, most)
+    return local, known.rgb
+
+
+def _strongest(local: LocalFeatures, most: int) -> LocalFeatures:
+    """Keep the first ``most`` keypoints: extractors return the strongest first."""
+    return LocalFeatures(
+        local.keypoints[:most], local.descriptors[:most], local.scores[:most], local.scales[:most]
+    )

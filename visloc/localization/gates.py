@@ -1,0 +1,283 @@
+"""Gates: acceptance tests that a solved pose must pass before it is an answer.
+
+A gate takes the problem and its best pose and returns a refusal, or None to accept. ``GATES`` look
+at the pose; ``CONFIRMATIONS`` solve again, so they come last. The reasons behind them:
+docs/decisions/0002-refuse-instead-of-guess.md and 0012-halves-must-agree.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.geometry import Camera, Pose
+from visloc.localization.constraints import Constraints
+from visloc.pose.distance import mahalanobis2
+from visloc.pose.generalized import (
+    GeneralizedPose,
+    estimate_generalized_pose,
+    refine_generalized_pose,
+)
+from visloc.pose.views import MatchedView
+from visloc.types import (
+    DEFAULT_PRESET,
+    LocalizeOptions,
+    Reason,
+    Refusal,
+    RegistrationPreset,
+)
+
+# The default max_error_px applies to photos whose longer side has at least this many pixels, and
+# shrinks with smaller ones: 12 px are so large a part of a photo of 256 px that wrong poses
+# explain up to 10 % of the matches by chance.
+FULL_ERROR_FROM_PX = 640
+# A prior decides between two poses that the photo leaves open. The photo leaves them open when the
+# pose that the prior allows has at least this share of the other's inliers.
+_AMBIGUOUS_SHARE = 0.7
+# A pose with fewer inliers must be confirmed by two halves of the matches. Their distance is
+# chi-square with six degrees of freedom: above the limit once in a thousand times.
+_SURE_INLIERS = 100
+_MAX_HALVES_MAHALANOBIS2 = 22.46
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """The search for one pose: what the images show, and what is asked.
+
+    Attributes:
+        views: of the images, relative to the map's origin.
+    """
+
+    views: tuple[MatchedView, ...]
+    options: LocalizeOptions
+    constraints: Constraints
+
+    @property
+    def registration(self) -> RegistrationPreset:
+        return registration_for(self.options, [view.camera for view in self.views])
+
+    @property
+    def num_matches(self) -> int:
+        return sum(len(view) for view in self.views)
+
+    def of(self, views: Sequence[MatchedView]) -> Problem:
+        """Return the same search in other views."""
+        return replace(self, views=tuple(views))
+
+    def solve(self, *, with_gravity: bool = True) -> GeneralizedPose | None:
+        return estimate_generalized_pose(
+            self.views,
+            max_error_px=self.registration.max_error_px,
+            seed=self.options.seed,
+            gravity=self.constraints.gravity if with_gravity else None,
+            solver=self.options.solver,
+        )
+
+
+Gate = Callable[[Problem, GeneralizedPose], Refusal | None]
+
+
+def registration_for(options: LocalizeOptions, cameras: Sequence[Camera]) -> RegistrationPreset:
+    """Return the thresholds for photos of these cameras.
+
+    The default inlier threshold shrinks with the smallest photo.
+    """
+    registration = options.registration
+    if options.preset != DEFAULT_PRESET or options.max_error_px is not None:
+        return registration
+    smallest = min(max(camera.width, camera.height) for camera in cameras)
+    share = min(1.0, smallest / FULL_ERROR_FROM_PX)
+    return replace(registration, max_error_px=registration.max_error_px * share)
+
+
+def accepted(problem: Problem, best: GeneralizedPose) -> tuple[GeneralizedPose, Refusal | None]:
+    """Judge the best pose of a problem.
+
+    Where the images leave the place open, a pose prior decides: another pose may be returned.
+
+    Returns:
+        The judged pose, and the reason to refuse it or None.
+    """
+    refusal = first_refusal(GATES, problem, best)
+    if refusal is not None and refusal.reason is Reason.CONTRADICTS_PRIOR:
+        other = _near_pose_prior(problem, best)
+        if other is not None and first_refusal(GATES, problem, other) is None:
+            best, refusal = other, None
+    return best, refusal or first_refusal(CONFIRMATIONS, problem, best)
+
+
+def first_refusal(gates: Sequence[Gate], problem: Problem, pose: GeneralizedPose) -> Refusal | None:
+    """Return the refusal of the first gate that the pose does not pass."""
+    return next((refusal for gate in gates if (refusal := gate(problem, pose))), None)
+
+
+def enough_inliers(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
+    """Refuse a pose that fewer matches agree with than ``min_inliers``."""
+    needed = problem.registration.min_inliers
+    if pose.num_inliers >= needed:
+        return None
+    return _refused(
+        Reason.TOO_FEW_INLIERS,
+        f"the best pose explains {pose.num_inliers} matches, {needed} are needed; "
+        f"{_doubt(problem)}",
+    )
+
+
+def enough_of_the_matches(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
+    """Refuse a pose that a smaller share of the matches agrees with than ``min_inlier_ratio``."""
+    ratio, needed = pose.num_inliers / problem.num_matches, problem.registration.min_inlier_ratio
+    if ratio >= needed:
+        return None
+    return _refused(
+        Reason.LOW_INLIER_RATIO,
+        f"the best pose explains {ratio:.1%} of the matches, {needed:.1%} are needed; "
+        f"{_doubt(problem)}",
+    )
+
+
+def determined(_: Problem, pose: GeneralizedPose) -> Refusal | None:
+    """Refuse a pose that its inliers leave undetermined."""
+    if pose.covariance is not None:
+        return None
+    if pose.camera is None:
+        why = "the matched landmarks leave the pose undetermined: they lie in a line or a spot"
+    else:
+        why = (
+            "the matched landmarks, in a plane or a spot, leave focal length and distance "
+            "undetermined: send the camera"
+        )
+    return _refused(Reason.UNCERTAIN_POSE, why)
+
+
+def within_the_priors(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
+    """Refuse a pose that contradicts a prior."""
+    assert pose.covariance is not None  # ``determined`` comes first
+    return contradicts_priors(problem.constraints, pose.rig_from_world, pose.covariance)
+
+
+def not_better_without_gravity(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
+    """Refuse an upright pose when one that is not upright explains the images better."""
+    if problem.constraints.gravity is None or pose.camera is not None:  # gravity was not used
+        return None
+    num_others = problem.num_matches - pose.num_inliers
+    if pose.num_inliers >= _AMBIGUOUS_SHARE * num_others:  # no other pose can have enough
+        return None
+    other = problem.solve(with_gravity=False)
+    if other is None or pose.num_inliers >= _AMBIGUOUS_SHARE * other.num_inliers:
+        return None
+    return _refused(
+        Reason.CONTRADICTS_PRIOR,
+        f"a pose that the prior gravity excludes explains {other.num_inliers} matches, the one "
+        f"that it allows {pose.num_inliers}: the gravity is wrong, or the place looks alike twice",
+    )
+
+
+def halves_agree(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
+    """Refuse a pose of few inliers when two halves of the matches give different poses.
+
+    Dozens of matches of a blurred photo can agree within 12 pixels on a pose that is metres off.
+    The covariance does not show it. With a focal length to find, halves agree too easily: such a
+    pose needs more inliers instead.
+    """
+    options = problem.options
+    if (
+        pose.num_inliers >= _SURE_INLIERS
+        or options.preset != DEFAULT_PRESET
+        or options.min_inliers is not None
+    ):
+        return None
+    if pose.camera is not None:
+        return _refused(
+            Reason.UNCERTAIN_POSE,
+            f"the best pose, with a focal length found together with it, explains only "
+            f"{pose.num_inliers} matches, {_SURE_INLIERS} are needed: send the camera",
+        )
+    # Of two places that explain the photo, a pose prior may have decided for one.
+    near = problem.constraints.near_pose_prior(problem.views, problem.registration.max_error_px)
+    views = near or problem.views
+    random = np.random.default_rng(options.seed)
+    first = [random.permutation(len(view)) < len(view) // 2 for view in views]
+    halves = []
+    for masks in (first, [~mask for mask in first]):
+        half = [view.selected(mask) for view, mask in zip(views, masks, strict=True)]
+        found = problem.of(half).solve()
+        if found is not None and found.covariance is not None:
+            halves.append((found.rig_from_world, found.covariance))
+    if len(halves) == 2 and mahalanobis2(*halves[0], *halves[1]) <= _MAX_HALVES_MAHALANOBIS2:
+        return None
+    return _refused(
+        Reason.UNCERTAIN_POSE,
+        f"the best pose explains only {pose.num_inliers} matches, and two halves of the matches "
+        "give poses that contradict each other: the photo is blurred, or of another place",
+    )
+
+
+GATES: tuple[Gate, ...] = (enough_inliers, enough_of_the_matches, determined, within_the_priors)
+CONFIRMATIONS: tuple[Gate, ...] = (not_better_without_gravity, halves_agree)
+
+
+def not_better_elsewhere(elsewhere: Problem, pose: GeneralizedPose | None) -> Refusal | None:
+    """Refuse what the priors allow when a pose that they forbid explains the images better.
+
+    Args:
+        elsewhere: matches with the photos that the priors exclude.
+        pose: the best pose that the priors allow; None when there is none.
+    """
+    if elsewhere.num_matches < elsewhere.options.registration.min_inliers:
+        return None
+    registration = elsewhere.registration
+    other = elsewhere.solve(with_gravity=False)
+    num_inliers = 0 if pose is None else pose.num_inliers
+    if (
+        other is None
+        or other.num_inliers < registration.min_inliers
+        or other.num_inliers < registration.min_inlier_ratio * elsewhere.num_matches
+        or num_inliers >= _AMBIGUOUS_SHARE * other.num_inliers
+    ):
+        return None
+    return _refused(
+        Reason.CONTRADICTS_PRIOR,
+        f"a place that the priors exclude explains {other.num_inliers} matches, the one that "
+        f"they allow {num_inliers}: the priors are wrong, or both places look alike",
+    )
+
+
+def contradicts_priors(
+    constraints: Constraints, rig_from_world: Pose, covariance: NDArray[np.float64]
+) -> Refusal | None:
+    """Refuse a pose (covariance (6, 6)) that contradicts the priors, both from the map's origin."""
+    contradiction = constraints.contradiction(rig_from_world, covariance)
+    if contradiction is None:
+        return None
+    return _refused(
+        Reason.CONTRADICTS_PRIOR, f"the best pose contradicts what is known: {contradiction}"
+    )
+
+
+def _near_pose_prior(problem: Problem, forbidden: GeneralizedPose) -> GeneralizedPose | None:
+    """Where the images leave the place open, return the pose that the pose prior decides for."""
+    max_error_px = problem.registration.max_error_px
+    near = problem.constraints.near_pose_prior(problem.views, max_error_px)
+    start = None if near is None else problem.of(near).solve()
+    if start is None:
+        return None
+    views = problem.views
+    if start.camera is not None:
+        views = tuple(replace(view, camera=start.camera) for view in views)
+    found = refine_generalized_pose(views, start.rig_from_world, max_error_px=max_error_px)
+    if found is None or found.num_inliers < _AMBIGUOUS_SHARE * forbidden.num_inliers:
+        return None
+    return found
+
+
+def _doubt(problem: Problem) -> str:
+    if problem.constraints.narrow:
+        return "only the part of the map that the priors allow was searched: are they right?"
+    return "is this photo of the mapped place?"
+
+
+def _refused(reason: Reason, message: str) -> Refusal:
+    return Refusal("gate", reason, message)
