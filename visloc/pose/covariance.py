@@ -70,18 +70,16 @@ def pose_covariance(
     num_parameters = jacobian.shape[2]
     curvature = _squared(by_weight.reshape(-1, num_parameters)) - 2.0 / loss_scale_px**2 * scatter
 
-    num_residuals = 2 * num_points
-    spare = num_residuals - num_parameters
+    spare = 2 * num_points - num_parameters
     slope = np.mean(weight**2)  # half the trace of the second derivative
     if slope == 0:  # all errors are huge
         return None
-    common = _inverse(_squared(jacobian.reshape(-1, num_parameters)))
-    bread = _inverse(curvature)
+    common, bread = _inverse(_squared(jacobian.reshape(-1, num_parameters))), _inverse(curvature)
     if common is None or bread is None:
         return None
     # Never quite zero: exact correspondences, as in tests, would leave nothing to compare.
     common *= max(np.sum(psi**2) / spare, _MIN_VARIANCE_PX2) / slope**2
-    sandwich = bread @ scatter @ bread * (num_residuals / spare)
+    sandwich = bread @ scatter @ bread * (2 * num_points / spare)
     # The sandwich scatters by about 1 / sqrt(n) in each direction: the largest of both would be
     # too wide by that in half of them, were it not taken off first.
     wider = _wider(common, sandwich / (1.0 + _SANDWICH_SCATTER / math.sqrt(num_points)))
@@ -89,15 +87,25 @@ def pose_covariance(
         return wider
     if wider[6, 6] > _MAX_FOCAL_STD**2:
         return None
-    (view,) = (view for view in views if len(view))
-    # Projections move as the principal point does; the pose that is best for them by this.
+    # Projections move as the principal point does, and the best pose moves with them.
     moves = np.einsum("n,nai->ia", weight, jacobian)
     moves -= 2.0 / loss_scale_px**2 * np.einsum("ni,na->ia", gradients, psi)
-    by_point = bread @ moves
-    longer_side = max(view.camera.width, view.camera.height)
-    return np.asarray(
-        (wider + (_PRINCIPAL_POINT_STD * longer_side) ** 2 * by_point @ by_point.T)[:6, :6]
-    )
+    return _with_principal_point(wider, bread @ moves, views)
+
+
+def _with_principal_point(
+    covariance: NDArray[np.float64], by_point: NDArray[np.float64], views: Sequence[MatchedView]
+) -> NDArray[np.float64]:
+    """Add the doubt in the principal point; return the pose's part (6, 6).
+
+    Args:
+        covariance: (7, 7) of the pose and the focal length.
+        by_point: (7, 2) derivative of these by the principal point.
+        views: one of them has inliers.
+    """
+    (camera,) = (view.camera for view in views if len(view))
+    std_px = _PRINCIPAL_POINT_STD * max(camera.width, camera.height)
+    return np.asarray((covariance + std_px**2 * by_point @ by_point.T)[:6, :6])
 
 
 def _squared(rows: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -224,9 +224,7 @@ def _solve_together(
     for _ in range(_MAX_ROUNDS):
         inliers = [_inliers(i.views, p, registration) for i, p in zip(instants, poses, strict=True)]
         seen = {
-            i: tuple(
-                v.selected(k) for v, k in zip(instant.views, inliers[i], strict=True) if k.any()
-            )
+            i: _selected(instant.views, inliers[i])
             for i, instant in enumerate(instants)
             if i not in measured
             and _supports(inliers[i], fewest.get(i, _MIN_OWN_INLIERS), registration)
@@ -235,8 +233,8 @@ def _solve_together(
         old_scale = scale
         scale = error_scale(known, poses, covariances, LOSS_SCALE_PX, old_scale)
         now = [mask for i in seen for mask in inliers[i]]
-        same = len(now) == len(before) and all(map(np.array_equal, now, before))
-        if same and covariances is not None and abs(scale / old_scale - 1.0) < _SCALE_SETTLED:
+        settled = covariances is not None and abs(scale / old_scale - 1.0) < _SCALE_SETTLED
+        if settled and len(now) == len(before) and all(map(np.array_equal, now, before)):
             break
         before = now
         solved = solve_chain(known, poses, LOSS_SCALE_PX, scale)
@@ -245,21 +243,27 @@ def _solve_together(
         poses, covariances = solved
     if covariances is None:
         return None
-    found = []
     taking_part = {*known.measured, *known.seen}
-    for i, (instant, pose, covariance) in enumerate(zip(instants, poses, covariances, strict=True)):
-        own = _measured_from(instant.views, pose, registration)
-        found.append(
-            own
-            or WindowPose(
-                pose,
-                UncertainPose(pose, covariance).additive(),
-                _inliers(instant.views, pose, registration),
-                measured=False,
-                supported=i in taking_part,
-            )
+    return [
+        _measured_from(instant.views, pose, registration)
+        or WindowPose(
+            pose,
+            UncertainPose(pose, covariance).additive(),
+            _inliers(instant.views, pose, registration),
+            measured=False,
+            supported=i in taking_part,
         )
-    return found
+        for i, (instant, pose, covariance) in enumerate(
+            zip(instants, poses, covariances, strict=True)
+        )
+    ]
+
+
+def _selected(
+    views: Sequence[MatchedView], inliers: Sequence[NDArray[np.bool_]]
+) -> tuple[MatchedView, ...]:
+    """Return the inliers of the views that have any."""
+    return tuple(v.selected(k) for v, k in zip(views, inliers, strict=True) if k.any())
 
 
 def _measured_from(
