@@ -32,20 +32,18 @@ _PRINCIPAL_POINT_STD = 0.01
 def pose_covariance(
     views: Sequence[MatchedView], rig_from_world: Pose, loss_scale_px: float
 ) -> NDArray[np.float64] | None:
-    """Covariance of a rig's pose that was refined on these inliers with a Cauchy loss.
+    """Return the covariance of a rig's pose that was refined on these inliers with a Cauchy loss.
 
-    Two classical estimates for an M-estimator: Huber's for residuals of one common spread
-    (Huber 1981, section 7.6: scaled by the residuals themselves; steady with few points), and
-    the sandwich of Huber (1967) and White (1980), right when some landmarks scatter more than
-    others. Along every direction the wider one counts, so that the answer does not claim more
-    than either supports. pycolmap's own covariance assumes one pixel of noise and counts
-    rotation in half-angles. Checked by Monte Carlo in tests/visloc/pose.
+    There are two classical estimates for an M-estimator. Huber's (Huber 1981, section 7.6) assumes
+    one common spread of the residuals and is steady with few points. The sandwich (Huber 1967,
+    White 1980) is right when some landmarks scatter more than others. Along every direction the
+    wider one counts. pycolmap's own covariance assumes one pixel of noise and counts rotation in
+    half-angles. Checked by Monte Carlo in tests/visloc/pose.
 
     Args:
-        views: inliers only; views without any are fine. Those at the very edge of what their
-            camera sees, where errors have no derivative, count as none. For one of unknown focal
-            length the covariance has what that leaves open, and a principal point that may be
-            off by a hundredth of the longer side.
+        views: inliers only; some views may have none. Inliers at the very edge of the picture,
+            where errors have no derivative, are left out. With an unknown focal length, the
+            principal point may be off by a hundredth of the longer side.
         rig_from_world: the refined pose.
         loss_scale_px: scale c of the loss c^2 / 2 log(1 + r^2 / c^2).
 

@@ -206,13 +206,10 @@ def _solve_together(
     """Solve for linked instants from close poses, choosing again and again whose pixels count.
 
     Args:
-        instants: N.
-        links: N - 1.
+        instants: N, with N - 1 ``links`` and N poses to ``start`` from.
         measured: poses that some have, relative to which the others are found.
-        start: N poses.
         fewest: inliers that an instant needs to take part with its pixels, where that is not
             ``_MIN_OWN_INLIERS``.
-        registration: the gate.
 
     Returns:
         None when all that takes part leaves the poses undetermined.
