@@ -13,7 +13,7 @@ from pathlib import Path
 import PIL.Image  # noqa: F401  Pillow saves PNGs only when it was imported before pycolmap
 import pycolmap
 
-from mapping.importers.text_lines import TextLines
+from mapping.importers.reading.text_lines import TextLines
 from visloc.errors import DatasetError
 from visloc.geometry import MAX_IMAGE_SIDE
 

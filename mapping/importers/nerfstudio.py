@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.importers.dataset import depth_sensor_id
-from mapping.importers.json_fields import JsonValue, read_json
 from mapping.importers.model import ImportedImage, ImportedModel
-from mapping.importers.photo_names import photo_names, photo_size
-from mapping.importers.tracks import rotation_from_matrix
+from mapping.importers.reading.json_fields import JsonValue, read_json
+from mapping.importers.reading.photo_names import photo_names, photo_size
+from mapping.importers.reading.tracks import rotation_from_matrix
 from mapping.methods.depth import DEFAULT_DEPTH_SCALE
 from visloc.errors import DatasetError, InvalidInput
 from visloc.geometry import MAX_IMAGE_SIDE, Camera, Pose

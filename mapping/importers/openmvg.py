@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.importers.json_fields import JsonValue, read_json
 from mapping.importers.model import ImportedImage, ImportedModel
-from mapping.importers.photo_names import photo_names
+from mapping.importers.reading.json_fields import JsonValue, read_json
+from mapping.importers.reading.photo_names import photo_names
+from mapping.importers.reading.tracks import Measurements, pose_from_center, rotation_from_matrix
 from mapping.importers.regions import PIXELS, with_features
-from mapping.importers.tracks import Measurements, pose_from_center, rotation_from_matrix
 from visloc.errors import DatasetError, InvalidInput
 from visloc.geometry import MAX_IMAGE_SIDE, Camera, Pose
 from visloc.kapture import Sensor

@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mapping.frames.anchor import scale_doubt
-from mapping.importers.json_fields import JsonValue, read_json
 from mapping.importers.largest import ModelSize, largest_model
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.opensfm_features import Features, read_features
-from mapping.importers.photo_names import photo_names
-from mapping.importers.text_lines import TextLines
-from mapping.importers.tracks import Measurements, keypoints_of
+from mapping.importers.reading.json_fields import JsonValue, read_json
+from mapping.importers.reading.photo_names import photo_names
+from mapping.importers.reading.text_lines import TextLines
+from mapping.importers.reading.tracks import Measurements, keypoints_of
 from visloc.errors import DatasetError, InvalidInput
 from visloc.geodesy import geodetic_from_enu
 from visloc.geometry import MAX_IMAGE_SIDE, Camera, Pose

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.importers.json_fields import LARGEST
+from mapping.importers.reading.json_fields import LARGEST
 from visloc.errors import DatasetError
 
 _MAX_FEATURES = 1_000_000

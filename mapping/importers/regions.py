@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.importers.json_fields import read_json
 from mapping.importers.model import ImportedImage
-from mapping.importers.text_lines import TextLines
-from mapping.importers.tracks import Measurements, keypoints_of
+from mapping.importers.reading.json_fields import read_json
+from mapping.importers.reading.text_lines import TextLines
+from mapping.importers.reading.tracks import Measurements, keypoints_of
 from visloc.errors import DatasetError
 from visloc.geometry import PixelOrigin
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from mapping.importers import nvm
 from mapping.importers.bundler import read
-from mapping.importers.tracks import reprojection_errors
+from mapping.importers.reading.tracks import reprojection_errors
 from visloc.errors import DatasetError
 
 SIZE = (640, 480)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mapping.importers.nvm import read
-from mapping.importers.tracks import reprojection_errors
+from mapping.importers.reading.tracks import reprojection_errors
 from visloc.errors import DatasetError
 from visloc.geometry import Pose
 

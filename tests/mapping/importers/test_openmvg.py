@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mapping.importers.openmvg import read
-from mapping.importers.tracks import reprojection_errors
+from mapping.importers.reading.tracks import reprojection_errors
 from visloc.errors import DatasetError
 from visloc.pose.colmap import project
 

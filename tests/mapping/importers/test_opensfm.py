@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mapping.importers.opensfm import read
-from mapping.importers.tracks import reprojection_errors
+from mapping.importers.reading.tracks import reprojection_errors
 from visloc.errors import DatasetError
 from visloc.geodesy import geodetic_from_enu
 from visloc.pose.colmap import project

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.importers.model import ImportedImage, ImportedModel
-from mapping.importers.tracks import Measurements, keypoints_of, projections
+from mapping.importers.reading.tracks import Measurements, keypoints_of, projections
 from visloc.errors import DatasetError
 from visloc.kapture import Sensor
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from mapping.importers.json_fields import LARGEST
+from mapping.importers.reading.json_fields import LARGEST
 from visloc.errors import DatasetError
 
 

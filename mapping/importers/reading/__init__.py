@@ -1,0 +1,1 @@
+"""Parts that several importers share: text, JSON, names of photos, tracks, measurements."""
