@@ -112,7 +112,9 @@ def ask(maps_dir: Path, answers: Path) -> None:
                         *PLACES[queries].batch,
                     )
                     lines = Path(folder, "results.jsonl").read_text(encoding="utf-8").splitlines()
-                kept = sorted(json.dumps(stable(json.loads(line))) for line in lines)
+                kept = sorted(
+                    json.dumps(stable(json.loads(line)), sort_keys=True) for line in lines
+                )
                 name = f"{asked}.{queries}.{mode}.{transport}.jsonl"
                 (answers / name).write_text("\n".join(kept) + "\n", encoding="utf-8")
     finally:

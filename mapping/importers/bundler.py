@@ -66,13 +66,8 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     photos = list_file.parent if photos is None else photos
     named = _read_list(list_file)
     with TextLines(path) as lines:
-        num_cameras, num_points = _read_header(lines)
-        if num_cameras != len(named):
-            raise lines.error(
-                f"the list of photos ({list_file}) is not of this file",
-                expected=f"{len(named)} cameras, one per photo of the list",
-                got=num_cameras,
-            )
+        num_points = _read_header(lines, len(named), list_file)
+        num_cameras = len(named)
         cameras = [_read_camera(lines) for _ in range(num_cameras)]
         points: list[list[float]] = []
         colors: list[list[int]] = []
@@ -90,11 +85,10 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     images: list[ImportedImage] = []
     for index in kept:
         width, height = sizes[index] or (0, 0)
-        camera = cameras[index]
-        sensor = _sensor(path, f"camera_{index}", camera, width, height)
-        sensors[sensor.id] = sensor
+        camera, id_ = cameras[index], f"camera_{index}"
+        sensors[id_] = _sensor(path, id_, camera, width, height)
         pose = None if camera is None else camera.pose
-        images.append(ImportedImage(names[index], sensor.id, index, pose))
+        images.append(ImportedImage(names[index], id_, index, pose))
     if num_lost := sum(cameras[index] is None for index in kept):
         notes += (f"{num_lost} of {len(kept)} photos were not reconstructed",)
     notes += _note_on_visualsfm([camera for camera in cameras if camera is not None])
@@ -104,7 +98,6 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
         photos,
         np.array(points, np.float64).reshape(-1, 3),
         np.array(colors, np.uint8).reshape(-1, 3),
-        np.empty((0, 3), np.int64),
         keypoints_type="sift",
         notes=notes,
     )
@@ -169,14 +162,22 @@ def _note_on_visualsfm(cameras: Sequence[_CameraBlock]) -> tuple[str, ...]:
     )
 
 
-def _read_header(lines: TextLines) -> tuple[int, int]:
+def _read_header(lines: TextLines, num_named: int, list_file: Path) -> int:
+    """Check the number of cameras; return the number of points."""
     header = lines.next("# Bundle file v0.3")
     if header != "# Bundle file v0.3":
         raise lines.error("not a Bundler file", expected="# Bundle file v0.3", got=header)
     fields = lines.next("the number of cameras and that of points").split()
     if len(fields) != 2:
         raise lines.error("wrong number of fields", expected="2: cameras, points", got=len(fields))
-    return lines.to_integer(fields[0], _MAX_COUNT), lines.to_integer(fields[1], _MAX_COUNT)
+    num_cameras, num_points = (lines.to_integer(field, _MAX_COUNT) for field in fields)
+    if num_cameras != num_named:
+        raise lines.error(
+            f"the list of photos ({list_file}) is not of this file",
+            expected=f"{num_named} cameras, one per photo of the list",
+            got=num_cameras,
+        )
+    return num_points
 
 
 def _read_camera(lines: TextLines) -> _CameraBlock | None:

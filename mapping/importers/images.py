@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 from PIL import ExifTags, Image
 
 from mapping.importers.left_out import notes_on
@@ -119,16 +118,7 @@ def read(
             "import.missing", "no such folder", field=str(path), expected="a folder of photos"
         )
     files = _files_in(path)
-    found: list[_Found] = []
-    for done, name in enumerate(files.photos):
-        if progress is not None:
-            progress(done, len(files.photos))
-        try:
-            found.append(_read_photo(path, name))
-        except InvalidInput as error:
-            files.leave_out(name, _reason(error))
-    if progress is not None:
-        progress(len(files.photos), len(files.photos))
+    found = _read_photos(path, files, progress or (lambda _done, _total: None))
     if not found:
         raise DatasetError(
             "import.empty",
@@ -136,14 +126,7 @@ def read(
             field=str(path),
             expected=f"photos of {FORMATS}",
         )
-    notes = []
-    dated = [photo for photo in found if photo.taken is not None]
-    if len(dated) == len(found):
-        found.sort(key=lambda photo: (photo.taken or "", photo.name))
-    elif dated:
-        notes.append(
-            f"{len(found) - len(dated)} photos have no EXIF time: the order is that of the names"
-        )
+    notes = _sort_by_time(found)
     cameras = _cameras(found)
     gnss = _gnss(found, notes)
     sensors = {sensor.id: sensor for sensor in cameras.values()}
@@ -159,13 +142,35 @@ def read(
             for rank, photo in enumerate(found)
         ),
         photos=path,
-        points=np.empty((0, 3)),
-        colors=np.empty((0, 3), np.uint8),
-        observations=np.empty((0, 3), np.int64),
         gnss=gnss,
         notes=tuple(notes),
         left_out=files.left_out,
     )
+
+
+def _sort_by_time(found: list[_Found]) -> list[str]:
+    """Sort the photos by their EXIF time where all have one; else say why not."""
+    dated = [photo for photo in found if photo.taken is not None]
+    if len(dated) == len(found):
+        found.sort(key=lambda photo: (photo.taken or "", photo.name))
+    elif dated:
+        return [
+            f"{len(found) - len(dated)} photos have no EXIF time: the order is that of the names"
+        ]
+    return []
+
+
+def _read_photos(path: Path, files: _Files, progress: Callable[[int, int], None]) -> list[_Found]:
+    """Read what the photos tell of themselves; leave out those that cannot be read."""
+    found = []
+    for done, name in enumerate(files.photos):
+        progress(done, len(files.photos))
+        try:
+            found.append(_read_photo(path, name))
+        except InvalidInput as error:
+            files.leave_out(name, _reason(error))
+    progress(len(files.photos), len(files.photos))
+    return found
 
 
 def _not_a_folder(file: Path) -> InvalidInput:

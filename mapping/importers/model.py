@@ -61,9 +61,9 @@ class ImportedModel:
     sensors: Mapping[str, Sensor]
     images: tuple[ImportedImage, ...]
     photos: Path | None
-    points: NDArray[np.float64]
-    colors: NDArray[np.uint8]
-    observations: NDArray[np.int64]
+    points: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
+    colors: NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
+    observations: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 3), np.int64))
     keypoints_type: str = "imported"
     gnss: tuple[GnssRecord, ...] = ()
     metric: bool = False

@@ -245,7 +245,6 @@ def _model(
             f"{len(undistortable)} cameras have a distortion that folds the photo over itself; "
             f"their intrinsics count as unknown: {', '.join(undistortable[:3])}"
         )
-    points = np.array(part.points, np.float64).reshape(-1, 3)
     measurements = kept_measurements(Measurements.from_rows(part.rows), kept, len(names))
     return with_measurements(
         path,
@@ -253,9 +252,8 @@ def _model(
             sensors,
             tuple(images),
             photos,
-            points,
+            np.array(part.points, np.float64).reshape(-1, 3),
             np.array(part.colors, np.uint8).reshape(-1, 3),
-            np.empty((0, 3), np.int64),
             keypoints_type="sift",
             notes=tuple(notes),
         ),

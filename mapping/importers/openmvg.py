@@ -10,6 +10,7 @@ pixel here.
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,13 +64,7 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     found_photos = root if photos is None and _is_folder(root) else photos
     cameras, left_out = _read_intrinsics(top["intrinsics"])
     poses = _read_poses(top["extrinsics"])
-    views = _read_views(top["views"])
-    notes: list[str] = []
-    for kind, ids in left_out.items():
-        num = sum(view.intrinsic in ids for view in views.values())
-        notes.append(f"{num} photos of a camera of the kind {kind!r} were left out")
-    lost = set().union(*left_out.values())
-    views = {key: view for key, view in views.items() if view.intrinsic not in lost}
+    views, notes = _usable(_read_views(top["views"]), left_out)
     if not views:
         raise DatasetError(
             "import.empty",
@@ -106,6 +101,18 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
         keypoints_type=keypoints_type,
         notes=(*notes, *feature_notes),
     )
+
+
+def _usable(
+    views: dict[int, _View], left_out: Mapping[str, set[int]]
+) -> tuple[dict[int, _View], list[str]]:
+    """Leave out the views of cameras of unknown kinds; return the others, and notes."""
+    notes = []
+    for kind, ids in left_out.items():
+        num = sum(view.intrinsic in ids for view in views.values())
+        notes.append(f"{num} photos of a camera of the kind {kind!r} were left out")
+    lost = set().union(*left_out.values())
+    return {key: view for key, view in views.items() if view.intrinsic not in lost}, notes
 
 
 def _is_folder(path: Path) -> bool:

@@ -70,14 +70,7 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     folder = path.parent
     reconstruction, notes = _largest(read_json(path))
     cameras, unknown = _read_cameras(reconstruction["cameras"])
-    shots = [_read_shot(name, value) for name, value in reconstruction["shots"].fields()]
-    for shot in shots:
-        if shot.camera not in cameras and shot.camera not in unknown:
-            raise shot.at["camera"].error("no such camera", expected="a key of cameras")
-    for camera, kind in unknown.items():
-        num = sum(shot.camera == camera for shot in shots)
-        notes.append(f"{num} photos of a camera of the kind {kind!r} were left out")
-    shots = [shot for shot in shots if shot.camera in cameras]
+    shots = _read_shots(reconstruction, cameras, unknown, notes)
     if not shots:
         raise DatasetError(
             "import.empty",
@@ -90,12 +83,7 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     names, name_notes = photo_names([(s.name, s.at.where) for s in shots], base, base)
     notes += name_notes
 
-    sensors = {
-        f"camera_{rank}": Sensor.with_camera(
-            f"camera_{rank}", cameras[key], name=key if is_field(key) else ""
-        )
-        for rank, key in enumerate(cameras)
-    }
+    sensors = _sensors(cameras)
     sensor_of = dict(zip(cameras, sensors, strict=True))
     images = [
         ImportedImage(name, sensor_of[shot.camera], rank, shot.pose)
@@ -107,17 +95,12 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     )
     sizes = np.array([(cameras[s.camera].width, cameras[s.camera].height) for s in shots])
     features = read_features(folder / "features", names)
-    keypoints_type = "opensfm"
     if features is not None:
         images = _with_features(images, features, sizes)
         observations = _checked_rows(folder / "tracks.csv", measurements, features)
     else:
         notes.append("not all photos have features; the observations are the keypoints")
-        pixels = _pixels(measurements.xy, sizes[measurements.image])
-        found, observations = keypoints_of(
-            measurements, pixels, len(images), str(folder / "tracks.csv")
-        )
-        images = [replace(image, keypoints=k) for image, k in zip(images, found, strict=True)]
+        images, observations = _with_observed(images, measurements, sizes, folder / "tracks.csv")
 
     gnss, metric, gnss_notes = _fixes(folder, reconstruction, shots)
     if gnss:
@@ -129,11 +112,49 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
         points,
         colors,
         observations,
-        keypoints_type=keypoints_type,
+        keypoints_type="opensfm",
         gnss=gnss,
         metric=metric,
         notes=(*notes, *gnss_notes),
     )
+
+
+def _with_observed(
+    images: Sequence[ImportedImage],
+    measurements: Measurements,
+    sizes: NDArray[np.int64],
+    tracks: Path,
+) -> tuple[list[ImportedImage], NDArray[np.int64]]:
+    """Take the observations as keypoints; return the images and the observations (M, 3)."""
+    pixels = _pixels(measurements.xy, sizes[measurements.image])
+    found, observations = keypoints_of(measurements, pixels, len(images), str(tracks))
+    return [replace(i, keypoints=k) for i, k in zip(images, found, strict=True)], observations
+
+
+def _read_shots(
+    model: JsonValue,
+    cameras: Mapping[str, Camera],
+    unknown: Mapping[str, str],
+    notes: list[str],
+) -> list[_Shot]:
+    """Read the shots of usable cameras; add a note on those of cameras of ``unknown`` kinds."""
+    shots = [_read_shot(name, value) for name, value in model["shots"].fields()]
+    for shot in shots:
+        if shot.camera not in cameras and shot.camera not in unknown:
+            raise shot.at["camera"].error("no such camera", expected="a key of cameras")
+    for camera, kind in unknown.items():
+        num = sum(shot.camera == camera for shot in shots)
+        notes.append(f"{num} photos of a camera of the kind {kind!r} were left out")
+    return [shot for shot in shots if shot.camera in cameras]
+
+
+def _sensors(cameras: Mapping[str, Camera]) -> dict[str, Sensor]:
+    return {
+        f"camera_{rank}": Sensor.with_camera(
+            f"camera_{rank}", camera, name=key if is_field(key) else ""
+        )
+        for rank, (key, camera) in enumerate(cameras.items())
+    }
 
 
 def _largest(top: JsonValue) -> tuple[JsonValue, list[str]]:

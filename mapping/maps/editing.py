@@ -112,7 +112,7 @@ def selected(
     seen = np.bincount(old.observed[kept], minlength=len(old.points))
     stay = seen > 0
     row_of = np.cumsum(stay) - 1
-    kept_by_image = [int(kept[a:b].sum()) for a, b in pairwise(old.offsets.tolist())]
+    kept_by_image = np.array([int(kept[a:b].sum()) for a, b in pairwise(old.offsets.tolist())])
     rows = np.flatnonzero(kept_images)
 
     def descriptors() -> Iterator[NDArray[np.float32]]:
@@ -133,9 +133,7 @@ def selected(
             track_lengths=np.minimum(seen[stay], 65535).astype(np.uint16),
             errors_px=old.errors_px[stay],
             angles_deg=old.angles_deg[stay],
-            offsets=np.concatenate([[0], np.cumsum(np.array(kept_by_image)[rows])]).astype(
-                np.int64
-            ),
+            offsets=np.concatenate([[0], np.cumsum(kept_by_image[rows])]).astype(np.int64),
             observed=row_of[old.observed[kept]].astype(np.uint32),
             keypoints=old.keypoints[kept],
             colors=None if old.colors is None else old.colors[stay],

@@ -12,7 +12,7 @@ import numpy as np
 from mapping.build.photos import read_in_frame
 from visloc.archive import FingerprintRecord, Map
 from visloc.errors import Conflict
-from visloc.features import make_global_descriptor, make_local_features
+from visloc.features import LocalFeatureExtractor, make_global_descriptor, make_local_features
 from visloc.kapture import (
     Dataset,
     read_dataset,
@@ -38,19 +38,15 @@ def export_features(
     """Write a kapture of the same photos with keypoints, descriptors and global descriptors.
 
     ``output`` gets the dataset's text files, a link to its photos, and
-    ``reconstruction/<kind>/<name>/``. Keypoints are x, y, scale in our pixel convention (the
-    centre of the first pixel is 0.5, as COLMAP has it). Finished photos are not done again.
+    ``reconstruction/<kind>/<name>/``. Keypoints are x, y, scale in pixels; the centre of the
+    top-left pixel is (0.5, 0.5). Photos finished by an earlier run are kept.
 
     Args:
-        dataset_root: kapture folder.
         output: folder to make, or one that an earlier run with the same settings left.
         local_features: a name of ``visloc.features.LOCAL_FEATURES``.
-        weights_dir: folder with network weights.
-        inference: how networks are computed.
         max_keypoints: strongest keypoints kept per photo.
-        global_from: a map whose global descriptors are computed for the photos; its local
-            features must be the same and as many, since ``localvlad`` is made of them.
-        progress: told the stage, how much is done, and how much there is.
+        global_from: a map whose global descriptors are computed for the photos. Its local
+            features must be the same and as many, because ``localvlad`` is made of them.
 
     Returns:
         The names of photos that are listed but absent; they have no features.
@@ -64,18 +60,7 @@ def export_features(
     extractor = make_local_features(local_features, weights_dir, inference)
     descriptors = {}
     if global_from is not None:
-        built_with = global_from.manifest.local_features
-        if (built_with.fingerprint, built_with.max_keypoints) != (
-            FingerprintRecord.of(extractor.fingerprint),
-            max_keypoints,
-        ):
-            raise Conflict(
-                "map.features",
-                "the map was built with other local features",
-                field="--map",
-                expected=f"{local_features}, at most {max_keypoints} per photo",
-                got=f"{built_with.fingerprint.name}, at most {built_with.max_keypoints} per photo",
-            )
+        _refuse_other_features(global_from, extractor, max_keypoints)
         for features in global_from.manifest.global_features:
             name = features.fingerprint.name
             descriptor = make_global_descriptor(name, weights_dir, inference)
@@ -92,14 +77,13 @@ def export_features(
     _claim(reconstruction / f"{local_features}.json", settings)
     absent = []
     for done, record in enumerate(dataset.images, 1):
+        last_written = [
+            reconstruction / "descriptors" / local_features / f"{record.path}.desc",
+            *(reconstruction / "global_features" / n / f"{record.path}.gfeat" for n in descriptors),
+        ]
         if not dataset.has_file(record):
             absent.append(record.path)
-            progress("features", done, len(dataset.images))
-            continue
-        last_written = [reconstruction / "descriptors" / local_features / f"{record.path}.desc"]
-        for name in descriptors:
-            last_written.append(reconstruction / "global_features" / name / f"{record.path}.gfeat")
-        if not all(path.is_file() for path in last_written):
+        elif not all(path.is_file() for path in last_written):
             size = dataset.sensors[record.sensor_id].image_size
             assert size is not None  # every sensor of a photo has one
             photo = read_in_frame(dataset.path_of(record), size, record.sensor_id)
@@ -107,16 +91,26 @@ def export_features(
             for name, (descriptor, model) in descriptors.items():
                 vector = descriptor.describe(rgb, local, model)
                 write_global_features(output, name, record.path, vector, name=name)
-            write_local_features(
-                output,
-                local_features,
-                record.path,
-                np.column_stack([local.keypoints, local.scales]),
-                local.descriptors,
-                name=local_features,
-            )
+            keypoints = np.column_stack([local.keypoints, local.scales])
+            kind = local_features
+            write_local_features(output, kind, record.path, keypoints, local.descriptors, name=kind)
         progress("features", done, len(dataset.images))
     return absent
+
+
+def _refuse_other_features(
+    opened: Map, extractor: LocalFeatureExtractor, max_keypoints: int
+) -> None:
+    built_with = opened.manifest.local_features
+    fingerprint = FingerprintRecord.of(extractor.fingerprint)
+    if (built_with.fingerprint, built_with.max_keypoints) != (fingerprint, max_keypoints):
+        raise Conflict(
+            "map.features",
+            "the map was built with other local features",
+            field="--map",
+            expected=f"{fingerprint.name}, at most {max_keypoints} per photo",
+            got=f"{built_with.fingerprint.name}, at most {built_with.max_keypoints} per photo",
+        )
 
 
 def _claim(path: Path, settings: Mapping[str, object]) -> None:

@@ -106,16 +106,7 @@ def publish_set(
         NotFound: ``map.unknown``, ``map.version``.
     """
     checked_name(set_id, "set")
-    if not tiles:
-        raise InvalidInput("set.tiles", "no maps", field="MAP", expected="one or more")
-    if len(tiles) > MAX_TILES:
-        raise InvalidInput(
-            "set.tiles",
-            "too many maps",
-            field="MAP",
-            expected=f"at most {MAX_TILES}",
-            got=len(tiles),
-        )
+    _refuse_number(len(tiles))
     refuse_map_of_this_name(store, set_id, "ID")
     folders = [store.folder(ref) for ref, _ in tiles]
     _refuse_twice(folders)
@@ -137,6 +128,19 @@ def publish_set(
         notes=tuple(notes),
     )
     return _publish_changed(store, set_id, content)
+
+
+def _refuse_number(num_tiles: int) -> None:
+    if not num_tiles:
+        raise InvalidInput("set.tiles", "no maps", field="MAP", expected="one or more")
+    if num_tiles > MAX_TILES:
+        raise InvalidInput(
+            "set.tiles",
+            "too many maps",
+            field="MAP",
+            expected=f"at most {MAX_TILES}",
+            got=num_tiles,
+        )
 
 
 def refuse_map_of_this_name(store: MapStore, set_id: str, field: str) -> None:

@@ -48,19 +48,9 @@ def photo_names(
     places: dict[str, str] = {}
     shortened: list[str] = []
     for text, where in raw:
-        slashed = text.replace("\\", "/")
-        is_absolute = slashed.startswith("/") or _WINDOWS_DRIVE.match(slashed) is not None
-        plain = os.path.normpath(slashed) if slashed else ""
-        leads_out = is_absolute or plain.split("/", 1)[0] == ".."
-        full = PurePosixPath(plain if is_absolute else _absolute(base, plain))
-        is_inside = full.is_relative_to(folder) and full != PurePosixPath(folder)
-        if is_inside and (leads_out or (not _is_file(photos / plain) and _is_file(Path(full)))):
-            name = full.relative_to(folder).as_posix()
-        elif leads_out:
-            name = full.name
+        name, is_shortened = _relative(text, base, photos, folder)
+        if is_shortened:
             shortened.append(text)
-        else:
-            name = plain
         if name in ("", ".", "..") or not is_field(name) or has_control_characters(text):
             raise DatasetError(
                 "import.photo_name",
@@ -85,6 +75,19 @@ def photo_names(
         f"{len(shortened)} photo names lead out of the folder of photos; their last part was "
         f"taken: {', '.join(shortened[:3])}" + (", ..." if len(shortened) > 3 else ""),
     )
+
+
+def _relative(text: str, base: Path, photos: Path, folder: str) -> tuple[str, bool]:
+    """Return a name relative to ``photos`` (absolute: ``folder``), and whether it was shortened."""
+    slashed = text.replace("\\", "/")
+    is_absolute = slashed.startswith("/") or _WINDOWS_DRIVE.match(slashed) is not None
+    plain = os.path.normpath(slashed) if slashed else ""
+    leads_out = is_absolute or plain.split("/", 1)[0] == ".."
+    full = PurePosixPath(plain if is_absolute else _absolute(base, plain))
+    is_inside = full.is_relative_to(folder) and full != PurePosixPath(folder)
+    if is_inside and (leads_out or (not _is_file(photos / plain) and _is_file(Path(full)))):
+        return full.relative_to(folder).as_posix(), False
+    return (full.name, True) if leads_out else (plain, False)
 
 
 def photo_size(path: Path) -> tuple[int, int] | None:

@@ -30,7 +30,7 @@ from mapping.maps.updating.capture import (
     where_localized,
 )
 from mapping.maps.updating.joining import landmarks_in_same_voxel, part_of_map, scaled_rigs
-from mapping.maps.updating.localizing import Placed, localize_photos
+from mapping.maps.updating.localizing import LocalizeTask, Placed, localize_photos
 from mapping.maps.updating.placing import (
     Placement,
     beside,
@@ -278,17 +278,15 @@ class _Job:
         )
 
     def _localized(self, capture: Capture) -> list[Placed]:
-        return localize_photos(
-            self.opened,
+        task = LocalizeTask(
             self.work,
-            capture.photos,
+            self.opened.path,
+            self.opened.manifest.content_hash,
             self.features,
-            capture.described,
             self.settings.weights_dir,
             self.settings.inference,
-            self.workers,
-            self.progress,
         )
+        return localize_photos(task, capture.photos, capture.described, self.workers, self.progress)
 
     def _joined(
         self, capture: Capture, placement: Placement, notes: Sequence[str]

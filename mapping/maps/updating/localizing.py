@@ -17,7 +17,7 @@ from mapping.build.stages import Item, WorkFolder, key_of
 from mapping.cluster.executors import Executor
 from mapping.methods.matching import camera_values
 from visloc import __version__
-from visloc.archive import Map, open_map
+from visloc.archive import open_map
 from visloc.geometry import Pose
 from visloc.localization.localizer import Localizer
 from visloc.types import Inference, Localized, LocalizeOptions, QueryFeatures
@@ -51,38 +51,27 @@ class Placed:
 
 
 def localize_photos(
-    opened: Map,
-    work: WorkFolder,
+    task: LocalizeTask,
     photos: Sequence[MappingPhoto],
-    features: LocalFeaturesSource,
     described: Mapping[str, NDArray[np.float32]],
-    weights_dir: Path | None,
-    inference: Inference,
     workers: Executor,
     progress: Progress,
 ) -> list[Placed]:
     """Localize photos from the features that were found already, as queries are.
 
     Args:
-        opened: the map.
-        work: keeps finished photos.
+        task: the map, and where features are and answers are kept.
         photos: with their cameras.
-        features: their local features, of the map's kind.
         described: global descriptors (n, D) of these photos by name, as the map describes them.
-        weights_dir: folder with network weights.
-        inference: how networks are computed.
         workers: where they are localized.
         progress: told how far it is.
     """
-    task = _LocalizeTask(
-        work, opened.path, opened.manifest.content_hash, features, weights_dir, inference
-    )
     queries = [
         _Query(photo, {name: rows[row] for name, rows in described.items()})
         for row, photo in enumerate(photos)
     ]
     workers.run(task.localize, queries, partial(progress, "localized"))
-    return [_placed(work.read(task.key(query))) for query in queries]
+    return [_placed(task.work.read(task.key(query))) for query in queries]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,8 +81,14 @@ class _Query:
 
 
 @dataclass(frozen=True, slots=True)
-class _LocalizeTask:
-    """What workers do for a photo."""
+class LocalizeTask:
+    """What workers do for a photo.
+
+    Attributes:
+        work: keeps finished photos.
+        folder: of the map, with its ``content_hash``.
+        features: local features of the photos, of the map's kind.
+    """
 
     work: WorkFolder
     folder: Path

@@ -125,23 +125,41 @@ def place_capture(
     localized = (
         f"{len(both)} of {len(photos)} photos that were tried are localized in map {opened.ref}"
     )
+    if poses == "tie":
+        rigid = metric and opened.manifest.world.metric
+        similarity, agrees = _tied(localized, both, lift, metric=metric, rigid=rigid)
+        own = [similarity.move(photo.pose) for photo, _ in both]
+        return _placement(similarity, placed, both, own, agrees)
     if poses == "localize":
         both = [(replace(photo, cam_from_world=one.cam_from_map), one) for photo, one in both]
         agrees = [True] * len(both)
-        _refuse_other_depth(localized, both, agrees, lift)
-        own = [one.cam_from_map for _, one in both]
-        return _placement(Similarity.identity(), placed, both, own, agrees)
-    if poses == "given":
-        own = [photo.pose for photo, _ in both]
+    else:
         agrees = [_fits(photo, one) for photo, one in both]
         if sum(agrees) <= len(both) / 2:  # as a tie needs more than half
             raise _elsewhere(
                 f"{localized}, but only {sum(agrees)} where --poses given has them",
                 "poses in the map's frame, or --poses tie",
             )
-        _refuse_other_depth(localized, both, agrees, lift)
-        return _placement(Similarity.identity(), placed, both, own, agrees)
-    rigid = metric and opened.manifest.world.metric
+    if lift is not None:
+        _refuse_depth(localized, _all_lifted(both, agrees, lift), Similarity.identity())
+    return _placement(
+        Similarity.identity(), placed, both, [photo.pose for photo, _ in both], agrees
+    )
+
+
+def _tied(
+    localized: str,
+    both: Sequence[tuple[MappingPhoto, Placed]],
+    lift: Lift | None,
+    *,
+    metric: bool,
+    rigid: bool,
+) -> tuple[Similarity, list[bool]]:
+    """Tie the frame of the photos' own poses to the map's, with depth where there is any.
+
+    Returns:
+        The similarity, and whether each photo agrees with it.
+    """
     seen = [_seen(photo, one) for photo, one in both]
     found = tie(seen, rigid=rigid)
     if isinstance(found, NoTie):
@@ -152,24 +170,24 @@ def place_capture(
             else "poses that agree with where the photos are localized, or --poses localize",
         )
     similarity, agrees = found.there_from_here, found.tied.tolist()
-    if lift is not None:
-        lifted = _all_lifted(both, agrees, lift)
-        count = sum(len(one.points) for one in lifted)
-        if count < _MIN_LIFTED and not metric:
-            raise _elsewhere(
-                f"{localized}, but only {count} points that they see have depth, which do not tell "
-                "whether its unit is that of the poses",
-                f"{_MIN_LIFTED} points with depth, or --method sfm",
-            )
-        _refuse_depth(localized, lifted, similarity)
-        if count >= _MIN_LIFTED:
-            similarity = refined_by_depth(lifted, similarity, rigid=rigid)
-            tied = agreeing(seen, similarity)
-            if (few := too_few(tied)) is not None:
-                raise _elsewhere(f"{localized}, but with depth {few}", _GOOD_DEPTH)
-            agrees = tied.tolist()
-    own = [similarity.move(photo.pose) for photo, _ in both]
-    return _placement(similarity, placed, both, own, agrees)
+    if lift is None:
+        return similarity, agrees
+    lifted = _all_lifted(both, agrees, lift)
+    count = sum(len(one.points) for one in lifted)
+    if count < _MIN_LIFTED and not metric:
+        raise _elsewhere(
+            f"{localized}, but only {count} points that they see have depth, which do not tell "
+            "whether its unit is that of the poses",
+            f"{_MIN_LIFTED} points with depth, or --method sfm",
+        )
+    _refuse_depth(localized, lifted, similarity)
+    if count < _MIN_LIFTED:
+        return similarity, agrees
+    similarity = refined_by_depth(lifted, similarity, rigid=rigid)
+    tied = agreeing(seen, similarity)
+    if (few := too_few(tied)) is not None:
+        raise _elsewhere(f"{localized}, but with depth {few}", _GOOD_DEPTH)
+    return similarity, tied.tolist()
 
 
 def contradicted(
@@ -196,17 +214,6 @@ def beside(wrong: Collection[int], localized: Collection[int], count: int) -> li
         if not set(known[max(at - 1, 0) : at + 1]).isdisjoint(wrong):
             found.append(row)
     return found
-
-
-def _refuse_other_depth(
-    localized: str,
-    both: Sequence[tuple[MappingPhoto, Placed]],
-    agrees: Sequence[bool],
-    lift: Lift | None,
-) -> None:
-    """Refuse depth that contradicts the map, where poses are in its frame."""
-    if lift is not None:
-        _refuse_depth(localized, _all_lifted(both, agrees, lift), Similarity.identity())
 
 
 def _refuse_depth(localized: str, lifted: Sequence[Seen], map_from_dataset: Similarity) -> None:
