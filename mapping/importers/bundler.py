@@ -58,16 +58,15 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     Raises:
         DatasetError: ``import.missing`` (also for the list), ``import.unreadable``,
             ``import.truncated``, ``import.line`` (malformed, with file and line),
-            ``import.photo_name``, ``import.photo``, ``import.feature_moved``, or
-            ``import.no_photos`` if no photo of the model is there.
+            ``import.photo_name``, ``import.photo``, ``import.feature_moved``, ``import.no_photos``.
     """
     path = _bundle_file(path)
     list_file = _list_file(path, photos)
     photos = list_file.parent if photos is None else photos
     named = _read_list(list_file)
+    num_cameras = len(named)
     with TextLines(path) as lines:
-        num_points = _read_header(lines, len(named), list_file)
-        num_cameras = len(named)
+        num_points = _read_header(lines, num_cameras, list_file)
         cameras = [_read_camera(lines) for _ in range(num_cameras)]
         points: list[list[float]] = []
         colors: list[list[int]] = []

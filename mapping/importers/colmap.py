@@ -6,12 +6,8 @@ the name takes their place, and photos of one rig frame share the rank of the fi
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import PIL.Image  # noqa: F401  Pillow saves PNGs only when it was imported before pycolmap
@@ -19,6 +15,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mapping.importers.colmap_checks import check_model, has_model
+from mapping.importers.colmap_database import REFUSALS, Database, DatabaseImage, read_database
 from mapping.importers.largest import ModelSize, largest_model
 from mapping.importers.model import ImportedImage, ImportedModel
 from visloc.errors import DatasetError, InvalidInput, NotFound, VislocError
@@ -27,29 +24,8 @@ from visloc.kapture import GnssRecord, Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
 
 _GNSS = "gnss"
-# What pycolmap raises on files that it cannot read; seen by damaging them.
-_REFUSALS = (ValueError, RuntimeError, IndexError, KeyError, MemoryError, OSError)
-_SQLITE = b"SQLite format 3\0"
 # A model's keypoints are the database's if they are this near: text models have few digits.
 _SAME_PX = 0.05
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _DatabaseImage:
-    camera: int
-    frame: tuple[str, int]
-    keypoints: NDArray[np.float32] | None
-    descriptors: NDArray[Any] | None
-    fix: tuple[float, float, float] | None  # longitude, latitude in degrees, altitude in metres
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Database:
-    path: Path
-    cameras: Mapping[int, pycolmap.Camera]
-    images: Mapping[str, _DatabaseImage]
-    keypoints_type: str
-    notes: tuple[str, ...]
 
 
 def read(path: Path, photos: Path | None = None) -> ImportedModel:
@@ -80,7 +56,7 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
         )
     if photos is None:
         photos = next((p / "images" for p in places if (p / "images").is_dir()), None)
-    database = None if database_path is None else _read_database(database_path)
+    database = None if database_path is None else read_database(database_path)
     if model is not None and folder is not None:
         return _model(model, folder, database, photos, notes)
     assert database is not None
@@ -142,7 +118,7 @@ def _reconstruction(folder: Path) -> pycolmap.Reconstruction:
     check_model(folder)
     try:
         return pycolmap.Reconstruction(folder)
-    except _REFUSALS as error:
+    except REFUSALS as error:
         raise DatasetError(
             "import.colmap",
             "not a COLMAP model, or a damaged one",
@@ -155,7 +131,7 @@ def _reconstruction(folder: Path) -> pycolmap.Reconstruction:
 def _model(
     model: pycolmap.Reconstruction,
     folder: Path,
-    database: _Database | None,
+    database: Database | None,
     photos: Path | None,
     notes: list[str],
 ) -> ImportedModel:
@@ -163,7 +139,7 @@ def _model(
     rows = {image.image_id: row for row, image in enumerate(colmap_images)}
     keypoints = [_points2d(image) for image in colmap_images]
     names = [image.name for image in colmap_images]
-    known: Mapping[str, _DatabaseImage] = {}
+    known: Mapping[str, DatabaseImage] = {}
     keypoints_type = "colmap"
     if database is not None and _belongs(database, names, keypoints, notes):
         known, keypoints_type = database.images, database.keypoints_type
@@ -207,7 +183,7 @@ def _model(
     )
 
 
-def _model_of_database(database: _Database, photos: Path | None) -> ImportedModel:
+def _model_of_database(database: Database, photos: Path | None) -> ImportedModel:
     names = sorted(database.images)
     timestamps = _timestamps([(name, database.images[name].frame) for name in names])
     users = {database.images[name].camera: name for name in names}
@@ -251,7 +227,7 @@ def _model_of_database(database: _Database, photos: Path | None) -> ImportedMode
 
 
 def _belongs(
-    database: _Database,
+    database: Database,
     names: list[str],
     keypoints: list[NDArray[np.float32]],
     notes: list[str],
@@ -350,7 +326,7 @@ def _timestamps(frames: Iterable[tuple[str, object]]) -> dict[str, int]:
 
 
 def _gnss(
-    images: Mapping[str, _DatabaseImage], timestamps: Mapping[str, int]
+    images: Mapping[str, DatabaseImage], timestamps: Mapping[str, int]
 ) -> tuple[GnssRecord, ...]:
     fixes: dict[int, GnssRecord] = {}
     for name, timestamp in timestamps.items():
@@ -362,101 +338,3 @@ def _gnss(
 
 def _gnss_sensors(gnss: tuple[GnssRecord, ...]) -> dict[str, Sensor]:
     return {_GNSS: Sensor(_GNSS, "", "gnss", ("EPSG:4326",), None)} if gnss else {}
-
-
-def _read_database(path: Path) -> _Database:
-    try:
-        with path.open("rb") as file:
-            is_database = file.read(len(_SQLITE)) == _SQLITE
-    except OSError as error:
-        raise DatasetError(
-            "import.unreadable", "cannot be read", field=str(path), got=error.strerror
-        ) from error
-    if not is_database:
-        raise DatasetError(
-            "import.colmap", "not a COLMAP database", field=str(path), expected="an SQLite file"
-        )
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / "database.db"  # pycolmap migrates old databases in place
-        shutil.copyfile(path, copy)
-        journal = path.with_name(path.name + "-wal")  # where COLMAP's last writes may still be
-        if journal.is_file():
-            shutil.copyfile(journal, copy.with_name(copy.name + "-wal"))
-        try:
-            database = pycolmap.Database.open(copy)
-            try:
-                return _contents(path, database)
-            finally:
-                database.close()
-        except _REFUSALS as error:
-            raise DatasetError(
-                "import.colmap",
-                "not a COLMAP database, or a damaged one",
-                field=str(path),
-                got=str(error),
-            ) from error
-
-
-def _contents(path: Path, database: pycolmap.Database) -> _Database:
-    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
-    frames = {
-        data.id: frame.frame_id
-        for frame in database.read_all_frames()
-        for data in frame.data_ids
-        if data.sensor_id.type == pycolmap.SensorType.CAMERA
-    }
-    fixes, notes = _fixes(database)
-    images: dict[str, _DatabaseImage] = {}
-    kinds: set[str] = set()
-    for image in database.read_all_images():
-        if image.camera_id not in cameras:
-            raise DatasetError(
-                "import.colmap",
-                f"image {image.name!r} is of a camera that the database does not have",
-                field=str(path),
-                expected=f"one of {', '.join(map(str, sorted(cameras)[:10]))}",
-                got=image.camera_id,
-            )
-        key = image.image_id
-        keypoints = (
-            np.array(database.read_keypoints(key)) if database.exists_keypoints(key) else None
-        )
-        descriptors = None
-        if keypoints is not None and database.exists_descriptors(key):
-            found = database.read_descriptors(key)
-            kinds.add(found.type.name)
-            # Other types are floating point numbers in the same bytes, how is not documented.
-            if found.type == pycolmap.FeatureExtractorType.SIFT:
-                descriptors = np.array(found.data)
-        frame = ("frame", frames[key]) if key in frames else ("image", key)
-        images[image.name] = _DatabaseImage(
-            image.camera_id, frame, keypoints, descriptors, fixes.get(key)
-        )
-    others = sorted(kinds - {"SIFT"})
-    if others:
-        notes.append(f"descriptors of type {', '.join(others)} were left out: only SIFT is read")
-    kind = kinds.pop().lower() if len(kinds) == 1 else "colmap"
-    return _Database(path, cameras, images, kind, tuple(notes))
-
-
-def _fixes(
-    database: pycolmap.Database,
-) -> tuple[dict[int, tuple[float, float, float]], list[str]]:
-    """Return the priors of positions on Earth by image id."""
-    fixes: dict[int, tuple[float, float, float]] = {}
-    num_others = 0
-    for prior in database.read_all_pose_priors():
-        if prior.corr_data_id.sensor_id.type != pycolmap.SensorType.CAMERA:
-            continue
-        latitude, longitude, altitude = map(float, prior.position.ravel())
-        if (
-            prior.coordinate_system != pycolmap.PosePriorCoordinateSystem.WGS84
-            or not (abs(latitude) <= 90 and abs(longitude) <= 180)  # NaN is not
-            or not np.isfinite(altitude)
-        ):
-            num_others += 1
-        else:
-            fixes[prior.corr_data_id.id] = (longitude, latitude, altitude)
-    if not num_others:
-        return fixes, []
-    return fixes, [f"{num_others} pose priors that are not positions on Earth were left out"]

@@ -93,11 +93,6 @@ def read(
     the focal length, else of unknown intrinsics. Every file that is not used is in the model's
     ``left_out``, with the reason.
 
-    Args:
-        path: the folder.
-        photos: must be None: the folder is that of the photos.
-        progress: told how many photos were read, and of how many.
-
     Raises:
         InvalidInput: ``import.photos`` if ``photos`` is given; ``import.folder`` for a file.
         NotFound: ``import.missing`` if there is no such folder.

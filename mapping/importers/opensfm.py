@@ -70,19 +70,12 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     folder = path.parent
     reconstruction, notes = _largest(read_json(path))
     cameras, unknown = _read_cameras(reconstruction["cameras"])
-    shots = _read_shots(reconstruction, cameras, unknown, notes)
-    if not shots:
-        raise DatasetError(
-            "import.empty",
-            "no photo of the reconstruction can be used" + "".join(f"; {n}" for n in notes),
-            field=str(path),
-        )
+    shots = _read_shots(path, reconstruction, cameras, unknown, notes)
     default = folder / "images"
     found_photos = default if photos is None and default.is_dir() else photos
     base = default if found_photos is None else found_photos
     names, name_notes = photo_names([(s.name, s.at.where) for s in shots], base, base)
     notes += name_notes
-
     sensors = _sensors(cameras)
     sensor_of = dict(zip(cameras, sensors, strict=True))
     images = [
@@ -132,6 +125,7 @@ def _with_observed(
 
 
 def _read_shots(
+    path: Path,
     model: JsonValue,
     cameras: Mapping[str, Camera],
     unknown: Mapping[str, str],
@@ -145,7 +139,14 @@ def _read_shots(
     for camera, kind in unknown.items():
         num = sum(shot.camera == camera for shot in shots)
         notes.append(f"{num} photos of a camera of the kind {kind!r} were left out")
-    return [shot for shot in shots if shot.camera in cameras]
+    usable = [shot for shot in shots if shot.camera in cameras]
+    if not usable:
+        raise DatasetError(
+            "import.empty",
+            "no photo of the reconstruction can be used" + "".join(f"; {n}" for n in notes),
+            field=str(path),
+        )
+    return usable
 
 
 def _sensors(cameras: Mapping[str, Camera]) -> dict[str, Sensor]:

@@ -8,13 +8,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapping.build.photos import read_in_frame
 from visloc.archive import FingerprintRecord, Map
 from visloc.errors import Conflict
-from visloc.features import LocalFeatureExtractor, make_global_descriptor, make_local_features
+from visloc.features import (
+    GlobalDescriptor,
+    LocalFeatureExtractor,
+    make_global_descriptor,
+    make_local_features,
+)
 from visloc.kapture import (
     Dataset,
+    FileRecord,
     read_dataset,
     write_dataset,
     write_global_features,
@@ -52,9 +59,7 @@ def export_features(
         The names of photos that are listed but absent; they have no features.
 
     Raises:
-        Conflict: ``map.features`` when the map has other local features;
-            ``export.other_dataset`` or ``export.other_settings`` when ``output`` holds something
-            else.
+        Conflict: ``map.features``, ``export.other_dataset``, ``export.other_settings``.
     """
     dataset = read_dataset(dataset_root)
     extractor = make_local_features(local_features, weights_dir, inference)
@@ -77,25 +82,39 @@ def export_features(
     _claim(reconstruction / f"{local_features}.json", settings)
     absent = []
     for done, record in enumerate(dataset.images, 1):
-        last_written = [
-            reconstruction / "descriptors" / local_features / f"{record.path}.desc",
-            *(reconstruction / "global_features" / n / f"{record.path}.gfeat" for n in descriptors),
-        ]
         if not dataset.has_file(record):
             absent.append(record.path)
-        elif not all(path.is_file() for path in last_written):
-            size = dataset.sensors[record.sensor_id].image_size
-            assert size is not None  # every sensor of a photo has one
-            photo = read_in_frame(dataset.path_of(record), size, record.sensor_id)
-            local, rgb = extract_features(photo, extractor, max_keypoints=max_keypoints)
-            for name, (descriptor, model) in descriptors.items():
-                vector = descriptor.describe(rgb, local, model)
-                write_global_features(output, name, record.path, vector, name=name)
-            keypoints = np.column_stack([local.keypoints, local.scales])
-            kind = local_features
-            write_local_features(output, kind, record.path, keypoints, local.descriptors, name=kind)
+        else:
+            _export_photo(dataset, record, output, extractor, max_keypoints, descriptors)
         progress("features", done, len(dataset.images))
     return absent
+
+
+def _export_photo(
+    dataset: Dataset,
+    record: FileRecord,
+    output: Path,
+    extractor: LocalFeatureExtractor,
+    max_keypoints: int,
+    descriptors: Mapping[str, tuple[GlobalDescriptor, Mapping[str, NDArray[np.float32]]]],
+) -> None:
+    """Write the features of one photo, unless they are there."""
+    kind, root = extractor.fingerprint.name, output / "reconstruction"
+    last_written = [
+        root / "descriptors" / kind / f"{record.path}.desc",
+        *(root / "global_features" / name / f"{record.path}.gfeat" for name in descriptors),
+    ]
+    if all(path.is_file() for path in last_written):
+        return
+    size = dataset.sensors[record.sensor_id].image_size
+    assert size is not None  # every sensor of a photo has one
+    photo = read_in_frame(dataset.path_of(record), size, record.sensor_id)
+    local, rgb = extract_features(photo, extractor, max_keypoints=max_keypoints)
+    for name, (descriptor, model) in descriptors.items():
+        vector = descriptor.describe(rgb, local, model)
+        write_global_features(output, name, record.path, vector, name=name)
+    keypoints = np.column_stack([local.keypoints, local.scales])
+    write_local_features(output, kind, record.path, keypoints, local.descriptors, name=kind)
 
 
 def _refuse_other_features(
