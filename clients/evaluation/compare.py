@@ -15,9 +15,11 @@ from clients.evaluation.benchmark import Run, figures_of, known_poses
 from clients.evaluation.queries import Query
 from clients.evaluation.running import Outcome, localize_one
 from clients.evaluation.sending import Reader
-from clients.wire.types import LocalizeOptions, MapInfo, ServerInfo
+from clients.wire.answers import ServerInfo
+from clients.wire.types import LocalizeOptions
 from visloc.errors import Forbidden, InvalidInput, Unauthenticated, Unavailable, VislocError
 from visloc.evaluation import Threshold
+from visloc_api.words.maps import MapInfo
 
 
 class Axis(StrEnum):

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from clients.wire.answers import parse_pose, parse_result
+from clients.wire.answers import (
+    ImageResult,
+    InstantResult,
+    LocalizeResult,
+    parse_pose,
+    parse_result,
+)
 from clients.wire.requests import JsonObject
-from clients.wire.rigs import ImageResult, InstantResult, Rig
-from clients.wire.types import LocalizeResult, PoseEstimate
+from clients.wire.rigs import Rig
 from visloc.geometry import Pose
 from visloc.sequences.filling import PoseSource, TracedPose, center_covariance, fill_rig
+from visloc_api.words.answers import PoseEstimate
 
 
 def measured(pose: PoseEstimate, num_inliers: int) -> TracedPose:

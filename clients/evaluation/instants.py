@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from clients.evaluation.queries import Query, QuerySet
 from clients.wire.rigs import Rig, RigSensor
-from clients.wire.types import MapInfo
 from visloc.errors import DatasetError, NotFound
 from visloc.geometry import Pose
+from visloc_api.words.maps import MapInfo
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,8 +15,8 @@ from pydantic.json_schema import WithJsonSchema
 from pydantic_core import PydanticCustomError
 
 import visloc.types
-from service.api.message import IncomingMessage, converted
 from visloc.errors import InvalidInput
+from visloc_api.words.message import IncomingMessage, converted
 
 # What an array may be made of, little-endian where it has more than one byte.
 ARRAY_DTYPES: Mapping[str, np.dtype[Any]] = {

@@ -9,8 +9,8 @@ from typing import Annotated, ClassVar
 from pydantic import Field
 
 import visloc.types
-from service.api.message import IncomingMessage, converted
 from visloc.errors import InvalidInput
+from visloc_api.words.message import IncomingMessage, converted
 
 # More global descriptors than any map has, and longer names.
 _MAX_WEIGHTS = 16

@@ -9,9 +9,9 @@ import numpy as np
 from pydantic import FailFast, Field
 
 import visloc.priors
-from service.api.geometry import Numbers, Transform, covariance_to_core
-from service.api.message import IncomingMessage, converted
 from visloc.archive.set_schema import MAX_TILES
+from visloc_api.words.geometry import Numbers, Transform, covariance_to_core
+from visloc_api.words.message import IncomingMessage, converted
 
 _GRAVITY_STD_DEG = 1.0
 

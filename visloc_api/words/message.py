@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 from pydantic import (
@@ -16,7 +15,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from visloc.errors import InvalidInput, TooLarge, VislocError
+from visloc.errors import InvalidInput, TooLarge, VislocError, placed
 
 _NOT_AN_OBJECT, _UNKNOWN_FIELD, _REFUSED = "not_an_object", "unknown_field", "refused"
 _MAX_NAME = 100  # characters of a name from outside
@@ -30,7 +29,7 @@ MAX_INSTANT_VALUES = 100_000
 class IncomingMessage(BaseModel):
     """A message from outside: unknown fields are refused by name."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, defer_build=True)
     # Where this message sits in the request, for errors of what is read on its own.
     path: ClassVar[str] = ""
 
@@ -157,23 +156,6 @@ def counted(check: Callable[[Any, Any], None]) -> BeforeValidator:
 
 def _located(error: InvalidInput) -> PydanticCustomError:
     return PydanticCustomError(_REFUSED, "refused", {"error": error})
-
-
-@contextmanager
-def inside(place: str) -> Iterator[None]:
-    """Place what is found wrong: ``camera.width`` becomes ``PLACE.camera.width``."""
-    try:
-        yield
-    except VislocError as error:
-        raise placed(error, place) from None
-
-
-def placed(error: VislocError, place: str) -> VislocError:
-    """Return the error of a field within a larger message."""
-    field = ".".join(part for part in (place, error.field) if part)
-    return type(error)(
-        error.code, error.message, field=field or None, expected=error.expected, got=error.got
-    )
 
 
 def refusal_of(complaint: Mapping[str, Any], path: str = "") -> VislocError:

@@ -12,8 +12,8 @@ from pydantic.json_schema import WithJsonSchema
 
 import visloc.geometry
 import visloc.priors
-from service.api.message import IncomingMessage, converted
 from visloc.errors import InvalidInput
+from visloc_api.words.message import IncomingMessage, converted
 
 _CAMERA_TEXT = "PINHOLE,640,480,525,525,320,240"
 # How far the length of a quaternion may be from 1: it was written with three digits at least.
