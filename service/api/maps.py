@@ -71,7 +71,7 @@ def _map_facts(outline: MapOutline) -> dict[str, Any]:
         "local_features": manifest.local_features.fingerprint.name,
         "global_features": [record.fingerprint.name for record in manifest.global_features],
         "observations": manifest.counts.observations,
-        "rigs": [{"id": id_, "sensors": sensors} for id_, sensors in outline.rigs.items()],
+        "rigs": [{"id": id_, "sensors": tuple(sensors)} for id_, sensors in outline.rigs.items()],
         "fusion": manifest.retrieval.fusion.value,
         "fusion_weights": manifest.retrieval.weights or {},
     }

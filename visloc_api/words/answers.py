@@ -37,18 +37,30 @@ _COVARIANCE = (
     "6 x 6, row by row: rotation (rad), then translation, for R <- Exp(w) R and t <- t + dt of "
 )
 
-SentPose = Annotated[
-    Pose,
-    SentAs(
-        Transform,
-        Pose,
-        lambda raw: Pose.from_quaternion(
-            [float(each) for each in raw["rotation_wxyz"]],
-            [float(each) for each in raw["translation"]],
-        ),
-        Transform.from_core,
-    ),
-]
+class _ReceivedPose(Pose):
+    """A pose, and the numbers that were sent of it, which a rotation matrix rounds."""
+
+    __slots__ = ("sent",)
+    sent: Transform
+
+    @staticmethod
+    def read(raw: Any) -> _ReceivedPose:
+        """Read JSON."""
+        rotation_wxyz, translation = (
+            [float(number) for number in raw[name]] for name in ("rotation_wxyz", "translation")
+        )
+        pose = Pose.from_quaternion(rotation_wxyz, translation)
+        received = _ReceivedPose(pose.rotation, pose.translation)
+        sent = Transform(rotation_wxyz=rotation_wxyz, translation=translation)
+        object.__setattr__(received, "sent", sent)
+        return received
+
+
+def _transform(pose: Pose) -> Transform:
+    return pose.sent if isinstance(pose, _ReceivedPose) else Transform.from_core(pose)
+
+
+SentPose = Annotated[Pose, SentAs(Transform, Pose, _ReceivedPose.read, _transform)]
 
 
 class _PoseWithDigits(AnswerWithArrays):
@@ -63,7 +75,7 @@ class _PoseWithDigits(AnswerWithArrays):
             return values
         sent = values[cls.pose_field]
         if isinstance(sent, Pose):
-            sent = Transform.from_core(sent).model_dump()
+            sent = _transform(sent).model_dump()
         return {**values, **{name: sent[name] for name in ("rotation_wxyz", "translation")}}
 
 

@@ -16,26 +16,24 @@ from service.api import (
     RigCalibration,
     UseVersionRequest,
 )
-from service.http.openapi import batch_examples, examples
+from service.http.openapi import example
 from service.http.responses import NDJSON
 
 _REF = "#/components/schemas/{model}"
 
-_ANSWERS: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {
-    ("/localize", "post", "200"): {
-        "localized": examples.LOCALIZED,
-        "not_localized": examples.NOT_LOCALIZED,
-    },
-    ("/localize/rig", "post", "200"): {"localized": batch_examples.RIG},
-    ("/localize/sequence", "post", "200"): {"sequence": batch_examples.SEQUENCE},
-    ("/maps", "get", "200"): {"maps": {"maps": [examples.MAP]}},
-    ("/maps/{ref}", "get", "200"): {"map": examples.MAP, "set": examples.SET},
-    ("/maps/{ref}/images", "get", "200"): {"images": examples.MAP_IMAGES},
-    ("/maps/{map_id}/current", "post", "200"): {"map": examples.MAP},
-    ("/maps/{map_id}/versions/{version}", "get", "200"): {"map": examples.NEW_MAP},
-    ("/maps/{map_id}/versions/{version}", "put", "201"): {"map": examples.NEW_MAP},
-    ("/readyz", "get", "200"): {"ready": examples.READY},
-    ("/readyz", "get", "503"): {"loading": examples.LOADING},
+# Files of examples by the name that they are shown under.
+_ANSWERS: dict[tuple[str, str, str], dict[str, str]] = {
+    ("/localize", "post", "200"): {"localized": "localized", "not_localized": "not_localized"},
+    ("/localize/rig", "post", "200"): {"localized": "rig"},
+    ("/localize/sequence", "post", "200"): {"sequence": "sequence"},
+    ("/maps", "get", "200"): {"maps": "maps"},
+    ("/maps/{ref}", "get", "200"): {"map": "map", "set": "set"},
+    ("/maps/{ref}/images", "get", "200"): {"images": "map_images"},
+    ("/maps/{map_id}/current", "post", "200"): {"map": "map"},
+    ("/maps/{map_id}/versions/{version}", "get", "200"): {"map": "new_map"},
+    ("/maps/{map_id}/versions/{version}", "put", "201"): {"map": "new_map"},
+    ("/readyz", "get", "200"): {"ready": "ready"},
+    ("/readyz", "get", "503"): {"loading": "loading"},
 }
 
 _PROBLEMS = {
@@ -49,19 +47,6 @@ _PROBLEMS = {
     503: "the maps are being loaded; try again",
     504: "the time for the request is over",
     507: "there is no room on the server's disk",
-}
-
-_EXAMPLE_PROBLEM = {
-    "type": "about:blank",
-    "title": "Unprocessable Entity",
-    "status": 422,
-    "detail": "wrong number of parameters for PINHOLE",
-    "code": "camera.param_count",
-    "field": "camera.params",
-    "expected": "4: fx, fy, cx, cy",
-    "got": "3",
-    "kind": "InvalidInput",
-    "request_id": "3f1d5c0b8a7e4e1f9d2c6b5a49382716",
 }
 
 
@@ -98,12 +83,12 @@ class App(FastAPI):
                 ref_template=_REF,
             )
             schema["components"]["schemas"].update(ours["$defs"])
-            schema["components"]["schemas"]["Problem"]["example"] = _EXAMPLE_PROBLEM
+            schema["components"]["schemas"]["Problem"]["example"] = example("problem")
             # Not given to the routes: FastAPI would drop their nulls.
             for (path, method, status), shown in _ANSWERS.items():
                 response = schema["paths"][path][method]["responses"][status]
                 response["content"]["application/json"]["examples"] = {
-                    name: {"value": answer} for name, answer in shown.items()
+                    name: {"value": example(file)} for name, file in shown.items()
                 }
             lines = schema["paths"]["/localize/sequence"]["post"]["responses"]["200"]["content"]
             lines[NDJSON] = {
@@ -122,8 +107,8 @@ class App(FastAPI):
                     ],
                 },
                 "examples": {
-                    "answer": {"value": batch_examples.RIG},
-                    "error": {"value": {"problem": _EXAMPLE_PROBLEM}},
+                    "answer": {"value": example("rig")},
+                    "error": {"value": {"problem": example("problem")}},
                 },
             }
         return super().openapi()
