@@ -8,24 +8,16 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from visloc.errors import InvalidInput
+from visloc_api.words.options import KINDS
 
 OptionValue = int | float | str | Mapping[str, float]
 
-# On the wire whole numbers are uint32. Narrower ranges are the server's to tell.
+# On the wire whole numbers are uint32. Narrower ranges are the server's to tell, and so are the
+# words that an option may have: a newer server knows more.
 _MAX_WHOLE = 2**32 - 1
 _OPTION_KINDS: Mapping[str, type[OptionValue]] = {
-    "preset": str,
-    "top_k": int,
-    "max_error_px": float,
-    "min_inliers": int,
-    "min_inlier_ratio": float,
-    "read_as": str,
-    "extraction": str,
-    "fusion": str,
-    "fusion_weights": dict,
-    "matcher": str,
-    "solver": str,
-    "seed": int,
+    name: dict if kind is Mapping else str if issubclass(kind, str) else kind
+    for name, kind in KINDS.items()
 }
 _EXPECTED = {
     int: f"a whole number from 0 to {_MAX_WHOLE}",
@@ -39,24 +31,7 @@ _EXPECTED = {
 class LocalizeOptions:
     """What may be chosen per photo; None leaves the choice to the server.
 
-    Attributes:
-        preset: thresholds to start from: default, config1 or config2.
-        top_k: how many mapping photos to match against.
-        max_error_px: largest reprojection error of an inlier, pixels.
-        min_inliers: fewest inliers of an accepted pose.
-        min_inlier_ratio: smallest share of inliers among the correspondences, 0 to 1.
-        read_as: ``upright`` (the server's default) to turn the photo by its EXIF orientation
-            before features are found, or ``stored``; camera, keypoints and pose are those of the
-            stored pixels either way.
-        extraction: the effort that goes into finding the photo's features: fast, default or
-            accurate. Features that are sent are taken as they are.
-        fusion: how similarities under several global descriptors become one ranking, such as
-            gharm or mean; None for the map's way.
-        fusion_weights: positive weight by global descriptor; those without one are left out. None
-            for the map's weights.
-        matcher: how keypoints are matched: mutual, ratio or lightglue.
-        solver: what searches for the pose: pycolmap, poselib or registration.
-        seed: of RANSAC; equal seeds give equal answers.
+    ``visloc.types.LocalizeOptions`` says what each is, and ``localize image --help`` lists them.
 
     Raises:
         InvalidInput: ``options.NAME`` for a value that cannot be sent.

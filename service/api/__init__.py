@@ -15,9 +15,6 @@ from service.api.localize import (
     MAX_MAPS,
     LocalizeRequest,
 )
-from service.api.options import (
-    LocalizeOptions,
-)
 from service.api.rigs import (
     MAX_SENSORS,
     BatchLimits,
@@ -45,6 +42,9 @@ from visloc_api.words.maps import (
     ListMapsResponse,
     MapInfo,
     UseVersionRequest,
+)
+from visloc_api.words.options import (
+    LocalizeOptions,
 )
 from visloc_api.words.scenes import (
     MapImages,

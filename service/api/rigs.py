@@ -12,12 +12,12 @@ import service.values
 from service.api.features import GivenFeatures, GivenImage, query_to_core
 from service.api.geopose import GivenNear, GivenYpr
 from service.api.localize import GivenMaps, where_to_core
-from service.api.options import GivenOptions, LocalizeOptions
 from service.api.priors import GivenPriors, priors_to_core
 from service.values import ONLY_SENSOR, ImageJob, RigJob
 from visloc.errors import InvalidInput, TooLarge, inside
 from visloc_api.words.geometry import GivenCamera, Transform
 from visloc_api.words.message import IncomingMessage, converted, counted
+from visloc_api.words.options import GivenOptions, LocalizeOptions
 
 # More than any rig has: it bounds what a request can make the server look at.
 MAX_SENSORS = 256

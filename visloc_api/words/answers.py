@@ -37,6 +37,7 @@ _COVARIANCE = (
     "6 x 6, row by row: rotation (rad), then translation, for R <- Exp(w) R and t <- t + dt of "
 )
 
+
 class _ReceivedPose(Pose):
     """A pose, and the numbers that were sent of it, which a rotation matrix rounds."""
 
