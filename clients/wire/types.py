@@ -15,7 +15,7 @@ OptionValue = int | float | str | Mapping[str, float]
 # On the wire whole numbers are uint32. Narrower ranges are the server's to tell, and so are the
 # words that an option may have: a newer server knows more.
 _MAX_WHOLE = 2**32 - 1
-_OPTION_KINDS: Mapping[str, type[OptionValue]] = {
+_OPTION_KINDS: Mapping[str, type] = {
     name: dict if kind is Mapping else str if issubclass(kind, str) else kind
     for name, kind in KINDS.items()
 }

@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-from service.api.features import (
-    ARRAY_DTYPES,
-    MAX_GLOBAL_DESCRIPTORS,
-    Array,
-    Features,
-)
 from service.api.geopose import (
     Near,
 )
@@ -34,6 +28,12 @@ from visloc_api.words.answers import (
     InstantAnswer,
     LocalizeResponse,
     LocalizeSequenceResponse,
+)
+from visloc_api.words.features import (
+    ARRAY_DTYPES,
+    MAX_GLOBAL_DESCRIPTORS,
+    Array,
+    Features,
 )
 from visloc_api.words.geometry import (
     Camera,

@@ -9,15 +9,15 @@ from typing import Annotated, ClassVar
 from pydantic import FailFast, Field
 
 import service.values
-from service.api.features import GivenFeatures, GivenImage, query_to_core
 from service.api.geopose import GivenNear, GivenYpr
 from service.api.localize import GivenMaps, where_to_core
-from service.api.priors import GivenPriors, priors_to_core
 from service.values import ONLY_SENSOR, ImageJob, RigJob
 from visloc.errors import InvalidInput, TooLarge, inside
+from visloc_api.words.features import GivenFeatures, GivenImage, query_to_core
 from visloc_api.words.geometry import GivenCamera, Transform
 from visloc_api.words.message import IncomingMessage, converted, counted
 from visloc_api.words.options import GivenOptions, LocalizeOptions
+from visloc_api.words.priors import GivenPriors, priors_to_core
 
 # More than any rig has: it bounds what a request can make the server look at.
 MAX_SENSORS = 256

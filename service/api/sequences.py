@@ -11,7 +11,6 @@ import service.values
 import visloc.sequences.filling
 from service.api.geopose import GivenNear, GivenYpr
 from service.api.localize import GivenMaps, where_to_core
-from service.api.priors import GivenPriors, priors_to_core
 from service.api.rigs import (
     NO_PARTS,
     BatchLimits,
@@ -28,6 +27,7 @@ from visloc.sequences.filling import TimeUnit
 from visloc_api.words.geometry import Numbers, Transform, covariance_to_core
 from visloc_api.words.message import IncomingMessage, counted
 from visloc_api.words.options import GivenOptions, LocalizeOptions
+from visloc_api.words.priors import GivenPriors, priors_to_core
 
 
 class Odometry(IncomingMessage):
