@@ -19,12 +19,10 @@ from service.errors import internal_error, request_id, statuses_of
 from service.telemetry.logs import RequestRecord
 from service.telemetry.observer import Observer
 from visloc.errors import VislocError
+from visloc_api.words.wire import ERROR_DOMAIN, VERSION_KEY
 
 logger = logging.getLogger(__name__)
 
-ERROR_DOMAIN = "visloc"
-# The server's version goes with every answer, as a header.
-VERSION_KEY = "visloc-version"
 # Details travel in a header, of which gRPC clients accept 8 kB by default.
 _MAX_DETAIL = 1000
 

@@ -28,7 +28,7 @@ from service.api import (
     Readiness,
 )
 from service.api.answers import instant_answer, localize_response
-from service.api.deadlines import TIMEOUT_HEADER, each_within, timeout_of, within
+from service.api.deadlines import each_within, timeout_of, within
 from service.engine.engine import Engine
 from service.errors import internal_error, request_id, stopping_error
 from service.http.acceptor import OpenConnections
@@ -39,7 +39,6 @@ from service.http.openapi.app import App, problems
 from service.http.openapi.request_bodies import LOCALIZE_BODY, RIG_BODY, SEQUENCE_BODY
 from service.http.oscp.routes import add_geopose_routes
 from service.http.responses import (
-    NDJSON,
     Lines,
     json_response,
     problem_response,
@@ -56,6 +55,7 @@ from service.telemetry.observer import Observer, route_of
 from service.values import Instant, InstantLocalization, SequenceStart
 from visloc.errors import InvalidInput, NotFound, Overloaded, VislocError
 from visloc_api.words.message import refusal_of
+from visloc_api.words.wire import NDJSON, TIMEOUT_HEADER
 
 logger = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from service.api import (
     UseVersionRequest,
 )
 from service.http.openapi import example
-from service.http.responses import NDJSON
+from visloc_api.words.wire import NDJSON
 
 _REF = "#/components/schemas/{model}"
 
