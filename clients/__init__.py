@@ -3,10 +3,11 @@
 from clients.client import AsyncClient, Client
 from clients.wire.answers import ImageResult, InstantResult, LocalizeResult, ServerInfo
 from clients.wire.features import Features
-from clients.wire.rigs import Instant, Odometry, Rig, RigImage, RigSensor
-from clients.wire.types import LocalizeOptions, Near
+from clients.wire.rigs import Instant, Rig, RigImage
+from clients.wire.types import LocalizeOptions
 from visloc.priors import GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
-from visloc.sequences.filling import PoseSource
+from visloc.sequences.filling import Odometry, PoseSource
+from visloc.types import Near, RigSensor
 from visloc_api.words.answers import (
     CameraUsed,
     Debug,

@@ -52,9 +52,10 @@ from clients.wire.rig_requests import (
     sequence_start,
 )
 from clients.wire.rigs import Instant, Rig, RigImage
-from clients.wire.types import LocalizeOptions, Near
+from clients.wire.types import LocalizeOptions
 from visloc.geometry import Camera
 from visloc.priors import Priors
+from visloc.types import Near
 from visloc_api.words.maps import MapInfo
 
 DEFAULT_TIMEOUT_S = 60.0

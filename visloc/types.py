@@ -71,6 +71,61 @@ class QueryFeatures:
     global_descriptors: Mapping[str, NDArray[np.generic]] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class RigSensor:
+    """One camera of a rig.
+
+    Attributes:
+        cam_from_rig: where it sits.
+        camera: the intrinsics of its photos; None when unknown.
+    """
+
+    cam_from_rig: Pose
+    camera: Camera | None = None
+
+
+# Half of the Earth's girth reaches everywhere.
+MAX_RADIUS_M = 20_050_000.0
+
+
+@dataclass(frozen=True, slots=True)
+class Near:
+    """A circle on the Earth, WGS84; it stands for the anchored maps that reach into it.
+
+    Attributes:
+        latitude: degrees.
+        longitude: degrees.
+        radius: metres.
+
+    Raises:
+        InvalidInput: ``near.latitude``, ``near.longitude`` or ``near.radius``.
+    """
+
+    latitude: float
+    longitude: float
+    radius: float
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("latitude", -90.0, 90.0),
+            ("longitude", -180.0, 180.0),
+            ("radius", 0.0, MAX_RADIUS_M),
+        ):
+            value = getattr(self, name)
+            is_number = isinstance(value, int | float) and not isinstance(value, bool)
+            # NaN fails too.
+            if not is_number or not low <= value <= high or (name == "radius" and value == 0):
+                raise InvalidInput(
+                    f"near.{name}",
+                    "not a place on Earth",
+                    field=f"near.{name}",
+                    expected=f"more than 0, at most {high:.0f} metres"
+                    if name == "radius"
+                    else f"{low:g} to {high:g} degrees",
+                    got=value,
+                )
+
+
 class CameraSource(StrEnum):
     """Where the intrinsics of a query came from."""
 

@@ -35,7 +35,7 @@ from clients.wire.rig_requests import (
     rig_as_json,
     search_as_json,
 )
-from clients.wire.types import Near
+from visloc.types import Near
 from visloc_api.words.wire import NDJSON, REQUEST_ID_HEADER, TIMEOUT_HEADER
 
 

@@ -12,10 +12,11 @@ import httpx
 
 from clients.wire.features import Features, PhotoOrFeatures
 from clients.wire.priors import priors_from_json
-from clients.wire.types import LocalizeOptions, Near
+from clients.wire.types import LocalizeOptions
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera
 from visloc.priors import NO_PRIORS, Priors
+from visloc.types import Near
 from visloc_api.words.wire import REQUEST_ID
 
 JsonObject = dict[str, Any]

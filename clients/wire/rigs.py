@@ -5,26 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from clients.wire.features import PhotoOrFeatures
-from visloc.geometry import Camera, Pose
+from visloc.geometry import Camera
 from visloc.priors import Priors
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RigSensor:
-    """One camera of a rig.
-
-    Attributes:
-        cam_from_rig: where it sits.
-        camera: the intrinsics of its photos, where they are known.
-    """
-
-    cam_from_rig: Pose
-    camera: Camera | None = None
-
+from visloc.sequences.filling import Odometry
+from visloc.types import RigSensor
 
 # The id of a rig that the map knows, or the cameras of a rig by name.
 Rig = str | Mapping[str, RigSensor]
@@ -46,20 +31,6 @@ class RigImage:
     query: PhotoOrFeatures
     camera: Camera | None = None
     timestamp: int | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Odometry:
-    """Where a tracker (visual-inertial, wheels, ARKit, ARCore) has the rig, in its own world.
-
-    Attributes:
-        rig_from_odometry: the pose, in metres; only the motion between instants is used.
-        covariance: (6, 6) of the motion ``rig_from_previous_rig`` since the previous instant:
-            rotation (rad), then translation; None leaves an allowance for drift to the server.
-    """
-
-    rig_from_odometry: Pose
-    covariance: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

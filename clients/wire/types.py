@@ -101,36 +101,6 @@ class LocalizeOptions:
         }
 
 
-@dataclass(frozen=True, slots=True)
-class Near:
-    """A circle on the Earth, WGS84; it stands for the anchored maps that reach into it.
-
-    Attributes:
-        latitude: degrees.
-        longitude: degrees.
-        radius: metres.
-
-    Raises:
-        InvalidInput: ``near.NAME`` for what is not a finite number.
-    """
-
-    latitude: float
-    longitude: float
-    radius: float
-
-    def __post_init__(self) -> None:
-        for each in fields(self):
-            value = getattr(self, each.name)
-            if not _can_be_sent(value, float):
-                raise InvalidInput(
-                    f"near.{each.name}",
-                    "not usable",
-                    field=f"near.{each.name}",
-                    expected=_EXPECTED[float],
-                    got=value,
-                )
-
-
 def _check_option_name(name: str) -> None:
     if name not in _OPTION_KINDS:
         raise InvalidInput(

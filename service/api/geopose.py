@@ -6,16 +6,13 @@ from typing import Annotated
 
 from pydantic import Field
 
-from service.values import Near as NearCore
 from visloc.archive import Geodetic
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose
 from visloc.geopose import geopose_of
+from visloc.types import Near as NearCore
 from visloc_api.words.geopose import GeoAngles, GeoPose, GeoPoseYpr, GeoPosition, GeoQuaternion
 from visloc_api.words.message import IncomingMessage, converted
-
-# Half of the Earth's girth reaches everywhere.
-MAX_RADIUS_M = 20_050_000.0
 
 
 class Near(IncomingMessage):
@@ -31,23 +28,6 @@ class Near(IncomingMessage):
         Raises:
             InvalidInput: ``near.latitude``, ``near.longitude`` or ``near.radius``.
         """
-        for name, low, high in (
-            ("latitude", -90.0, 90.0),
-            ("longitude", -180.0, 180.0),
-            ("radius", 0.0, MAX_RADIUS_M),
-        ):
-            value = getattr(self, name)
-            # NaN fails too.
-            if not low <= value <= high or (name == "radius" and value == 0):
-                raise InvalidInput(
-                    f"near.{name}",
-                    "not a place on Earth",
-                    field=f"near.{name}",
-                    expected=f"more than 0, at most {high:.0f} metres"
-                    if name == "radius"
-                    else f"{low:g} to {high:g} degrees",
-                    got=value,
-                )
         return NearCore(self.latitude, self.longitude, self.radius)
 
 

@@ -16,8 +16,9 @@ from service.api import (
 from service.api import Instant as InstantWords
 from service.api import SequenceStart as SequenceStartWords
 from service.api.geopose import Near as NearWords
-from service.values import Instant, LocalizeJob, Near, RigJob, SequenceStart
+from service.values import Instant, LocalizeJob, RigJob, SequenceStart
 from visloc.errors import InvalidInput, TooLarge, inside
+from visloc.types import Near
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.words.message import MAX_INSTANT_VALUES, check_num_values
 

@@ -8,14 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from service.values import (
-    ONLY_SENSOR,
-    ImageJob,
-    InstantLocalization,
-    Query,
-    Rig,
-    RigSensor,
-)
+from service.values import ONLY_SENSOR, ImageJob, InstantLocalization, Query, Rig
 from service.workers.tiles import Read, summed
 from visloc.archive import Map
 from visloc.archive.places import anchor_rms
@@ -26,7 +19,7 @@ from visloc.localization.constraints import Constraints
 from visloc.localization.localizer import FeatureCache, Localizer
 from visloc.localization.solving import Look, Matches, SeenImage
 from visloc.priors import Priors
-from visloc.types import InstantAnswer, LocalizeOptions, QueryFeatures, Reason, Refusal
+from visloc.types import InstantAnswer, LocalizeOptions, QueryFeatures, Reason, Refusal, RigSensor
 
 _MAX_LISTED = 500  # characters of names from outside
 # Codes that begin so say what is wrong with all images: that is wrong with the request.

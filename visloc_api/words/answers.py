@@ -65,23 +65,28 @@ SentPose = Annotated[Pose, SentAs(Transform, Pose, _ReceivedPose.read, _transfor
 
 
 class _PoseWithDigits(AnswerWithArrays):
-    """A pose, and the numbers that were sent of it, which a rotation matrix rounds."""
+    """A pose whose numbers can be had with every digit as sent."""
 
     pose_field: ClassVar[str]
 
     @model_validator(mode="before")
     @classmethod
-    def _keep_digits(cls, values: Any) -> Any:
-        if not isinstance(values, Mapping) or "rotation_wxyz" in values:
-            return values
-        sent = values[cls.pose_field]
-        if isinstance(sent, Pose):
-            sent = _transform(sent).model_dump()
-        return {**values, **{name: sent[name] for name in ("rotation_wxyz", "translation")}}
+    def _from_digits(cls, values: Any) -> Any:
+        if isinstance(values, Mapping) and "rotation_wxyz" in values:
+            values = {**values, cls.pose_field: values}
+        return values
 
+    @property
+    def rotation_wxyz(self) -> tuple[float, float, float, float]:
+        """The rotation as a unit quaternion (w, x, y, z)."""
+        w, x, y, z = _transform(getattr(self, self.pose_field)).rotation_wxyz
+        return w, x, y, z
 
-_Quaternion = Annotated[tuple[float, float, float, float], Field(exclude=True)]
-_Translation = Annotated[tuple[float, float, float], Field(exclude=True)]
+    @property
+    def translation(self) -> tuple[float, float, float]:
+        """The translation, metres when the map is metric."""
+        x, y, z = _transform(getattr(self, self.pose_field)).translation
+        return x, y, z
 
 
 class PoseEstimate(_PoseWithDigits):
@@ -90,8 +95,6 @@ class PoseEstimate(_PoseWithDigits):
     pose_field = "cam_from_world"
 
     cam_from_world: SentPose
-    rotation_wxyz: _Quaternion
-    translation: _Translation
     position: Annotated[
         Numbers3,
         Field(description="camera centre in the world, metres when the map is metric"),
@@ -121,8 +124,6 @@ class RigPose(_PoseWithDigits):
     pose_field = "rig_from_world"
 
     rig_from_world: SentPose
-    rotation_wxyz: _Quaternion
-    translation: _Translation
     position: Annotated[
         Numbers3,
         Field(description="the rig's origin in the world, metres when the map is metric"),
