@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from visloc.errors import InvalidInput
-from visloc_api.words.features import ARRAY_DTYPES
+from visloc_api.words.wire import ARRAY_DTYPES
 
 
 @dataclass(frozen=True, slots=True, eq=False)

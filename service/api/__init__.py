@@ -30,7 +30,6 @@ from visloc_api.words.answers import (
     LocalizeSequenceResponse,
 )
 from visloc_api.words.features import (
-    ARRAY_DTYPES,
     MAX_GLOBAL_DESCRIPTORS,
     Array,
     Features,
@@ -57,7 +56,6 @@ from visloc_api.words.status import (
 )
 
 __all__ = [
-    "ARRAY_DTYPES",
     "MAX_GLOBAL_DESCRIPTORS",
     "MAX_MAPS",
     "MAX_SENSORS",

@@ -5,8 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import math
-from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +16,8 @@ from pydantic_core import PydanticCustomError
 import visloc.types
 from visloc.errors import InvalidInput
 from visloc_api.words.message import IncomingMessage, converted
+from visloc_api.words.wire import ARRAY_DTYPES
 
-# What an array may be made of, little-endian where it has more than one byte.
-ARRAY_DTYPES: Mapping[str, np.dtype[Any]] = {
-    "float32": np.dtype("<f4"),
-    "float16": np.dtype("<f2"),
-    "uint8": np.dtype("u1"),
-    "int8": np.dtype("i1"),
-}
 MAX_GLOBAL_DESCRIPTORS = 32
 # Two such sides stay within what NumPy can count.
 _MAX_ARRAY_SIDE = 2**31 - 1

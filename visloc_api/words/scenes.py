@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from visloc_api.words.answers import MapRef
+from visloc_api.words.base import Answer
 
 
-class MapCamera(BaseModel):
+class MapCamera(Answer):
     """Intrinsics of mapping photos."""
 
     model: Annotated[str, Field(description="COLMAP's name, such as PINHOLE")]
@@ -18,7 +19,7 @@ class MapCamera(BaseModel):
     params: Annotated[list[float], Field(description="in COLMAP's order")]
 
 
-class MapImage(BaseModel):
+class MapImage(Answer):
     """A mapping photo: where it was taken, and looking which way."""
 
     name: str
@@ -29,7 +30,7 @@ class MapImage(BaseModel):
     ]
 
 
-class MapImages(BaseModel):
+class MapImages(Answer):
     """Mapping photos of one version of a map, in the map's order."""
 
     map: MapRef

@@ -1,8 +1,12 @@
-"""Names on the wire besides the messages: headers, media types, patterns."""
+"""What both sides know of the wire besides its messages: headers, media types, dtypes."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
 
 # Names a request in the logs; over gRPC it is a field of the request.
 REQUEST_ID_HEADER = "X-Request-ID"
@@ -14,3 +18,10 @@ NDJSON = "application/x-ndjson"
 VERSION_KEY = "visloc-version"
 # Of the ErrorInfo that an error over gRPC carries.
 ERROR_DOMAIN = "visloc"
+# What an array may be made of, little-endian where it has more than one byte.
+ARRAY_DTYPES: Mapping[str, np.dtype[Any]] = {
+    "float32": np.dtype("<f4"),
+    "float16": np.dtype("<f2"),
+    "uint8": np.dtype("u1"),
+    "int8": np.dtype("i1"),
+}
