@@ -80,7 +80,7 @@ def parse_answer(server: str, parse: Callable[_P, _T], *given: _P.args, **named:
         first = error.errors(include_url=False)[0]
         place = ".".join(map(str, first["loc"]))
         raise not_understood(server, f"{place}: {first['msg']}") from None
-    except (KeyError, TypeError, ValueError, InvalidInput) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, InvalidInput) as error:
         raise not_understood(server, f"{type(error).__name__}: {error}") from error
 
 

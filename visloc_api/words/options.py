@@ -38,7 +38,11 @@ KINDS: Mapping[str, type] = {
 # The texts that an option may have, where they are listed.
 CHOICES: Mapping[str, tuple[str, ...]] = {
     "preset": tuple(visloc.types.PRESETS),
-    **{name: tuple(kind) for name, kind in KINDS.items() if issubclass(kind, StrEnum)},
+    **{
+        name: tuple(word.value for word in kind)
+        for name, kind in KINDS.items()
+        if issubclass(kind, StrEnum)
+    },
 }
 
 
