@@ -21,19 +21,21 @@ from visloc_api.words.wire import NDJSON
 
 _REF = "#/components/schemas/{model}"
 
-# Files of examples by the name that they are shown under.
-_ANSWERS: dict[tuple[str, str, str], dict[str, str]] = {
-    ("/localize", "post", "200"): {"localized": "localized", "not_localized": "not_localized"},
-    ("/localize/rig", "post", "200"): {"localized": "rig"},
-    ("/localize/sequence", "post", "200"): {"sequence": "sequence"},
-    ("/maps", "get", "200"): {"maps": "maps"},
-    ("/maps/{ref}", "get", "200"): {"map": "map", "set": "set"},
-    ("/maps/{ref}/images", "get", "200"): {"images": "map_images"},
-    ("/maps/{map_id}/current", "post", "200"): {"map": "map"},
-    ("/maps/{map_id}/versions/{version}", "get", "200"): {"map": "new_map"},
-    ("/maps/{map_id}/versions/{version}", "put", "201"): {"map": "new_map"},
-    ("/readyz", "get", "200"): {"ready": "ready"},
-    ("/readyz", "get", "503"): {"loading": "loading"},
+_ANSWERS: dict[tuple[str, str, str], dict[str, Any]] = {
+    ("/localize", "post", "200"): {
+        "localized": example("localized"),
+        "not_localized": example("not_localized"),
+    },
+    ("/localize/rig", "post", "200"): {"localized": example("rig")},
+    ("/localize/sequence", "post", "200"): {"sequence": example("sequence")},
+    ("/maps", "get", "200"): {"maps": {"maps": [example("map")]}},
+    ("/maps/{ref}", "get", "200"): {"map": example("map"), "set": example("set")},
+    ("/maps/{ref}/images", "get", "200"): {"images": example("map_images")},
+    ("/maps/{map_id}/current", "post", "200"): {"map": example("map")},
+    ("/maps/{map_id}/versions/{version}", "get", "200"): {"map": example("new_map")},
+    ("/maps/{map_id}/versions/{version}", "put", "201"): {"map": example("new_map")},
+    ("/readyz", "get", "200"): {"ready": example("ready")},
+    ("/readyz", "get", "503"): {"loading": example("loading")},
 }
 
 _PROBLEMS = {
@@ -88,7 +90,7 @@ class App(FastAPI):
             for (path, method, status), shown in _ANSWERS.items():
                 response = schema["paths"][path][method]["responses"][status]
                 response["content"]["application/json"]["examples"] = {
-                    name: {"value": example(file)} for name, file in shown.items()
+                    name: {"value": answer} for name, answer in shown.items()
                 }
             lines = schema["paths"]["/localize/sequence"]["post"]["responses"]["200"]["content"]
             lines[NDJSON] = {
