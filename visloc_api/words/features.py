@@ -1,4 +1,4 @@
-"""Photos, and what was found in them instead."""
+"""Photos in requests, and features that are sent instead of them."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ GivenFeatures = Annotated[Features | None, converted(_features_from_text)]
 def query_to_core(
     image: bytes | None, features: Features | None
 ) -> bytes | visloc.types.QueryFeatures:
-    """Return the one of both that there is.
+    """Return the photo or the features, whichever was sent.
 
     Raises:
         InvalidInput: ``request.query``, or a code of the features.

@@ -1,4 +1,4 @@
-"""What is known before any photo is looked at."""
+"""Priors: what is known of the device before any photo is looked at."""
 
 from __future__ import annotations
 
