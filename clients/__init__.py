@@ -1,40 +1,26 @@
 """Clients of the localization service: synchronous and asynchronous, over HTTP and gRPC."""
 
 from clients.client import AsyncClient, Client
+from clients.wire.answers import ImageResult, InstantResult, LocalizeResult, ServerInfo
 from clients.wire.features import Features
-from clients.wire.geopose import GeoPose, GeoPoseYpr
-from clients.wire.rigs import (
-    ImageResult,
-    Instant,
-    InstantResult,
-    Odometry,
-    Rig,
-    RigImage,
-    RigPose,
-    RigSensor,
-)
-from clients.wire.types import (
-    Anchor,
+from clients.wire.rigs import Instant, Rig, RigImage
+from clients.wire.types import LocalizeOptions
+from visloc.priors import GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
+from visloc.sequences.filling import Odometry
+from visloc.types import Near, PoseSource, RigSensor
+from visloc_api.words.answers import (
     CameraUsed,
     Debug,
-    GeoCircle,
-    Geodetic,
-    LocalizeOptions,
-    LocalizeResult,
-    MapInfo,
-    MapVersion,
-    Near,
     Orientation,
     PoseEstimate,
     Refusal,
     RetrievedImage,
-    RigInfo,
-    ServerInfo,
-    TileInfo,
-    VersionInfo,
+    RigPose,
 )
-from visloc.priors import GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
-from visloc.types import PoseSource
+from visloc_api.words.answers import MapRef as MapVersion
+from visloc_api.words.geopose import GeoPose, GeoPoseYpr
+from visloc_api.words.maps import Anchor, GeoCircle, Geodetic, MapInfo, RigInfo, VersionInfo
+from visloc_api.words.maps import Tile as TileInfo
 
 __all__ = [
     "Anchor",

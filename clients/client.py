@@ -26,6 +26,7 @@ from clients.transport.grpc import AsyncGrpcTransport, GrpcTransport
 from clients.transport.http import AsyncHttpTransport, HttpTransport
 from clients.transport.uploads import OnProgress, Upload, upload_request
 from clients.wire import answers
+from clients.wire.answers import InstantResult, LocalizeResult, ServerInfo
 from clients.wire.features import PhotoOrFeatures
 from clients.wire.requests import (
     CheckReady,
@@ -50,10 +51,12 @@ from clients.wire.rig_requests import (
     sent_instant,
     sequence_start,
 )
-from clients.wire.rigs import Instant, InstantResult, Rig, RigImage
-from clients.wire.types import LocalizeOptions, LocalizeResult, MapInfo, Near, ServerInfo
+from clients.wire.rigs import Instant, Rig, RigImage
+from clients.wire.types import LocalizeOptions
 from visloc.geometry import Camera
 from visloc.priors import Priors
+from visloc.types import Near
+from visloc_api.words.maps import MapInfo
 
 DEFAULT_TIMEOUT_S = 60.0
 

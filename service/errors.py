@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import uuid
 from collections.abc import Mapping
 from http import HTTPStatus
@@ -25,6 +24,7 @@ from visloc.errors import (
     VislocError,
     WeightsError,
 )
+from visloc_api.words.wire import REQUEST_ID
 
 STATUSES: Mapping[type[VislocError], tuple[HTTPStatus, grpc.StatusCode]] = {
     VislocError: (HTTPStatus.INTERNAL_SERVER_ERROR, grpc.StatusCode.INTERNAL),
@@ -51,8 +51,6 @@ _STATUSES_OF_CODES = {
 
 RETRY_AFTER_S = 1
 
-_REQUEST_ID = re.compile(r"[\x21-\x7e]{1,128}")
-
 
 def statuses_of(error: VislocError) -> tuple[HTTPStatus, grpc.StatusCode]:
     """Return the HTTP and the gRPC status of an error, by the nearest class in the table."""
@@ -75,4 +73,4 @@ def stopping_error() -> Unavailable:
 
 def request_id(given: str | None) -> str:
     """Return the caller's id when it is short and visible ASCII, else a new one."""
-    return given if given and _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
+    return given if given and REQUEST_ID.fullmatch(given) else uuid.uuid4().hex

@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from service.api.message import MAX_INSTANT_VALUES
+from visloc_api.words.message import MAX_INSTANT_VALUES
 
 PREFIX = "VISLOC_"
 CONFIG_VARIABLE = "VISLOC_CONFIG"

@@ -10,30 +10,22 @@ from numpy.typing import NDArray
 
 from visloc.archive import Geodetic
 from visloc.errors import InvalidInput
-from visloc.geometry import Camera, Pose
+from visloc.geometry import Camera
 from visloc.priors import NO_PRIORS, Priors
 from visloc.sequences.filling import Odometry, TimeUnit
-from visloc.types import Answer, InstantAnswer, LocalizeOptions, QueryFeatures
+from visloc.types import (
+    Answer,
+    InstantAnswer,
+    LocalizeOptions,
+    Near,
+    QueryFeatures,
+    RigSensor,
+)
 
 # The longest time between two measured instants across which gaps are filled, by default.
 DEFAULT_MAX_GAP_S = 1.0
 # The sensor of the only image of an instant, when no rig is named.
 ONLY_SENSOR = "camera"
-
-
-@dataclass(frozen=True, slots=True)
-class Near:
-    """A circle on the Earth, WGS84.
-
-    Attributes:
-        latitude: degrees.
-        longitude: degrees.
-        radius: metres.
-    """
-
-    latitude: float
-    longitude: float
-    radius: float
 
 
 # Where to search: one or several maps, each ``id``, for its current version, or ``id@version``; or
@@ -79,19 +71,6 @@ class LocalizeJob:
     priors: Priors = NO_PRIORS
     ypr: bool = False
     debug: bool = False
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RigSensor:
-    """One camera of a rig.
-
-    Attributes:
-        cam_from_rig: where it sits.
-        camera: the intrinsics of its photos; None when unknown.
-    """
-
-    cam_from_rig: Pose
-    camera: Camera | None
 
 
 # The id of a rig that the map knows, or a rig as it is.

@@ -35,12 +35,10 @@ from service.api import (
     LocalizeSequenceRequest,
     MapImages,
     MapInfo,
-    PoseEstimate,
     Problem,
 )
 from service.errors import STATUSES
 from service.settings import CONFIG_VARIABLE, PREFIX, ServiceSettings, read_settings
-from service.values import Near
 from tests import docs_check
 from tests.docs_check import commands_of
 from visloc.archive import MapStore
@@ -54,10 +52,12 @@ from visloc.types import (
     Fusion,
     LocalizeOptions,
     Matcher,
+    Near,
     ReadAs,
     Reason,
     Solver,
 )
+from visloc_api.words.answers import PoseEstimate
 
 ROOT = Path(__file__).resolve().parents[1]
 README, API = ROOT / "README.md", ROOT / "docs" / "api.md"
@@ -416,6 +416,7 @@ CODE = re.compile(
 ANSWERING = (
     *("service/**/*.py", "visloc/*.py", "visloc/archive/*.py", "visloc/features/**/*.py"),
     *(f"visloc/{room}/*.py" for room in ("drawing", "localization", "sequences", "sets")),
+    "visloc_api/words/*.py",
     *(
         "clients/wire/requests.py",
         "clients/transport/connection.py",

@@ -20,6 +20,9 @@ A photo that cannot be localized is not an error: it is an answer (``visloc.type
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class VislocError(Exception):
     """Base of every error that a caller may want to catch.
@@ -113,3 +116,20 @@ class StorageFull(Unavailable):
 def _short(value: object, limit: int = 200) -> str:
     text = value if isinstance(value, str) else repr(value)
     return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+@contextmanager
+def inside(place: str) -> Iterator[None]:
+    """Prefix the fields of errors in the block: ``camera.width`` becomes ``PLACE.camera.width``."""
+    try:
+        yield
+    except VislocError as error:
+        raise placed(error, place) from None
+
+
+def placed(error: VislocError, place: str) -> VislocError:
+    """Return the error of a field within a larger message."""
+    field = ".".join(part for part in (place, error.field) if part)
+    return type(error)(
+        error.code, error.message, field=field or None, expected=error.expected, got=error.got
+    )

@@ -27,6 +27,8 @@ REACH = 2.0
 HEIGHT_REACH = 0.25
 # An area of so many standard deviations around a pose prior is searched.
 POSE_PRIOR_STDS = 3.0
+# Of a set of maps. Its manifest lists them; with so many it has about 12 MB.
+MAX_TILES = 10_000
 # Further than any place, wider than any doubt; squares and products of it are still numbers.
 _MOST = 1e15
 # Of a covariance without units. That of a pose 5000 km from the origin is within a hair of singular

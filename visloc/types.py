@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +78,61 @@ class PoseSource(StrEnum):
     MOTION = "motion"  # images of other instants, through the relative motion that was given
     INTERPOLATED = "interpolated"  # the instants before and after
     NEAREST = "nearest"  # the nearest instant
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigSensor:
+    """One camera of a rig.
+
+    Attributes:
+        cam_from_rig: where it sits.
+        camera: the intrinsics of its photos; None when unknown.
+    """
+
+    cam_from_rig: Pose
+    camera: Camera | None = None
+
+
+# Half of the Earth's girth reaches everywhere.
+MAX_RADIUS_M = 20_050_000.0
+
+
+@dataclass(frozen=True, slots=True)
+class Near:
+    """A circle on the Earth, WGS84; it stands for the anchored maps that reach into it.
+
+    Attributes:
+        latitude: degrees.
+        longitude: degrees.
+        radius: metres.
+
+    Raises:
+        InvalidInput: ``near.latitude``, ``near.longitude`` or ``near.radius``.
+    """
+
+    latitude: float
+    longitude: float
+    radius: float
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("latitude", -90.0, 90.0),
+            ("longitude", -180.0, 180.0),
+            ("radius", 0.0, MAX_RADIUS_M),
+        ):
+            value = getattr(self, name)
+            is_number = isinstance(value, int | float) and not isinstance(value, bool)
+            # NaN fails too.
+            if not is_number or not low <= value <= high or (name == "radius" and value == 0):
+                raise InvalidInput(
+                    f"near.{name}",
+                    "not a place on Earth",
+                    field=f"near.{name}",
+                    expected=f"more than 0, at most {high:.0f} metres"
+                    if name == "radius"
+                    else f"{low:g} to {high:g} degrees",
+                    got=value,
+                )
 
 
 class CameraSource(StrEnum):
@@ -229,41 +284,89 @@ PRESETS: Mapping[str, RegistrationPreset] = {
 }
 
 
+_PRESETS_VALUE, _MAPS_VALUE = "the preset's", "the map's"
+
+
+def _option(
+    default: Any,
+    description: str,
+    low: float | None = None,
+    high: float | None = None,
+    *,
+    unset: str | None = None,
+    details: str = "",
+    **more: Any,
+) -> Any:
+    """An option of ``LocalizeOptions``; the API's words and the clients are made from these.
+
+    Args:
+        default: its value when the caller leaves it out.
+        description: what it is, without its values.
+        low: least value, when it is a number.
+        high: greatest value.
+        unset: whose value is taken when the default is None.
+        details: sentences to add.
+        more: for ``dataclasses.field``.
+    """
+    metadata = {
+        "description": description,
+        "range": None if low is None else (low, high),
+        "default": unset or default,
+        "details": details,
+    }
+    return field(default=default, metadata=metadata, **more)
+
+
 @dataclass(frozen=True, slots=True)
 class LocalizeOptions:
-    """What a caller may choose per query; None takes the preset's value.
+    """What a caller may choose per query; None takes the preset's or the map's value.
 
-    Attributes:
-        preset: a key of ``PRESETS``.
-        top_k: how many mapping photos to match against.
-        max_error_px: largest reprojection error of an inlier, pixels. The default preset's is
-            for photos of 640 px and more on the longer side, and shrinks with smaller ones.
-        min_inliers: fewest inliers of an accepted pose.
-        min_inlier_ratio: smallest share of inliers among the correspondences, 0 to 1.
-        read_as: the orientation in which features are found. Camera, pose and 2D points refer
-            to the pixels as stored either way.
-        extraction: the effort that goes into finding the photo's local features.
-        fusion: how similarities under several global descriptors become one ranking; None for the
-            map's way.
-        fusion_weights: positive weight by global descriptor; those without one are left out. None
-            for the map's weights.
-        matcher: how keypoints are matched.
-        solver: what searches for the pose.
-        seed: of RANSAC; equal seeds give equal answers.
+    The default largest error is for photos of 640 px and more on the longer side, and shrinks
+    with smaller ones. Equal seeds give equal answers.
     """
 
-    preset: str = DEFAULT_PRESET
-    top_k: int = 20
-    max_error_px: float | None = None
-    min_inliers: int | None = None
-    min_inlier_ratio: float | None = None
-    read_as: ReadAs = ReadAs.UPRIGHT
-    extraction: Extraction = Extraction.DEFAULT
-    fusion: Fusion | None = None
-    fusion_weights: Mapping[str, float] | None = field(default=None, hash=False)  # a dict
-    matcher: Matcher = Matcher.MUTUAL
-    solver: Solver = Solver.PYCOLMAP
-    seed: int = 0
+    preset: str = _option(DEFAULT_PRESET, "the thresholds to start from")
+    top_k: int = _option(20, "mapping photos to match against", 1, 1000)
+    max_error_px: float | None = _option(
+        None, "largest reprojection error of an inlier, pixels", 0.1, 1000.0, unset=_PRESETS_VALUE
+    )
+    min_inliers: int | None = _option(
+        None, "fewest inliers of an accepted pose", 4, 1_000_000, unset=_PRESETS_VALUE
+    )
+    min_inlier_ratio: float | None = _option(
+        None,
+        "smallest share of inliers among the correspondences",
+        0.0,
+        1.0,
+        unset=_PRESETS_VALUE,
+    )
+    read_as: ReadAs = _option(
+        ReadAs.UPRIGHT,
+        "orientation in which features are found",
+        details="upright turns the photo by its EXIF orientation first. Camera, keypoints and "
+        "pose are those of the stored pixels either way. It has no meaning for features that are "
+        "sent.",
+    )
+    extraction: Extraction = _option(
+        Extraction.DEFAULT,
+        "effort that goes into finding the photo's features",
+        details="Features that are sent are taken as they are.",
+    )
+    fusion: Fusion | None = _option(
+        None,
+        "how similarities under several global descriptors become one ranking",
+        unset=_MAPS_VALUE,
+    )
+    fusion_weights: Mapping[str, float] | None = _option(
+        None,
+        "positive weight by global descriptor",
+        unset=_MAPS_VALUE,
+        details="Descriptors without a weight are left out.",
+        hash=False,  # a dict
+    )
+    matcher: Matcher = _option(Matcher.MUTUAL, "how keypoints are matched")
+    solver: Solver = _option(Solver.PYCOLMAP, "what searches for the pose")
+    seed: int = _option(0, "of RANSAC", 0, 2**31 - 1)
 
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:
@@ -274,19 +377,16 @@ class LocalizeOptions:
                 expected=f"one of {', '.join(PRESETS)}",
                 got=self.preset,
             )
-        for name, low, high in (
-            ("top_k", 1, 1000),
-            ("max_error_px", 0.1, 1000.0),
-            ("min_inliers", 4, 1_000_000),
-            ("min_inlier_ratio", 0.0, 1.0),
-            ("seed", 0, 2**31 - 1),
-        ):
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:  # NaN fails too
+        for option in fields(self):
+            value = getattr(self, option.name)
+            if value is None or option.metadata["range"] is None:
+                continue
+            low, high = option.metadata["range"]
+            if not low <= value <= high:  # NaN fails too
                 raise InvalidInput(
-                    f"options.{name}",
+                    f"options.{option.name}",
                     "out of range",
-                    field=f"options.{name}",
+                    field=f"options.{option.name}",
                     expected=f"{low} to {high}",
                     got=value,
                 )

@@ -11,8 +11,10 @@ from rich.table import Table
 from rich.text import Text
 
 from clients.evaluation.running import Outcome
-from clients.wire.geopose import GeoPose
-from clients.wire.types import LocalizeResult, MapInfo, PoseEstimate
+from clients.wire.answers import LocalizeResult
+from visloc_api.words.answers import PoseEstimate
+from visloc_api.words.geopose import GeoPose
+from visloc_api.words.maps import MapInfo
 
 _NUM_RETRIEVED_SHOWN = 3
 _NUM_FAILED_SHOWN = 5

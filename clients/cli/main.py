@@ -54,10 +54,10 @@ from clients.evaluation.results import check_can_be_written, write_poses, write_
 from clients.evaluation.running import InstantOutcome, Outcome
 from clients.evaluation.sending import choose_reader
 from clients.wire.priors import priors_from_text
-from clients.wire.types import PoseEstimate
 from visloc.errors import VislocError
 from visloc.geometry import Camera, PixelOrigin
 from visloc.sequences.filling import TimeUnit
+from visloc_api.words.answers import PoseEstimate
 
 EXIT_ERROR = 1  # 2 is wrong usage, by convention
 EXIT_NOT_LOCALIZED = 3

@@ -29,8 +29,8 @@ from clients.cli.maps_display import print_map, print_maps
 from clients.cli.progress import EXIT_STOPPED
 from clients.client import DEFAULT_TIMEOUT_S, Client
 from clients.wire.requests import checked_version
-from clients.wire.types import Near
 from visloc.errors import InvalidInput, VislocError
+from visloc.types import Near
 
 maps_app = typer.Typer(
     help="See, publish, switch and remove the maps of a localization service.",

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rich.console import Console
 
 from clients.cli.display import print_line, unit_of
-from clients.wire.types import Anchor, MapInfo
+from visloc_api.words.maps import Anchor, MapInfo
 
 _NUM_TILES_SHOWN = 20
 

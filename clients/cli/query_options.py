@@ -12,6 +12,12 @@ from clients.evaluation.benchmark import parse_threshold
 from clients.wire.types import LocalizeOptions
 from visloc.evaluation import DEFAULT_THRESHOLDS, Threshold
 from visloc.geometry import PixelOrigin
+from visloc_api.words.options import CHOICES, KINDS
+
+
+def _named(name: str) -> str:
+    return f"{name} ({', '.join(CHOICES[name])})" if name in CHOICES else name
+
 
 MapRef = Annotated[str, typer.Option("--map", metavar="ID", help="id, or id@version.")]
 Options = Annotated[
@@ -19,10 +25,8 @@ Options = Annotated[
     typer.Option(
         "--option",
         metavar="NAME=VALUE",
-        help="preset, top_k, max_error_px, min_inliers, min_inlier_ratio, read_as, extraction "
-        "(fast, default, accurate), fusion (such as mean), fusion_weights (such as "
-        "densevlad=1,localvlad=2), matcher (mutual, ratio, lightglue), solver (pycolmap, poselib, "
-        "registration) or seed; can be repeated.",
+        help=f"{'; '.join(map(_named, KINDS))}. Weights are such as densevlad=1,localvlad=2. "
+        "Can be repeated.",
     ),
 ]
 Seed = Annotated[int | None, typer.Option("--seed", min=0, help="The same as --option seed=...")]

@@ -14,7 +14,7 @@ from clients.evaluation.filling import estimate_of, measured
 from clients.evaluation.modes import Mode
 from clients.evaluation.queries import Query
 from clients.evaluation.running import InstantOutcome, Outcome
-from clients.wire.types import MapInfo, ServerInfo
+from clients.wire.answers import ServerInfo
 from visloc.errors import InvalidInput
 from visloc.evaluation import (
     Threshold,
@@ -25,6 +25,7 @@ from visloc.evaluation import (
 )
 from visloc.sequences.filling import TracedPose
 from visloc.types import PoseSource
+from visloc_api.words.maps import MapInfo
 
 _ERROR_PERCENTILES = {"p50": 50, "p75": 75, "p90": 90, "max": 100}
 

@@ -15,9 +15,12 @@ from clients.evaluation.benchmark import Run, figures_of, known_poses
 from clients.evaluation.queries import Query
 from clients.evaluation.running import Outcome, localize_one
 from clients.evaluation.sending import Reader
-from clients.wire.types import LocalizeOptions, MapInfo, ServerInfo
+from clients.wire.answers import ServerInfo
+from clients.wire.types import LocalizeOptions
 from visloc.errors import Forbidden, InvalidInput, Unauthenticated, Unavailable, VislocError
 from visloc.evaluation import Threshold
+from visloc_api.words.maps import MapInfo
+from visloc_api.words.options import CHOICES
 
 
 class Axis(StrEnum):
@@ -41,14 +44,8 @@ class Axis(StrEnum):
 
 # The values when none are named: all words that the server knows.
 DEFAULT_VALUES: Mapping[Axis, tuple[str, ...]] = {
-    Axis.FUSION: (
-        *("gharm", "mean", "power", "min", "max", "mean_and_power", "min_and_max", "mean_and_min"),
-        *("harmonic", "round_robin"),
-    ),
-    Axis.MATCHER: ("mutual", "ratio", "lightglue"),
-    Axis.SOLVER: ("pycolmap", "poselib", "registration"),
+    **{axis: CHOICES[axis.value] for axis in Axis if axis.value in CHOICES},
     Axis.TOP_K: ("1", "5", "10", "20", "50"),
-    Axis.EXTRACTION: ("fast", "default", "accurate"),
 }
 ALL_TOGETHER = "all"
 

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from clients.wire.answers import parse_pose, parse_result
+from clients.wire.answers import (
+    ImageResult,
+    InstantResult,
+    LocalizeResult,
+    parse_pose,
+    parse_result,
+)
 from clients.wire.requests import JsonObject
-from clients.wire.rigs import ImageResult, InstantResult, Rig
-from clients.wire.types import LocalizeResult, PoseEstimate
+from clients.wire.rigs import Rig
 from visloc.geometry import Pose, center_covariance
 from visloc.sequences.filling import TracedPose, fill_rig
 from visloc.types import PoseSource
+from visloc_api.words.answers import PoseEstimate
 
 
 def measured(pose: PoseEstimate, num_inliers: int) -> TracedPose:

@@ -6,10 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from clients.evaluation.queries import Query, QuerySet
-from clients.wire.rigs import Rig, RigSensor
-from clients.wire.types import MapInfo
+from clients.wire.rigs import Rig
 from visloc.errors import DatasetError, NotFound
 from visloc.geometry import Pose
+from visloc.types import RigSensor
+from visloc_api.words.maps import MapInfo
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,9 +11,9 @@ from enum import StrEnum
 
 from clients.evaluation.instants import QueryInstant, instants_of_dataset, instants_of_map_rig
 from clients.evaluation.queries import Query, QuerySet
-from clients.wire.types import MapInfo
 from visloc.errors import DatasetError, InvalidInput
 from visloc.sequences.filling import TimeUnit, TracedPose, fill_rig, fill_sequence, guess_time_unit
+from visloc_api.words.maps import MapInfo
 
 DEFAULT_MAX_GAP_S = 1.0
 

@@ -14,10 +14,10 @@ from urllib.parse import quote
 from clients.evaluation.filling import pose_as_json
 from clients.evaluation.running import Outcome
 from clients.wire.answers import parse_pose
-from clients.wire.types import PoseEstimate
 from visloc.errors import DatasetError, InvalidInput
 from visloc.sequences.filling import TracedPose
 from visloc.types import PoseSource
+from visloc_api.words.answers import PoseEstimate
 
 _LOCALIZED, _NOT_LOCALIZED, _ERROR, _FILLED = "localized", "not_localized", "error", "filled"
 # Errors that say nothing about the photo: it may be answered when it is asked about again.

@@ -13,10 +13,10 @@ from clients.errors import not_understood
 from clients.evaluation.filling import photo_result, poses_from_rig
 from clients.evaluation.instants import QueryInstant
 from clients.evaluation.queries import Query
-from clients.wire.answers import parse_answer
+from clients.wire.answers import InstantResult, LocalizeResult, parse_answer
 from clients.wire.features import Features
-from clients.wire.rigs import InstantResult, RigImage
-from clients.wire.types import LocalizeOptions, LocalizeResult
+from clients.wire.rigs import RigImage
+from clients.wire.types import LocalizeOptions
 from visloc.errors import InvalidInput, Overloaded, VislocError, WeightsError
 from visloc.sequences.filling import TracedPose
 

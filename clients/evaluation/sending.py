@@ -11,7 +11,6 @@ import numpy as np
 from clients.evaluation.queries import Query
 from clients.wire.features import Features
 from clients.wire.requests import read_image
-from clients.wire.types import MapInfo
 from visloc.errors import InvalidInput
 from visloc.geometry import PixelOrigin
 from visloc.kapture import (
@@ -21,6 +20,7 @@ from visloc.kapture import (
     open_local_features,
     read_local,
 )
+from visloc_api.words.maps import MapInfo
 
 Reader = Callable[[Query], bytes | Features]
 

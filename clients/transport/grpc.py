@@ -38,13 +38,12 @@ from clients.wire.requests import (
 )
 from clients.wire.rig_requests import AnyRequest, LocalizeRig, SentInstant, SequenceStart
 from visloc_api.v1 import localization_pb2 as wire
+from visloc_api.words.wire import VERSION_KEY
 
 _SERVICE = f"/{wire.DESCRIPTOR.services_by_name['Localization'].full_name}"
 _MAPS = f"/{wire.DESCRIPTOR.services_by_name['Maps'].full_name}"
 _PUT_VERSION = f"{_MAPS}/PutVersion"
 _SEQUENCE = f"{_SERVICE}/LocalizeSequence"
-# Sent by the service with every answer; the protocol has no other place for it.
-_VERSION_KEY = "visloc-version"
 # HealthCheckResponse with status SERVING. Two bytes are not worth another dependency.
 _SERVING = b"\x08\x01"
 
@@ -246,7 +245,7 @@ def _read_nothing(answer: bytes, _: Metadata) -> JsonObject:
 
 
 def _read_server(_: bytes, metadata: Metadata) -> JsonObject:
-    return {"version": dict(metadata).get(_VERSION_KEY)}
+    return {"version": dict(metadata).get(VERSION_KEY)}
 
 
 def _read_ready(answer: bytes, _: Metadata) -> JsonObject:

@@ -11,6 +11,7 @@ from google.rpc import error_details_pb2, status_pb2
 
 from clients import errors
 from visloc.errors import VislocError
+from visloc_api.words.wire import ERROR_DOMAIN
 
 Metadata = Iterable[tuple[str, str | bytes]]
 
@@ -61,6 +62,6 @@ def _error_info(error: grpc.RpcError) -> error_details_pb2.ErrorInfo | None:
                 return None
             for detail in status.details:
                 info = error_details_pb2.ErrorInfo()
-                if detail.Unpack(info) and info.domain == "visloc":
+                if detail.Unpack(info) and info.domain == ERROR_DOMAIN:
                     return info
     return None

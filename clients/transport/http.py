@@ -13,12 +13,13 @@ import httpx
 
 from clients import errors
 from clients.transport.connection import Connection
-from clients.transport.http_requests import NDJSON, encode_request, encode_sequence, encode_upload
+from clients.transport.http_requests import encode_request, encode_sequence, encode_upload
 from clients.transport.retry import RESEND_PAUSE_S, may_resend
 from clients.transport.uploads import OnProgress, Upload, pieces, pieces_async
 from clients.wire.requests import CheckReady, JsonObject
 from clients.wire.rig_requests import AnyRequest, SentInstant, SequenceStart
 from visloc.errors import Conflict, Unavailable, VislocError
+from visloc_api.words.wire import NDJSON
 
 _CONNECT_TIMEOUT_S = 10.0
 _LIMITS = httpx.Limits(

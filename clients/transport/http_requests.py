@@ -35,9 +35,8 @@ from clients.wire.rig_requests import (
     rig_as_json,
     search_as_json,
 )
-from clients.wire.types import Near
-
-NDJSON = "application/x-ndjson"
+from visloc.types import Near
+from visloc_api.words.wire import NDJSON, REQUEST_ID_HEADER, TIMEOUT_HEADER
 
 
 def encode_request(request: AnyRequest, timeout_s: float) -> tuple[str, str, dict[str, Any]]:
@@ -171,9 +170,9 @@ def _near(near: Near) -> dict[str, str]:
 
 def _headers(search: Search, timeout_s: float) -> dict[str, str]:
     # So that the server does not work for a caller that waits no longer.
-    headers = {"X-Request-Timeout": f"{timeout_s:g}"}
+    headers = {TIMEOUT_HEADER: f"{timeout_s:g}"}
     if search.request_id is not None:
-        headers["X-Request-ID"] = search.request_id
+        headers[REQUEST_ID_HEADER] = search.request_id
     return headers
 
 

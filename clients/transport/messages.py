@@ -24,8 +24,8 @@ from clients.wire.rig_requests import (
     rig_as_json,
 )
 from clients.wire.rigs import Rig
-from clients.wire.types import Near
 from visloc.geometry import Camera
+from visloc.types import Near
 from visloc_api.v1 import localization_pb2 as wire
 
 

@@ -9,7 +9,7 @@ import httpx
 from clients.transport.uploads import Upload
 from clients.wire.requests import DeleteVersion, GetMap, GetVersion, Localize, UseVersion
 from clients.wire.rig_requests import AnyRequest, LocalizeRig, SequenceStart
-from clients.wire.types import Near
+from visloc.types import Near
 
 # Header of HTTP and metadata of gRPC. A balancer that chooses by it finds the map open.
 MAP_HEADER = "x-visloc-map"

@@ -12,14 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from visloc.errors import InvalidInput
-
-# As the server reads them: little-endian where they have more than one byte.
-ARRAY_DTYPES: Mapping[str, np.dtype[Any]] = {
-    "float32": np.dtype("<f4"),
-    "float16": np.dtype("<f2"),
-    "uint8": np.dtype("u1"),
-    "int8": np.dtype("i1"),
-}
+from visloc_api.words.wire import ARRAY_DTYPES
 
 
 @dataclass(frozen=True, slots=True, eq=False)

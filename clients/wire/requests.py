@@ -12,10 +12,12 @@ import httpx
 
 from clients.wire.features import Features, PhotoOrFeatures
 from clients.wire.priors import priors_from_json
-from clients.wire.types import LocalizeOptions, Near
+from clients.wire.types import LocalizeOptions
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera
 from visloc.priors import NO_PRIORS, Priors
+from visloc.types import Near
+from visloc_api.words.wire import REQUEST_ID
 
 JsonObject = dict[str, Any]
 # A map, several, or the anchored ones around a place.
@@ -24,7 +26,6 @@ Where = str | Sequence[str] | Near
 # The first character keeps ``.`` and ``..`` out of the path of a URL; the server has the rest.
 _MAP = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]*")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
-_REQUEST_ID = re.compile(r"[\x21-\x7e]{1,128}")
 _SERVER = re.compile(
     r"(?:(?P<scheme>https?)|grpcs?)://"
     r"(?:(?:[A-Za-z0-9_-]{1,63}\.)*[A-Za-z0-9_-]{1,63}\.?|\[[0-9A-Fa-f:.]+\])"
@@ -131,7 +132,7 @@ def checked_search(
         InvalidInput: ``map.id``, ``request.map`` for no map, ``options.*``, ``priors.*`` or
             ``request.id``.
     """
-    if request_id is not None and not _REQUEST_ID.fullmatch(request_id):
+    if request_id is not None and not REQUEST_ID.fullmatch(request_id):
         raise InvalidInput(
             "request.id",
             "not usable",

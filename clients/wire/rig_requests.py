@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from clients.wire.features import Features
 from clients.wire.priors import checked_covariance, priors_as_json, transform_as_json
 from clients.wire.requests import Request, Search, read_query
-from clients.wire.rigs import Instant, Odometry, Rig, RigImage, RigSensor
-from clients.wire.types import Near
+from clients.wire.rigs import Instant, Rig, RigImage
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.priors import Priors
-from visloc.sequences.filling import TimeUnit, guess_time_unit
+from visloc.sequences.filling import Odometry, TimeUnit, guess_time_unit
+from visloc.types import Near, RigSensor
 
 _MAX_SCALE_ERROR = 1e-3  # of a rotation, as the server has it
 _MAX_TIMESTAMP = 2**63

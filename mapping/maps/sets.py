@@ -32,13 +32,13 @@ from visloc.archive.checks import read_any_manifest
 from visloc.archive.places import enu_of, origin_of
 from visloc.archive.schema import Extent, Geodetic
 from visloc.archive.set_rules import refuse_other_features
-from visloc.archive.set_schema import MAX_TILES
 from visloc.archive.sets import joined_extent
 from visloc.archive.store import checked_name, open_published
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound
 from visloc.geodesy import ecef_from_geodetic, geodetic_from_enu
 from visloc.geometry import Similarity
 from visloc.localization.constraints import MapGeometry
+from visloc.priors import MAX_TILES
 from visloc.sets.coarse import CoarseModel, DescribedTile, coarse_index, describe, learn
 
 # Metric maps of one set have one unit, as far as a fit to positions can tell.

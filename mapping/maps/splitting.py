@@ -17,11 +17,11 @@ from visloc.archive import Map, MapContent, MapStore, write_map
 from visloc.archive.anchoring import link_or_copy
 from visloc.archive.checks import read_any_manifest
 from visloc.archive.schema import ID_PATTERN, photo_file
-from visloc.archive.set_schema import MAX_TILES
 from visloc.archive.store import checked_name, open_published
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound
 from visloc.geometry import Similarity
 from visloc.localization.constraints import MapGeometry
+from visloc.priors import MAX_TILES
 
 # Fewer photos localize too little to be a map of their own.
 MIN_PHOTOS = 5

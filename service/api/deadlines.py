@@ -9,11 +9,10 @@ from contextlib import asynccontextmanager
 from typing import TypeVar
 
 from visloc.errors import InvalidInput, TimedOut
+from visloc_api.words.wire import TIMEOUT_HEADER
 
 T = TypeVar("T")
 
-# The header with which an HTTP caller says how many seconds it waits; gRPC has deadlines.
-TIMEOUT_HEADER = "X-Request-Timeout"
 _MAX_TIMEOUT_CHARS = 32
 
 

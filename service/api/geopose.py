@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
-from service.api.message import IncomingMessage, converted
-from service.values import Near as NearCore
 from visloc.archive import Geodetic
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose
 from visloc.geopose import geopose_of
-
-# Half of the Earth's girth reaches everywhere.
-MAX_RADIUS_M = 20_050_000.0
+from visloc.types import Near as NearCore
+from visloc_api.words.geopose import GeoAngles, GeoPose, GeoPoseYpr, GeoPosition, GeoQuaternion
+from visloc_api.words.message import IncomingMessage, converted
 
 
 class Near(IncomingMessage):
@@ -30,23 +28,6 @@ class Near(IncomingMessage):
         Raises:
             InvalidInput: ``near.latitude``, ``near.longitude`` or ``near.radius``.
         """
-        for name, low, high in (
-            ("latitude", -90.0, 90.0),
-            ("longitude", -180.0, 180.0),
-            ("radius", 0.0, MAX_RADIUS_M),
-        ):
-            value = getattr(self, name)
-            # NaN fails too.
-            if not low <= value <= high or (name == "radius" and value == 0):
-                raise InvalidInput(
-                    f"near.{name}",
-                    "not a place on Earth",
-                    field=f"near.{name}",
-                    expected=f"more than 0, at most {high:.0f} metres"
-                    if name == "radius"
-                    else f"{low:g} to {high:g} degrees",
-                    got=value,
-                )
         return NearCore(self.latitude, self.longitude, self.radius)
 
 
@@ -96,48 +77,6 @@ GivenYpr = Annotated[
     converted(flag_from_text),
     Field(description="also say the GeoPose in yaw, pitch and roll"),
 ]
-
-
-class GeoPosition(BaseModel):
-    """Where on Earth."""
-
-    lat: Annotated[float, Field(description="degrees, WGS84")]
-    lon: Annotated[float, Field(description="degrees")]
-    h: Annotated[float, Field(description="metres above the ellipsoid, not above the sea")]
-
-
-class GeoQuaternion(BaseModel):
-    """A rotation as a unit quaternion, w >= 0."""
-
-    x: float
-    y: float
-    z: float
-    w: float
-
-
-class GeoAngles(BaseModel):
-    """Turns about z, the turned y and the twice turned x."""
-
-    yaw: Annotated[float, Field(description="degrees within (-180, 180]: 0 looks east, 90 north")]
-    pitch: Annotated[float, Field(description="degrees within [-90, 90]; positive looks down")]
-    roll: Annotated[float, Field(description="degrees within (-180, 180]")]
-
-
-class GeoPose(BaseModel):
-    """OGC GeoPose 1.0, Basic-Quaternion.
-
-    It rotates the body's axes (x forward, y left, z up) to east, north and up at the position.
-    """
-
-    position: GeoPosition
-    quaternion: GeoQuaternion
-
-
-class GeoPoseYpr(BaseModel):
-    """OGC GeoPose 1.0, Basic-YPR: the same pose in angles."""
-
-    position: GeoPosition
-    angles: GeoAngles
 
 
 def geoposes_to_words(

@@ -7,14 +7,14 @@ from typing import Annotated
 
 from pydantic import FailFast, Field
 
-from service.api.features import GivenFeatures, GivenImage, query_to_core
-from service.api.geometry import GivenCamera
 from service.api.geopose import GivenNear, GivenYpr, Near, flag_from_text
-from service.api.message import IncomingMessage, converted
-from service.api.options import GivenOptions, LocalizeOptions
-from service.api.priors import GivenPriors, priors_to_core
 from service.values import LocalizeJob, Where
 from visloc.errors import InvalidInput
+from visloc_api.words.features import GivenFeatures, GivenImage, query_to_core
+from visloc_api.words.geometry import GivenCamera
+from visloc_api.words.message import IncomingMessage, converted
+from visloc_api.words.options import GivenOptions, LocalizeOptions
+from visloc_api.words.priors import GivenPriors, priors_to_core
 
 MAX_MAPS = 16
 

@@ -14,13 +14,13 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from service.api.geopose import MAX_RADIUS_M, GeoPose
-from service.api.message import MAX_INSTANT_VALUES, check_json_values, inside, refusal_of
 from service.api.oscp_images import image_bytes
-from service.values import ImageJob, LocalizeJob, Near, RigJob, RigSensor
-from visloc.errors import InvalidInput, TooLarge
+from service.values import ImageJob, LocalizeJob, RigJob
+from visloc.errors import InvalidInput, TooLarge, inside
 from visloc.geometry import Camera, Pose
-from visloc.types import LocalizeOptions
+from visloc.types import MAX_RADIUS_M, LocalizeOptions, Near, RigSensor
+from visloc_api.words.geopose import GeoPose
+from visloc_api.words.message import MAX_INSTANT_VALUES, check_json_values, refusal_of
 
 # A device is searched for so far around a position at least: cities make fixes worse than they say.
 _MIN_RADIUS_M = 100.0

@@ -9,15 +9,16 @@ from typing import Annotated, ClassVar
 from pydantic import FailFast, Field
 
 import service.values
-from service.api.features import GivenFeatures, GivenImage, query_to_core
-from service.api.geometry import GivenCamera, Transform
+import visloc.types
 from service.api.geopose import GivenNear, GivenYpr
 from service.api.localize import GivenMaps, where_to_core
-from service.api.message import IncomingMessage, converted, counted, inside
-from service.api.options import GivenOptions, LocalizeOptions
-from service.api.priors import GivenPriors, priors_to_core
 from service.values import ONLY_SENSOR, ImageJob, RigJob
-from visloc.errors import InvalidInput, TooLarge
+from visloc.errors import InvalidInput, TooLarge, inside
+from visloc_api.words.features import GivenFeatures, GivenImage, query_to_core
+from visloc_api.words.geometry import GivenCamera, Transform
+from visloc_api.words.message import IncomingMessage, converted, counted
+from visloc_api.words.options import GivenOptions, LocalizeOptions
+from visloc_api.words.priors import GivenPriors, priors_to_core
 
 # More than any rig has: it bounds what a request can make the server look at.
 MAX_SENSORS = 256
@@ -134,7 +135,7 @@ class RigCalibration(IncomingMessage):
         dict[str, RigSensor], converted(_sensors_in_bounds), Field(description="by the sensor's id")
     ]
 
-    def to_core(self) -> Mapping[str, service.values.RigSensor]:
+    def to_core(self) -> Mapping[str, visloc.types.RigSensor]:
         """Return the rig, checked.
 
         Raises:
@@ -147,9 +148,9 @@ class RigCalibration(IncomingMessage):
         return {name: _sensor_to_core(name, sensor) for name, sensor in self.sensors.items()}
 
 
-def _sensor_to_core(name: str, sensor: RigSensor) -> service.values.RigSensor:
+def _sensor_to_core(name: str, sensor: RigSensor) -> visloc.types.RigSensor:
     with inside(f"rig.sensors.{name}"):
-        return service.values.RigSensor(
+        return visloc.types.RigSensor(
             sensor.cam_from_rig.to_core("cam_from_rig", "rig.rotation"),
             None if sensor.camera is None else sensor.camera.to_core(),
         )

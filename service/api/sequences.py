@@ -9,12 +9,8 @@ from pydantic import FailFast, Field
 
 import service.values
 import visloc.sequences.filling
-from service.api.geometry import Numbers, Transform, covariance_to_core
 from service.api.geopose import GivenNear, GivenYpr
 from service.api.localize import GivenMaps, where_to_core
-from service.api.message import IncomingMessage, counted, inside
-from service.api.options import GivenOptions, LocalizeOptions
-from service.api.priors import GivenPriors, priors_to_core
 from service.api.rigs import (
     NO_PARTS,
     BatchLimits,
@@ -26,8 +22,12 @@ from service.api.rigs import (
     rig_to_core,
 )
 from service.values import DEFAULT_MAX_GAP_S
-from visloc.errors import InvalidInput, TooLarge
+from visloc.errors import InvalidInput, TooLarge, inside
 from visloc.sequences.filling import TimeUnit
+from visloc_api.words.geometry import Numbers, Transform, covariance_to_core
+from visloc_api.words.message import IncomingMessage, counted
+from visloc_api.words.options import GivenOptions, LocalizeOptions
+from visloc_api.words.priors import GivenPriors, priors_to_core
 
 
 class Odometry(IncomingMessage):

@@ -17,7 +17,7 @@ from typing import Any
 from service.engine.gather import together
 from service.engine.listing import Listing
 from service.engine.stores import Store
-from service.values import Near, Where
+from service.values import Where
 from service.workers import process as worker
 from service.workers.pool import Workers
 from service.workers.process import MapFolder
@@ -25,6 +25,7 @@ from visloc.archive import SetOutline, read_any_outline
 from visloc.archive.set_rules import refuse_if_tile
 from visloc.archive.store import version_in_use
 from visloc.errors import MapCorrupt, NotFound, Unavailable, VislocError
+from visloc.types import Near
 
 logger = logging.getLogger(__name__)
 

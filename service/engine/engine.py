@@ -30,7 +30,6 @@ from service.values import (
     InstantLocalization,
     Localization,
     LocalizeJob,
-    Near,
     RigJob,
     SequenceStart,
 )
@@ -45,6 +44,7 @@ from visloc.errors import (
     VislocError,
 )
 from visloc.priors import NO_PRIORS
+from visloc.types import Near
 
 logger = logging.getLogger(__name__)
 

@@ -8,12 +8,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from service.engine.stores import Store
-from service.values import Near
 from service.workers.process import MapFolder
 from visloc.archive import MapOutline, SetOutline
-from visloc.archive.set_schema import MAX_TILES
 from visloc.errors import InvalidInput, MapCorrupt, NotFound, VislocError
+from visloc.priors import MAX_TILES
 from visloc.sets.choosing import tiles_near
+from visloc.types import Near
 
 logger = logging.getLogger(__name__)
 

@@ -15,7 +15,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from service.api.message import inside
 from service.engine.catalog import Catalog
 from service.engine.instant_tasks import look, without_photos
 from service.engine.set_photos import SetPhotos
@@ -39,7 +38,7 @@ from service.workers import process as worker
 from service.workers.pool import Workers
 from service.workers.process import MapFolder, Seen
 from visloc.archive import SetOutline
-from visloc.errors import InvalidInput, NotFound, Unavailable, VislocError
+from visloc.errors import InvalidInput, NotFound, Unavailable, VislocError, inside
 from visloc.pose.centre import moved_pose
 from visloc.priors import Priors
 from visloc.sequences.filling import guess_time_unit

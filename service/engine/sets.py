@@ -26,7 +26,6 @@ from service.values import (
     InstantLocalization,
     Localization,
     LocalizeJob,
-    Near,
     Query,
     Rig,
     RigJob,
@@ -55,7 +54,7 @@ from visloc.sets.choosing import (
     tiles_near,
 )
 from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
-from visloc.types import Localized, LocalizeOptions
+from visloc.types import Localized, LocalizeOptions, Near
 
 T = TypeVar("T")
 

@@ -19,12 +19,10 @@ from service.errors import internal_error, request_id, statuses_of
 from service.telemetry.logs import RequestRecord
 from service.telemetry.observer import Observer
 from visloc.errors import VislocError
+from visloc_api.words.wire import ERROR_DOMAIN, VERSION_KEY
 
 logger = logging.getLogger(__name__)
 
-ERROR_DOMAIN = "visloc"
-# The server's version goes with every answer, as a header.
-VERSION_KEY = "visloc-version"
 # Details travel in a header, of which gRPC clients accept 8 kB by default.
 _MAX_DETAIL = 1000
 
@@ -33,38 +31,30 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 
 def message_of(answer: BaseModel, message: MessageT) -> MessageT:
-    """Fill a message from the model with the same fields: HTTP and gRPC answer the same.
+    """Fill a message from the model with the same fields: HTTP and gRPC answer the same."""
+    _fill(message, answer.model_dump())
+    return message
 
-    Straight from one to the other: by way of JSON, an answer with its matches takes several
-    times as long.
-    """
-    for name in type(answer).model_fields:
-        value = getattr(answer, name)
-        if isinstance(value, BaseModel):
+
+def _fill(message: Message, values: Mapping[str, Any]) -> None:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
             part = getattr(message, name)
-            part.SetInParent()  # it is there, also when it is empty
-            message_of(value, part)
-        elif isinstance(value, Mapping):
-            _fill_map(getattr(message, name), value)
+            if isinstance(part, Message):
+                part.SetInParent()  # it is there, also when it is empty
+                _fill(part, value)
+            else:
+                part.update(value)
         elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
             _fill_list(getattr(message, name), value)
         elif value is not None:
             setattr(message, name, value)
-    return message
-
-
-def _fill_map(entries: Any, values: Mapping[str, Any]) -> None:
-    for name, value in values.items():
-        if isinstance(value, BaseModel):
-            message_of(value, entries[name])
-        else:
-            entries[name] = value
 
 
 def _fill_list(entries: Any, values: Sequence[Any]) -> None:
-    if values and isinstance(values[0], BaseModel):
+    if values and isinstance(values[0], Mapping):
         for value in values:
-            message_of(value, entries.add())
+            _fill(entries.add(), value)
     else:
         entries.extend(values)
 

@@ -10,14 +10,10 @@ import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from service.api import (
-    BatchLimits,
-    InstantAnswer,
-    ListMapsResponse,
-    LocalizeResponse,
-    MapInfo,
-)
+from service.api import BatchLimits, ListMapsResponse
+from service.api.answers import instant_answer, localize_response
 from service.api.deadlines import within
+from service.api.maps import map_info
 from service.engine.engine import Engine
 from service.errors import request_id
 from service.grpc.access import AccessInterceptor
@@ -65,7 +61,7 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
                 job = await asyncio.to_thread(localize_job_of, request, self._max_request_bytes)
                 found = await self._engine.localize(job)
             self._observer.localization(found)
-            answer = LocalizeResponse.from_localization(found, id_)
+            answer = localize_response(found, id_)
             return message_of(answer, pb2.LocalizeResponse())
 
     async def LocalizeRig(  # noqa: N802
@@ -79,7 +75,7 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
                     job = await asyncio.to_thread(rig_job_of, request, self._limits)
                     found = await self._engine.localize_rig(job)
             self._observer.instant(found)
-            return message_of(InstantAnswer.from_localization(found, id_), pb2.InstantAnswer())
+            return message_of(instant_answer(found, id_), pb2.InstantAnswer())
 
     # A coroutine that writes, not a generator: it ends, whatever becomes of the call, before the
     # place that it holds is given to another.
@@ -101,7 +97,7 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
                 ):
                     async for found in answers:
                         self._observer.instant(found)
-                        answer = InstantAnswer.from_localization(found, id_)
+                        answer = instant_answer(found, id_)
                         async with within(self._patience_s):
                             await context.write(message_of(answer, pb2.InstantAnswer()))
 
@@ -123,7 +119,7 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
             served = await self._engine.maps(near_of(request))
 
             def answer() -> pb2.ListMapsResponse:
-                maps = [MapInfo.from_served(each, in_list=True) for each in served]
+                maps = tuple(map_info(each, in_list=True) for each in served)
                 return message_of(ListMapsResponse(maps=maps), pb2.ListMapsResponse())
 
             # Of ten thousand maps, it takes a moment.
@@ -136,7 +132,7 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
         async with self._envelope("GetMap", request_id(None), context):
             served = await self._engine.map(request.map)
             # Of a set with ten thousand tiles, it takes a moment.
-            info = await asyncio.to_thread(MapInfo.from_served, served)
+            info = await asyncio.to_thread(map_info, served)
             return message_of(info, pb2.MapInfo())
 
 

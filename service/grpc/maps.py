@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing
 
-from service.api import MapInfo
+from service.api.maps import map_info
 from service.engine.engine import Engine
 from service.errors import request_id
 from service.grpc.envelope import Context, Envelope, message_of
@@ -29,7 +29,7 @@ class MapsServicer(pb2_grpc.MapsServicer):
         """Describe one version, published but not necessarily in use."""
         async with self._envelope("GetVersion", request_id(None), context):
             served = await self._engine.map(f"{request.map}@{request.version}")
-            return message_of(MapInfo.from_served(served), pb2.MapInfo())
+            return message_of(map_info(served), pb2.MapInfo())
 
     async def PutVersion(  # noqa: N802
         self, request_iterator: AsyncIterator[pb2.PutVersionRequest], context: Context
@@ -42,7 +42,7 @@ class MapsServicer(pb2_grpc.MapsServicer):
                 raise _wrong_message("start", kind)
             async with aclosing(_chunks(request_iterator)) as chunks:
                 served = await self._engine.upload(first.start.map, first.start.version, chunks)
-            return message_of(MapInfo.from_served(served), pb2.MapInfo())
+            return message_of(map_info(served), pb2.MapInfo())
 
     async def DeleteVersion(  # noqa: N802
         self, request: pb2.VersionRef, context: Context
@@ -58,7 +58,7 @@ class MapsServicer(pb2_grpc.MapsServicer):
         """Put a version into use."""
         async with self._envelope("SetCurrent", request_id(None), context):
             served = await self._engine.set_current(request.map, request.version)
-            return message_of(MapInfo.from_served(served), pb2.MapInfo())
+            return message_of(map_info(served), pb2.MapInfo())
 
 
 async def _chunks(messages: AsyncIterator[pb2.PutVersionRequest]) -> AsyncGenerator[bytes]:

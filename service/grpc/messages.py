@@ -16,10 +16,11 @@ from service.api import (
 from service.api import Instant as InstantWords
 from service.api import SequenceStart as SequenceStartWords
 from service.api.geopose import Near as NearWords
-from service.api.message import MAX_INSTANT_VALUES, check_num_values, inside
-from service.values import Instant, LocalizeJob, Near, RigJob, SequenceStart
-from visloc.errors import InvalidInput, TooLarge
+from service.values import Instant, LocalizeJob, RigJob, SequenceStart
+from visloc.errors import InvalidInput, TooLarge, inside
+from visloc.types import Near
 from visloc_api.v1 import localization_pb2 as pb2
+from visloc_api.words.message import MAX_INSTANT_VALUES, check_num_values
 
 # A rig has one name in JSON.
 _RIG_NAMES = {"rig_id": "rig", "calibration": "rig"}

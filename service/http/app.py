@@ -27,8 +27,8 @@ from service.api import (
     MapNotLoaded,
     Readiness,
 )
-from service.api.deadlines import TIMEOUT_HEADER, each_within, timeout_of, within
-from service.api.message import refusal_of
+from service.api.answers import instant_answer, localize_response
+from service.api.deadlines import each_within, timeout_of, within
 from service.engine.engine import Engine
 from service.errors import internal_error, request_id, stopping_error
 from service.http.acceptor import OpenConnections
@@ -39,7 +39,6 @@ from service.http.openapi.app import App, problems
 from service.http.openapi.request_bodies import LOCALIZE_BODY, RIG_BODY, SEQUENCE_BODY
 from service.http.oscp.routes import add_geopose_routes
 from service.http.responses import (
-    NDJSON,
     Lines,
     json_response,
     problem_response,
@@ -55,6 +54,8 @@ from service.telemetry.metrics_port import metrics_response
 from service.telemetry.observer import Observer, route_of
 from service.values import Instant, InstantLocalization, SequenceStart
 from visloc.errors import InvalidInput, NotFound, Overloaded, VislocError
+from visloc_api.words.message import refusal_of
+from visloc_api.words.wire import NDJSON, TIMEOUT_HEADER
 
 logger = logging.getLogger(__name__)
 
@@ -126,7 +127,7 @@ def create_app(
         async with within(timeout_s):
             found = await while_connected(request.receive, engine.localize(job))
         observer.localization(found)
-        return json_response(LocalizeResponse.from_localization(found, request.state.request_id))
+        return json_response(localize_response(found, request.state.request_id))
 
     @app.post(
         "/localize/rig",
@@ -145,7 +146,7 @@ def create_app(
             async with within(timeout_s):
                 found = await while_connected(request.receive, engine.localize_rig(job))
         observer.instant(found)
-        return json_response(InstantAnswer.from_localization(found, request.state.request_id))
+        return json_response(instant_answer(found, request.state.request_id))
 
     @app.post(
         "/localize/sequence",
@@ -163,7 +164,7 @@ def create_app(
         start, instants = await read_sequence_jobs(request, settings)
         answers = _observed(_admitted(engine, start, instants), timeout_s, observer)
         id_ = request.state.request_id
-        message = partial(InstantAnswer.from_localization, request_id=id_)
+        message = partial(instant_answer, request_id=id_)
         if _wants_lines(request):
             first = await while_connected(request.receive, _next_of(answers))
             return Lines(first, answers, message, id_, settings.arrival_timeout_s)

@@ -20,11 +20,11 @@ from service.api import (
     LocalizeSequenceRequest,
     UseVersionRequest,
 )
-from service.api.message import MAX_INSTANT_VALUES
 from service.http.slow_clients import arrivals_of
 from service.settings import REQUEST_OVERHEAD_BYTES, ServiceSettings
 from service.values import Instant, LocalizeJob, RigJob, SequenceStart
 from visloc.errors import InvalidInput
+from visloc_api.words.message import MAX_INSTANT_VALUES
 
 _CHUNK_BYTES = 64 * 1024
 # The parts of the form of one photo that are files, and how curl sends them.

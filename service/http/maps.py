@@ -10,6 +10,7 @@ from fastapi import FastAPI, Query, Request, Response
 
 from service.api import ListMapsResponse, MapInfo
 from service.api.geopose import near_from_text
+from service.api.maps import map_info
 from service.engine.engine import Engine
 from service.http.bodies import checked_media_type, read_use_version
 from service.http.openapi.app import problems
@@ -53,7 +54,7 @@ def add_map_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) -> N
         listed = await engine.maps(circle)
 
         def answer() -> Response:
-            maps = [MapInfo.from_served(served, in_list=True) for served in listed]
+            maps = tuple(map_info(served, in_list=True) for served in listed)
             return json_response(ListMapsResponse(maps=maps))
 
         # Of ten thousand maps, it takes a moment.
@@ -62,7 +63,7 @@ def add_map_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) -> N
     @app.get("/maps/{ref}", response_model=MapInfo, responses=problems(404, 422, 500))
     async def get_map(ref: str) -> Response:
         """Describe one map: `id`, or `id@version`."""
-        return json_response(await asyncio.to_thread(MapInfo.from_served, await engine.map(ref)))
+        return json_response(await asyncio.to_thread(map_info, await engine.map(ref)))
 
     @app.post(
         "/maps/{map_id}/current",
@@ -77,7 +78,7 @@ def add_map_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) -> N
         """
         asked = await read_use_version(request)
         served = await engine.set_current(map_id, asked.version)
-        return json_response(MapInfo.from_served(served))
+        return json_response(map_info(served))
 
     path = "/maps/{map_id}/versions/{version}"
 
@@ -85,7 +86,7 @@ def add_map_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) -> N
     async def get_version(map_id: str, version: str) -> Response:
         """Describe one version, published but not necessarily in use."""
         served = await engine.map(f"{map_id}@{version}")
-        return json_response(await asyncio.to_thread(MapInfo.from_served, served))
+        return json_response(await asyncio.to_thread(map_info, served))
 
     @app.put(
         path,
@@ -104,7 +105,7 @@ def add_map_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) -> N
         _check_declared_size(request, settings)
         async with aclosing(arrivals_of(request).chunks(request)) as chunks:
             served = await engine.upload(map_id, version, chunks)
-        response = json_response(MapInfo.from_served(served), 201)
+        response = json_response(map_info(served), 201)
         response.headers["Location"] = f"/maps/{map_id}/versions/{version}"
         return response
 

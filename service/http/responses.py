@@ -17,10 +17,9 @@ from starlette.types import Receive, Scope, Send
 from service.api import Problem
 from service.errors import RETRY_AFTER_S, internal_error, statuses_of
 from visloc.errors import Unavailable, VislocError
+from visloc_api.words.wire import NDJSON
 
 logger = logging.getLogger(__name__)
-
-NDJSON = "application/x-ndjson"
 
 T = TypeVar("T")
 

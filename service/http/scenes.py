@@ -9,7 +9,8 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Query, Request, Response
 
 from service.api import MapImages
-from service.api.deadlines import TIMEOUT_HEADER, timeout_of, within
+from service.api.deadlines import timeout_of, within
+from service.api.maps import map_images
 from service.engine.engine import Engine
 from service.http.cache_headers import (
     ASK_ALWAYS_PRIVATE,
@@ -22,6 +23,7 @@ from service.settings import ServiceSettings
 from visloc.archive import MapOutline, SetOutline
 from visloc.archive.checks import is_set
 from visloc.errors import NotFound
+from visloc_api.words.wire import TIMEOUT_HEADER
 
 MAX_POINTS, MAX_IMAGES = 262_144, 10_000
 
@@ -93,7 +95,7 @@ def add_scene_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) ->
                 return not_modified(headers)
             photos = await engine.scenes.photos(outline)
             text = await asyncio.to_thread(
-                lambda: MapImages.of(outline, photos, first, count).model_dump_json()
+                lambda: map_images(outline, photos, first, count).model_dump_json()
             )
             return Response(text, headers=headers, media_type="application/json")
 

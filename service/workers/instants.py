@@ -8,14 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from service.values import (
-    ONLY_SENSOR,
-    ImageJob,
-    InstantLocalization,
-    Query,
-    Rig,
-    RigSensor,
-)
+from service.values import ONLY_SENSOR, ImageJob, InstantLocalization, Query, Rig
 from service.workers.tiles import Read, summed
 from visloc.archive import Map
 from visloc.archive.places import anchor_rms
@@ -27,7 +20,7 @@ from visloc.localization.feature_cache import FeatureCache
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import Look, Matches, SeenImage
 from visloc.priors import Priors
-from visloc.types import InstantAnswer, LocalizeOptions, QueryFeatures, Reason, Refusal
+from visloc.types import InstantAnswer, LocalizeOptions, QueryFeatures, Reason, Refusal, RigSensor
 
 _MAX_LISTED = 500  # characters of names from outside
 # Codes that begin so say what is wrong with all images: that is wrong with the request.

@@ -17,7 +17,7 @@ from google.protobuf.json_format import MessageToDict, ParseDict
 from google.rpc.error_details_pb2 import ErrorInfo
 from grpc_status import rpc_status
 
-from service.http.openapi.request_bodies import EXAMPLE_RIG_REQUEST, EXAMPLE_SEQUENCE_REQUEST
+from service.http.openapi import example
 from visloc.geometry import Camera, Pose, rotation_angle
 from visloc.kapture import Dataset, read_dataset
 from visloc_api.v1 import localization_pb2 as pb2
@@ -551,8 +551,8 @@ def test_priors_and_maps_are_fields_of_a_form_too(doors: Any, query: Any) -> Non
 
 
 def test_the_examples_of_the_documentation_are_answered(doors: Any) -> None:
-    for path, example in (("rig", EXAMPLE_RIG_REQUEST), ("sequence", EXAMPLE_SEQUENCE_REQUEST)):
-        answer = answer_of(post(doors, path, example | {"map": "room"}))
+    for path, body in (("rig", example("rig_request")), ("sequence", example("sequence_request"))):
+        answer = answer_of(post(doors, path, body | {"map": "room"}))
         answers = answer.get("answers", [answer])
         assert {each["status"] for each in answers} == {"not_localized"}
 

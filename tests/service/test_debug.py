@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from service.api import LocalizeRequest, LocalizeResponse
+from service.api.answers import localize_response
 from service.grpc.envelope import message_of
 from service.values import Localization, MatchPicture
 from visloc.errors import InvalidInput
@@ -28,9 +29,7 @@ def answer(debug: MatchPicture | None) -> LocalizeResponse:
     camera = Camera("SIMPLE_PINHOLE", 64, 48, (50.0, 32.0, 24.0))
     evidence = Evidence(camera, CameraSource.GIVEN, 1, ReadAs.STORED)
     refused = NotLocalized(evidence, "gate", Reason.TOO_FEW_INLIERS, "no")
-    return LocalizeResponse.from_localization(
-        Localization(refused, "room", "v1", debug=debug), "id"
-    )
+    return localize_response(Localization(refused, "room", "v1", debug=debug), "id")
 
 
 PICTURE = MatchPicture(

@@ -19,7 +19,7 @@ from grpc_status import rpc_status
 from numpy.typing import NDArray
 
 from service.api import Array, LocalizeRequest
-from service.http.openapi.request_bodies import EXAMPLE_FEATURES_REQUEST
+from service.http.openapi import example
 from visloc.archive import Map, MapStore
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.features.local.readymade import MAX_READY_MADE_KEYPOINTS
@@ -371,7 +371,7 @@ def test_an_array_is_read_without_a_copy_of_its_bytes() -> None:
 
 
 def test_features_become_the_job_that_they_say() -> None:
-    job = LocalizeRequest.read_json(json.dumps(EXAMPLE_FEATURES_REQUEST)).to_job()
+    job = LocalizeRequest.read_json(json.dumps(example("features_request"))).to_job()
     assert isinstance(job.query, QueryFeatures)
     assert job.query.kind == "xfeat"
     np.testing.assert_array_equal(job.query.keypoints, [[12.5, 25.0], [32.0, 18.0]])

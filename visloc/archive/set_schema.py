@@ -20,11 +20,10 @@ from visloc.archive.schema import (
     Vector,
 )
 from visloc.geometry import Pose, Similarity
+from visloc.priors import MAX_TILES
 
 SET_FORMAT = "visloc-set"
 SET_MAJOR, SET_MINOR = 1, 0
-# The manifest lists them; with so many it has about 12 MB.
-MAX_TILES = 10_000
 # Of where a tile lies. Beyond that, squares and inverses of it are no numbers any more.
 MIN_SCALE, MAX_SCALE = 1e-9, 1e9
 # What a query takes is proportional to it.

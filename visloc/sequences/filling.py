@@ -78,7 +78,7 @@ class Odometry:
     """
 
     rig_from_odometry: Pose
-    covariance: NDArray[np.float64] | None
+    covariance: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,1 +1,18 @@
 """What /openapi.json says: bodies, examples, problems."""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+from typing import Any
+
+
+def example(name: str) -> Any:
+    """Return ``examples/NAME.json``.
+
+    Requests can be sent as they are: their photo is a grey one of 64 x 48 pixels, their features
+    are two keypoints of XFeat. Answers are those of a server, with fewer digits and photos. What
+    ends in ``_body`` is the schema of a body.
+    """
+    text = files(__name__).joinpath("examples", f"{name}.json").read_text(encoding="utf-8")
+    return json.loads(text)

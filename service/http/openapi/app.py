@@ -16,26 +16,26 @@ from service.api import (
     RigCalibration,
     UseVersionRequest,
 )
-from service.http.openapi import batch_examples, examples
-from service.http.responses import NDJSON
+from service.http.openapi import example
+from visloc_api.words.wire import NDJSON
 
 _REF = "#/components/schemas/{model}"
 
-_ANSWERS: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {
+_ANSWERS: dict[tuple[str, str, str], dict[str, Any]] = {
     ("/localize", "post", "200"): {
-        "localized": examples.LOCALIZED,
-        "not_localized": examples.NOT_LOCALIZED,
+        "localized": example("localized"),
+        "not_localized": example("not_localized"),
     },
-    ("/localize/rig", "post", "200"): {"localized": batch_examples.RIG},
-    ("/localize/sequence", "post", "200"): {"sequence": batch_examples.SEQUENCE},
-    ("/maps", "get", "200"): {"maps": {"maps": [examples.MAP]}},
-    ("/maps/{ref}", "get", "200"): {"map": examples.MAP, "set": examples.SET},
-    ("/maps/{ref}/images", "get", "200"): {"images": examples.MAP_IMAGES},
-    ("/maps/{map_id}/current", "post", "200"): {"map": examples.MAP},
-    ("/maps/{map_id}/versions/{version}", "get", "200"): {"map": examples.NEW_MAP},
-    ("/maps/{map_id}/versions/{version}", "put", "201"): {"map": examples.NEW_MAP},
-    ("/readyz", "get", "200"): {"ready": examples.READY},
-    ("/readyz", "get", "503"): {"loading": examples.LOADING},
+    ("/localize/rig", "post", "200"): {"localized": example("rig")},
+    ("/localize/sequence", "post", "200"): {"sequence": example("sequence")},
+    ("/maps", "get", "200"): {"maps": {"maps": [example("map")]}},
+    ("/maps/{ref}", "get", "200"): {"map": example("map"), "set": example("set")},
+    ("/maps/{ref}/images", "get", "200"): {"images": example("map_images")},
+    ("/maps/{map_id}/current", "post", "200"): {"map": example("map")},
+    ("/maps/{map_id}/versions/{version}", "get", "200"): {"map": example("new_map")},
+    ("/maps/{map_id}/versions/{version}", "put", "201"): {"map": example("new_map")},
+    ("/readyz", "get", "200"): {"ready": example("ready")},
+    ("/readyz", "get", "503"): {"loading": example("loading")},
 }
 
 _PROBLEMS = {
@@ -49,19 +49,6 @@ _PROBLEMS = {
     503: "the maps are being loaded; try again",
     504: "the time for the request is over",
     507: "there is no room on the server's disk",
-}
-
-_EXAMPLE_PROBLEM = {
-    "type": "about:blank",
-    "title": "Unprocessable Entity",
-    "status": 422,
-    "detail": "wrong number of parameters for PINHOLE",
-    "code": "camera.param_count",
-    "field": "camera.params",
-    "expected": "4: fx, fy, cx, cy",
-    "got": "3",
-    "kind": "InvalidInput",
-    "request_id": "3f1d5c0b8a7e4e1f9d2c6b5a49382716",
 }
 
 
@@ -98,7 +85,7 @@ class App(FastAPI):
                 ref_template=_REF,
             )
             schema["components"]["schemas"].update(ours["$defs"])
-            schema["components"]["schemas"]["Problem"]["example"] = _EXAMPLE_PROBLEM
+            schema["components"]["schemas"]["Problem"]["example"] = example("problem")
             # Not given to the routes: FastAPI would drop their nulls.
             for (path, method, status), shown in _ANSWERS.items():
                 response = schema["paths"][path][method]["responses"][status]
@@ -122,8 +109,8 @@ class App(FastAPI):
                     ],
                 },
                 "examples": {
-                    "answer": {"value": batch_examples.RIG},
-                    "error": {"value": {"problem": _EXAMPLE_PROBLEM}},
+                    "answer": {"value": example("rig")},
+                    "error": {"value": {"problem": example("problem")}},
                 },
             }
         return super().openapi()

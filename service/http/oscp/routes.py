@@ -12,7 +12,7 @@ from fastapi import FastAPI, Request
 from numpy.typing import NDArray
 from starlette.responses import Response
 
-from service.api.deadlines import TIMEOUT_HEADER, timeout_of, within
+from service.api.deadlines import timeout_of, within
 from service.api.geopose import geoposes_to_words
 from service.api.oscp import (
     GeoPoseAccuracy,
@@ -34,6 +34,7 @@ from visloc.errors import InvalidInput, NotFound
 from visloc.geometry import Pose
 from visloc.geopose import accuracy_of
 from visloc.types import Localized
+from visloc_api.words.wire import TIMEOUT_HEADER
 
 OSCP = "application/vnd.oscp+json"
 OGC = "application/geopose+json"

@@ -20,10 +20,12 @@ from clients.cli.compare_display import command_text, markdown_of
 from clients.cli.compare_plot import draw_comparison
 from clients.cli.main import main
 from clients.evaluation.compare import DEFAULT_VALUES, Axis, make_variants, parse_values
-from clients.wire.types import LocalizeOptions, LocalizeResult, MapInfo
+from clients.wire.answers import LocalizeResult
+from clients.wire.types import LocalizeOptions
 from visloc.errors import InvalidInput, Unavailable
 from visloc.types import Extraction, Fusion, Matcher, Solver
 from visloc.types import LocalizeOptions as CoreOptions
+from visloc_api.words.maps import MapInfo
 
 Dataset = Callable[..., Path]
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -31,9 +33,31 @@ TRUTH_WXYZ = [0.9298410554097046, 0.01755162593, 0.31931803130557, 0.18199875544
 TRUTH_TRANSLATION = [0.24164110554685916, 0.0, 1e-17]
 
 ROOM = MapInfo(
-    *("room", "v1", "2026-01-02T03:04:05Z", True, "rgbd", "xfeat", ("densevlad", "localvlad")),
-    *(300, 7, 5, ((-1.0,), (1.0,)), 2**20, None, (), None, None, True, (), "ab"),
+    id="room",
+    version="v1",
+    created="2026-01-02T03:04:05Z",
+    metric=True,
+    method="rgbd",
+    local_features="xfeat",
+    global_features=("densevlad", "localvlad"),
+    images=300,
+    landmarks=7,
+    observations=5,
+    extent=((-1.0,), (1.0,)),
+    size_bytes=2**20,
+    down=None,
+    rigs=(),
+    anchor=None,
+    place=None,
+    current=True,
+    versions=(),
+    content_hash="ab",
 )
+
+
+def another(**changes: object) -> MapInfo:
+    """The same map, but for some of its facts."""
+    return ROOM.model_copy(update=changes)
 
 
 def compare(*arguments: object) -> int:
@@ -99,13 +123,13 @@ def test_global_features_are_compared_alone_then_all_together() -> None:
         "localvlad": {"localvlad": 1},
         "all": {"densevlad": 1, "localvlad": 1},
     }
-    three = replace(ROOM, global_features=("densevlad", "localvlad", "gem"))
+    three = another(global_features=("densevlad", "localvlad", "gem"))
     assert weights(["localvlad+gem"], three) == {"localvlad+gem": {"localvlad": 1, "gem": 1}}
-    assert weights((), replace(ROOM, global_features=("gem",))) == {"gem": {"gem": 1}}
+    assert weights((), another(global_features=("gem",))) == {"gem": {"gem": 1}}
 
 
 def test_maps_are_named_by_their_local_features_as_far_as_these_differ() -> None:
-    maps = [ROOM, replace(ROOM, id="b", local_features="sift"), replace(ROOM, id="c")]
+    maps = [ROOM, another(id="b", local_features="sift"), another(id="c")]
 
     variants = make_variants(Axis.LOCAL_FEATURES, (), maps, LocalizeOptions())
 
@@ -116,7 +140,7 @@ def test_maps_are_named_by_their_local_features_as_far_as_these_differ() -> None
 @pytest.mark.parametrize(
     ("axis", "values", "maps", "options", "code"),
     [
-        (Axis.FUSION, (), [ROOM, replace(ROOM, id="b")], {}, "compare.maps"),
+        (Axis.FUSION, (), [ROOM, another(id="b")], {}, "compare.maps"),
         (Axis.LOCAL_FEATURES, (), [ROOM, ROOM], {}, "compare.maps"),
         (Axis.LOCAL_FEATURES, ("xfeat",), [ROOM], {}, "compare.values"),
         (Axis.FUSION, (), [ROOM], {"fusion": "mean"}, "compare.option"),

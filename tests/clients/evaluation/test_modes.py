@@ -14,20 +14,32 @@ from clients.cli.main import main
 from clients.evaluation.instants import instants_of_dataset
 from clients.evaluation.modes import Mode, arrange, parse_modes
 from clients.evaluation.queries import read_queries
-from clients.wire.types import MapInfo, RigInfo
 from visloc.errors import DatasetError, InvalidInput, NotFound, VislocError
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose
 from visloc.sequences.filling import TimeUnit, TracedPose
 from visloc.types import PoseSource
+from visloc_api.words.maps import MapInfo, RigInfo
 
 Dataset = Callable[..., Path]
 HERE, LOST, BROKEN = None, b"refuse", b"broken"
 # Unix times in milliseconds; the rig drives 10 m/s and turns 10 degrees/s.
 START = 1_700_000_000_000
 INFO = MapInfo(
-    *("room", "v1", "", True, "rgbd", "xfeat", (), 1, 1, 1, ((0.0,), (0.0,)), 1, None),
-    rigs=(RigInfo("stereo", ("left", "right")),),
+    id="room",
+    version="v1",
+    created="",
+    metric=True,
+    method="rgbd",
+    local_features="xfeat",
+    global_features=(),
+    images=1,
+    landmarks=1,
+    observations=1,
+    extent=((0.0,), (0.0,)),
+    size_bytes=1,
+    down=None,
+    rigs=(RigInfo(id="stereo", sensors=("left", "right")),),
     anchor=None,
     place=None,
     current=True,

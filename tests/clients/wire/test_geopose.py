@@ -6,7 +6,6 @@ import pytest
 
 from clients import GeoPose, GeoPoseYpr, Near
 from clients.transport.messages import localize_message, plain, rig_message, start_message
-from clients.wire.geopose import parse_geopose, parse_geopose_ypr
 from clients.wire.requests import checked_search, localize_request
 from clients.wire.rig_requests import rig_request, search_as_json, sequence_start
 from visloc.errors import InvalidInput
@@ -45,11 +44,12 @@ def test_a_place_is_made_of_numbers() -> None:
 
 def test_geoposes_keep_every_digit() -> None:
     quaternion = {"x": 0.1, "y": -1 / 3, "z": 0.2, "w": 0.9}
-    found = parse_geopose({"position": POSITION, "quaternion": quaternion})
-    assert found == GeoPose(48.25, -122.1, 90.5, (0.1, -1 / 3, 0.2, 0.9))
+    found = GeoPose.model_validate({"position": POSITION, "quaternion": quaternion})
+    assert (found.latitude, found.longitude, found.height) == (48.25, -122.1, 90.5)
+    assert found.quaternion_xyzw == (0.1, -1 / 3, 0.2, 0.9)
+    place = {"latitude": 48.25, "longitude": -122.1, "height": 90.5}
+    assert found == GeoPose(**place, quaternion_xyzw=found.quaternion_xyzw)
     angles = {"yaw": 30.0, "pitch": -1.5, "roll": 180.0}
-    assert parse_geopose_ypr({"position": POSITION, "angles": angles}) == GeoPoseYpr(
-        48.25, -122.1, 90.5, 30.0, -1.5, 180.0
-    )
-    assert parse_geopose(None) is None
-    assert parse_geopose_ypr(None) is None
+    turned = GeoPoseYpr.model_validate({"position": POSITION, "angles": angles})
+    assert turned == GeoPoseYpr(**place, yaw_deg=30.0, pitch_deg=-1.5, roll_deg=180.0)
+    assert (turned.yaw_deg, turned.pitch_deg, turned.roll_deg) == (30.0, -1.5, 180.0)

@@ -15,8 +15,7 @@ from service.api import (
     LocalizeRigRequest,
     LocalizeSequenceRequest,
 )
-from service.api import InstantAnswer as AnswerWords
-from service.api.message import MAX_INSTANT_VALUES, IncomingMessage
+from service.api.answers import instant_answer
 from service.grpc.messages import instant_of, rig_job_of, sequence_start_of
 from service.settings import ServiceSettings
 from service.values import ONLY_SENSOR, InstantLocalization, RigJob
@@ -30,10 +29,13 @@ from visloc.types import (
     ImageAnswer,
     InstantAnswer,
     ReadAs,
+    Reason,
+    Refusal,
     RetrievedImage,
 )
 from visloc.types import LocalizeOptions as CoreOptions
 from visloc_api.v1 import localization_pb2 as pb2
+from visloc_api.words.message import MAX_INSTANT_VALUES, IncomingMessage
 
 NAN = float("nan")
 LONG = "x" * 101
@@ -475,9 +477,10 @@ def test_an_image_of_an_instant_lists_the_best_twenty_photos() -> None:
     retrieved = tuple(RetrievedImage(f"{i}.jpg", 1.0 - i / 100, {}) for i in range(30))
     evidence = Evidence(camera, CameraSource.GIVEN, 1, ReadAs.STORED, retrieved=retrieved)
     seen = ImageAnswer("camera", Pose.identity(), evidence, None)
-    answer = InstantAnswer(None, (seen,), None, None, {})
+    refusal = Refusal("pose", Reason.NO_POSE, "no pose")
+    answer = InstantAnswer(None, (seen,), None, refusal, {})
 
-    message = AnswerWords.from_localization(InstantLocalization(answer, "room", "1"), "id")
+    message = instant_answer(InstantLocalization(answer, "room", "1"), "id")
 
     names = [photo.image for photo in message.images[0].retrieved]
     assert names == [f"{i}.jpg" for i in range(20)]

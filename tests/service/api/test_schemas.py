@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import base64
+import importlib
 import json
 import math
+import pkgutil
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,8 @@ import pytest
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from pydantic import BaseModel
 
-from service import api as schemas
+import service.api
+import visloc_api.words
 from service.api import LocalizeOptions, LocalizeRequest
 from visloc.errors import InvalidInput, TooLarge
 from visloc.priors import NO_PRIORS, HeightBand
@@ -395,11 +398,27 @@ def fields_of(message: Descriptor) -> list[str]:
     return fields
 
 
+def models() -> dict[str, type[BaseModel]]:
+    """The models of the words, by name."""
+    modules = [
+        importlib.import_module(f"{package.__name__}.{module.name}")
+        for package in (service.api, visloc_api.words)
+        for module in pkgutil.iter_modules(package.__path__)
+    ]
+    return {
+        name: value
+        for module in modules
+        for name, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, BaseModel)
+    }
+
+
 def pairs() -> list[tuple[type[BaseModel], Descriptor]]:
+    found = models()
     return [
-        (getattr(schemas, name), message)
+        (found[name], message)
         for name, message in pb2.DESCRIPTOR.message_types_by_name.items()
-        if hasattr(schemas, name) and name != STREAM
+        if name in found and name != STREAM
     ]
 
 

@@ -25,7 +25,6 @@ from service.values import (
     InstantLocalization,
     LocalizeJob,
     RigJob,
-    RigSensor,
     SequenceStart,
 )
 from service.workers.process import WorkerSettings
@@ -46,7 +45,7 @@ from visloc.images import ImageLimits
 from visloc.kapture import read_dataset
 from visloc.priors import NO_PRIORS, GravityPrior, PositionPrior, Priors
 from visloc.sequences.filling import Odometry, TimeUnit
-from visloc.types import Localized, LocalizeOptions, PoseSource, Reason
+from visloc.types import Localized, LocalizeOptions, PoseSource, Reason, RigSensor
 
 T = TypeVar("T")
 

@@ -14,11 +14,14 @@ from PIL import Image
 
 from service.api.oscp import GeoPoseRequest
 from service.api.oscp_images import image_bytes
-from service.http.oscp.examples import EXAMPLE_GEOPOSE_REQUEST_V1, EXAMPLE_GEOPOSE_REQUEST_V2
+from service.http.openapi import example
 from service.http.oscp.routes import answer_kind
-from service.values import LocalizeJob, Near, RigJob
+from service.values import LocalizeJob, RigJob
 from visloc.errors import InvalidInput, TooLarge, VislocError
+from visloc.types import Near
 
+EXAMPLE_GEOPOSE_REQUEST_V1 = example("geopose_request_v1")
+EXAMPLE_GEOPOSE_REQUEST_V2 = example("geopose_request_v2")
 PHOTO = base64.b64decode(EXAMPLE_GEOPOSE_REQUEST_V1["sensorReadings"][0]["reading"]["imageBytes"])
 CAMERA: dict[str, Any] = {
     "timestamp": 1750939398316,

@@ -1,4 +1,4 @@
-"""What is known before any photo is looked at."""
+"""Priors: what is known of the device before any photo is looked at."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numpy as np
 from pydantic import FailFast, Field
 
 import visloc.priors
-from service.api.geometry import Numbers, Transform, covariance_to_core
-from service.api.message import IncomingMessage, converted
-from visloc.archive.set_schema import MAX_TILES
+from visloc.errors import InvalidInput
+from visloc.priors import MAX_TILES
+from visloc_api.words.geometry import Numbers, Transform, covariance_to_core
+from visloc_api.words.message import IncomingMessage, converted
 
 _GRAVITY_STD_DEG = 1.0
 
@@ -26,6 +27,10 @@ class PositionPrior(IncomingMessage):
         """Return the prior, checked."""
         return visloc.priors.PositionPrior(np.array(self.position), self.radius)
 
+    @staticmethod
+    def from_core(prior: visloc.priors.PositionPrior) -> PositionPrior:
+        return PositionPrior(position=prior.position.tolist(), radius=prior.radius)
+
 
 class HeightBand(IncomingMessage):
     """The device is between two heights, measured along the world's up from its (0, 0, 0)."""
@@ -36,6 +41,10 @@ class HeightBand(IncomingMessage):
     def to_core(self) -> visloc.priors.HeightBand:
         """Return the prior, checked."""
         return visloc.priors.HeightBand(self.min, self.max)
+
+    @staticmethod
+    def from_core(prior: visloc.priors.HeightBand) -> HeightBand:
+        return HeightBand(min=prior.min, max=prior.max)
 
 
 class PosePrior(IncomingMessage):
@@ -57,6 +66,13 @@ class PosePrior(IncomingMessage):
         return visloc.priors.PosePrior(
             self.device_from_world.to_core("priors.pose.device_from_world"),
             covariance_to_core(self.covariance, "priors.pose.covariance"),
+        )
+
+    @staticmethod
+    def from_core(prior: visloc.priors.PosePrior) -> PosePrior:
+        return PosePrior(
+            device_from_world=Transform.from_core(prior.device_from_world),
+            covariance=prior.covariance.ravel().tolist(),
         )
 
 
@@ -94,6 +110,14 @@ class GravityPrior(IncomingMessage):
             None if self.world is None else np.array(self.world),
         )
 
+    @staticmethod
+    def from_core(prior: visloc.priors.GravityPrior) -> GravityPrior:
+        return GravityPrior(
+            direction=prior.direction.tolist(),
+            std_deg=math.degrees(prior.std),
+            world=None if prior.world is None else prior.world.tolist(),
+        )
+
 
 class Priors(IncomingMessage):
     """What is known of the device. A pose that contradicts it is refused; none is bent by it."""
@@ -127,6 +151,29 @@ class Priors(IncomingMessage):
             pose=None if self.pose is None else self.pose.to_core(),
             gravity=None if self.gravity is None else self.gravity.to_core(),
             maps=None if self.maps is None else tuple(self.maps),
+        )
+
+    @staticmethod
+    def from_core(priors: visloc.priors.Priors) -> Priors:
+        """Say it in the API's words.
+
+        Raises:
+            InvalidInput: ``priors.height`` for heights along another direction than the map's.
+        """
+        position, height, pose = priors.position, priors.height, priors.pose
+        if height is not None and height.down is not None:
+            raise InvalidInput(
+                "priors.height",
+                "heights are measured along what the map, or the gravity prior, knows of down",
+                field="priors.height",
+                expected="no down",
+            )
+        return Priors(
+            position=None if position is None else PositionPrior.from_core(position),
+            height=None if height is None else HeightBand.from_core(height),
+            pose=None if pose is None else PosePrior.from_core(pose),
+            gravity=None if priors.gravity is None else GravityPrior.from_core(priors.gravity),
+            maps=None if priors.maps is None else list(priors.maps),
         )
 
 

@@ -1,9 +1,8 @@
-"""Messages from outside: checked by name and type, refused in our words."""
+"""Incoming messages: names and types are checked; errors have the codes of this API."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 from pydantic import (
@@ -16,7 +15,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from visloc.errors import InvalidInput, TooLarge, VislocError
+from visloc.errors import InvalidInput, TooLarge, VislocError, placed
 
 _NOT_AN_OBJECT, _UNKNOWN_FIELD, _REFUSED = "not_an_object", "unknown_field", "refused"
 _MAX_NAME = 100  # characters of a name from outside
@@ -28,9 +27,9 @@ MAX_INSTANT_VALUES = 100_000
 
 
 class IncomingMessage(BaseModel):
-    """A message from outside: unknown fields are refused by name."""
+    """An incoming message. Unknown fields are refused by name."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, defer_build=True)
     # Where this message sits in the request, for errors of what is read on its own.
     path: ClassVar[str] = ""
 
@@ -70,7 +69,7 @@ class IncomingMessage(BaseModel):
 
         Args:
             text: the message.
-            limits: as of ``read``.
+            limits: as for ``read``.
             max_values: how many values it may have. They are counted by commas and brackets, those
                 in texts too.
 
@@ -96,7 +95,7 @@ class IncomingMessage(BaseModel):
 
 
 def check_json_values(text: str | bytes, max_values: int, field: str = "") -> None:
-    """Refuse JSON of too many values before it is parsed, which keeps all other threads waiting.
+    """Refuse JSON with too many values before parsing it, which would block all other threads.
 
     Raises:
         TooLarge: ``request.too_large``.
@@ -127,10 +126,10 @@ def check_num_values(values: int, max_values: int, field: str = "") -> None:
 
 
 def converted(convert: Callable[[Any], Any]) -> BeforeValidator:
-    """Make ``convert`` the first thing that happens to a field; its refusals keep their codes.
+    """Apply ``convert`` to a field before pydantic sees it; its errors keep their codes.
 
-    What it names as wrong is placed where the field is: ``camera.width`` of the second image
-    becomes ``images[1].camera.width``.
+    Their fields get the place of the message: ``camera.width`` of the second image becomes
+    ``images[1].camera.width``.
     """
 
     def validate(value: Any) -> Any:
@@ -143,7 +142,7 @@ def converted(convert: Callable[[Any], Any]) -> BeforeValidator:
 
 
 def counted(check: Callable[[Any, Any], None]) -> BeforeValidator:
-    """Let ``check`` see a field and the limits of the reading before its parts are looked at."""
+    """Call ``check`` with a field and the limits of ``read`` before its parts are validated."""
 
     def validate(value: Any, info: ValidationInfo) -> Any:
         try:
@@ -159,25 +158,8 @@ def _located(error: InvalidInput) -> PydanticCustomError:
     return PydanticCustomError(_REFUSED, "refused", {"error": error})
 
 
-@contextmanager
-def inside(place: str) -> Iterator[None]:
-    """Place what is found wrong: ``camera.width`` becomes ``PLACE.camera.width``."""
-    try:
-        yield
-    except VislocError as error:
-        raise placed(error, place) from None
-
-
-def placed(error: VislocError, place: str) -> VislocError:
-    """Return the error of a field within a larger message."""
-    field = ".".join(part for part in (place, error.field) if part)
-    return type(error)(
-        error.code, error.message, field=field or None, expected=error.expected, got=error.got
-    )
-
-
 def refusal_of(complaint: Mapping[str, Any], path: str = "") -> VislocError:
-    """Say one of pydantic's complaints in our words. Never echoes a large value."""
+    """Translate one of pydantic's errors. Never echoes a large value."""
     kind, message, location = complaint["type"], complaint["msg"], complaint["loc"]
     if kind == _REFUSED:
         return placed(complaint["ctx"]["error"], (path + _joined(location[:-1])).rstrip("."))

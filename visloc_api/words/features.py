@@ -1,12 +1,11 @@
-"""Photos, and what was found in them instead."""
+"""Photos in requests, and features that are sent instead of them."""
 
 from __future__ import annotations
 
 import base64
 import binascii
 import math
-from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +14,10 @@ from pydantic.json_schema import WithJsonSchema
 from pydantic_core import PydanticCustomError
 
 import visloc.types
-from service.api.message import IncomingMessage, converted
 from visloc.errors import InvalidInput
+from visloc_api.words.message import IncomingMessage, converted
+from visloc_api.words.wire import ARRAY_DTYPES
 
-# What an array may be made of, little-endian where it has more than one byte.
-ARRAY_DTYPES: Mapping[str, np.dtype[Any]] = {
-    "float32": np.dtype("<f4"),
-    "float16": np.dtype("<f2"),
-    "uint8": np.dtype("u1"),
-    "int8": np.dtype("i1"),
-}
 MAX_GLOBAL_DESCRIPTORS = 32
 # Two such sides stay within what NumPy can count.
 _MAX_ARRAY_SIDE = 2**31 - 1
@@ -174,7 +167,7 @@ GivenFeatures = Annotated[Features | None, converted(_features_from_text)]
 def query_to_core(
     image: bytes | None, features: Features | None
 ) -> bytes | visloc.types.QueryFeatures:
-    """Return the one of both that there is.
+    """Return the photo or the features, whichever was sent.
 
     Raises:
         InvalidInput: ``request.query``, or a code of the features.

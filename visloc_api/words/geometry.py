@@ -12,8 +12,8 @@ from pydantic.json_schema import WithJsonSchema
 
 import visloc.geometry
 import visloc.priors
-from service.api.message import IncomingMessage, converted
 from visloc.errors import InvalidInput
+from visloc_api.words.message import IncomingMessage, converted
 
 _CAMERA_TEXT = "PINHOLE,640,480,525,525,320,240"
 # How far the length of a quaternion may be from 1: it was written with three digits at least.
@@ -80,7 +80,6 @@ class Transform(IncomingMessage):
 
     @staticmethod
     def from_core(pose: visloc.geometry.Pose) -> Transform:
-        """Say it in the API's words."""
         return Transform(
             rotation_wxyz=pose.rotation_wxyz.tolist(), translation=pose.translation.tolist()
         )
@@ -93,9 +92,9 @@ class Transform(IncomingMessage):
             rotation_code: the code of an error of its rotation.
 
         Raises:
-            InvalidInput: ``rotation_code`` for what is not a unit quaternion within 1e-3, as of a
-                transform with a scale; ``pose.translation`` for what is not three finite numbers
-                of any place.
+            InvalidInput: ``rotation_code`` unless the quaternion has length 1 within 1e-3, which a
+                transform with a scale has not; ``pose.translation`` unless it is three finite
+                numbers within reach.
         """
         length = math.hypot(*self.rotation_wxyz)
         # NaN fails too.
@@ -122,7 +121,7 @@ class Transform(IncomingMessage):
 
 
 def covariance_to_core(numbers: list[float], field: str) -> NDArray[np.float64]:
-    """Return the covariance (6, 6) of a pose, checked.
+    """Return the checked covariance (6, 6) of a pose.
 
     Raises:
         InvalidInput: ``pose.covariance``.

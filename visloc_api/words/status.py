@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import Field
+
+from visloc_api.words.base import Answer
 
 
-class Health(BaseModel):
+class Health(Answer):
     """The process answers."""
 
     status: Literal["ok"] = "ok"
     version: str
 
 
-class MapNotLoaded(BaseModel):
+class MapNotLoaded(Answer):
     """A map that is on disk and cannot be served."""
 
     id: str
@@ -22,7 +24,7 @@ class MapNotLoaded(BaseModel):
     message: str
 
 
-class Readiness(BaseModel):
+class Readiness(Answer):
     """Whether photos are accepted."""
 
     ready: Annotated[bool, Field(description="whether the maps of the start are open and warm")]
@@ -30,7 +32,7 @@ class Readiness(BaseModel):
     not_loaded: Annotated[list[MapNotLoaded], Field(description="they do not prevent readiness")]
 
 
-class Problem(BaseModel):
+class Problem(Answer):
     """An error, as RFC 9457 problem details. ``code`` and ``kind`` are stable."""
 
     type: str = "about:blank"

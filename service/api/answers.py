@@ -1,0 +1,165 @@
+"""From what the engine found to the words of its answers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+import visloc.types
+from service.api.geopose import geoposes_to_words
+from service.values import InstantLocalization, Localization, MatchPicture
+from visloc.errors import VislocError
+from visloc.geometry import Pose
+from visloc.types import PoseSource
+from visloc_api.words.answers import (
+    MAX_RETRIEVED,
+    CameraUsed,
+    Debug,
+    ImageAnswer,
+    ImageError,
+    InstantAnswer,
+    LocalizeResponse,
+    MapRef,
+    Orientation,
+    PoseEstimate,
+    Refusal,
+    RetrievedImage,
+    RigPose,
+)
+
+
+def localize_response(found: Localization, request_id: str) -> LocalizeResponse:
+    """Answer a photo."""
+    answer, evidence = found.answer, found.answer.evidence
+    localized = answer if isinstance(answer, visloc.types.Localized) else None
+    cam_from_world = None if localized is None else localized.cam_from_world
+    geopose, geopose_ypr = geoposes_to_words(cam_from_world, found.geodetic, ypr=found.ypr)
+    return LocalizeResponse(
+        request_id=request_id,
+        status="not_localized" if localized is None else "localized",
+        pose=None if localized is None else _pose_estimate(localized),
+        refusal=_refusal(answer) if isinstance(answer, visloc.types.NotLocalized) else None,
+        keypoints=evidence.num_keypoints,
+        correspondences=evidence.num_correspondences,
+        inliers=evidence.num_inliers,
+        inlier_ratio=evidence.inlier_ratio,
+        retrieved=_retrieved(evidence.retrieved),
+        camera=_camera(evidence),
+        orientation=_orientation(evidence),
+        map=MapRef(id=found.map_id, version=found.map_version),
+        seconds=dict(evidence.seconds),
+        geopose=geopose,
+        geopose_ypr=geopose_ypr,
+        debug=None if found.debug is None else _debug(found.debug),
+        tile=found.tile,
+    )
+
+
+def instant_answer(found: InstantLocalization, request_id: str) -> InstantAnswer:
+    """Answer the images of one instant."""
+    answer = found.answer
+    pose, correspondences = answer.pose, answer.num_correspondences
+    rig_from_world = None if pose is None else pose.rig_from_world
+    geopose, geopose_ypr = geoposes_to_words(rig_from_world, found.geodetic, ypr=found.ypr)
+    return InstantAnswer(
+        request_id=request_id,
+        timestamp=answer.timestamp,
+        status="not_localized"
+        if pose is None
+        else "localized"
+        if pose.source is PoseSource.ESTIMATED
+        else "filled",
+        source=None if pose is None else pose.source,
+        pose=None if pose is None else _rig_pose(pose),
+        refusal=None if answer.refusal is None else _refusal(answer.refusal),
+        images=tuple(_image_answer(image, pose) for image in answer.images),
+        correspondences=correspondences,
+        inliers=answer.num_inliers,
+        inlier_ratio=answer.num_inliers / correspondences if correspondences else 0.0,
+        map=MapRef(id=found.map_id, version=found.map_version),
+        seconds=dict(answer.seconds),
+        geopose=geopose,
+        geopose_ypr=geopose_ypr,
+        tile=found.tile,
+    )
+
+
+def _pose_estimate(localized: visloc.types.Localized) -> PoseEstimate:
+    pose = localized.cam_from_world
+    return PoseEstimate.model_validate({"cam_from_world": pose, **_uncertain(pose, localized)})
+
+
+def _rig_pose(pose: visloc.types.RigPose) -> RigPose:
+    return RigPose.model_validate(
+        {"rig_from_world": pose.rig_from_world, **_uncertain(pose.rig_from_world, pose)}
+    )
+
+
+def _uncertain(
+    pose: Pose, measured: visloc.types.Localized | visloc.types.RigPose
+) -> dict[str, Any]:
+    return {
+        "position": pose.center,
+        "orientation": pose.inverse().rotation_wxyz,
+        "covariance": measured.covariance,
+        "position_std": measured.position_std,
+        "orientation_std_deg": np.degrees(measured.orientation_std),
+    }
+
+
+def _refusal(refused: visloc.types.NotLocalized | visloc.types.Refusal) -> Refusal:
+    return Refusal(stage=refused.stage, reason=refused.reason, message=refused.message)
+
+
+def _retrieved(images: Sequence[visloc.types.RetrievedImage]) -> tuple[RetrievedImage, ...]:
+    return tuple(
+        RetrievedImage(image=each.name, score=each.score, similarities=dict(each.similarities))
+        for each in images
+    )
+
+
+def _camera(evidence: visloc.types.Evidence) -> CameraUsed:
+    camera = evidence.camera
+    return CameraUsed(
+        model=camera.model,
+        width=camera.width,
+        height=camera.height,
+        params=camera.params,
+        source=evidence.camera_source,
+    )
+
+
+def _orientation(evidence: visloc.types.Evidence) -> Orientation:
+    return Orientation(exif=evidence.exif_orientation, read_as=evidence.read_as)
+
+
+def _debug(picture: MatchPicture) -> Debug:
+    return Debug(
+        keypoints=picture.keypoints,
+        points=picture.points,
+        inliers=picture.inliers,
+        overlay=picture.overlay,
+    )
+
+
+def _image_answer(
+    image: visloc.types.ImageAnswer, pose: visloc.types.RigPose | None
+) -> ImageAnswer:
+    seen = image.evidence
+    return ImageAnswer(
+        sensor=image.sensor,
+        error=None if image.error is None else _image_error(image.error),
+        cam_from_world=None if pose is None else image.cam_from_rig @ pose.rig_from_world,
+        keypoints=0 if seen is None else seen.num_keypoints,
+        correspondences=0 if seen is None else seen.num_correspondences,
+        inliers=0 if seen is None else seen.num_inliers,
+        retrieved=() if seen is None else _retrieved(seen.retrieved[:MAX_RETRIEVED]),
+        camera=None if seen is None else _camera(seen),
+        orientation=None if seen is None else _orientation(seen),
+    )
+
+
+def _image_error(error: VislocError) -> ImageError:
+    return ImageError(kind=type(error).__name__, code=error.code, message=str(error))

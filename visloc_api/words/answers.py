@@ -1,0 +1,402 @@
+"""The answers to a photo, to the images of a rig, and to the instants of a sequence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+import visloc.types
+from visloc.geometry import Camera, Pose
+from visloc.types import PoseSource
+from visloc_api.words.base import (
+    Answer,
+    AnswerWithArrays,
+    Base64,
+    Covariance,
+    Flags,
+    Numbers3,
+    Numbers4,
+    NumbersNx2,
+    NumbersNx3,
+    OneOf,
+    SentAs,
+)
+from visloc_api.words.geometry import Transform
+from visloc_api.words.geopose import GeoPose, GeoPoseYpr
+
+# A sequence has thousands of images, and each may have been matched against a thousand photos.
+MAX_RETRIEVED = 20
+# Of every stated uncertainty.
+_NOT_COVERED = (
+    "; from the scatter of the matches alone, without errors that landmarks share (depth, "
+    "calibration, poses of mapping photos): on one map from depth the error was 13 times as large"
+)
+_COVARIANCE = (
+    "6 x 6, row by row: rotation (rad), then translation, for R <- Exp(w) R and t <- t + dt of "
+)
+
+
+class _ReceivedPose(Pose):
+    """A pose, and the numbers that were sent of it, which a rotation matrix rounds."""
+
+    __slots__ = ("sent",)
+    sent: Transform
+
+    @staticmethod
+    def read(raw: Any) -> _ReceivedPose:
+        """Read JSON."""
+        rotation_wxyz, translation = (
+            [float(number) for number in raw[name]] for name in ("rotation_wxyz", "translation")
+        )
+        pose = Pose.from_quaternion(rotation_wxyz, translation)
+        received = _ReceivedPose(pose.rotation, pose.translation)
+        sent = Transform(rotation_wxyz=rotation_wxyz, translation=translation)
+        object.__setattr__(received, "sent", sent)
+        return received
+
+
+def _transform(pose: Pose) -> Transform:
+    return pose.sent if isinstance(pose, _ReceivedPose) else Transform.from_core(pose)
+
+
+SentPose = Annotated[Pose, SentAs(Transform, Pose, _ReceivedPose.read, _transform)]
+
+
+class _PoseWithDigits(AnswerWithArrays):
+    """A pose whose numbers can be had with every digit as sent."""
+
+    pose_field: ClassVar[str]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_digits(cls, values: Any) -> Any:
+        if isinstance(values, Mapping) and "rotation_wxyz" in values:
+            values = {**values, cls.pose_field: values}
+        return values
+
+    @property
+    def rotation_wxyz(self) -> tuple[float, float, float, float]:
+        """The rotation as a unit quaternion (w, x, y, z)."""
+        w, x, y, z = _transform(getattr(self, self.pose_field)).rotation_wxyz
+        return w, x, y, z
+
+    @property
+    def translation(self) -> tuple[float, float, float]:
+        """The translation, metres when the map is metric."""
+        x, y, z = _transform(getattr(self, self.pose_field)).translation
+        return x, y, z
+
+
+class PoseEstimate(_PoseWithDigits):
+    """Where the photo was taken, and how sure that is."""
+
+    pose_field = "cam_from_world"
+
+    cam_from_world: SentPose
+    position: Annotated[
+        Numbers3,
+        Field(description="camera centre in the world, metres when the map is metric"),
+    ]
+    orientation: Annotated[Numbers4, Field(description="rotation of world_from_cam as w, x, y, z")]
+    covariance: Annotated[
+        Covariance, Field(description=f"{_COVARIANCE}cam_from_world{_NOT_COVERED}")
+    ]
+    position_std: Annotated[
+        Numbers3,
+        Field(
+            description=f"standard deviations of the position along the world's axes{_NOT_COVERED}"
+        ),
+    ]
+    orientation_std_deg: Annotated[
+        Numbers3,
+        Field(
+            description="standard deviations about the camera's x, y and z axes, degrees"
+            + _NOT_COVERED
+        ),
+    ]
+
+
+class RigPose(_PoseWithDigits):
+    """Where the rig was, and how sure that is."""
+
+    pose_field = "rig_from_world"
+
+    rig_from_world: SentPose
+    position: Annotated[
+        Numbers3,
+        Field(description="the rig's origin in the world, metres when the map is metric"),
+    ]
+    orientation: Annotated[Numbers4, Field(description="rotation of world_from_rig as w, x, y, z")]
+    covariance: Annotated[
+        Covariance, Field(description=f"{_COVARIANCE}rig_from_world{_NOT_COVERED}")
+    ]
+    position_std: Annotated[
+        Numbers3,
+        Field(
+            description=f"standard deviations of the position along the world's axes{_NOT_COVERED}"
+        ),
+    ]
+    orientation_std_deg: Annotated[
+        Numbers3,
+        Field(
+            description="standard deviations about the rig's x, y and z axes, degrees"
+            + _NOT_COVERED
+        ),
+    ]
+
+
+class Refusal(Answer):
+    """Why there is no pose."""
+
+    stage: Annotated[str, OneOf(visloc.types.Stage), Field(description="the stage that gave up")]
+    reason: Annotated[str, OneOf(visloc.types.Reason), Field(description="a stable word")]
+    message: Annotated[str, Field(description="for a person")]
+
+
+class RetrievedImage(Answer):
+    """A mapping photo that was matched against."""
+
+    image: Annotated[str, Field(description="its name in the map")]
+    score: Annotated[float, Field(description="fused, comparable within one answer only")]
+    similarities: Annotated[dict[str, float], Field(description="cosine by global descriptor")]
+
+
+class CameraUsed(Answer):
+    """The intrinsics used, for the pixels as stored."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+    source: Annotated[
+        str,
+        OneOf(visloc.types.CameraSource),
+        Field(
+            description="given; given_scaled, for another size of the same aspect; exif, its "
+            "focal length; estimated, found together with the pose; or guess, 1.2 times the longer "
+            "side"
+        ),
+    ]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_camera(cls, values: Any) -> Any:
+        if isinstance(values, Mapping) and isinstance(camera := values.get("camera"), Camera):
+            names = ("model", "width", "height", "params")
+            values = {**values, **{name: getattr(camera, name) for name in names}}
+        return values
+
+    @model_validator(mode="after")
+    def _check_camera(self) -> Self:
+        self.camera  # noqa: B018  raises InvalidInput
+        return self
+
+    @property
+    def camera(self) -> Camera:
+        """As a camera of the core."""
+        return Camera(self.model, self.width, self.height, self.params)
+
+
+class Orientation(Answer):
+    """How the photo was turned to find features.
+
+    Camera, keypoints and pose are those of the stored pixels, whatever this says.
+    """
+
+    exif: Annotated[int, Field(description="1 to 8 as stored in the photo, 1 when absent")]
+    read_as: Annotated[
+        str,
+        OneOf(visloc.types.ReadAs),
+        Field(
+            description="upright: features were found in the photo turned by its EXIF orientation; "
+            "stored: in the pixels as stored, or the features were sent"
+        ),
+    ]
+
+
+class MapRef(Answer):
+    """The map that answered, or the set of maps."""
+
+    id: str
+    version: str
+
+
+# In Python, keypoints are (n, 2), points (n, 3) and inliers (n,).
+class Debug(AnswerWithArrays):
+    """What the solver was given, correspondence by correspondence, and what it made of it."""
+
+    keypoints: Annotated[
+        NumbersNx2,
+        Field(description="x, y of each in pixels of the photo as stored, one after the other"),
+    ]
+    points: Annotated[
+        NumbersNx3, Field(description="x, y, z of each in the world, one after the other")
+    ]
+    inliers: Annotated[
+        Flags, Field(description="of each: whether the best pose explains it, refused or not")
+    ]
+    overlay: Annotated[
+        Base64,
+        Field(description="JPEG: the photo with its matches, beside photos that it was found in"),
+    ]
+
+    @model_validator(mode="after")
+    def _check_lengths(self) -> Self:
+        if not len(self.keypoints) == len(self.points) == len(self.inliers):
+            raise ValueError("correspondences that are not whole")
+        return self
+
+
+# Of a set, the map in it that answered.
+_TileRef = Annotated[
+    str | None,
+    Field(
+        description="of a set of maps: id@version of the map in it that the answer rests on, or "
+        "that came closest; null for a map on its own"
+    ),
+]
+_RequestId = Annotated[str, Field(description="the caller's, or made by the server")]
+_Inliers = Annotated[
+    int, Field(description="of them, those that agree with the best pose, refused or not")
+]
+_InlierRatio = Annotated[float, Field(description="inliers / correspondences; 0 without any")]
+_Ypr = Annotated[GeoPoseYpr | None, Field(description="the same in angles, when asked for")]
+
+
+class LocalizeResponse(AnswerWithArrays):
+    """The answer: a pose, or the reason why there is none."""
+
+    request_id: _RequestId
+    status: Literal["localized", "not_localized"]
+    pose: Annotated[PoseEstimate | None, Field(description="null when not localized")]
+    refusal: Annotated[Refusal | None, Field(description="null when localized")]
+    keypoints: Annotated[int, Field(description="found in the photo")]
+    correspondences: Annotated[int, Field(description="2D-3D matches given to the solver")]
+    inliers: _Inliers
+    inlier_ratio: _InlierRatio
+    retrieved: Annotated[
+        tuple[RetrievedImage, ...],
+        Field(description="mapping photos matched against, best first"),
+    ]
+    camera: CameraUsed
+    orientation: Orientation
+    map: MapRef
+    seconds: Annotated[dict[str, float], Field(description="wall time by stage that was reached")]
+    geopose: Annotated[
+        GeoPose | None,
+        Field(description="of the camera; null when not localized or the map is not anchored"),
+    ] = None
+    geopose_ypr: _Ypr = None
+    debug: Annotated[Debug | None, Field(description="the matches, when asked for")] = None
+    tile: _TileRef = None
+
+    @model_validator(mode="after")
+    def _check_status(self) -> Self:
+        if (self.status, self.pose is None, self.refusal is None) not in (
+            ("localized", False, True),
+            ("not_localized", True, False),
+        ):
+            raise ValueError(f"status {self.status!r} does not fit pose and refusal")
+        return self
+
+    @property
+    def localized(self) -> bool:
+        """Whether there is a pose."""
+        return self.pose is not None
+
+
+class ImageError(Answer):
+    """Why an image could not be used."""
+
+    kind: Annotated[str, Field(description="the kind of error, such as InvalidInput")]
+    code: Annotated[str, Field(description="a stable word, such as image.undecodable")]
+    message: Annotated[str, Field(description="for a person")]
+
+
+class ImageAnswer(AnswerWithArrays):
+    """What one image of an instant contributed."""
+
+    sensor: str
+    error: Annotated[
+        ImageError | None,
+        Field(description="why it could not be used; the others are answered without it"),
+    ]
+    cam_from_world: Annotated[
+        SentPose | None,
+        Field(description="when the instant has a pose, also of an image that could not be used"),
+    ]
+    keypoints: Annotated[int, Field(description="found in the photo")]
+    correspondences: Annotated[int, Field(description="2D-3D matches given to the solver")]
+    inliers: Annotated[int, Field(description="of them, those that agree with the rig's pose")]
+    retrieved: Annotated[
+        tuple[RetrievedImage, ...],
+        Field(description=f"the best {MAX_RETRIEVED} mapping photos matched against, best first"),
+    ]
+    camera: Annotated[CameraUsed | None, Field(description="null when there is an error")]
+    orientation: Annotated[Orientation | None, Field(description="null when there is an error")]
+
+
+class InstantAnswer(AnswerWithArrays):
+    """The answer to an instant: a pose and what it rests on, or the reason why there is none."""
+
+    request_id: _RequestId
+    timestamp: Annotated[int | None, Field(description="as it was sent")]
+    status: Annotated[
+        Literal["localized", "filled", "not_localized"],
+        Field(description="filled: the pose rests on other instants"),
+    ]
+    source: Annotated[
+        PoseSource | None,
+        Field(
+            description="estimated, from the instant's own images; motion, interpolated or "
+            "nearest when filled; null without a pose"
+        ),
+    ]
+    pose: Annotated[RigPose | None, Field(description="null when not localized")]
+    refusal: Annotated[
+        Refusal | None, Field(description="why the instant's own images gave no pose")
+    ]
+    images: Annotated[tuple[ImageAnswer, ...], Field(description="in the order of the request")]
+    correspondences: Annotated[int, Field(description="of all images")]
+    inliers: _Inliers
+    inlier_ratio: _InlierRatio
+    map: MapRef
+    seconds: Annotated[
+        dict[str, float],
+        Field(description="wall time by stage that was reached, summed over the images"),
+    ]
+    geopose: Annotated[
+        GeoPose | None,
+        Field(
+            description="of the rig, whose frame is read like a camera's; null without a pose, or "
+            "when the map is not anchored"
+        ),
+    ] = None
+    geopose_ypr: _Ypr = None
+    tile: _TileRef = None
+
+    @model_validator(mode="after")
+    def _check_status(self) -> Self:
+        source = self.source
+        has = (self.pose is not None, self.refusal is not None, source is not None)
+        if (self.status, *has, source is PoseSource.ESTIMATED) not in (
+            ("localized", True, False, True, True),
+            ("filled", True, True, True, False),
+            ("not_localized", False, True, False, False),
+        ):
+            raise ValueError(f"status {self.status!r} does not fit pose, refusal and source")
+        return self
+
+    @property
+    def localized(self) -> bool:
+        """Whether the instant's own photos gave the pose; False when it was filled."""
+        return self.status == "localized"
+
+
+class LocalizeSequenceResponse(Answer):
+    """The answers to a sequence."""
+
+    request_id: _RequestId
+    answers: Annotated[tuple[InstantAnswer, ...], Field(description="one per instant, in order")]

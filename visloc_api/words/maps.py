@@ -1,0 +1,248 @@
+"""What maps are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
+
+import visloc.geometry
+from visloc_api.words.base import Answer, OneOf, SentAs
+from visloc_api.words.message import IncomingMessage
+
+Numbers = tuple[float, ...]
+# Least and greatest x, y, z.
+Box = tuple[Numbers, Numbers]
+
+
+class Extent(Answer):
+    """Smallest box along the world's axes that holds all landmarks."""
+
+    min: Numbers
+    max: Numbers
+
+
+def _box(raw: Any) -> Box:
+    return tuple(map(float, raw["min"])), tuple(map(float, raw["max"]))
+
+
+SentBox = Annotated[Box, SentAs(Extent, tuple, _box, lambda box: Extent(min=box[0], max=box[1]))]
+
+
+class RigInfo(Answer):
+    """A rig that the map knows."""
+
+    id: str
+    sensors: Annotated[tuple[str, ...], Field(description="ids of its cameras")]
+
+
+class Geodetic(Answer):
+    """Where the world lies on Earth.
+
+    enu = scale R x + translation gives metres east, north and up of the position.
+    """
+
+    latitude_deg: Annotated[float, Field(description="WGS84")]
+    longitude_deg: float
+    altitude_m: Annotated[float, Field(description="above the ellipsoid")]
+    scale: Annotated[float, Field(description="metres per unit of the world")]
+    rotation_wxyz: Annotated[Numbers, Field(description="R as a unit quaternion")]
+    translation: Annotated[Numbers, Field(description="metres")]
+
+
+class Anchor(Answer):
+    """What the world's position, orientation and scale rest on."""
+
+    kind: Annotated[
+        str,
+        Field(description="dataset, model, gnss, positions, correspondences or none"),
+    ]
+    images: Annotated[int, Field(description="photos, or given points, that it rests on")]
+    rms: Annotated[
+        float | None,
+        Field(description="how far they are from where they were said to be, units of the world"),
+    ]
+    geodetic: Annotated[Geodetic | None, Field(description="null when not anchored to the Earth")]
+
+
+class GeoCircle(Answer):
+    """A circle on Earth about the middle of a map, which holds the map."""
+
+    latitude: Annotated[float, Field(description="degrees, WGS84")]
+    longitude: Annotated[float, Field(description="degrees")]
+    radius: Annotated[float, Field(description="metres")]
+
+
+class Similarity(Answer):
+    """A change of frame and unit: x_a = scale R x_b + translation for one called a_from_b."""
+
+    rotation_wxyz: Annotated[Numbers, Field(description="R as a unit quaternion")]
+    translation: Annotated[Numbers, Field(description="in the unit of a")]
+    scale: Annotated[float, Field(description="units of a in one unit of b")]
+
+
+class SentSimilarity(visloc.geometry.Similarity):
+    """A similarity of the core over the numbers that are sent: a set may have 10 000 of them."""
+
+    __slots__ = ("sent",)
+    sent: Similarity
+
+    def __init__(self, sent: Similarity) -> None:
+        object.__setattr__(self, "sent", sent)
+
+    @property
+    def scale(self) -> float:
+        return self.sent.scale
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        sent = self.sent
+        return visloc.geometry.Pose.from_quaternion(sent.rotation_wxyz, sent.translation).rotation
+
+    @property
+    def translation(self) -> NDArray[np.float64]:
+        return np.array(self.sent.translation)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, SentSimilarity) and self.sent == other.sent
+
+    def __hash__(self) -> int:
+        return hash(self.sent)
+
+
+class Tile(Answer):
+    """One map of a set."""
+
+    map: str
+    version: str
+    set_from_tile: Annotated[
+        SentSimilarity,
+        SentAs(
+            Similarity,
+            SentSimilarity,
+            lambda raw: SentSimilarity(Similarity.model_validate(raw)),
+            lambda similarity: similarity.sent,
+        ),
+        Field(description="from the map's world to that of the set"),
+    ]
+    extent: Annotated[
+        SentBox, Field(description="of its landmarks and photos, in the world of the set")
+    ]
+    images: Annotated[int, Field(description="mapping photos")]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_parts(cls, values: Any) -> Any:
+        if isinstance(values, Mapping) and "scale" in values:
+            parts = {name: values[name] for name in Similarity.model_fields}
+            values = {"set_from_tile": parts, **values}
+        return values
+
+    @property
+    def scale(self) -> float:
+        """Units of the set's world in one of its own."""
+        return self.set_from_tile.sent.scale
+
+    @property
+    def rotation_wxyz(self) -> Numbers:
+        """R of ``x_set = scale R x + translation`` as a unit quaternion (w, x, y, z)."""
+        return self.set_from_tile.sent.rotation_wxyz
+
+    @property
+    def translation(self) -> Numbers:
+        """In the set's world."""
+        return self.set_from_tile.sent.translation
+
+    @property
+    def ref(self) -> str:
+        """``id@version``."""
+        return f"{self.map}@{self.version}"
+
+
+class VersionInfo(Answer):
+    """A published version of a map."""
+
+    version: str
+    current: Annotated[bool, Field(description="whether it is in use")]
+
+
+class UseVersionRequest(IncomingMessage):
+    """Which version of a map to put into use."""
+
+    version: Annotated[str, Field(description="of those that are published")]
+
+
+class MapInfo(Answer):
+    """What a map is, or a set of maps."""
+
+    id: str
+    version: str
+    created: Annotated[str, Field(description="ISO 8601, UTC")]
+    metric: Annotated[bool, Field(description="whether one unit of the world is a metre")]
+    method: Annotated[
+        str | None,
+        BeforeValidator(lambda value: value or None),
+        Field(description="how the landmarks were made, such as rgbd; null for a set"),
+    ]
+    local_features: Annotated[str, Field(description="such as xfeat")]
+    global_features: tuple[str, ...]
+    images: Annotated[int, Field(description="mapping photos")]
+    landmarks: Annotated[int, Field(description="3D points")]
+    observations: Annotated[
+        int | None,
+        Field(description="sightings of landmarks in mapping photos; null for a set"),
+    ]
+    extent: SentBox
+    size_bytes: Annotated[int, Field(description="on the server's disk; of a set without its maps")]
+    down: Annotated[
+        Numbers | None,
+        BeforeValidator(lambda value: value or None),
+        PlainSerializer(lambda down: list(down or ()), return_type=list[float]),
+        Field(description="unit vector that points down in the world; empty when not known"),
+    ]
+    rigs: Annotated[tuple[RigInfo, ...], Field(description="that requests may name by their ids")]
+    anchor: Annotated[
+        Anchor | None, Field(description="null for maps of format 1.0, which do not tell")
+    ] = None
+    place: Annotated[GeoCircle | None, Field(description="null when not anchored to the Earth")] = (
+        None
+    )
+    current: Annotated[bool, Field(description="whether this version is in use")]
+    versions: Annotated[
+        tuple[VersionInfo, ...], Field(description="all published ones of the map, oldest first")
+    ]
+    content_hash: Annotated[
+        str,
+        Field(description="sha256 over all that localizes: equal maps have equal ones"),
+    ]
+    fusion: Annotated[
+        str | None,
+        BeforeValidator(lambda value: value or None),
+        Field(description="of the global features, unless a query says otherwise; null for a set"),
+    ] = None
+    fusion_weights: Annotated[
+        dict[str, float],
+        BeforeValidator(lambda value: value or {}),
+        Field(description="by global feature; empty when all count alike"),
+    ] = {}  # noqa: RUF012  pydantic copies it
+    kind: Annotated[
+        str, OneOf(Literal["map", "set"]), Field(description="set: of several maps")
+    ] = "map"
+    num_tiles: Annotated[int | None, Field(description="maps of a set; null for a map")] = None
+    tiles: Annotated[
+        tuple[Tile, ...], Field(description="the maps of a set; left empty in lists of maps")
+    ] = ()
+
+    @property
+    def ref(self) -> str:
+        """``id@version``: this version, even after the server has switched to a newer one."""
+        return f"{self.id}@{self.version}"
+
+
+class ListMapsResponse(Answer):
+    """The maps that are served."""
+
+    maps: tuple[MapInfo, ...]

@@ -1,0 +1,130 @@
+"""What may be chosen per query, made from ``visloc.types.LocalizeOptions`` field by field."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_args, get_type_hints
+
+from pydantic import Field, create_model
+
+import visloc.types
+from visloc.errors import InvalidInput
+from visloc_api.words.message import IncomingMessage, converted
+
+# More global descriptors than any map has, and longer names.
+_MAX_WEIGHTS = 16
+_MAX_NAME = 100
+_MESSAGES = {
+    "read_as": "unknown orientation to read in",
+    "extraction": "unknown effort",
+    "fusion": "unknown way of fusing",
+    "matcher": "unknown way of matching",
+    "solver": "unknown solver",
+}
+
+
+def _kind_of(hint: Any) -> type:
+    """Return the class of an option that may be None."""
+    (kind,) = (each for each in get_args(hint) or (hint,) if each is not type(None))
+    found: type = getattr(kind, "__origin__", kind)
+    return found
+
+
+# The class of each option: int, float, str, Mapping, or an enumeration of texts.
+KINDS: Mapping[str, type] = {
+    name: _kind_of(hint) for name, hint in get_type_hints(visloc.types.LocalizeOptions).items()
+}
+# The texts that an option may have, where they are listed.
+CHOICES: Mapping[str, tuple[str, ...]] = {
+    "preset": tuple(visloc.types.PRESETS),
+    **{
+        name: tuple(word.value for word in kind)
+        for name, kind in KINDS.items()
+        if issubclass(kind, StrEnum)
+    },
+}
+
+
+def _check_names(value: object) -> object:
+    """Refuse too many or too long names before any weight is looked at."""
+    if isinstance(value, Mapping):
+        if len(value) > _MAX_WEIGHTS:
+            raise InvalidInput(
+                "options.fusion_weights",
+                "too many weights",
+                field="fusion_weights",
+                expected=f"at most {_MAX_WEIGHTS}",
+                got=len(value),
+            )
+        for name in value:
+            if not isinstance(name, str) or not 0 < len(name) <= _MAX_NAME:
+                raise InvalidInput(
+                    "options.fusion_weights",
+                    "not the name of a global descriptor",
+                    field="fusion_weights",
+                    expected=f"a text of 1 to {_MAX_NAME} characters",
+                    got=f"{len(name)} characters" if isinstance(name, str) else type(name).__name__,
+                )
+    return value
+
+
+class OptionsMessage(IncomingMessage):
+    """What may be chosen per query. null is the same as left out."""
+
+    path: ClassVar[str] = "options."
+
+    def to_core(self) -> visloc.types.LocalizeOptions:
+        """Return the options, checked."""
+        given = self.model_dump(exclude_none=True)
+        for name in given.keys() & _MESSAGES.keys():
+            if given[name] not in CHOICES[name]:
+                raise InvalidInput(
+                    f"options.{name}",
+                    _MESSAGES[name],
+                    field=f"options.{name}",
+                    expected=f"one of {', '.join(CHOICES[name])}",
+                    got=given[name],
+                )
+            given[name] = KINDS[name](given[name])
+        return visloc.types.LocalizeOptions(**given)
+
+
+def describe(name: str) -> str:
+    """Tell callers what an option is: its values, its default, and what else there is to know."""
+    option = visloc.types.LocalizeOptions.__dataclass_fields__[name]
+    facts = option.metadata
+    text = facts["description"]
+    if name in CHOICES:
+        text += f": {', '.join(CHOICES[name])}"
+    elif facts["range"] is not None:
+        text += ": {:g} to {:.10g}".format(*facts["range"])
+    text += f"; by default {facts['default']}"
+    return f"{text}. {facts['details']}" if facts["details"] else text
+
+
+def _field(name: str, kind: type) -> Any:
+    described = Field(description=describe(name))
+    if kind is Mapping:
+        return Annotated[dict[str, float] | None, converted(_check_names), described]
+    return Annotated[(str if issubclass(kind, StrEnum) else kind) | None, described]
+
+
+if TYPE_CHECKING:
+    LocalizeOptions = OptionsMessage
+else:
+    LocalizeOptions = create_model(
+        "LocalizeOptions",
+        __base__=OptionsMessage,
+        __doc__=OptionsMessage.__doc__,
+        __module__=__name__,
+        **{name: (_field(name, kind), None) for name, kind in KINDS.items()},
+    )
+
+
+def _options_from_text(value: object) -> object:
+    return LocalizeOptions.read_json(value) if isinstance(value, str) else value
+
+
+# Options as an object, or as JSON in a field of a form.
+GivenOptions = Annotated[LocalizeOptions, converted(_options_from_text)]

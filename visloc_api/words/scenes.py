@@ -1,0 +1,42 @@
+"""What of a map is drawn."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from visloc_api.words.answers import MapRef
+from visloc_api.words.base import Answer
+
+
+class MapCamera(Answer):
+    """Intrinsics of mapping photos."""
+
+    model: Annotated[str, Field(description="COLMAP's name, such as PINHOLE")]
+    width: Annotated[int, Field(description="pixels")]
+    height: Annotated[int, Field(description="pixels")]
+    params: Annotated[list[float], Field(description="in COLMAP's order")]
+
+
+class MapImage(Answer):
+    """A mapping photo: where it was taken, and looking which way."""
+
+    name: str
+    camera: Annotated[str, Field(description="one of `cameras`")]
+    position: Annotated[list[float], Field(description="the camera centre in the world")]
+    orientation: Annotated[
+        list[float], Field(description="the rotation of world_from_cam: w, x, y, z with w >= 0")
+    ]
+
+
+class MapImages(Answer):
+    """Mapping photos of one version of a map, in the map's order."""
+
+    map: MapRef
+    total: Annotated[int, Field(description="photos that the map has")]
+    first: Annotated[int, Field(description="as asked for; 0 is the first")]
+    cameras: Annotated[
+        dict[str, MapCamera], Field(description="of these photos, by the ids that they name")
+    ]
+    images: list[MapImage]
