@@ -43,8 +43,8 @@ from clients.evaluation.compare import (
     parse_values,
 )
 from clients.evaluation.queries import read_queries
+from clients.evaluation.readers import choose_reader, takes_features
 from clients.evaluation.results import check_can_be_written, write_whole
-from clients.evaluation.sending import choose_reader, takes_features
 from visloc.errors import InvalidInput
 from visloc.geometry import PixelOrigin
 

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from clients.evaluation.running import Outcome
+from clients.evaluation.run import Outcome
 from clients.wire.geopose import GeoPose
 from clients.wire.types import LocalizeResult, MapInfo, PoseEstimate
 

@@ -50,9 +50,9 @@ from clients.evaluation.benchmark import Run, known_poses, make_report
 from clients.evaluation.dataset_run import Asking
 from clients.evaluation.modes import DEFAULT_MAX_GAP_S, Arrangement, Mode, arrange, parse_modes
 from clients.evaluation.queries import read_queries
+from clients.evaluation.readers import choose_reader
 from clients.evaluation.results import check_can_be_written, write_poses, write_whole
-from clients.evaluation.running import InstantOutcome, Outcome
-from clients.evaluation.sending import choose_reader
+from clients.evaluation.run import InstantOutcome, Outcome
 from clients.wire.priors import priors_from_text
 from clients.wire.types import PoseEstimate
 from visloc.errors import VislocError

@@ -23,7 +23,7 @@ from clients.evaluation.results import (
     write_poses,
     write_whole,
 )
-from clients.evaluation.running import InstantOutcome, Outcome, localize_all, localize_instants
+from clients.evaluation.run import InstantOutcome, Outcome, localize_all, localize_instants
 from clients.wire.features import Features
 from clients.wire.types import LocalizeOptions
 from visloc.errors import Conflict

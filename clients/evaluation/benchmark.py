@@ -13,7 +13,7 @@ import numpy as np
 from clients.evaluation.filling import estimate_of, measured
 from clients.evaluation.modes import Mode
 from clients.evaluation.queries import Query
-from clients.evaluation.running import InstantOutcome, Outcome
+from clients.evaluation.run import InstantOutcome, Outcome
 from clients.wire.types import MapInfo, ServerInfo
 from visloc.errors import InvalidInput
 from visloc.evaluation import (

@@ -13,8 +13,8 @@ from clients.cli.display import unit_of
 from clients.client import AsyncClient
 from clients.evaluation.benchmark import Run, figures_of, known_poses
 from clients.evaluation.queries import Query
-from clients.evaluation.running import Outcome, localize_one
-from clients.evaluation.sending import Reader
+from clients.evaluation.readers import Reader
+from clients.evaluation.run import Outcome, localize_one
 from clients.wire.types import LocalizeOptions, MapInfo, ServerInfo
 from visloc.errors import Forbidden, InvalidInput, Unauthenticated, Unavailable, VislocError
 from visloc.evaluation import Threshold

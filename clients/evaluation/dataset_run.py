@@ -13,8 +13,8 @@ from clients.cli.progress import run_with_progress
 from clients.client import AsyncClient
 from clients.evaluation.benchmark import Run
 from clients.evaluation.modes import Arrangement
-from clients.evaluation.running import InstantOutcome, Outcome, localize_all, localize_instants
-from clients.evaluation.sending import Reader
+from clients.evaluation.readers import Reader
+from clients.evaluation.run import InstantOutcome, Outcome, localize_all, localize_instants
 from clients.wire.types import LocalizeOptions
 
 

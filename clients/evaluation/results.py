@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 from urllib.parse import quote
 
 from clients.evaluation.filling import pose_as_json
-from clients.evaluation.running import Outcome
+from clients.evaluation.run import Outcome
 from clients.wire.answers import parse_pose
 from clients.wire.types import PoseEstimate
 from visloc.errors import DatasetError, InvalidInput
