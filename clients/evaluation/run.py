@@ -1,4 +1,4 @@
-"""Asking about many photos, several at a time."""
+"""Localizing many photos, several at a time."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from clients.errors import not_understood
 from clients.evaluation.filling import photo_result, poses_from_rig
 from clients.evaluation.instants import QueryInstant
 from clients.evaluation.queries import Query
+from clients.evaluation.readers import Reader
 from clients.wire.answers import parse_answer
-from clients.wire.features import Features
 from clients.wire.rigs import InstantResult, RigImage
 from clients.wire.types import LocalizeOptions, LocalizeResult
 from visloc.errors import InvalidInput, Overloaded, VislocError, WeightsError
 from visloc.sequences.filling import TracedPose
 
 _T = TypeVar("_T")
+_R = TypeVar("_R")
 
-# After these waits a server that is still overloaded ends the run.
+# A server that is still overloaded after these waits ends the run.
 _RETRY_AFTER_S = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-# What may go wrong with one photo while the others are fine ...
+# Errors that concern one photo while the others may be fine.
 _CODES_OF_ONE_PHOTO = ("server.internal", "server.timeout")
-# ... and what would be refused with every photo.
+# Errors that every photo would get.
 _CODES_OF_ALL_PHOTOS = ("options.", "map.", "rig.", "features.required", "features.kind")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """What became of one photo: a result, or the error that concerns this photo only.
+    """The result of one photo, or the error that concerns this photo only.
 
     Attributes:
         query: the photo.
         result: the answer, localized or not.
         error: why there is no answer.
-        seconds: from sending to the parsed answer, as the caller sees it, including waits for an
-            overloaded server.
+        seconds: from sending to the parsed answer, including waits for an overloaded server.
         filled: the pose that the other cameras of its rig give a photo without one of its own.
     """
 
@@ -49,16 +49,21 @@ class Outcome:
     seconds: float
     filled: TracedPose | None = None
 
+    @property
+    def photos(self) -> tuple[Outcome, ...]:
+        """Itself, as an ``InstantOutcome`` has several."""
+        return (self,)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstantOutcome:
-    """What became of the photos of one instant.
+    """The results of the photos of one instant.
 
     Attributes:
-        photos: what became of each, in the order of the instant; their seconds are the instant's.
+        photos: in the order of the instant; their seconds are the instant's.
         localized: whether the instant has a pose of its own.
-        has_answer: whether the server said anything.
-        seconds: as of ``Outcome``.
+        has_answer: whether the server answered.
+        seconds: from sending to the parsed answer, including waits for an overloaded server.
     """
 
     photos: tuple[Outcome, ...]
@@ -67,90 +72,61 @@ class InstantOutcome:
     seconds: float
 
 
-async def localize_all(
-    client: AsyncClient,
-    queries: Iterable[Query],
-    map_ref: str,
-    options: LocalizeOptions,
-    concurrency: int,
-    on_outcome: Callable[[Outcome], None],
-    read: Callable[[Query], bytes | Features],
-) -> None:
-    """Localize photos, ``concurrency`` at a time, and report each one as it is done.
+@dataclass(frozen=True, slots=True, eq=False)
+class QueryClient:
+    """A client, and what all queries of a run share.
 
-    ``read`` gives what is sent of a photo: the photo, or its features.
-
-    A photo that cannot be read, or that the server refuses or fails on, fails alone. Cancelling
-    abandons the photos under way; those reported are done.
-
-    Raises:
-        VislocError: what makes going on pointless, such as a server that is gone.
+    Attributes:
+        client: of the server.
+        map_ref: ``id@version``.
+        options: for every query.
+        read: reads what is sent for a photo: its bytes or its features.
     """
 
-    async def work(query: Query) -> None:
-        on_outcome(await localize_one(client, query, map_ref, options, read))
+    client: AsyncClient
+    map_ref: str
+    options: LocalizeOptions
+    read: Reader
 
-    await _work_through(queries, concurrency, work)
+    async def localize(self, query: Query) -> Outcome:
+        """Localize one photo.
 
+        A photo that cannot be read, or that the server refuses or fails on, fails alone.
 
-async def localize_one(
-    client: AsyncClient,
-    query: Query,
-    map_ref: str,
-    options: LocalizeOptions,
-    read: Callable[[Query], bytes | Features],
-) -> Outcome:
-    """Localize one photo, as ``localize_all`` does.
-
-    Raises:
-        VislocError: what would be refused with every photo, or makes going on pointless.
-    """
-    started = time.perf_counter()
-    try:
-        sent = await asyncio.to_thread(read, query)
+        Raises:
+            VislocError: an error that every photo would get, or that makes going on pointless,
+                such as a server that is gone.
+        """
         started = time.perf_counter()
-        result = await _ask_patiently(lambda: client.localize(sent, map_ref, query.camera, options))
-    except VislocError as error:
-        _raise_unless_of_one(error)
-        return Outcome(query, None, error, time.perf_counter() - started)
-    return Outcome(query, result, None, time.perf_counter() - started)
+        try:
+            sent = await asyncio.to_thread(self.read, query)
+            started = time.perf_counter()
+            result = await _ask_patiently(
+                lambda: self.client.localize(sent, self.map_ref, query.camera, self.options)
+            )
+        except VislocError as error:
+            _raise_unless_of_one(error)
+            return Outcome(query, None, error, time.perf_counter() - started)
+        return Outcome(query, result, None, time.perf_counter() - started)
 
+    async def localize_instant(self, instant: QueryInstant) -> InstantOutcome:
+        """Localize the photos of one instant together.
 
-async def localize_instants(
-    client: AsyncClient,
-    instants: Iterable[QueryInstant],
-    map_ref: str,
-    options: LocalizeOptions,
-    concurrency: int,
-    on_outcome: Callable[[InstantOutcome], None],
-    read: Callable[[Query], bytes | Features],
-) -> None:
-    """Localize instants as ``localize_all`` does photos.
+        Photos that cannot be read fail alone, and the others are sent. Photos that contribute
+        nothing to the pose of their rig, by an error or without one, are filled.
 
-    Of an instant, photos that cannot be read fail alone, and the others are asked about. Those
-    that contributed nothing to the pose of their rig, by an error or without one, are filled.
-
-    Raises:
-        VislocError: what makes going on pointless, such as a server that is gone.
-    """
-
-    async def work(instant: QueryInstant) -> None:
-        images: dict[str, RigImage] = {}
-        errors: dict[str, VislocError] = {}
-        for query in instant.photos:
-            try:
-                sent = await asyncio.to_thread(read, query)
-            except VislocError as error:
-                _raise_unless_of_one(error)
-                errors[query.name] = error
-            else:
-                images[query.name] = RigImage(query.sensor, sent, query.camera, query.timestamp)
+        Raises:
+            VislocError: as ``localize``.
+        """
+        images, errors = await self._read_images(instant)
         started = time.perf_counter()
         result = None
         try:
             if images:
                 result = await _ask_patiently(
-                    lambda: client.localize_rig(images.values(), map_ref, instant.rig, options)
+                    lambda: self.client.localize_rig(
+                        images.values(), self.map_ref, instant.rig, self.options
+                    )
                 )
         except VislocError as error:
             _raise_unless_of_one(error)
@@ -159,8 +135,9 @@ async def localize_instants(
         results: dict[str, LocalizeResult] = {}
         filled: dict[str, TracedPose] = {}
         if result is not None:
-            _take_answer(client.server, result, images, results, errors)
-            filled = parse_answer(client.server, poses_from_rig, result, instant.rig)
+            server = self.client.server
+            _take_answer(server, result, images, results, errors)
+            filled = parse_answer(server, poses_from_rig, result, instant.rig)
         photos = tuple(
             Outcome(
                 *(query, results.get(query.name), errors.get(query.name), seconds),
@@ -169,9 +146,50 @@ async def localize_instants(
             for query in instant.photos
         )
         localized = result is not None and result.localized
-        on_outcome(InstantOutcome(photos, localized, result is not None, seconds))
+        return InstantOutcome(photos, localized, result is not None, seconds)
 
-    await _work_through(instants, concurrency, work)
+    async def _read_images(
+        self, instant: QueryInstant
+    ) -> tuple[dict[str, RigImage], dict[str, VislocError]]:
+        """Return what is sent, and the errors of the photos that cannot be read, both by name."""
+        images: dict[str, RigImage] = {}
+        errors: dict[str, VislocError] = {}
+        for query in instant.photos:
+            try:
+                sent = await asyncio.to_thread(self.read, query)
+            except VislocError as error:
+                _raise_unless_of_one(error)
+                errors[query.name] = error
+            else:
+                images[query.name] = RigImage(query.sensor, sent, query.camera, query.timestamp)
+        return images, errors
+
+
+async def localize_all(
+    items: Iterable[_T],
+    localize: Callable[[_T], Awaitable[_R]],
+    concurrency: int,
+    on_outcome: Callable[[_R], None],
+) -> None:
+    """Localize photos or instants, ``concurrency`` at a time, and report each one when it is done.
+
+    Cancelling abandons the items under way; those reported are done.
+
+    Raises:
+        VislocError: the first error of ``localize``.
+    """
+    waiting = iter(items)
+
+    async def take() -> None:
+        for item in waiting:
+            on_outcome(await localize(item))
+
+    try:
+        async with asyncio.TaskGroup() as group:
+            for _ in range(concurrency):
+                group.create_task(take())
+    except ExceptionGroup as failed:
+        raise failed.exceptions[0] from None
 
 
 def _take_answer(
@@ -192,25 +210,8 @@ def _take_answer(
             results[name] = parse_answer(server, photo_result, result, index)
 
 
-async def _work_through(
-    items: Iterable[_T], concurrency: int, work: Callable[[_T], Awaitable[None]]
-) -> None:
-    waiting = iter(items)
-
-    async def take() -> None:
-        for item in waiting:
-            await work(item)
-
-    try:
-        async with asyncio.TaskGroup() as group:
-            for _ in range(concurrency):
-                group.create_task(take())
-    except ExceptionGroup as failed:
-        raise failed.exceptions[0] from None
-
-
 def _raise_unless_of_one(error: VislocError) -> None:
-    """Raise what does not concern one photo or instant only."""
+    """Raise an error that does not concern one photo or instant only."""
     if isinstance(error, InvalidInput) and not isinstance(error, WeightsError):
         is_of_one = not error.code.startswith(_CODES_OF_ALL_PHOTOS)
     else:
