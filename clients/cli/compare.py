@@ -87,6 +87,7 @@ class Comparison(Photos, QueryOptions):
 
 @spread
 def compare(
+    *,
     context: typer.Context,
     comparison: Comparison,
     output: Annotated[

@@ -98,13 +98,14 @@ class DatasetRun(Photos, QueryOptions):
 
 @spread
 def localize_batch(
+    *,
     run: DatasetRun,
     output: Annotated[Path, typer.Option(help="Folder for results.jsonl and poses.")],
-    connection: Connection,
     mode: Annotated[Mode, typer.Option(help=_MODES)] = Mode.SINGLE,
     restart: Annotated[
         bool, typer.Option("--restart", help="Remove the results in the folder and begin again.")
     ] = False,
+    connection: Connection,
 ) -> None:
     """Localize all photos of a dataset or list, or their features for a map of ready-made ones.
 
@@ -158,9 +159,9 @@ def localize_batch(
 
 @spread
 def benchmark(
+    *,
     run: DatasetRun,
     report: Annotated[Path, typer.Option(metavar="FILE.json", help="File for the figures.")],
-    connection: Connection,
     mode: Annotated[
         list[str] | None,
         typer.Option(
@@ -177,6 +178,7 @@ def benchmark(
             "poses.txt. No file has the filled ones.",
         ),
     ] = None,
+    connection: Connection,
 ) -> None:
     """Measure how fast and, where the dataset has true poses, how well photos are localized.
 

@@ -51,10 +51,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
 @app.command()
 @spread
 def image(
+    *,
     photo: Annotated[Path, typer.Argument(metavar="PHOTO", help="The photo to localize.")],
     map_ref: MapRef,
     query: QueryOptions,
-    connection: Connection,
     camera: Annotated[
         str | None,
         typer.Option(
@@ -77,6 +77,7 @@ def image(
             metavar="FILE.jpg", help="Write a picture of the matches and their mapping photos."
         ),
     ] = None,
+    connection: Connection,
 ) -> None:
     """Localize one photo.
 

@@ -37,7 +37,7 @@ Version = Annotated[str, typer.Argument(metavar="ID@VERSION", help="The map and 
 @maps_app.command("list")
 @spread
 def list_maps(
-    connection: Connection,
+    *,
     near: Annotated[
         str | None,
         typer.Option(
@@ -46,6 +46,7 @@ def list_maps(
             "and metres, WGS84.",
         ),
     ] = None,
+    connection: Connection,
 ) -> None:
     """List the maps, each in the version that is in use."""
     circle = None if near is None else _near(near)
@@ -97,10 +98,7 @@ def push(
 
 @maps_app.command()
 @spread
-def use(
-    version: Version,
-    connection: Connection,
-) -> None:
+def use(version: Version, connection: Connection) -> None:
     """Put a version into use, a newer or an older one, without dropping a request.
 
     Ends when the service answers with it.
@@ -112,10 +110,7 @@ def use(
 
 @maps_app.command()
 @spread
-def remove(
-    version: Version,
-    connection: Connection,
-) -> None:
+def remove(version: Version, connection: Connection) -> None:
     """Delete a version that is not in use, or the last one of a map."""
     map_id, name = _names(version)
     with connection.client() as client:

@@ -51,6 +51,8 @@ def spread(command: Callable[..., T]) -> Callable[..., T]:
             given[name] = group(**{each.name: given.pop(each.name) for each in fields(group)})
         return command(**given)
 
+    required = inspect.Parameter.empty
+    parameters.sort(key=lambda each: each.default is not required)  # first in --help
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     return run
 

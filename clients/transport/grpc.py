@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import AsyncGenerator, AsyncIterable, Callable
+from collections.abc import AsyncGenerator, AsyncIterable, Callable, Iterator
 from contextlib import aclosing
 from functools import partial
 from typing import Any, assert_never
@@ -16,7 +16,6 @@ from clients import errors
 from clients.transport.connection import Connection
 from clients.transport.grpc_errors import Metadata, grpc_failure
 from clients.transport.grpc_streams import stream_answers
-from clients.transport.grpc_uploads import UploadFeed
 from clients.transport.messages import (
     list_maps_message,
     localize_message,
@@ -25,7 +24,7 @@ from clients.transport.messages import (
     version_message,
 )
 from clients.transport.retry import GRPC_OPTIONS, map_header
-from clients.transport.uploads import OnProgress, Upload
+from clients.transport.uploads import OnProgress, Upload, pieces
 from clients.wire.requests import (
     CheckReady,
     DeleteVersion,
@@ -38,15 +37,16 @@ from clients.wire.requests import (
     UseVersion,
 )
 from clients.wire.rig_requests import AnyRequest, LocalizeRig, SentInstant, SequenceStart
+from visloc.errors import VislocError
 from visloc_api.v1 import localization_pb2 as wire
 
 _SERVICE = f"/{wire.DESCRIPTOR.services_by_name['Localization'].full_name}"
 _MAPS = f"/{wire.DESCRIPTOR.services_by_name['Maps'].full_name}"
 _PUT_VERSION = f"{_MAPS}/PutVersion"
 _SEQUENCE = f"{_SERVICE}/LocalizeSequence"
-# Sent by the service with every answer; the protocol has no other place for it.
+# Metadata of every answer.
 _VERSION_KEY = "visloc-version"
-# HealthCheckResponse with status SERVING. Two bytes are not worth another dependency.
+# HealthCheckResponse with status SERVING; two bytes are not worth another dependency.
 _SERVING = b"\x08\x01"
 # The process that first used gRPC.
 _process: int | None = None
@@ -106,14 +106,26 @@ class GrpcTransport:
             channel.close()  # cancels the call when this coroutine is cancelled
 
     def _upload(self, channel: grpc.Channel, upload: Upload, on_progress: OnProgress) -> JsonObject:
-        feed = UploadFeed(upload, on_progress)
+        failure: VislocError | OSError | None = None
+
+        def messages() -> Iterator[bytes]:
+            nonlocal failure
+            start = version_message(upload.map_id, upload.version)
+            yield wire.PutVersionRequest(start=start).SerializeToString()
+            try:
+                for piece in pieces(upload, on_progress):
+                    yield wire.PutVersionRequest(chunk=piece).SerializeToString()
+            except (VislocError, OSError) as error:
+                # gRPC would only log it. The server takes nothing that ends early.
+                failure = error
+
         call = channel.stream_unary(_PUT_VERSION, None, None)
         within_s = upload.done_within_s(self._timeout_s)
         metadata = _metadata(self._connection, upload)
         try:
-            answer, context = call.with_call(feed.messages(), timeout=within_s, metadata=metadata)
+            answer, context = call.with_call(messages(), timeout=within_s, metadata=metadata)
         except grpc.RpcError as error:
-            raise feed.failure or grpc_failure(self._server, within_s, error) from error
+            raise failure or grpc_failure(self._server, within_s, error) from error
         return _decoded(self._server, _reads(wire.MapInfo), answer, context.initial_metadata())
 
     async def close(self) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import ssl
-from collections.abc import AsyncGenerator, AsyncIterable, Iterator, Mapping
+from collections.abc import AsyncGenerator, AsyncIterable, AsyncIterator, Mapping
 from typing import Any
 
 import httpx
@@ -78,11 +78,8 @@ class HttpTransport:
                 if response.status_code != 200:
                     await response.aread()
                 _check_lines(self._server, response)
-                lines = _Lines(self._server)
-                async for chunk in response.aiter_bytes():
-                    for answer in lines.take(chunk):
-                        yield answer
-                lines.finish()
+                async for line in _lines(self._server, response.aiter_bytes()):
+                    yield _read_line(self._server, line)
         except httpx.HTTPError as error:
             raise self._failure(error) from error
 
@@ -177,50 +174,40 @@ def _check_lines(server: str, response: httpx.Response) -> None:
         raise errors.not_understood(server, f"200 with {content_type}")
 
 
-class _Lines:
-    """Cuts a stream of chunks into lines of JSON."""
+async def _lines(server: str, chunks: AsyncIterable[bytes]) -> AsyncIterator[bytes]:
+    """Cut chunks into lines.
 
-    def __init__(self, server: str) -> None:
-        self._server = server
-        self._rest = bytearray()
-
-    def take(self, chunk: bytes) -> Iterator[JsonObject]:
-        """Give the objects that are complete.
-
-        Raises:
-            VislocError: the error that a last line describes, or ``server.answer``.
-        """
+    Raises:
+        VislocError: ``server.answer`` when the last line is not complete.
+    """
+    rest = bytearray()
+    async for chunk in chunks:
         # Not str.splitlines, which also cuts at characters that a line of JSON may contain.
-        *lines, rest = chunk.split(b"\n")
+        *lines, tail = chunk.split(b"\n")
         for line in lines:
-            whole = bytes(self._rest + line)
-            self._rest.clear()
+            whole = bytes(rest + line)
+            rest.clear()
             if whole.strip():
-                yield self._read(whole)
-        self._rest += rest
+                yield whole
+        rest += tail
+    if rest.strip():
+        raise errors.not_understood(server, f"half a line, {len(rest)} bytes")
 
-    def finish(self) -> None:
-        """Check that the last line is complete.
 
-        Raises:
-            VislocError: ``server.answer`` when it is not.
-        """
-        if self._rest.strip():
-            raise errors.not_understood(self._server, f"half a line, {len(self._rest)} bytes")
-
-    def _read(self, line: bytes) -> JsonObject:
-        try:
-            said = json.loads(line)
-        except ValueError as error:
-            raise errors.not_understood(self._server, f"a line that is not JSON: {error}") from None
-        if not isinstance(said, dict):
-            raise errors.not_understood(self._server, f"a line with {type(said).__name__}")
-        problem = said.get("problem")
-        if isinstance(problem, dict):
-            status = problem.get("status")
-            status = status if isinstance(status, int) else 500
-            raise _refusal(status, "the server failed half-way", problem)
-        return said
+def _read_line(server: str, line: bytes) -> JsonObject:
+    """Read an answer, or raise the error that a last line describes."""
+    try:
+        answer = json.loads(line)
+    except ValueError as error:
+        raise errors.not_understood(server, f"a line that is not JSON: {error}") from None
+    if not isinstance(answer, dict):
+        raise errors.not_understood(server, f"a line with {type(answer).__name__}")
+    problem = answer.get("problem")
+    if isinstance(problem, dict):
+        status = problem.get("status")
+        status = status if isinstance(status, int) else 500
+        raise _refusal(status, "the server failed half-way", problem)
+    return answer
 
 
 def _refusal(status: int, message: str, problem: Mapping[str, object]) -> VislocError:
