@@ -139,7 +139,7 @@ def compare(
     write_whole(picture, [image])
     write_whole(table, [markdown_of(made, picture.name).encode()])
     print_comparison(_out, made)
-    outcomes = (outcome for each in asked for outcome in each.outcomes.values())
+    outcomes = (outcome for each in asked for outcome in each.run.outcomes)
     failed = {outcome.query.name: outcome for outcome in outcomes if outcome.error is not None}
     print_failed(_err, list(failed.values()))
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -24,19 +24,15 @@ from clients.cli.options import (
     thresholds_of,
 )
 from clients.cli.progress import run_with_progress
+from clients.client import AsyncClient
 from clients.evaluation.batch import Batch, finish_batch, open_batch, run_batch
 from clients.evaluation.benchmark import Run, known_poses, make_report
-from clients.evaluation.instants import QueryInstant
 from clients.evaluation.modes import DEFAULT_MAX_GAP_S, Arrangement, Mode, arrange, parse_modes
-from clients.evaluation.queries import Query, QuerySet
-from clients.evaluation.readers import Reader
+from clients.evaluation.queries import QuerySet
 from clients.evaluation.results import check_can_be_written, write_poses, write_whole
 from clients.evaluation.run import InstantOutcome, Outcome, QueryClient, localize_all
-from clients.wire.types import LocalizeOptions, MapInfo, PoseEstimate
+from clients.wire.types import MapInfo, PoseEstimate
 from visloc.sequences.filling import TimeUnit
-
-_T = TypeVar("_T")
-_R = TypeVar("_R")
 
 _out = Console()
 _err = Console(stderr=True)
@@ -195,68 +191,57 @@ def benchmark(
         info, about = client.map(run.map_ref), client.server_info()
     arrangement = run.arrange(queries, modes, info)
     read = run.reader(info)
-    asked = _Questions(connection, info.ref, options, read, run.concurrency)
-    photos, instants = queries.photos, arrangement.asked
-    of_photos = asked.about_photos(photos) if set(modes) != {Mode.GP3P} else None
-    of_instants = asked.about_instants(instants, photos) if Mode.GP3P in modes else None
-    runs = {m: of_instants if m is Mode.GP3P else of_photos for m in modes}
-    runs_of = {m: each for m, each in runs.items() if each is not None}
-    poses_of = {m: arrangement.fill(m, known_poses(each)) for m, each in runs_of.items()}
-    figures = make_report(runs_of, poses_of, thresholds, about, info)
+    ask = partial(QueryClient, map_ref=info.ref, options=options, read=read)
+    timed = {
+        in_instants: _timed(connection, ask, arrangement, run.concurrency, in_instants=in_instants)
+        for in_instants in sorted({mode is Mode.GP3P for mode in modes})
+    }
+    runs = {mode: timed[mode is Mode.GP3P] for mode in modes}
+    poses_of = {mode: arrangement.fill(mode, known_poses(each)) for mode, each in runs.items()}
+    figures = make_report(runs, poses_of, thresholds, about, info)
     write_whole(report, [json.dumps(figures, indent=2, allow_nan=False).encode() + b"\n"])
     if poses is not None:
-        write_poses(poses, _measured_poses(runs_of[modes[0]]))
+        write_poses(poses, _measured_poses(runs[modes[0]]))
     # By name: a photo that fails on its own mostly fails in its rig as well.
-    outcomes = (o for each in (of_photos, of_instants) if each is not None for o in each.outcomes)
+    outcomes = (outcome for each in timed.values() for outcome in each.outcomes)
     failed = {o.query.name: o for o in outcomes if o.error is not None}
-    num_with_truth = sum(query.truth is not None for query in photos)
+    num_with_truth = sum(query.truth is not None for query in queries.photos)
     print_report(_out, figures, num_with_truth, len(failed), unit_of(info))
     print_failed(_err, list(failed.values()))
 
 
-@dataclass(frozen=True, slots=True)
-class _Questions:
-    """Localizes a dataset and measures how long it takes."""
+def _timed(
+    connection: Connection,
+    ask: Callable[[AsyncClient], QueryClient],
+    arrangement: Arrangement,
+    concurrency: int,
+    *,
+    in_instants: bool,
+) -> Run:
+    """Localize a dataset and measure how long it takes."""
+    answers: list[Outcome | InstantOutcome] = []
+    seconds = 0.0
 
-    connection: Connection
-    map_ref: str
-    options: LocalizeOptions
-    read: Reader
-    concurrency: int
+    async def work(advance: Callable[[], None]) -> None:
+        nonlocal seconds
 
-    def about_photos(self, photos: Sequence[Query]) -> Run:
-        outcomes, seconds = self._measure(QueryClient.localize, photos, "photos")
-        by_name = {outcome.query.name: outcome for outcome in outcomes}
-        return Run.of_photos([by_name[query.name] for query in photos], seconds)
+        def keep(answer: Outcome | InstantOutcome) -> None:
+            answers.append(answer)
+            advance()
 
-    def about_instants(self, instants: Sequence[QueryInstant], photos: Sequence[Query]) -> Run:
-        outcomes, seconds = self._measure(QueryClient.localize_instant, instants, "instants")
-        return Run.of_instants(outcomes, photos, seconds)
+        async with connection.async_client() as client:
+            asked = ask(client)
+            started = time.perf_counter()
+            if in_instants:
+                await localize_all(arrangement.asked, asked.localize_instant, concurrency, keep)
+            else:
+                await localize_all(arrangement.photos, asked.localize, concurrency, keep)
+            seconds = time.perf_counter() - started
 
-    def _measure(
-        self,
-        localize: Callable[[QueryClient, _T], Awaitable[_R]],
-        items: Sequence[_T],
-        what: str,
-    ) -> tuple[list[_R], float]:
-        outcomes: list[_R] = []
-        seconds = 0.0
-
-        async def work(advance: Callable[[], None]) -> None:
-            nonlocal seconds
-
-            def keep(outcome: _R) -> None:
-                outcomes.append(outcome)
-                advance()
-
-            async with self.connection.async_client() as client:
-                asked = QueryClient(client, self.map_ref, self.options, self.read)
-                started = time.perf_counter()
-                await localize_all(items, partial(localize, asked), self.concurrency, keep)
-                seconds = time.perf_counter() - started
-
-        run_with_progress(_err, work, what, len(items), "no report was written")
-        return outcomes, seconds
+    total = len(arrangement.asked if in_instants else arrangement.photos)
+    what = "instants" if in_instants else "photos"
+    run_with_progress(_err, work, what, total, "no report was written")
+    return Run.of(answers, arrangement.photos, seconds)
 
 
 def _measured_poses(run: Run) -> Iterator[tuple[str, PoseEstimate]]:

@@ -66,32 +66,25 @@ class Asked:
     Attributes:
         variant: the value.
         refusal: why the server does not take it at all.
-        outcomes: by the photo's name, each of its first request.
-        latencies_s: of all answers.
-        stage_seconds: of all answers.
+        outcomes: of all requests, in their order.
     """
 
     variant: Variant
     refusal: VislocError | None = None
-    outcomes: dict[str, Outcome] = field(default_factory=dict)
-    latencies_s: list[float] = field(default_factory=list)
-    stage_seconds: list[Mapping[str, float]] = field(default_factory=list)
-
-    def keep(self, outcome: Outcome) -> None:
-        """Count an outcome."""
-        self.outcomes.setdefault(outcome.query.name, outcome)
-        if outcome.result is not None:
-            self.latencies_s.append(outcome.seconds)
-            self.stage_seconds.append(outcome.result.seconds)
+    outcomes: list[Outcome] = field(default_factory=list)
 
     @property
     def run(self) -> Run:
-        """The measurements, taken one request after the other."""
+        """The first outcome of each photo, and the times of all, one request after the other."""
+        firsts = {outcome.query.name: outcome for outcome in reversed(self.outcomes)}
+        photos = list(dict.fromkeys(outcome.query.name for outcome in self.outcomes))
+        answered = [(o.seconds, o.result.seconds) for o in self.outcomes if o.result is not None]
+        latencies_s = tuple(seconds for seconds, _ in answered)
         return Run(
-            tuple(self.outcomes.values()),
-            tuple(self.latencies_s),
-            tuple(self.stage_seconds),
-            sum(self.latencies_s),
+            tuple(firsts[name] for name in photos),
+            latencies_s,
+            tuple(stages for _, stages in answered),
+            sum(latencies_s),
         )
 
 
@@ -209,7 +202,7 @@ async def ask_each(
             for index in rng.permutation(len(asked)):
                 outcome = await _ask(client, asked[index], query, readers)
                 if outcome is not None:
-                    asked[index].keep(outcome)
+                    asked[index].outcomes.append(outcome)
                 advance()
     return asked
 

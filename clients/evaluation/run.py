@@ -54,6 +54,10 @@ class Outcome:
         """Itself, as an ``InstantOutcome`` has several."""
         return (self,)
 
+    @property
+    def has_answer(self) -> bool:
+        return self.result is not None
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstantOutcome:
@@ -63,7 +67,7 @@ class InstantOutcome:
         photos: in the order of the instant; their seconds are the instant's.
         localized: whether the instant has a pose of its own.
         has_answer: whether the server answered.
-        seconds: from sending to the parsed answer, including waits for an overloaded server.
+        seconds: as for ``Outcome``.
     """
 
     photos: tuple[Outcome, ...]
