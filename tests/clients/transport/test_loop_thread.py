@@ -213,3 +213,20 @@ def test_a_process_ends_with_an_open_client(url: str) -> None:
         check=False,
     )
     assert (ran.returncode, ran.stdout, ran.stderr) == (0, "True\n", "")
+
+
+def test_a_process_ends_although_the_next_instant_never_comes(grpc_url: str) -> None:
+    code = (
+        "import threading\nfrom clients import Client, Instant, RigImage\n"
+        "def instants():\n"
+        "    yield Instant(1, (RigImage('camera', b'photo'),))\n"
+        "    threading.Event().wait()\n"
+        f"with Client({grpc_url!r}) as client:\n"
+        "    for answer in client.localize_sequence(instants(), 'room', time_unit='ms'):\n"
+        "        print(answer.timestamp)\n"
+        "        break\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (ran.returncode, ran.stdout, ran.stderr) == (0, "1\n", "")
