@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 import mapping.methods.matching
 from clients.evaluation.queries import read_queries
-from clients.evaluation.sending import FeatureReader
+from clients.evaluation.readers import FeatureReader
 from mapping.build.build import BuildSettings, build_map
 from mapping.build.features import ReadyMadeFeatures
 from mapping.build.photos import MappingPhoto

@@ -1,7 +1,6 @@
-"""One client, synchronous and asynchronous, over HTTP and gRPC.
+"""One client over HTTP and gRPC: asynchronous, and for callers that wait.
 
-Requests are built and answers are parsed in one place (``requests``, ``answers``); the transports
-(``http``, ``grpc``) only carry them.
+``clients.wire`` builds requests and parses answers; ``clients.transport`` carries them.
 """
 
 from __future__ import annotations
@@ -10,20 +9,24 @@ import asyncio
 from collections.abc import (
     AsyncGenerator,
     AsyncIterable,
-    AsyncIterator,
+    Callable,
+    Coroutine,
     Iterable,
     Iterator,
     Mapping,
 )
 from contextlib import aclosing
+from functools import partial, wraps
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Concatenate, ParamSpec, Protocol, Self, TypeVar
 
 from clients.errors import not_understood
 from clients.transport.connection import checked_connection
-from clients.transport.grpc import AsyncGrpcTransport, GrpcTransport
-from clients.transport.http import AsyncHttpTransport, HttpTransport
+from clients.transport.grpc import GrpcTransport
+from clients.transport.http import HttpTransport
+from clients.transport.loop_thread import LoopThread
+from clients.transport.read_in_thread import read_in_thread
 from clients.transport.uploads import OnProgress, Upload, upload_request
 from clients.wire import answers
 from clients.wire.answers import InstantResult, LocalizeResult, ServerInfo
@@ -41,6 +44,7 @@ from clients.wire.requests import (
     checked_version,
     get_map_request,
     localize_request,
+    read_query,
 )
 from clients.wire.rig_requests import (
     AnyRequest,
@@ -58,19 +62,13 @@ from visloc.priors import Priors
 from visloc.types import Near
 from visloc_api.words.maps import MapInfo
 
+P = ParamSpec("P")
+T = TypeVar("T")
+
 DEFAULT_TIMEOUT_S = 60.0
 
 
 class _Transport(Protocol):
-    def send(self, request: AnyRequest) -> JsonObject: ...
-    def stream(
-        self, start: SequenceStart, instants: Iterable[SentInstant]
-    ) -> Iterator[JsonObject]: ...
-    def upload(self, upload: Upload, on_progress: OnProgress) -> JsonObject: ...
-    def close(self) -> None: ...
-
-
-class _AsyncTransport(Protocol):
     async def send(self, request: AnyRequest) -> JsonObject: ...
     def stream(
         self, start: SequenceStart, instants: AsyncIterable[SentInstant]
@@ -79,18 +77,18 @@ class _AsyncTransport(Protocol):
     async def close(self) -> None: ...
 
 
-class Client:
-    """Asks a localization service; use it with ``with``, from any thread.
+class AsyncClient:
+    """Asks a localization service from an event loop; use it with ``async with``.
 
-    Every method raises ``visloc.errors.VislocError``: what the server refuses as the server
-    raised it, and ``Unavailable`` with a code ``server.*`` when no usable answer came.
+    Every method raises ``visloc.errors.VislocError``: the server's refusals as the server raised
+    them, and ``Unavailable`` with a code ``server.*`` when no usable answer came.
 
     Args:
         server: ``http://host:port`` or ``grpc://host:port``; with TLS ``https://`` or
             ``grpcs://``.
-        api_key: as the server's operator gave it; needed unless the server is on this machine and
-            has no keys. Only TLS keeps it from being read on the way.
-        ca: PEM file of the certificate authorities to trust, instead of the usual ones.
+        api_key: from the server's operator; needed unless the server is on this machine and has
+            no keys. Without TLS it can be read on the way.
+        ca: PEM file of the certificate authorities to trust instead of the usual ones.
         timeout_s: longest wait for an answer, seconds. The server is told, and gives up then too.
     """
 
@@ -107,7 +105,7 @@ class Client:
         transport = GrpcTransport if connection.is_grpc else HttpTransport
         self._transport: _Transport = transport(connection)
 
-    def localize(
+    async def localize(
         self,
         query: PhotoOrFeatures,
         map: Where,
@@ -124,26 +122,26 @@ class Client:
         A photo that cannot be localized is an answer without a pose, not an error.
 
         Args:
-            query: the encoded photo (JPEG, PNG, ...), the path of the file that holds it, or
-                the features that were found in it, which need a camera.
-            map: ``id`` or ``id@version``; of several, one answer counts, and
-                a photo that two of them explain is refused as ambiguous; or those that
-                are anchored around a place, as ``Near``.
-            camera: intrinsics; without them the server uses EXIF, estimates or guesses, and says
-                so.
+            query: the encoded photo (JPEG, PNG, ...), the path of its file, or the features that
+                were found in it, which need a camera.
+            map: ``id`` or ``id@version``, or several: one of them answers, and a photo that fits
+                two of them is refused as ambiguous. Or ``Near``: the anchored maps around a place.
+            camera: intrinsics. Without them the server uses EXIF, estimates or guesses; the answer
+                says which.
             options: choices for this photo.
-            request_id: names the request in the server's logs; made up there when None.
+            request_id: names the request in the server's logs; None lets the server choose.
             priors: what is known of the camera, also as the API's JSON.
-            ypr: also say the GeoPose in yaw, pitch and roll.
-            debug: also return the matches and a picture of them (``LocalizeResult.debug``); needs a
-                photo.
+            ypr: also return the GeoPose in yaw, pitch and roll.
+            debug: also return the matches and a picture of them (``LocalizeResult.debug``); needs
+                a photo.
         """
         search = checked_search(map, options, priors, request_id, ypr=ypr)
+        if isinstance(query, str | Path):
+            query = await asyncio.to_thread(read_query, query)
         request = localize_request(search, query, camera, debug=debug)
-        raw = self._transport.send(request)
-        return answers.parse_answer(self.server, answers.parse_result, raw)
+        return await self._ask(request, answers.parse_result)
 
-    def localize_rig(
+    async def localize_rig(
         self,
         images: Iterable[RigImage],
         map: Where,
@@ -160,198 +158,16 @@ class Client:
 
         Args:
             images: the photos, each of another camera; some may be missing.
-            map: ``id`` or ``id@version``; of several, one answer counts, and
-                a photo that two of them explain is refused as ambiguous; or those that
-                are anchored around a place, as ``Near``.
+            map: as for ``localize``.
             rig: how the cameras sit, or the id of a rig that the map knows (``MapInfo.rigs``).
             options: choices for this instant.
-            request_id: names the request in the server's logs; made up there when None.
+            request_id: names the request in the server's logs; None lets the server choose.
             priors: what is known of the rig, also as the API's JSON.
-            ypr: also say the GeoPose in yaw, pitch and roll.
+            ypr: also return the GeoPose in yaw, pitch and roll.
         """
         search = checked_search(map, options, priors, request_id, ypr=ypr)
-        raw = self._transport.send(rig_request(search, rig, images))
-        return answers.parse_answer(self.server, answers.parse_instant, raw)
-
-    def localize_sequence(
-        self,
-        instants: Iterable[Instant],
-        map: Where,
-        rig: Rig | None = None,
-        time_unit: str | None = None,
-        max_gap_s: float | None = None,
-        options: LocalizeOptions | Mapping[str, Any] | None = None,
-        request_id: str | None = None,
-        *,
-        priors: Priors | Mapping[str, Any] | None = None,
-        ypr: bool = False,
-    ) -> Iterator[InstantResult]:
-        """Estimate the poses of a sequence, each answered as soon as its answer is final.
-
-        Over gRPC, the first instant is taken from ``instants`` before anything is sent, and the
-        others as the server asks for them, in another thread. Over HTTP all instants are read
-        before anything is sent: they go into one request. What ``instants`` raises is raised
-        here, over gRPC after the answers to the instants before.
-
-        With odometry an instant is answered when instants ``max_gap_s`` later, or 30 instants,
-        have come, also when its own photos localize it: its neighbours may contradict it. Whoever
-        waits for every answer before sending the next instant must use ``max_gap_s`` 0 or no
-        odometry.
-
-        Args:
-            instants: in the order of time.
-            map: ``id`` or ``id@version``; of several, that of the first pose is kept; or, as
-                ``Near``, those that are anchored around a place.
-            rig: how the cameras sit, or the id of a rig that the map knows; None when every
-                instant is one photo of one camera.
-            time_unit: of the timestamps, s, ms, us or ns; None tells it by their size, which must
-                be that of Unix times.
-            max_gap_s: longest time between measured instants across which poses are filled; None
-                leaves it to the server, 0 fills none.
-            options: choices for all instants.
-            request_id: names the request in the server's logs; made up there when None.
-            priors: what is known at every instant that has none of its own.
-            ypr: also say the GeoPose in yaw, pitch and roll.
-        """
-        search = checked_search(map, options, priors, request_id, ypr=ypr)
-        start = sequence_start(search, rig, time_unit, max_gap_s)
-        return self._stream(start, instants)
-
-    def maps(self, near: Near | None = None) -> list[MapInfo]:
-        """List the maps that the server has: all, or the anchored ones that reach into a circle."""
-        raw = self._transport.send(ListMaps(near))
-        return answers.parse_answer(self.server, answers.parse_maps, raw)
-
-    def map(self, map: str) -> MapInfo:
-        """Describe one map, ``id`` or ``id@version``."""
-        raw = self._transport.send(get_map_request(map))
-        return answers.parse_answer(self.server, answers.parse_map, raw)
-
-    def map_version(self, map_id: str, version: str) -> MapInfo:
-        """Describe a version of a map, in use or not."""
-        raw = self._transport.send(GetVersion(*checked_version(map_id, version)))
-        return answers.parse_answer(self.server, answers.parse_map, raw)
-
-    def upload_map(
-        self,
-        packed: str | Path,
-        map_id: str | None = None,
-        version: str | None = None,
-        *,
-        on_progress: OnProgress | None = None,
-    ) -> MapInfo:
-        """Publish a version of a map, which is not in use until ``use_version`` names it.
-
-        The server reads and checks every byte before anyone can see it. When this is stopped or
-        fails, nothing is left there. When the answer is lost, so that it is not known whether
-        the map came through, ``map_version`` tells, or trying again: ``map.version_exists``.
-
-        Args:
-            packed: the file that ``mapping pack`` wrote.
-            map_id: the map's id; None reads it from the file.
-            version: the version's name; None reads it from the file.
-            on_progress: is called with the number of bytes that were sent since the last call,
-                over gRPC in another thread.
-        """
-        upload = upload_request(Path(packed), map_id, version)
-        raw = self._transport.upload(upload, on_progress or _ignore)
-        return answers.parse_answer(self.server, answers.parse_map, raw)
-
-    def use_version(self, map_id: str, version: str) -> MapInfo:
-        """Put a version of a map into use, a newer or an older one.
-
-        Returns once the server answers with it. Requests that are under way are answered by the
-        version that they began with.
-        """
-        raw = self._transport.send(UseVersion(*checked_version(map_id, version)))
-        return answers.parse_answer(self.server, answers.parse_map, raw)
-
-    def delete_version(self, map_id: str, version: str) -> None:
-        """Delete a version of a map that is not in use, or the last one there is."""
-        self._transport.send(DeleteVersion(*checked_version(map_id, version)))
-
-    def server_info(self) -> ServerInfo:
-        """Describe the server."""
-        raw = self._transport.send(GetServer())
-        return answers.parse_answer(self.server, answers.parse_server, raw)
-
-    def ready(self) -> bool:
-        """Tell whether the server has its maps loaded; raises when it cannot be reached."""
-        raw = self._transport.send(CheckReady())
-        return answers.parse_answer(self.server, answers.parse_ready, raw)
-
-    def close(self) -> None:
-        """Close the connections."""
-        self._transport.close()
-
-    def _stream(self, start: SequenceStart, instants: Iterable[Instant]) -> Iterator[InstantResult]:
-        count = _Count(self.server, start.time_unit)
-        for raw in self._transport.stream(start, map(count.sent, instants)):
-            count.answers += 1
-            yield answers.parse_answer(self.server, answers.parse_instant, raw)
-        count.check()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
-
-
-class AsyncClient:
-    """``Client`` for an event loop: the same methods, awaited; use it with ``async with``."""
-
-    def __init__(
-        self,
-        server: str,
-        *,
-        api_key: str | None = None,
-        ca: str | Path | None = None,
-        timeout_s: float = DEFAULT_TIMEOUT_S,
-    ) -> None:
-        connection = checked_connection(server, timeout_s, api_key, ca)
-        self.server = server
-        transport = AsyncGrpcTransport if connection.is_grpc else AsyncHttpTransport
-        self._transport: _AsyncTransport = transport(connection)
-
-    async def localize(
-        self,
-        query: PhotoOrFeatures,
-        map: Where,
-        camera: Camera | None = None,
-        options: LocalizeOptions | Mapping[str, Any] | None = None,
-        request_id: str | None = None,
-        *,
-        priors: Priors | Mapping[str, Any] | None = None,
-        ypr: bool = False,
-        debug: bool = False,
-    ) -> LocalizeResult:
-        """As ``Client.localize``. A path is read in the loop; give bytes where that matters."""
-        search = checked_search(map, options, priors, request_id, ypr=ypr)
-        request = localize_request(search, query, camera, debug=debug)
-        raw = await self._transport.send(request)
-        return answers.parse_answer(self.server, answers.parse_result, raw)
-
-    async def localize_rig(
-        self,
-        images: Iterable[RigImage],
-        map: Where,
-        rig: Rig,
-        options: LocalizeOptions | Mapping[str, Any] | None = None,
-        request_id: str | None = None,
-        *,
-        priors: Priors | Mapping[str, Any] | None = None,
-        ypr: bool = False,
-    ) -> InstantResult:
-        """As ``Client.localize_rig``."""
-        search = checked_search(map, options, priors, request_id, ypr=ypr)
-        raw = await self._transport.send(rig_request(search, rig, images))
-        return answers.parse_answer(self.server, answers.parse_instant, raw)
+        request = await asyncio.to_thread(rig_request, search, rig, images)
+        return await self._ask(request, answers.parse_instant)
 
     def localize_sequence(
         self,
@@ -365,26 +181,48 @@ class AsyncClient:
         *,
         priors: Priors | Mapping[str, Any] | None = None,
         ypr: bool = False,
-    ) -> AsyncIterator[InstantResult]:
-        """As ``Client.localize_sequence``, for ``async for``."""
+    ) -> AsyncGenerator[InstantResult, None]:
+        """Estimate the poses of a sequence, each answered as soon as its answer is final.
+
+        An iterable that is not asynchronous is read in another thread. Over gRPC, its first
+        instant is taken before anything is sent, and the others as the server asks for them. Over
+        HTTP all instants are read before anything is sent: they go into one request. An error of
+        ``instants`` is raised here, over gRPC after the answers to the instants before it.
+
+        With odometry an instant is answered only when instants ``max_gap_s`` later, or 30
+        instants, have come, even if its own photos localize it: its neighbours may contradict it.
+        A caller that waits for every answer before sending the next instant must use
+        ``max_gap_s`` 0 or no odometry.
+
+        Args:
+            instants: in the order of time.
+            map: as for ``localize``; of several maps, the one of the first pose is kept.
+            rig: how the cameras sit, or the id of a rig that the map knows; None when every
+                instant is one photo of one camera.
+            time_unit: of the timestamps: s, ms, us or ns; None infers it from their size, which
+                must be that of Unix times.
+            max_gap_s: longest time between measured instants across which poses are filled; None
+                leaves it to the server, 0 fills none.
+            options: choices for all instants.
+            request_id: names the request in the server's logs; None lets the server choose.
+            priors: what is known at every instant that has none of its own.
+            ypr: also return the GeoPose in yaw, pitch and roll.
+        """
         search = checked_search(map, options, priors, request_id, ypr=ypr)
         start = sequence_start(search, rig, time_unit, max_gap_s)
         return self._stream(start, instants)
 
     async def maps(self, near: Near | None = None) -> list[MapInfo]:
-        """As ``Client.maps``."""
-        raw = await self._transport.send(ListMaps(near))
-        return answers.parse_answer(self.server, answers.parse_maps, raw)
+        """List the server's maps: all, or the anchored ones that reach into a circle."""
+        return await self._ask(ListMaps(near), answers.parse_maps)
 
     async def map(self, map: str) -> MapInfo:
-        """As ``Client.map``."""
-        raw = await self._transport.send(get_map_request(map))
-        return answers.parse_answer(self.server, answers.parse_map, raw)
+        """Describe one map, ``id`` or ``id@version``."""
+        return await self._ask(get_map_request(map), answers.parse_map)
 
     async def map_version(self, map_id: str, version: str) -> MapInfo:
-        """As ``Client.map_version``."""
-        raw = await self._transport.send(GetVersion(*checked_version(map_id, version)))
-        return answers.parse_answer(self.server, answers.parse_map, raw)
+        """Describe a version of a map, in use or not."""
+        return await self._ask(GetVersion(*checked_version(map_id, version)), answers.parse_map)
 
     async def upload_map(
         self,
@@ -394,48 +232,59 @@ class AsyncClient:
         *,
         on_progress: OnProgress | None = None,
     ) -> MapInfo:
-        """As ``Client.upload_map``."""
+        """Publish a version of a map; it is not in use until ``use_version`` names it.
+
+        The server reads and checks every byte before anyone can see the version. An upload that is
+        stopped or fails leaves nothing there. When the answer is lost, ``map_version`` tells
+        whether the version was published; uploading again fails with ``map.version_exists`` then.
+
+        Args:
+            packed: the file that ``mapping pack`` wrote.
+            map_id: the map's id; None reads it from the file.
+            version: the version's name; None reads it from the file.
+            on_progress: is called with the number of bytes that were sent since the last call,
+                over gRPC, and by ``Client``, in another thread.
+        """
         upload = await asyncio.to_thread(upload_request, Path(packed), map_id, version)
         raw = await self._transport.upload(upload, on_progress or _ignore)
         return answers.parse_answer(self.server, answers.parse_map, raw)
 
     async def use_version(self, map_id: str, version: str) -> MapInfo:
-        """As ``Client.use_version``."""
-        raw = await self._transport.send(UseVersion(*checked_version(map_id, version)))
-        return answers.parse_answer(self.server, answers.parse_map, raw)
+        """Put a version of a map into use, a newer or an older one.
+
+        Returns once the server answers with it. Requests that are under way are answered by the
+        version that they began with.
+        """
+        return await self._ask(UseVersion(*checked_version(map_id, version)), answers.parse_map)
 
     async def delete_version(self, map_id: str, version: str) -> None:
-        """As ``Client.delete_version``."""
+        """Delete a version of a map that is not in use, or the last one there is."""
         await self._transport.send(DeleteVersion(*checked_version(map_id, version)))
 
     async def server_info(self) -> ServerInfo:
-        """As ``Client.server_info``."""
-        raw = await self._transport.send(GetServer())
-        return answers.parse_answer(self.server, answers.parse_server, raw)
+        """Describe the server."""
+        return await self._ask(GetServer(), answers.parse_server)
 
     async def ready(self) -> bool:
-        """As ``Client.ready``."""
-        raw = await self._transport.send(CheckReady())
-        return answers.parse_answer(self.server, answers.parse_ready, raw)
+        """Return whether the server has its maps loaded; raises when it cannot be reached."""
+        return await self._ask(CheckReady(), answers.parse_ready)
 
     async def close(self) -> None:
         """Close the connections."""
         await self._transport.close()
 
+    async def _ask(self, request: AnyRequest, parse: Callable[[JsonObject], T]) -> T:
+        return answers.parse_answer(self.server, parse, await self._transport.send(request))
+
     async def _stream(
         self, start: SequenceStart, instants: AsyncIterable[Instant] | Iterable[Instant]
-    ) -> AsyncIterator[InstantResult]:
+    ) -> AsyncGenerator[InstantResult, None]:
         count = _Count(self.server, start.time_unit)
-
-        async def sent() -> AsyncIterator[SentInstant]:
-            if isinstance(instants, AsyncIterable):
-                async for instant in instants:
-                    yield count.sent(instant)
-            else:
-                for instant in instants:
-                    yield count.sent(instant)
-
-        async with aclosing(self._transport.stream(start, sent())) as stream:
+        if isinstance(instants, AsyncIterable):
+            sent = (count.sent(instant) async for instant in instants)
+        else:
+            sent = read_in_thread(map(count.sent, instants))
+        async with aclosing(self._transport.stream(start, sent)) as stream:
             async for raw in stream:
                 count.answers += 1
                 yield answers.parse_answer(self.server, answers.parse_instant, raw)
@@ -451,6 +300,80 @@ class AsyncClient:
         traceback: TracebackType | None,
     ) -> None:
         await self.close()
+
+
+def _waiting(
+    method: Callable[Concatenate[AsyncClient, P], Coroutine[Any, Any, T]],
+) -> Callable[Concatenate[Client, P], T]:
+    """Make a method of ``Client`` that waits for a method of ``AsyncClient``."""
+
+    @wraps(method)
+    def wait(client: Client, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        return client._loop_thread.run(lambda asked: method(asked, *args, **kwargs))
+
+    return wait
+
+
+def _iterating(
+    method: Callable[Concatenate[AsyncClient, P], AsyncGenerator[T, None]],
+) -> Callable[Concatenate[Client, P], Iterator[T]]:
+    """Make a method of ``Client`` that iterates over a method of ``AsyncClient``."""
+
+    @wraps(method)
+    def iterate(client: Client, /, *args: P.args, **kwargs: P.kwargs) -> Iterator[T]:
+        thread = client._loop_thread
+        return thread.iterate(method(thread.client, *args, **kwargs))
+
+    return iterate
+
+
+class Client:
+    """``AsyncClient`` for callers that wait: the same methods, without ``await``.
+
+    Use it with ``with``, from any thread, also where an event loop runs. Its requests are sent by a
+    thread of its own, which ends with it. Ctrl-C ends a call. A process that was forked after the
+    first call can go on over HTTP, over gRPC it gets a RuntimeError.
+    """
+
+    def __init__(
+        self,
+        server: str,
+        *,
+        api_key: str | None = None,
+        ca: str | Path | None = None,
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+    ) -> None:
+        self.server = server
+        self._loop_thread = LoopThread(
+            partial(AsyncClient, server, api_key=api_key, ca=ca, timeout_s=timeout_s)
+        )
+
+    localize = _waiting(AsyncClient.localize)
+    localize_rig = _waiting(AsyncClient.localize_rig)
+    localize_sequence = _iterating(AsyncClient.localize_sequence)
+    maps = _waiting(AsyncClient.maps)
+    map = _waiting(AsyncClient.map)
+    map_version = _waiting(AsyncClient.map_version)
+    upload_map = _waiting(AsyncClient.upload_map)
+    use_version = _waiting(AsyncClient.use_version)
+    delete_version = _waiting(AsyncClient.delete_version)
+    server_info = _waiting(AsyncClient.server_info)
+    ready = _waiting(AsyncClient.ready)
+
+    def close(self) -> None:
+        """Close the connections; calls that wait in other threads end with a RuntimeError."""
+        self._loop_thread.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
 
 
 class _Count:

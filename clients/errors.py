@@ -1,4 +1,4 @@
-"""Failures on the wire as the exceptions of ``visloc.errors``, the same over HTTP and gRPC."""
+"""Failures of requests as exceptions of ``visloc.errors``, the same over HTTP and gRPC."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _KINDS = {
 
 @dataclass(frozen=True, slots=True)
 class Fallback:
-    """What to raise when an answer has a status but not our words, as proxies send."""
+    """The exception for a status without our error fields, as proxies send it."""
 
     kind: type[VislocError]
     code: str
@@ -40,8 +40,8 @@ def received(parts: Mapping[str, object], fallback: Fallback, message: str) -> V
 
     Args:
         parts: ``kind``, ``code``, ``message``, ``field``, ``expected``, ``got``; any may lack.
-        fallback: kind and code where the server names none that is known.
-        message: stands in for a missing one.
+        fallback: kind and code when the server names none that is known.
+        message: used when ``parts`` has none.
     """
     text = {name: str(value) for name, value in parts.items() if value is not None}
     kind = _KINDS.get(text.get("kind", ""), fallback.kind)
@@ -55,7 +55,7 @@ def received(parts: Mapping[str, object], fallback: Fallback, message: str) -> V
 
 
 def unreachable(server: str, why: str) -> Unavailable:
-    """Make the exception for a server that does not take or keep the connection."""
+    """Make the exception for a server that refuses or drops the connection."""
     if "CERTIFICATE_VERIFY_FAILED" in why:
         return Unavailable(
             "server.unreachable",
@@ -82,7 +82,7 @@ def timed_out(server: str, timeout_s: float) -> TimedOut:
 
 
 def not_understood(server: str, got: object) -> Unavailable:
-    """Make the exception for an answer that no localization service gives."""
+    """Make the exception for an answer that is not one of a localization service."""
     return Unavailable(
         "server.answer",
         "this is not the answer of a localization service of this version; check the address",

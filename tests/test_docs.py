@@ -25,7 +25,7 @@ from pydantic import BaseModel
 
 import clients.cli.main
 import mapping.cli.main
-from clients.cli.connection_options import KEY_VARIABLE
+from clients.cli.options import KEY_VARIABLE
 from mapping.maps.export import export_map
 from service.api import (
     InstantAnswer,

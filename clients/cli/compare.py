@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,27 +13,16 @@ import typer
 from rich.console import Console
 
 from clients.cli.compare_display import command_text, markdown_of, print_comparison
-from clients.cli.connection_options import (
-    DEFAULT_SERVER,
-    ApiKeyFile,
-    Ca,
-    Server,
-    TimeoutS,
-    api_key_of,
-)
 from clients.cli.display import print_failed
-from clients.cli.progress import run_with_progress
-from clients.cli.query_options import (
-    FeaturesDir,
-    Options,
-    Origin,
-    Seed,
-    Source,
+from clients.cli.options import (
+    Connection,
+    Photos,
+    QueryOptions,
     Thresholds,
-    options_of,
+    spread,
     thresholds_of,
 )
-from clients.client import DEFAULT_TIMEOUT_S, AsyncClient, Client
+from clients.cli.progress import run_with_progress
 from clients.evaluation.compare import (
     DEFAULT_VALUES,
     Asked,
@@ -42,11 +32,10 @@ from clients.evaluation.compare import (
     make_variants,
     parse_values,
 )
-from clients.evaluation.queries import read_queries
+from clients.evaluation.readers import Reader, takes_features
 from clients.evaluation.results import check_can_be_written, write_whole
-from clients.evaluation.sending import choose_reader, takes_features
 from visloc.errors import InvalidInput
-from visloc.geometry import PixelOrigin
+from visloc_api.words.maps import MapInfo
 
 _out = Console()
 _err = Console(stderr=True)
@@ -54,9 +43,10 @@ _err = Console(stderr=True)
 _DEFAULTS = "; ".join(f"{axis}: {','.join(words)}" for axis, words in DEFAULT_VALUES.items())
 
 
-def compare(
-    context: typer.Context,
-    source: Source,
+@dataclass(frozen=True, kw_only=True)
+class Comparison(Photos, QueryOptions):
+    """The options that say what is compared."""
+
     map_refs: Annotated[
         list[str],
         typer.Option(
@@ -64,94 +54,92 @@ def compare(
             metavar="ID",
             help="id, or id@version; several for --axis local-features, one for each.",
         ),
-    ],
+    ]
     axis: Annotated[
         Axis,
         typer.Option(
             help="What varies. local-features: the maps. global-features: each of the map's alone, "
             "then all together. Others: the option of this name."
         ),
-    ],
-    output: Annotated[
-        Path, typer.Option(help="Folder for compare.md, compare.png and compare.json.")
-    ],
+    ]
     values: Annotated[
         str | None,
         typer.Option(
             metavar="VALUE,VALUE...",
-            help="The rows of the table; of global-features also sums such as densevlad+localvlad, "
-            f"and all. Without it {_DEFAULTS}.",
+            help="The rows of the table; for global-features also sums such as "
+            f"densevlad+localvlad, and all. Without it {_DEFAULTS}.",
         ),
-    ] = None,
-    server: Server = DEFAULT_SERVER,
-    option: Options = None,
-    seed: Seed = None,
-    threshold: Thresholds = None,
+    ] = None
+    threshold: Thresholds = None
     repeat: Annotated[
         int,
-        typer.Option(min=1, max=100, help="Times that each photo is asked about with each value."),
-    ] = 1,
-    features_dir: FeaturesDir = None,
-    pixel_origin: Origin = PixelOrigin.CORNER,
-    api_key_file: ApiKeyFile = None,
-    ca: Ca = None,
-    timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
+        typer.Option(min=1, max=100, help="How often each photo is sent with each value."),
+    ] = 1
+
+    def readers(self, maps: Sequence[MapInfo]) -> dict[str, Reader]:
+        """Choose what is sent to each map, by ``MapInfo.ref``; raises as ``choose_reader``."""
+        # Of several maps, those that take photos have no use for a folder of features.
+        return {
+            info.ref: self.reader(info, with_features_dir=len(maps) == 1 or takes_features(info))
+            for info in maps
+        }
+
+
+@spread
+def compare(
+    *,
+    context: typer.Context,
+    comparison: Comparison,
+    output: Annotated[
+        Path, typer.Option(help="Folder for compare.md, compare.png and compare.json.")
+    ],
+    connection: Connection,
 ) -> None:
     """Compare features, fusions, matchers or solvers: one axis varies, all else stays fixed.
 
     Writes a table with recall, errors, times and the size of the map for each value (compare.md,
     below the command that made it), a picture of it (compare.png) and all figures (compare.json).
 
-    The values take turns photo by photo, one request at a time, after one request of each that is
-    not counted. A value that the server refuses, such as a matcher that the map's features have
-    none of, is a row that says so. Needs matplotlib: the extra compare of visloc.
+    The values take turns photo by photo, one request at a time. A first request of each value is
+    not counted. A value that the server refuses, such as a matcher that does not know the map's
+    features, is a row that says so. Needs matplotlib: the extra compare of visloc.
 
     Exits with 0 when done, 1 on an error, 130 when stopped; then nothing was written.
     """
     draw = _drawing()
-    options, thresholds = options_of(option, seed), thresholds_of(threshold)
-    words = parse_values(values)
-    queries = read_queries(source, pixel_origin).photos
-    key = api_key_of(api_key_file)
-    with Client(server, api_key=key, ca=ca, timeout_s=timeout_s) as client:
-        maps, about = [client.map(ref) for ref in map_refs], client.server_info()
-    variants = make_variants(axis, words, maps, options)
-    readers = {
-        info.ref: choose_reader(
-            *(source, info),
-            # Of several maps those that take photos have no use for it.
-            features_dir if len(maps) == 1 or takes_features(info) else None,
-            pixel_origin,
-        )
-        for info in maps
-    }
+    options, thresholds = comparison.options, thresholds_of(comparison.threshold)
+    values, queries = parse_values(comparison.values), comparison.read().photos
+    with connection.client() as client:
+        maps, about = [client.map(ref) for ref in comparison.map_refs], client.server_info()
+    variants = make_variants(comparison.axis, values, maps, options)
+    readers = comparison.readers(maps)
     _make_folder(output)
     table, picture, figures = (output / f"compare.{kind}" for kind in ("md", "png", "json"))
     check_can_be_written([table, picture, figures])
-    order = options.seed or 0
+    repeats, seed = comparison.repeat, options.seed or 0
     asked: list[Asked] = []
 
-    async def run(advance: Callable[[], None]) -> None:
-        async with AsyncClient(server, api_key=key, ca=ca, timeout_s=timeout_s) as client:
+    async def work(advance: Callable[[], None]) -> None:
+        async with connection.async_client() as client:
             asked[:] = await ask_each(
-                *(client, variants, queries, readers), repeats=repeat, seed=order, advance=advance
+                *(client, variants, queries, readers), repeats=repeats, seed=seed, advance=advance
             )
 
-    total = len(variants) * len(queries) * repeat
-    run_with_progress(_err, run, "requests", total, "nothing was written")
-    comparison = make_comparison(
-        *(axis, asked, thresholds, queries, about),
+    total = len(variants) * len(queries) * repeats
+    run_with_progress(_err, work, "requests", total, "nothing was written")
+    made = make_comparison(
+        *(comparison.axis, asked, thresholds, queries, about),
         command=command_text(context.obj or ()),
         options=options.given(),
-        repeats=repeat,
-        seed=order,
+        repeats=repeats,
+        seed=seed,
     )
-    image = draw(comparison)
-    write_whole(figures, [json.dumps(comparison, indent=2, allow_nan=False).encode() + b"\n"])
+    image = draw(made)
+    write_whole(figures, [json.dumps(made, indent=2, allow_nan=False).encode() + b"\n"])
     write_whole(picture, [image])
-    write_whole(table, [markdown_of(comparison, picture.name).encode()])
-    print_comparison(_out, comparison)
-    outcomes = (outcome for each in asked for outcome in each.outcomes.values())
+    write_whole(table, [markdown_of(made, picture.name).encode()])
+    print_comparison(_out, made)
+    outcomes = (outcome for each in asked for outcome in each.run.outcomes)
     failed = {outcome.query.name: outcome for outcome in outcomes if outcome.error is not None}
     print_failed(_err, list(failed.values()))
 

@@ -19,11 +19,11 @@ _NOTHING = "-"
 
 
 def command_text(arguments: Sequence[str]) -> str:
-    """Write the command so that it can be pasted into a shell, in lines of a bearable length."""
+    """Write the command so that it can be pasted into a shell, broken into lines."""
     words = [shlex.quote(word) for word in ("localize", *arguments)]
     lines = [words[0]]
     for word in words[1:]:
-        # An option begins a line rather than its value.
+        # Only an option begins a line, never its value.
         begins = len(lines[-1]) > _MAX_LINE - 30 and word.startswith("-")
         if begins:
             lines.append(f"    {word}")
@@ -44,10 +44,10 @@ def mebibytes(size_bytes: int) -> str:
 
 
 def print_comparison(console: Console, comparison: Mapping[str, Any]) -> None:
-    """Print a row for each value, then what explains them."""
+    """Print a row for each value, then the remarks."""
     header, rows = _cells(comparison)
     for row in rows:
-        row[1] = row[1].partition(":")[0]  # why something is refused is said below
+        row[1] = row[1].partition(":")[0]  # the reason of a refusal is printed below
     # Two tables, so that they fit into 80 columns.
     num_accuracy = len(header) - _NUM_OF_COST
     for columns in (range(num_accuracy), (0, *range(num_accuracy, len(header)))):
@@ -71,7 +71,7 @@ def print_comparison(console: Console, comparison: Mapping[str, Any]) -> None:
 
 
 def markdown_of(comparison: Mapping[str, Any], picture: str) -> str:
-    """Write the command, the table, what explains it, and a link to the picture."""
+    """Write the command, the table, its remarks, and a link to the picture."""
     header, rows = _cells(comparison)
     lines = ["```", comparison["command"], "```", "", _markdown_row(header)]
     lines.append(_markdown_row(["---"] * len(header)))
@@ -133,7 +133,7 @@ def _refusal(value: Mapping[str, Any]) -> str:
 
 
 def _remarks(comparison: Mapping[str, Any]) -> list[str]:
-    """What a reader has to know to trust the figures."""
+    """Return the facts that a reader needs to trust the figures."""
     values = comparison["values"]
     maps = {
         value["map"]: ", ".join((value["local_features"], *value["global_features"]))
@@ -166,5 +166,5 @@ def _markdown_row(cells: Sequence[str]) -> str:
 
 
 def clean(text: str) -> str:
-    """Take out what could move a cursor or break a line; names come from elsewhere."""
+    """Replace characters that could move a cursor or break a line; names come from elsewhere."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)

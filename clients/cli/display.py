@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from clients.evaluation.running import Outcome
+from clients.evaluation.run import Outcome
 from clients.wire.answers import LocalizeResult
 from visloc_api.words.answers import PoseEstimate
 from visloc_api.words.geopose import GeoPose
@@ -25,7 +25,7 @@ _CAMERA_SOURCES: Mapping[str, str] = {
     "estimated": "estimated with the pose: give --camera for a better one",
     "guess": "a guess: give --camera for a better pose",
 }
-# What a filled pose rests on.
+# Sources of filled poses.
 _FILLED: Mapping[str, str] = {
     "rig": "from another camera of the rig",
     "interpolated": "between two instants",
@@ -33,17 +33,17 @@ _FILLED: Mapping[str, str] = {
 }
 _PERCENTILES = ("p50", "p75", "p90", "max")
 
-# Lengths in a world that is not metric, or may not be.
+# For lengths in a world that is not known to be metric.
 UNKNOWN_UNIT = "units of the map"
 
 
 def unit_of(map_info: MapInfo) -> str:
-    """The unit of lengths in a map's world."""
+    """Return the unit of lengths in a map's world."""
     return "m" if map_info.metric else UNKNOWN_UNIT
 
 
 def print_result(console: Console, result: LocalizeResult, unit: str) -> None:
-    """Print one answer, a line for each thing that it says."""
+    """Print one answer, a line for each fact."""
     if result.pose is not None:
         print_line(console, "localized", f"in {result.map.id}@{result.map.version}", "bold green")
         _print_pose(console, result.pose, unit)
@@ -88,7 +88,7 @@ def print_result(console: Console, result: LocalizeResult, unit: str) -> None:
 def print_report(
     console: Console, report: Mapping[str, Any], num_with_truth: int, num_errors: int, unit: str
 ) -> None:
-    """Print what the report of a benchmark says, with its modes side by side."""
+    """Print the report of a benchmark, with its modes side by side."""
     server, modes = report["server"], report["modes"]
     features = ", ".join((server["features"]["local"], *server["features"]["global"]))
     console.print(
@@ -109,7 +109,7 @@ def print_report(
 
 
 def print_batch(console: Console, counts: Mapping[str, int], num_photos: int, fills: bool) -> None:
-    """Print how many photos have a pose, and what it rests on."""
+    """Print how many photos have a pose, and its sources."""
     parts = [f"{counts['localized']} of {num_photos} localized"]
     if fills:
         sources = [f"{counts[name]} {words}" for name, words in _FILLED.items() if counts[name]]
@@ -119,7 +119,7 @@ def print_batch(console: Console, counts: Mapping[str, int], num_photos: int, fi
 
 
 def print_failed(console: Console, failed: Sequence[Outcome]) -> None:
-    """Print the first few photos that have no answer, and why."""
+    """Print the first few photos without an answer, and why."""
     for outcome in failed[:_NUM_FAILED_SHOWN]:
         if outcome.error is not None:
             text = f"{outcome.query.name} [{outcome.error.code}] {outcome.error}"
@@ -129,8 +129,8 @@ def print_failed(console: Console, failed: Sequence[Outcome]) -> None:
 
 
 def print_line(console: Console, label: str, text: str, style: str = "bold") -> None:
-    """Print a label and a text from anywhere on one line."""
-    # What comes from files and servers could move the cursor or paint the terminal.
+    """Print a label and a text on one line."""
+    # Texts from files and servers could move the cursor or paint the terminal.
     clean = "".join(letter if letter.isprintable() else "?" for letter in text)
     line = Text.assemble((f"{label:<14} ", style), clean)
     console.print(line, highlight=False, soft_wrap=True)
@@ -155,7 +155,7 @@ def _print_pose(console: Console, pose: PoseEstimate, unit: str) -> None:
 
 
 def _poses(modes: Mapping[str, Mapping[str, Any]], num_with_truth: int, unit: str) -> Table:
-    """The paper's table: what the modes make of the same photos."""
+    """Make the table of the paper: the modes over the same photos."""
     figures = list(modes.values())
     has_truth = figures[0]["recall"] is not None
     title = f"accuracy over {num_with_truth} with known pose" if has_truth else "poses"
@@ -210,7 +210,7 @@ def _share(fraction: float, total: int, num_columns: int) -> str:
 
 
 def _speed(modes: Mapping[str, Mapping[str, Any]]) -> Table:
-    # The modes that fill ask nothing of their own.
+    # The modes that fill send no requests of their own.
     asked: dict[str, Mapping[str, Any]] = {}
     for figures in modes.values():
         asked.setdefault("a photo" if figures["instants"] is None else "an instant", figures)

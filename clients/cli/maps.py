@@ -16,24 +16,16 @@ from rich.progress import (
     TransferSpeedColumn,
 )
 
-from clients.cli.connection_options import (
-    DEFAULT_SERVER,
-    ApiKeyFile,
-    Ca,
-    Server,
-    TimeoutS,
-    api_key_of,
-)
 from clients.cli.display import print_line
 from clients.cli.maps_display import print_map, print_maps
+from clients.cli.options import Connection, spread
 from clients.cli.progress import EXIT_STOPPED
-from clients.client import DEFAULT_TIMEOUT_S, Client
 from clients.wire.requests import checked_version
 from visloc.errors import InvalidInput, VislocError
 from visloc.types import Near
 
 maps_app = typer.Typer(
-    help="See, publish, switch and remove the maps of a localization service.",
+    help="List, publish, switch and remove the maps of a localization service.",
     no_args_is_help=True,
 )
 _out = Console()
@@ -43,7 +35,9 @@ Version = Annotated[str, typer.Argument(metavar="ID@VERSION", help="The map and 
 
 
 @maps_app.command("list")
+@spread
 def list_maps(
+    *,
     near: Annotated[
         str | None,
         typer.Option(
@@ -52,45 +46,38 @@ def list_maps(
             "and metres, WGS84.",
         ),
     ] = None,
-    server: Server = DEFAULT_SERVER,
-    api_key_file: ApiKeyFile = None,
-    ca: Ca = None,
-    timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
+    connection: Connection,
 ) -> None:
     """List the maps, each in the version that is in use."""
     circle = None if near is None else _near(near)
-    with Client(server, api_key=api_key_of(api_key_file), ca=ca, timeout_s=timeout_s) as client:
+    with connection.client() as client:
         print_maps(_out, client.maps(circle))
 
 
 @maps_app.command()
+@spread
 def show(
     map_ref: Annotated[str, typer.Argument(metavar="ID", help="id, or id@version.")],
-    server: Server = DEFAULT_SERVER,
-    api_key_file: ApiKeyFile = None,
-    ca: Ca = None,
-    timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
+    connection: Connection,
 ) -> None:
     """Describe a map: features, extent, place on Earth, versions."""
-    with Client(server, api_key=api_key_of(api_key_file), ca=ca, timeout_s=timeout_s) as client:
+    with connection.client() as client:
         print_map(_out, client.map(map_ref))
 
 
 @maps_app.command()
+@spread
 def push(
     packed: Annotated[Path, typer.Argument(metavar="FILE", help="A map as mapping pack wrote it.")],
-    server: Server = DEFAULT_SERVER,
-    api_key_file: ApiKeyFile = None,
-    ca: Ca = None,
-    timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
+    connection: Connection,
 ) -> None:
     """Publish a version of a map, under the names that it was built with.
 
-    It is verified byte by byte before anyone can see it, and is not in use until localize maps
-    use names it. When this is stopped, nothing is published.
+    The server verifies it byte by byte before anyone can see it. It is not in use until localize
+    maps use names it. When this command is stopped, nothing is published.
     """
     with (
-        Client(server, api_key=api_key_of(api_key_file), ca=ca, timeout_s=timeout_s) as client,
+        connection.client() as client,
         _bar() as progress,
     ):
         try:
@@ -110,33 +97,23 @@ def push(
 
 
 @maps_app.command()
-def use(
-    version: Version,
-    server: Server = DEFAULT_SERVER,
-    api_key_file: ApiKeyFile = None,
-    ca: Ca = None,
-    timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
-) -> None:
+@spread
+def use(version: Version, connection: Connection) -> None:
     """Put a version into use, a newer or an older one, without dropping a request.
 
-    Done when the service answers with it.
+    Ends when the service answers with it.
     """
-    with Client(server, api_key=api_key_of(api_key_file), ca=ca, timeout_s=timeout_s) as client:
+    with connection.client() as client:
         info = client.use_version(*_names(version))
     print_line(_out, "in use", info.ref, "bold green")
 
 
 @maps_app.command()
-def remove(
-    version: Version,
-    server: Server = DEFAULT_SERVER,
-    api_key_file: ApiKeyFile = None,
-    ca: Ca = None,
-    timeout_s: TimeoutS = DEFAULT_TIMEOUT_S,
-) -> None:
+@spread
+def remove(version: Version, connection: Connection) -> None:
     """Delete a version that is not in use, or the last one of a map."""
     map_id, name = _names(version)
-    with Client(server, api_key=api_key_of(api_key_file), ca=ca, timeout_s=timeout_s) as client:
+    with connection.client() as client:
         client.delete_version(map_id, name)
     print_line(_out, "removed", f"{map_id}@{name}")
 

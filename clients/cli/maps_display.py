@@ -1,4 +1,4 @@
-"""Maps for people."""
+"""Descriptions of maps on a terminal."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def print_maps(console: Console, maps: Sequence[MapInfo]) -> None:
 
 
 def print_map(console: Console, info: MapInfo) -> None:
-    """Print one map, a line for each thing that is known of it."""
+    """Print one map, a line for each fact."""
     unit = unit_of(info)
     low, high = info.extent
     sides = " x ".join(f"{b - a:.2f}" for a, b in zip(low, high, strict=True))

@@ -22,14 +22,14 @@ def run_with_progress(
     total: int,
     if_stopped: str,
 ) -> None:
-    """Run ``work``, which calls what it is given after each answer.
+    """Run ``work`` in an event loop, with a progress bar.
 
     Args:
         console: for the bar.
-        work: what to run in an event loop.
-        what: is counted.
-        total: how many there are.
-        if_stopped: what that means, for the person who stops it.
+        work: takes the function that advances the bar by one.
+        what: the things that are counted.
+        total: their number.
+        if_stopped: tells the person who stops the run what becomes of it.
     """
     columns = (
         TextColumn(what),

@@ -1,19 +1,16 @@
-"""Localizing all photos of a dataset, so that a stopped run can be taken up again."""
+"""Localizing all photos of a dataset in a run that can be stopped and resumed."""
 
 from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from clients.client import AsyncClient
 from clients.evaluation.filling import estimate_of, measured
-from clients.evaluation.instants import QueryInstant
 from clients.evaluation.modes import Arrangement, Mode
-from clients.evaluation.queries import Query
 from clients.evaluation.results import (
     StoredResult,
     copy_lines,
@@ -23,29 +20,30 @@ from clients.evaluation.results import (
     write_poses,
     write_whole,
 )
-from clients.evaluation.running import InstantOutcome, Outcome, localize_all, localize_instants
-from clients.wire.features import Features
+from clients.evaluation.run import InstantOutcome, Outcome, localize_all
 from clients.wire.types import LocalizeOptions
 from visloc.errors import Conflict
 from visloc.geometry import PixelOrigin
 from visloc.sequences.filling import TracedPose
 
 _FORMAT = 1
+_T = TypeVar("_T")
+_Outcome = TypeVar("_Outcome", Outcome, InstantOutcome)
 
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """A folder of results and what they are results of.
+    """A folder of results, and the run that they belong to.
 
     Attributes:
         output: holds ``results.jsonl``, ``poses.txt``, ``poses_filled.txt`` and ``run.json``.
         source: the dataset or list.
-        features_dir: where the features of the photos are, when not in the dataset.
-        pixel_origin: where its cameras and keypoints count from.
+        features_dir: of the photos' features, when they are not in the dataset.
+        pixel_origin: of the dataset's cameras and keypoints.
         map_ref: ``id@version``, so that all results are of one map.
         options: for every photo.
-        mode: what is made of the answers.
-        arranged: what more the mode is told, for the description.
+        mode: how poses are filled.
+        arranged: further options of the mode, for the description.
     """
 
     output: Path
@@ -64,28 +62,28 @@ class Batch:
 
     @property
     def poses(self) -> Path:
-        """The poses that were measured, written when all are done."""
+        """The measured poses, written when all photos are done."""
         return self.output / "poses.txt"
 
     @property
     def poses_filled(self) -> Path:
-        """The poses from other photos, apart, so that nobody takes them for measured ones."""
+        """The filled poses, in a file of their own so that nobody takes them for measured ones."""
         return self.output / "poses_filled.txt"
 
     @property
     def description(self) -> Path:
-        """What the results are of."""
+        """The map, the photos and the options of the run."""
         return self.output / "run.json"
 
 
 def open_batch(batch: Batch, *, restart: bool) -> set[str]:
-    """Make the folder ready and return the names of the photos that need not be asked about.
+    """Prepare the folder and return the names of the photos that are done.
 
-    Those are the photos that it has results of, but for errors of the server.
+    A photo is done when the folder has its result, unless that is an error of the server.
 
     Raises:
-        Conflict: ``batch.other_run`` when the folder holds results of something else, and
-            ``restart``, which removes them, is not set.
+        Conflict: ``batch.other_run`` when the folder holds results of another run and ``restart``,
+            which removes them, is not set.
         DatasetError: ``results.line`` when ``results.jsonl`` is damaged.
     """
     batch.output.mkdir(parents=True, exist_ok=True)
@@ -113,60 +111,34 @@ def open_batch(batch: Batch, *, restart: bool) -> set[str]:
 
 async def run_batch(
     batch: Batch,
-    client: AsyncClient,
-    queries: Sequence[Query],
+    items: Iterable[_T],
+    localize: Callable[[_T], Awaitable[_Outcome]],
     concurrency: int,
-    on_outcome: Callable[[Outcome], None],
-    read: Callable[[Query], bytes | Features],
+    on_outcome: Callable[[_Outcome], None],
 ) -> None:
-    """Localize ``queries`` and append each result to the folder at once.
+    """Localize photos or instants; each one's results are appended to the folder at once.
 
     Raises:
-        VislocError: what makes going on pointless; the results so far are kept.
+        VislocError: an error that makes going on pointless; the results so far are kept.
     """
     with batch.results.open("a", encoding="utf-8") as file:
 
-        def keep(outcome: Outcome) -> None:
-            file.write(result_line(outcome))
-            file.flush()
-            on_outcome(outcome)
-
-        await localize_all(client, queries, batch.map_ref, batch.options, concurrency, keep, read)
-
-
-async def run_instants(
-    batch: Batch,
-    client: AsyncClient,
-    instants: Sequence[QueryInstant],
-    concurrency: int,
-    on_outcome: Callable[[InstantOutcome], None],
-    read: Callable[[Query], bytes | Features],
-) -> None:
-    """As ``run_batch``, for instants; the results of an instant are appended together.
-
-    Raises:
-        VislocError: as ``run_batch``.
-    """
-    with batch.results.open("a", encoding="utf-8") as file:
-
-        def keep(outcome: InstantOutcome) -> None:
+        def keep(outcome: _Outcome) -> None:
             file.write("".join(map(result_line, outcome.photos)))
             file.flush()
             on_outcome(outcome)
 
-        await localize_instants(
-            client, instants, batch.map_ref, batch.options, concurrency, keep, read
-        )
+        await localize_all(items, localize, concurrency, keep)
 
 
 def finish_batch(batch: Batch, arrangement: Arrangement) -> Counter[str]:
-    """Bring ``results.jsonl`` into the order of the dataset, fill, and write the poses.
+    """Sort ``results.jsonl`` as the dataset, fill poses, and write them.
 
-    Of a photo that was asked about again the newest result is kept. ``poses_filled.txt`` is
-    written in the modes that fill, and in gp3p when any pose was filled.
+    The newest result of a photo is kept. ``poses_filled.txt`` is written in the modes that fill,
+    and in gp3p when any pose was filled.
 
     Returns:
-        How many photos are localized, filled, not_localized, and error; and how many were filled
+        How many photos are localized, filled, not_localized and error, and how many were filled
         from each source.
     """
     by_name = {result.name: result for result in read_results(batch.results)}
@@ -190,7 +162,7 @@ def finish_batch(batch: Batch, arrangement: Arrangement) -> Counter[str]:
 def _known(result: StoredResult, mode: Mode) -> TracedPose | None:
     if result.pose is not None:
         return measured(result.pose, result.num_inliers)
-    # What the other modes have filled is filled anew, but in gp3p it came with the answer.
+    # In gp3p the answer filled the pose; in the other modes poses are filled again.
     return result.filled if mode is Mode.GP3P else None
 
 

@@ -1,4 +1,4 @@
-"""How accurate and how fast a server answers the queries of a dataset."""
+"""Accuracy and speed of a server over a dataset."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from clients.evaluation.filling import estimate_of, measured
 from clients.evaluation.modes import Mode
 from clients.evaluation.queries import Query
-from clients.evaluation.running import InstantOutcome, Outcome
+from clients.evaluation.run import InstantOutcome, Outcome
 from clients.wire.answers import ServerInfo
 from visloc.errors import InvalidInput
 from visloc.evaluation import (
@@ -32,14 +32,14 @@ _ERROR_PERCENTILES = {"p50": 50, "p75": 75, "p90": 90, "max": 100}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Run:
-    """What was asked of the server, and how long it took.
+    """The outcomes of a dataset, and how long they took.
 
     Attributes:
         outcomes: of all photos, in the order of the dataset.
         latencies_s: of each answer, as the client saw it.
-        stage_seconds: of each answer, as the server says.
+        stage_seconds: of each answer, as the server reports it.
         wall_s: from the first request to the last answer.
-        instants: what was asked about, when it was not single photos.
+        instants: the requests, when they were not for single photos.
     """
 
     outcomes: tuple[Outcome, ...]
@@ -49,33 +49,23 @@ class Run:
     instants: tuple[InstantOutcome, ...] | None = None
 
     @staticmethod
-    def of_photos(outcomes: Sequence[Outcome], wall_s: float) -> Run:
-        """Make a run in which photos were asked about one by one."""
-        answered = [o for o in outcomes if o.result is not None]
-        return Run(
-            tuple(outcomes),
-            tuple(outcome.seconds for outcome in answered),
-            tuple(outcome.result.seconds for outcome in answered if outcome.result is not None),
-            wall_s,
-        )
-
-    @staticmethod
-    def of_instants(
-        instants: Sequence[InstantOutcome], photos: Sequence[Query], wall_s: float
+    def of(
+        answers: Sequence[Outcome | InstantOutcome],
+        photos: Sequence[Query],
+        wall_s: float,
     ) -> Run:
-        """Make a run in which the photos of an instant were asked about together."""
-        by_name = {o.query.name: o for instant in instants for o in instant.photos}
-        answered = [instant for instant in instants if instant.has_answer]
-        stages = []
-        for instant in answered:
-            results = [o.result for o in instant.photos if o.result is not None]
-            stages += [result.seconds for result in results[:1]]  # the same of all its photos
+        """Make a run of the answers to photos or to instants."""
+        by_name = {o.query.name: o for answer in answers for o in answer.photos}
+        answered = [answer for answer in answers if answer.has_answer]
+        # The photos of an instant share its seconds.
+        results = [[o.result for o in each.photos if o.result is not None] for each in answered]
+        instants = tuple(each for each in answers if isinstance(each, InstantOutcome))
         return Run(
             tuple(by_name[query.name] for query in photos),
-            tuple(instant.seconds for instant in answered),
-            tuple(stages),
+            tuple(answer.seconds for answer in answered),
+            tuple(each[0].seconds for each in results if each),
             wall_s,
-            tuple(instants),
+            instants or None,
         )
 
 
@@ -107,18 +97,18 @@ def make_report(
     server: ServerInfo,
     map_info: MapInfo,
 ) -> dict[str, Any]:
-    """Summarize a run as plain JSON; null where nothing can be said.
+    """Summarize runs as plain JSON; null where there is no figure.
 
-    Recall is over all photos with a known pose, localized or not; the medians and percentiles are
+    Recall is over all photos with a known pose, localized or not. The medians and percentiles are
     over those that have a pose, localized or filled. Latencies are those of answers as the client
     saw them. The seconds of a stage are the mean over the answers that reached it.
 
     Args:
-        runs: by mode, in the order of the table; the first is described at the top as well.
+        runs: by mode, in the order of the table; the first one's figures are also at the top.
         poses: of all photos, filled as the mode does.
         thresholds: of the recall.
         server: that answered.
-        map_info: the map that was asked for.
+        map_info: the map that was searched.
     """
     modes = {mode.value: figures_of(run, poses[mode], thresholds) for mode, run in runs.items()}
     first = next(iter(modes.values()))
@@ -143,7 +133,7 @@ _FIGURES_OF_THE_FIRST = (
 
 
 def known_poses(run: Run) -> list[TracedPose | None]:
-    """Return what the answers themselves tell: measured poses, and those filled from a rig's."""
+    """Return the poses of the answers: measured ones, and those filled from a rig's."""
     return [
         o.filled
         if o.result is None or o.result.pose is None
@@ -155,7 +145,7 @@ def known_poses(run: Run) -> list[TracedPose | None]:
 def figures_of(
     run: Run, poses: Sequence[TracedPose | None], thresholds: Sequence[Threshold]
 ) -> dict[str, Any]:
-    """Summarize one run, as ``make_report`` says."""
+    """Summarize one run as ``make_report`` does."""
     errors = pose_errors(run.outcomes, poses)
     num_with_truth = sum(outcome.query.truth is not None for outcome in run.outcomes)
     median_position_m, median_orientation_deg = median_errors_localized(errors)
@@ -192,7 +182,7 @@ def pose_errors(
 
 
 def _sources(poses: Sequence[TracedPose | None]) -> dict[str, dict[str, float]]:
-    """Count poses by what they rest on, with the median of how sure they are of the position."""
+    """Count poses by their source, with the median standard deviation of the position."""
     known = [pose for pose in poses if pose is not None]
     stds = defaultdict(list)
     for pose in known:
@@ -209,7 +199,7 @@ def _sources(poses: Sequence[TracedPose | None]) -> dict[str, dict[str, float]]:
 
 
 def _error_percentiles(values: Sequence[float]) -> dict[str, float] | None:
-    # Between two values where need be, so that p50 is the median above.
+    # Interpolated, so that p50 is the median above.
     if not values:
         return None
     return {name: float(np.percentile(values, q)) for name, q in _ERROR_PERCENTILES.items()}

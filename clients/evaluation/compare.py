@@ -1,4 +1,4 @@
-"""What one choice brings: a dataset asked about with each value of an axis, all else fixed."""
+"""A comparison: a dataset is localized with each value of an axis, all else fixed."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from clients.cli.display import unit_of
 from clients.client import AsyncClient
 from clients.evaluation.benchmark import Run, figures_of, known_poses
 from clients.evaluation.queries import Query
-from clients.evaluation.running import Outcome, localize_one
-from clients.evaluation.sending import Reader
+from clients.evaluation.readers import Reader
+from clients.evaluation.run import Outcome, QueryClient
 from clients.wire.answers import ServerInfo
 from clients.wire.types import LocalizeOptions
 from visloc.errors import Forbidden, InvalidInput, Unauthenticated, Unavailable, VislocError
@@ -52,13 +51,7 @@ ALL_TOGETHER = "all"
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One value of an axis.
-
-    Attributes:
-        value: its name.
-        map: that is asked.
-        options: for every photo.
-    """
+    """One value of an axis, with the map and the options that it stands for."""
 
     value: str
     map: MapInfo
@@ -67,37 +60,30 @@ class Variant:
 
 @dataclass(slots=True, eq=False)
 class Asked:
-    """What became of one value.
+    """The results with one value.
 
     Attributes:
-        variant: what was asked for.
-        refusal: why the server does not do this at all.
-        outcomes: of each photo, by its name; of several requests the first.
-        latencies_s: of all answers.
-        stage_seconds: of all answers.
+        variant: the value.
+        refusal: why the server does not take it at all.
+        outcomes: of all requests, in their order.
     """
 
     variant: Variant
     refusal: VislocError | None = None
-    outcomes: dict[str, Outcome] = field(default_factory=dict)
-    latencies_s: list[float] = field(default_factory=list)
-    stage_seconds: list[Mapping[str, float]] = field(default_factory=list)
-
-    def keep(self, outcome: Outcome) -> None:
-        """Count an outcome."""
-        self.outcomes.setdefault(outcome.query.name, outcome)
-        if outcome.result is not None:
-            self.latencies_s.append(outcome.seconds)
-            self.stage_seconds.append(outcome.result.seconds)
+    outcomes: list[Outcome] = field(default_factory=list)
 
     @property
     def run(self) -> Run:
-        """What was measured, one request after the other."""
+        """The first outcome of each photo, and the times of all, one request after the other."""
+        firsts = {outcome.query.name: outcome for outcome in reversed(self.outcomes)}
+        photos = list(dict.fromkeys(outcome.query.name for outcome in self.outcomes))
+        answered = [(o.seconds, o.result.seconds) for o in self.outcomes if o.result is not None]
+        latencies_s = tuple(seconds for seconds, _ in answered)
         return Run(
-            tuple(self.outcomes.values()),
-            tuple(self.latencies_s),
-            tuple(self.stage_seconds),
-            sum(self.latencies_s),
+            tuple(firsts[name] for name in photos),
+            latencies_s,
+            tuple(stages for _, stages in answered),
+            sum(latencies_s),
         )
 
 
@@ -124,11 +110,11 @@ def parse_values(text: str | None) -> tuple[str, ...]:
 def make_variants(
     axis: Axis, values: Sequence[str], maps: Sequence[MapInfo], fixed: LocalizeOptions
 ) -> list[Variant]:
-    """Return what is asked about each photo, in the order of the table.
+    """Return the rows of the table, in its order.
 
     Args:
-        axis: what is varied.
-        values: of it; those that are usual when there are none.
+        axis: the axis.
+        values: of the axis; its usual ones when empty.
         maps: one for each of the local features, else one.
         fixed: the options that do not vary.
 
@@ -185,18 +171,18 @@ async def ask_each(
     seed: int,
     advance: Callable[[], None],
 ) -> list[Asked]:
-    """Ask about each photo with each value, one request at a time.
+    """Localize each photo with each value, one request at a time.
 
-    Machines have moods, so the values take turns photo by photo, in an order drawn anew for each.
-    Before that, each value is asked about once, which counts for nothing: its caches are cold.
-    A value that the server refuses is marked and not asked about again.
+    The speed of a machine drifts, so the values take turns photo by photo, in an order drawn for
+    each photo. A first request of each value is not counted: its caches are cold. A value that
+    the server refuses is marked and not tried again.
 
     Args:
         client: of the server.
         variants: the values.
         queries: the photos.
-        readers: by ``MapInfo.ref``: gives what is sent of a photo.
-        repeats: how many times each photo is asked about with each value.
+        readers: by ``MapInfo.ref``.
+        repeats: how often each photo is sent with each value.
         seed: of the order.
         advance: called once for each photo, repetition and value.
 
@@ -215,7 +201,7 @@ async def ask_each(
             for index in rng.permutation(len(asked)):
                 outcome = await _ask(client, asked[index], query, readers)
                 if outcome is not None:
-                    asked[index].keep(outcome)
+                    asked[index].outcomes.append(outcome)
                 advance()
     return asked
 
@@ -233,21 +219,20 @@ def make_comparison(
     Figures are as in the report of ``localize benchmark``.
 
     Args:
-        axis: what was varied.
-        asked: what became of each value.
+        axis: the axis.
+        asked: the results with each value.
         thresholds: of the recall.
         queries: the photos.
         server: that answered.
-        told: what more to write down: how it was called.
+        told: further entries: how the comparison was called.
     """
-    units = {unit_of(each.variant.map) for each in asked}
     return {
         "axis": axis.value,
         **told,
         "server": {"version": server.version},
         "photos": len(queries),
         "photos_with_truth": sum(query.truth is not None for query in queries),
-        "metric": units == {"m"},
+        "metric": all(bool(each.variant.map.metric) for each in asked),
         "thresholds": [[t.max_position_error_m, t.max_orientation_error_deg] for t in thresholds],
         "values": [_row(each, thresholds) for each in asked],
     }
@@ -279,7 +264,7 @@ def _row(asked: Asked, thresholds: Sequence[Threshold]) -> dict[str, Any]:
 async def _warm_up(
     client: AsyncClient, asked: Asked, queries: Sequence[Query], readers: Mapping[str, Reader]
 ) -> None:
-    """Ask until there is an answer, which needs more than one photo when the first is broken."""
+    """Send photos until one is answered: the first ones may be broken."""
     for query in queries:
         outcome = await _ask(client, asked, query, readers)
         if outcome is None or outcome.result is not None:
@@ -289,13 +274,13 @@ async def _warm_up(
 async def _ask(
     client: AsyncClient, asked: Asked, query: Query, readers: Mapping[str, Reader]
 ) -> Outcome | None:
-    """Ask about one photo; None for a value that is refused."""
+    """Localize one photo; None for a value that is refused."""
     if asked.refusal is not None:
         return None
     variant = asked.variant
     ref = variant.map.ref
     try:
-        return await localize_one(client, query, ref, variant.options, readers[ref])
+        return await QueryClient(client, ref, variant.options, readers[ref]).localize(query)
     except (Unavailable, Unauthenticated, Forbidden):
         raise
     except VislocError as error:
@@ -332,7 +317,7 @@ def _variants_of_maps(
 
 
 def _check_words(words: Sequence[str], known: Sequence[str]) -> None:
-    """Refuse what the server would, after everything else was measured."""
+    """Refuse now what the server would refuse after everything else was measured."""
     for word in words:
         if word not in known:
             raise InvalidInput(

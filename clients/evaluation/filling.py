@@ -1,4 +1,4 @@
-"""From answers to poses that can be filled, and from filled poses to what answers look like."""
+"""Answers as poses that fill others, and filled poses as answers."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from visloc_api.words.answers import PoseEstimate
 
 
 def measured(pose: PoseEstimate, num_inliers: int) -> TracedPose:
-    """Return a pose that a photo gave."""
+    """Return the pose of an answer as a measured one."""
     return TracedPose(pose.cam_from_world, pose.covariance, PoseSource.ESTIMATED, num_inliers)
 
 
 def pose_as_json(traced: TracedPose) -> JsonObject:
-    """Return a pose ``cam_from_world`` as the API has a PoseEstimate."""
+    """Return a pose ``cam_from_world`` as a PoseEstimate of the API."""
     pose = traced.pose
     variances = np.diag(center_covariance(pose, traced.covariance))
     stds = np.sqrt(np.maximum(variances, 0.0))
@@ -43,15 +43,15 @@ def pose_as_json(traced: TracedPose) -> JsonObject:
 
 
 def estimate_of(traced: TracedPose) -> PoseEstimate:
-    """Return a pose as if it had been received."""
+    """Return a pose as a PoseEstimate, as if it had been received."""
     return parse_pose(pose_as_json(traced))
 
 
 def photo_result(result: InstantResult, index: int) -> LocalizeResult:
-    """Return what the answer to an instant says of one of its photos, which could be used.
+    """Return the answer to one photo of an instant.
 
-    The pose is the rig's, seen from the camera, and none when the photo has no inlier of it: it
-    then rests on the other cameras. Correspondences, inliers and what was retrieved are the
+    The pose is the rig's, seen from the camera. A photo without an inlier has none: the rig's
+    pose then rests on the other cameras. Correspondences, inliers and retrieved images are the
     photo's own; the seconds are those of the whole instant.
 
     Raises:
@@ -88,16 +88,16 @@ def photo_result(result: InstantResult, index: int) -> LocalizeResult:
 
 
 def poses_from_rig(result: InstantResult, rig: Rig) -> dict[str, TracedPose]:
-    """Return the poses, by sensor, of cameras whose photos contributed nothing to their rig's.
+    """Return the poses, by sensor, of cameras whose photos contributed nothing to the rig's pose.
 
-    They rest on the other cameras: of source RIG, and as wide as ``fill_rig`` makes them.
+    They rest on the other cameras: their source is RIG, their covariance that of ``fill_rig``.
 
     Args:
         result: the answer to an instant.
-        rig: whose it is. Of one that the map knows, only the answer tells where the cameras sit.
+        rig: the rig. For a rig that the map knows, only the answer tells where its cameras sit.
 
     Raises:
-        ValueError: for a pose that rests on no photo at all.
+        ValueError: for a pose without an inlier in any photo.
     """
     if not result.localized:
         return {}
@@ -122,13 +122,13 @@ def poses_from_rig(result: InstantResult, rig: Rig) -> dict[str, TracedPose]:
 
 
 def _measured_by(result: InstantResult, image: ImageResult) -> TracedPose | None:
-    """Return the pose of a camera whose photo contributed to that of its rig."""
+    """Return the pose of a camera whose photo contributed to its rig's pose."""
     if not result.localized or image.error is not None or image.inliers == 0:
         return None
     assert result.pose is not None
     if image.cam_from_world is None:
         raise ValueError("a photo without a pose in an instant with one")
-    # (w, dt) of the rig arrive at the camera turned: R = R_c R_rig, t = R_c t_rig + t_c.
+    # The camera sees the rig's (w, dt) rotated: R = R_c R_rig, t = R_c t_rig + t_c.
     turn = np.zeros((6, 6))
     cam_from_rig = image.cam_from_world.rotation @ result.pose.rig_from_world.rotation.T
     turn[:3, :3] = turn[3:, 3:] = cam_from_rig

@@ -1,4 +1,4 @@
-"""The photos of a dataset, put together as its rigs took them."""
+"""The photos of a dataset, grouped by rig and timestamp."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from visloc_api.words.maps import MapInfo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QueryInstant:
-    """Photos that were taken together.
+    """Photos that a rig took at one instant.
 
     Attributes:
-        rig: how their cameras sit, or the id of a rig of the map; a camera without a rig is a rig
+        rig: how the cameras sit, or the id of a rig of the map. A camera without a rig is a rig
             of its own.
         photos: each of another camera, in the order of the dataset.
     """
@@ -28,18 +28,18 @@ class QueryInstant:
 
 
 def instants_of_dataset(queries: QuerySet, *, or_else: str = "") -> list[QueryInstant]:
-    """Put photos of one rig and one timestamp together, in the order of their first ones.
+    """Group photos by rig and timestamp, in the order of their first photos.
 
     The rig of a camera is the outermost one that carries it.
 
     Args:
         queries: the photos and the rigs.
-        or_else: what would do instead of rigs, for errors.
+        or_else: names an alternative to rigs in the dataset, for the error.
 
     Raises:
-        DatasetError: ``queries.no_rigs`` when no photo was taken by a rig;
-            ``queries.rig_ambiguous`` when a camera is carried by several rigs;
-            ``queries.rig_transform`` when it is not known where it sits.
+        DatasetError: ``queries.no_rigs`` when no rig took a photo;
+            ``queries.rig_ambiguous`` when several rigs carry a camera;
+            ``queries.rig_transform`` when it is not known where a camera sits.
     """
     rig_of = {
         sensor_id: _rig_of(queries, sensor_id)
@@ -67,11 +67,11 @@ def instants_of_dataset(queries: QuerySet, *, or_else: str = "") -> list[QueryIn
 
 
 def instants_of_map_rig(queries: QuerySet, info: MapInfo, rig_id: str) -> list[QueryInstant]:
-    """Put photos of one rig that the map knows and of one timestamp together.
+    """Group the photos of a rig that the map knows by timestamp.
 
     Raises:
         NotFound: ``rig.unknown``.
-        DatasetError: ``queries.no_rigs`` when no photo was taken by one of its cameras.
+        DatasetError: ``queries.no_rigs`` when none of its cameras took a photo.
     """
     rigs = {rig.id: rig.sensors for rig in info.rigs}
     if rig_id not in rigs:
@@ -94,7 +94,7 @@ def _rig_of(queries: QuerySet, sensor_id: str) -> str | None:
     carriers = [rig_id for rig_id, members in queries.rigs.items() if sensor_id in members]
     if not carriers:
         return None
-    # Nested rigs are all listed with all their cameras: the outermost has those of the others.
+    # Every nested rig is listed with all of its cameras, so the outermost one has all of them.
     outermost = max(carriers, key=lambda rig_id: len(queries.rigs[rig_id]))
     others = [rig_id for rig_id in carriers if rig_id != outermost]
     if not all(queries.rigs[o].keys() < queries.rigs[outermost].keys() for o in others):

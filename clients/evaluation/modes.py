@@ -1,7 +1,4 @@
-"""What is made of the answers to the photos of a dataset: the paper's table.
-
-Humenberger et al. 2020, camera rigs and image sequences.
-"""
+"""Modes that fill poses from other photos, as in the tables of Humenberger et al. 2020."""
 
 from __future__ import annotations
 
@@ -19,40 +16,40 @@ DEFAULT_MAX_GAP_S = 1.0
 
 
 class Mode(StrEnum):
-    """How the photos of a dataset are taken together."""
+    """How photos of a dataset help each other."""
 
-    SINGLE = "single"  # each on its own
-    RIG = "rig"  # ... then from the best camera of the same rig and instant
-    SEQ = "seq"  # ... or from the instants before and after
-    RIG_SEQ = "rig+seq"  # ... or from both, in this order
-    GP3P = "gp3p"  # the photos of a rig and instant solve one pose, which fills those it ignores
+    SINGLE = "single"  # not at all
+    RIG = "rig"  # a photo without a pose takes it from the best camera of its rig and instant
+    SEQ = "seq"  # ... from the instants before and after
+    RIG_SEQ = "rig+seq"  # ... from both, in this order
+    GP3P = "gp3p"  # the photos of a rig and instant solve one pose, also for those without inliers
 
     @property
     def fills_rigs(self) -> bool:
-        """Whether a camera gets the pose of another one."""
+        """Whether a camera takes the pose of another one."""
         return self in (Mode.RIG, Mode.RIG_SEQ)
 
     @property
     def fills_sequences(self) -> bool:
-        """Whether an instant gets the pose of others."""
+        """Whether an instant takes the pose of others."""
         return self in (Mode.SEQ, Mode.RIG_SEQ)
 
     @property
     def fills(self) -> bool:
-        """Whether poses are filled from the answers; in gp3p the answers themselves fill."""
+        """Whether poses are filled here; in gp3p the server fills them."""
         return self.fills_rigs or self.fills_sequences
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrangement:
-    """How the photos of a dataset hang together, as far as the modes need it.
+    """The groups of a dataset's photos that the modes need.
 
     Attributes:
         photos: all of them.
         filled: the instants in which one camera's pose fills another's.
-        asked: the instants that are asked about as such.
+        asked: the instants that are sent in one request each.
         time_unit: of the timestamps; None when no mode needs it.
-        max_gap_s: longest time between poses that others are filled from.
+        max_gap_s: longest time between the poses that others are filled from, seconds.
     """
 
     photos: tuple[Query, ...]
@@ -77,7 +74,7 @@ class Arrangement:
 
 
 def parse_modes(texts: Iterable[str]) -> list[Mode]:
-    """Parse words, or words with commas between; ``all`` is all of them. Nothing is ``single``.
+    """Parse modes, also with commas between; ``all`` is every mode, none at all is ``single``.
 
     Raises:
         InvalidInput: ``mode.unknown``.
@@ -109,15 +106,15 @@ def arrange(
     time_unit: TimeUnit | None = None,
     max_gap_s: float = DEFAULT_MAX_GAP_S,
 ) -> Arrangement:
-    """Find out what the modes need to know about a dataset.
+    """Group the photos of a dataset as the modes need it.
 
     Args:
         queries: the photos and the rigs.
-        modes: all that are wanted.
-        info: the map that is asked.
-        rig_id: a rig that the map knows, for ``gp3p``, instead of those of the dataset.
-        time_unit: of the timestamps; None to tell it by their size.
-        max_gap_s: longest time between poses that others are filled from.
+        modes: the modes.
+        info: the map that is searched.
+        rig_id: for ``gp3p``: a rig that the map knows, instead of the dataset's rigs.
+        time_unit: of the timestamps; None infers it from their size.
+        max_gap_s: longest time between the poses that others are filled from.
 
     Raises:
         DatasetError: ``queries.no_rigs`` and others of ``clients.evaluation.instants``;
@@ -143,7 +140,7 @@ def arrange(
 
 
 def _fill_instant(instant: QueryInstant, by_name: dict[str, TracedPose | None]) -> None:
-    assert not isinstance(instant.rig, str)  # of the dataset: it is known where the cameras sit
+    assert not isinstance(instant.rig, str)  # a rig of the dataset
     cam_from_rig = {sensor: known.cam_from_rig for sensor, known in instant.rig.items()}
     names = {query.sensor: query.name for query in instant.photos}
     poses = fill_rig({sensor: by_name[name] for sensor, name in names.items()}, cam_from_rig)
@@ -158,7 +155,7 @@ def _fill_sequence(
 ) -> None:
     in_time = sorted((query.timestamp or 0, query.name) for query in photos)
     first = in_time[0][0]
-    # Counted from the first one while still whole numbers: as floats, Unix times lose digits.
+    # Subtracted as whole numbers: as floats, Unix times lose digits.
     times_s = [(timestamp - first) * unit.seconds for timestamp, _ in in_time]
     poses = fill_sequence(times_s, [by_name[name] for _, name in in_time], max_gap_s)
     by_name.update({name: pose for (_, name), pose in zip(in_time, poses, strict=True)})

@@ -1,4 +1,4 @@
-"""The photos to localize: a kapture dataset, or a list of image paths with cameras."""
+"""The photos to localize: a kapture dataset, or a list of photos with cameras."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ class Query:
     """One photo to localize.
 
     Attributes:
-        name: as the dataset or list has it; unique.
+        name: in the dataset or list; unique.
         path: the file, which may be missing.
         camera: intrinsics; None when unknown.
         truth: the true ``cam_from_world``, when known; never sent.
-        sensor_id: the sensor that took it; None in a list.
-        timestamp: when, in the dataset's own unit; None in a list.
+        sensor_id: None in a list.
+        timestamp: in the dataset's own unit; None in a list.
     """
 
     name: str
@@ -36,18 +36,18 @@ class Query:
 
     @property
     def sensor(self) -> str:
-        """What a request calls the sensor, also when it is not known."""
+        """The name of the sensor in a request, also when it is unknown."""
         return "camera" if self.sensor_id is None else self.sensor_id
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QuerySet:
-    """The photos to localize and how their cameras hang together.
+    """The photos to localize, and the rigs of their cameras.
 
     Attributes:
         source: the folder or list.
-        photos: in its order; a folder's by time, then by sensor.
-        rigs: rig id -> sensor id -> ``cam_from_rig``, None where it is unknown; none in a list.
+        photos: in the order of the list, or by time, then by sensor.
+        rigs: rig id -> sensor id -> ``cam_from_rig``, None where it is unknown; empty for a list.
     """
 
     source: Path
@@ -60,7 +60,7 @@ def read_queries(source: Path, origin: PixelOrigin = PixelOrigin.CORNER) -> Quer
 
     Each line of a list is ``image_name`` or ``image_name MODEL width height params...``,
     separated by blanks, with names relative to the folder of the list. Empty lines and those
-    that begin with ``#`` are skipped. UNKNOWN_CAMERA, here or in kapture, sends no camera.
+    that begin with ``#`` are skipped. For UNKNOWN_CAMERA, here or in kapture, no camera is sent.
     Principal points count from ``origin``.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Results on disk: ``results.jsonl``, poses, and files that are written whole or not."""
+"""Results on disk: ``results.jsonl``, poses, and files that are written whole or not at all."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 from urllib.parse import quote
 
 from clients.evaluation.filling import pose_as_json
-from clients.evaluation.running import Outcome
+from clients.evaluation.run import Outcome
 from clients.wire.answers import parse_pose
 from visloc.errors import DatasetError, InvalidInput
 from visloc.sequences.filling import TracedPose
@@ -20,7 +20,7 @@ from visloc.types import PoseSource
 from visloc_api.words.answers import PoseEstimate
 
 _LOCALIZED, _NOT_LOCALIZED, _ERROR, _FILLED = "localized", "not_localized", "error", "filled"
-# Errors that say nothing about the photo: it may be answered when it is asked about again.
+# Errors that say nothing about the photo: it may be answered when it is sent again.
 _PASSING_CODES = ("server.internal", "server.timeout")
 _PASSING_KINDS = ("Unavailable", "Overloaded")
 
@@ -31,12 +31,12 @@ class StoredResult:
 
     Attributes:
         name: of the photo.
-        status: localized, not_localized or error; of a filled one, what it was before.
+        status: localized, not_localized or error; for a filled photo, its status before filling.
         pose: when localized.
         num_inliers: of the pose.
-        filled: the pose from other photos that the line has.
-        is_final: whether asking again is pointless; False for errors of the server.
-        offset: where the line begins in the file, bytes.
+        filled: the pose from other photos, when the line has one.
+        is_final: False for errors of the server: the photo is sent again.
+        offset: of the line in the file, bytes.
         length: of the line with its end, bytes.
     """
 
@@ -53,9 +53,9 @@ class StoredResult:
 def result_line(outcome: Outcome) -> str:
     """Write an outcome as one line of JSON: the name, then the answer as received.
 
-    ``source`` tells what the pose rests on, null without one. A photo without an answer has
+    ``source`` is the source of the pose, null without one. A photo without an answer has
     ``"status": "error"`` and an object ``error`` with kind, code, message, field, expected and
-    got. One that is filled has status filled, a ``pose``, and the rest as without it.
+    got. A filled photo has status filled and a ``pose``; the rest is as before filling.
     """
     entry: dict[str, Any] = {"name": outcome.query.name}
     if outcome.result is not None:
@@ -75,7 +75,7 @@ def result_line(outcome: Outcome) -> str:
 
 
 def drop_torn_line(path: Path) -> None:
-    """Cut off what a killed run left of its last line; a missing file stays missing."""
+    """Cut off an incomplete last line, as a killed run leaves it; a missing file stays missing."""
     if not path.exists():
         return
     with path.open("r+b") as file:
@@ -129,8 +129,7 @@ def copy_lines(
         source: what ``results`` were read from.
         results: the lines.
         target: written whole.
-        filled: poses from other photos, by the photo's name; other lines lose theirs, and lines
-            that have it already stay as they are.
+        filled: poses from other photos, by the photo's name. Lines of other photos lose theirs.
     """
     filled = filled or {}
     with source.open("rb") as file:
@@ -155,7 +154,7 @@ def write_poses(path: Path, poses: Iterable[tuple[str, PoseEstimate]]) -> None:
 
 
 def write_whole(path: Path, parts: Iterable[bytes]) -> None:
-    """Write a file so that a reader sees the old one or the new one, never a half."""
+    """Write a file so that a reader sees the old or the new one, never a part."""
     unfinished = path.with_name(f".{path.name}.new")
     with unfinished.open("wb") as file:
         _write_and_sync(file, parts)
@@ -163,7 +162,7 @@ def write_whole(path: Path, parts: Iterable[bytes]) -> None:
 
 
 def check_can_be_written(paths: Sequence[Path]) -> None:
-    """Find out before a long run, not after it.
+    """Check before a long run that its files can be written.
 
     Raises:
         InvalidInput: ``output.folder``.
@@ -203,7 +202,7 @@ def _before_filling(entry: Mapping[str, Any]) -> str:
 
 
 def _refilled(line: bytes, pose: TracedPose | None) -> bytes:
-    """Write a pose from other photos into a line, or take it out; the rest stays as it is."""
+    """Put a pose from other photos into a line, or take it out; the rest stays."""
     entry = json.loads(line)
     entry["status"], entry["source"] = _before_filling(entry), None
     if "error" in entry:

@@ -1,4 +1,4 @@
-"""How a server is reached: its address, the key for it, and whom to trust."""
+"""The address of a server, the key for it, and the certificates to trust."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _KEY = re.compile(r"[\x21-\x7e]{1,512}")
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """What a transport has to know.
+    """The address of a server, and how to talk to it.
 
     Attributes:
         server: ``http://``, ``https://``, ``grpc://`` or ``grpcs://``, host and port.
         timeout_s: longest wait for an answer, seconds.
         api_key: sent with every request; never shown.
-        authorities: certificates in PEM that are trusted instead of the usual ones.
+        authorities: PEM text of the authorities to trust instead of the usual ones.
     """
 
     server: str
@@ -31,19 +31,17 @@ class Connection:
 
     @property
     def is_grpc(self) -> bool:
-        """Whether it speaks gRPC, not HTTP."""
         return self.server.startswith(("grpc:", "grpcs:"))
 
     @property
     def is_encrypted(self) -> bool:
-        """Whether it speaks TLS."""
         return self.server.startswith(("https:", "grpcs:"))
 
 
 def checked_connection(
     server: str, timeout_s: float, api_key: str | None, ca: str | Path | None
 ) -> Connection:
-    """Check what the caller of a client gave, and read the file of certificates.
+    """Check the arguments of a client, and read the file of certificates.
 
     Raises:
         InvalidInput: ``server.url``, ``server.api_key``, ``server.ca``.

@@ -1,21 +1,21 @@
-"""Requests over gRPC, synchronous and asynchronous."""
+"""Requests over gRPC."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, AsyncIterable, Callable, Iterable, Iterator
+import os
+from collections.abc import AsyncGenerator, AsyncIterable, Callable, Iterator
 from contextlib import aclosing
 from functools import partial
 from typing import Any, assert_never
 
 import grpc
-from google.protobuf.message import DecodeError
+from google.protobuf.message import DecodeError, Message
 
 from clients import errors
 from clients.transport.connection import Connection
 from clients.transport.grpc_errors import Metadata, grpc_failure
-from clients.transport.grpc_streams import stream_answers, stream_answers_async
-from clients.transport.grpc_uploads import UploadFeed
+from clients.transport.grpc_streams import stream_answers
 from clients.transport.messages import (
     list_maps_message,
     localize_message,
@@ -24,7 +24,7 @@ from clients.transport.messages import (
     version_message,
 )
 from clients.transport.retry import GRPC_OPTIONS, map_header
-from clients.transport.uploads import OnProgress, Upload
+from clients.transport.uploads import OnProgress, Upload, pieces
 from clients.wire.requests import (
     CheckReady,
     DeleteVersion,
@@ -37,6 +37,7 @@ from clients.wire.requests import (
     UseVersion,
 )
 from clients.wire.rig_requests import AnyRequest, LocalizeRig, SentInstant, SequenceStart
+from visloc.errors import VislocError
 from visloc_api.v1 import localization_pb2 as wire
 from visloc_api.words.wire import VERSION_KEY
 
@@ -44,71 +45,14 @@ _SERVICE = f"/{wire.DESCRIPTOR.services_by_name['Localization'].full_name}"
 _MAPS = f"/{wire.DESCRIPTOR.services_by_name['Maps'].full_name}"
 _PUT_VERSION = f"{_MAPS}/PutVersion"
 _SEQUENCE = f"{_SERVICE}/LocalizeSequence"
-# HealthCheckResponse with status SERVING. Two bytes are not worth another dependency.
+# HealthCheckResponse with status SERVING; two bytes are not worth another dependency.
 _SERVING = b"\x08\x01"
+# The process that first used gRPC.
+_process: int | None = None
 
 
 class GrpcTransport:
-    """Sends requests and waits for the answers; safe to share between threads."""
-
-    def __init__(self, connection: Connection) -> None:
-        self._server, self._timeout_s = connection.server, connection.timeout_s
-        self._connection = connection
-        target, credentials = _target(connection), _credentials(connection)
-        if credentials is None:
-            self._channel = grpc.insecure_channel(target, GRPC_OPTIONS)
-        else:
-            self._channel = grpc.secure_channel(target, credentials, GRPC_OPTIONS)
-
-    def send(self, request: AnyRequest) -> JsonObject:
-        """Return the answer as plain JSON, the same as over HTTP.
-
-        Raises:
-            VislocError: what the server refused, or ``server.*``.
-        """
-        path, message, decode = _encode(request)
-        call = self._channel.unary_unary(path, None, None)
-        try:
-            answer, context = call.with_call(
-                message, timeout=self._timeout_s, metadata=_metadata(self._connection, request)
-            )
-        except grpc.RpcError as error:
-            raise grpc_failure(self._server, self._timeout_s, error) from error
-        return _decoded(self._server, decode, answer, context.initial_metadata())
-
-    def stream(self, start: SequenceStart, instants: Iterable[SentInstant]) -> Iterator[JsonObject]:
-        """Send instants as the server takes them, and give each answer as it comes.
-
-        Raises:
-            VislocError: as ``send``.
-        """
-        metadata = _metadata(self._connection, start)
-        call = partial(self._channel.stream_stream(_SEQUENCE, None, None), metadata=metadata)
-        yield from stream_answers(call, self._server, self._timeout_s, start, instants)
-
-    def upload(self, upload: Upload, on_progress: OnProgress) -> JsonObject:
-        """Send a packed map, and return what it is.
-
-        Raises:
-            VislocError: as ``send``, and what the file raises.
-        """
-        feed = UploadFeed(upload, on_progress)
-        call = self._channel.stream_unary(_PUT_VERSION, None, None)
-        within_s = upload.done_within_s(self._timeout_s)
-        metadata = _metadata(self._connection, upload)
-        try:
-            answer, context = call.with_call(feed.messages(), timeout=within_s, metadata=metadata)
-        except grpc.RpcError as error:
-            raise feed.failure or grpc_failure(self._server, within_s, error) from error
-        return _decoded(self._server, _read_map, answer, context.initial_metadata())
-
-    def close(self) -> None:
-        """Close the connection."""
-        self._channel.close()
-
-
-class AsyncGrpcTransport:
-    """``GrpcTransport`` for the event loop in which it is first used."""
+    """Sends requests to one server, from the event loop in which it is first used."""
 
     def __init__(self, connection: Connection) -> None:
         self._server, self._timeout_s = connection.server, connection.timeout_s
@@ -116,96 +60,146 @@ class AsyncGrpcTransport:
         self._channel: grpc.aio.Channel | None = None
 
     async def send(self, request: AnyRequest) -> JsonObject:
-        """As ``GrpcTransport.send``."""
+        """Return the answer as plain JSON, the same as over HTTP.
+
+        Raises:
+            VislocError: what the server refused, or ``server.*``.
+        """
         path, message, decode = _encode(request)
         make_call = self._opened().unary_unary(path, None, None)
         metadata = _metadata(self._connection, request)
         call = make_call(message, timeout=self._timeout_s, metadata=metadata)
         try:
             answer = await call
-            said = await call.initial_metadata()
+            received = await call.initial_metadata()
         except grpc.aio.AioRpcError as error:
             raise grpc_failure(self._server, self._timeout_s, error) from error
-        return _decoded(self._server, decode, answer, said)
+        return _decoded(self._server, decode, answer, received)
 
     async def stream(
         self, start: SequenceStart, instants: AsyncIterable[SentInstant]
     ) -> AsyncGenerator[JsonObject, None]:
-        """As ``GrpcTransport.stream``."""
+        """Send instants as the server takes them, and give each answer as it comes.
+
+        Raises:
+            VislocError: as ``send``.
+        """
         make_call: Any = self._opened().stream_stream(_SEQUENCE, None, None)
         call = partial(make_call, metadata=_metadata(self._connection, start))
-        answers = stream_answers_async(call, self._server, self._timeout_s, start, instants)
+        answers = stream_answers(call, self._server, self._timeout_s, start, instants)
         async with aclosing(answers):
             async for answer in answers:
                 yield answer
 
     async def upload(self, upload: Upload, on_progress: OnProgress) -> JsonObject:
-        """As ``GrpcTransport.upload``; ``on_progress`` is called in another thread."""
-        # Not grpc.aio, which loses what the server says to a call that is still being written.
-        sending = GrpcTransport(self._connection)
+        """Send a packed map, and return its description; ``on_progress`` is called in a thread.
+
+        Raises:
+            VislocError: as ``send``, and what reading the file raises.
+        """
+        # Not grpc.aio: it loses the answer to a call that is still being written.
+        channel = _open_channel(grpc, self._connection)
         try:
-            return await asyncio.to_thread(sending.upload, upload, on_progress)
+            return await asyncio.to_thread(self._upload, channel, upload, on_progress)
         finally:
-            sending.close()  # when this is cancelled, the call is
+            channel.close()  # cancels the call when this coroutine is cancelled
+
+    def _upload(self, channel: grpc.Channel, upload: Upload, on_progress: OnProgress) -> JsonObject:
+        failure: VislocError | OSError | None = None
+
+        def messages() -> Iterator[bytes]:
+            nonlocal failure
+            start = version_message(upload.map_id, upload.version)
+            yield wire.PutVersionRequest(start=start).SerializeToString()
+            try:
+                for piece in pieces(upload, on_progress):
+                    yield wire.PutVersionRequest(chunk=piece).SerializeToString()
+            except (VislocError, OSError) as error:
+                # gRPC would only log it. The server takes nothing that ends early.
+                failure = error
+
+        call = channel.stream_unary(_PUT_VERSION, None, None)
+        within_s = upload.done_within_s(self._timeout_s)
+        metadata = _metadata(self._connection, upload)
+        try:
+            answer, context = call.with_call(messages(), timeout=within_s, metadata=metadata)
+        except grpc.RpcError as error:
+            raise failure or grpc_failure(self._server, within_s, error) from error
+        return _decoded(self._server, _reads(wire.MapInfo), answer, context.initial_metadata())
 
     async def close(self) -> None:
-        """Close the connection."""
         if self._channel is not None:
             await self._channel.close(None)
 
     def _opened(self) -> grpc.aio.Channel:
         if self._channel is None:  # not in the constructor: it binds to the running loop
-            target, credentials = _target(self._connection), _credentials(self._connection)
-            if credentials is None:
-                self._channel = grpc.aio.insecure_channel(target, GRPC_OPTIONS)
-            else:
-                self._channel = grpc.aio.secure_channel(target, credentials, GRPC_OPTIONS)
+            _refuse_after_fork()
+            self._channel = _open_channel(grpc.aio, self._connection)
         return self._channel
 
 
 _Decode = Callable[[bytes, Metadata], JsonObject]
 
 
-def _target(connection: Connection) -> str:
-    return connection.server.partition("://")[2].rstrip("/")
-
-
-def _credentials(connection: Connection) -> grpc.ChannelCredentials | None:
+def _open_channel(library: Any, connection: Connection) -> Any:
+    """Open a channel of ``grpc`` or ``grpc.aio``."""
+    target = connection.server.partition("://")[2].rstrip("/")
     if not connection.is_encrypted:
-        return None
+        return library.insecure_channel(target, GRPC_OPTIONS)
     authorities = connection.authorities
-    return grpc.ssl_channel_credentials(None if authorities is None else authorities.encode())
+    certificates = None if authorities is None else authorities.encode()
+    credentials = grpc.ssl_channel_credentials(certificates)
+    return library.secure_channel(target, credentials, GRPC_OPTIONS)
+
+
+def _refuse_after_fork() -> None:
+    """Refuse to wait for an answer that never comes: grpc.aio does not survive a fork.
+
+    Raises:
+        RuntimeError: in a process that was forked from one in which gRPC was used.
+    """
+    global _process
+    if _process not in (None, os.getpid()):
+        raise RuntimeError(
+            "gRPC cannot be used here: this process was forked after its parent used it; start "
+            "processes by 'spawn', or use HTTP"
+        )
+    _process = os.getpid()
 
 
 def _metadata(
     connection: Connection, request: AnyRequest | SequenceStart | Upload
 ) -> tuple[tuple[str, str], ...]:
     key = connection.api_key
-    of_key = {} if key is None else {"authorization": f"Bearer {key}"}
-    return tuple((of_key | map_header(request)).items())
+    authorization = {} if key is None else {"authorization": f"Bearer {key}"}
+    return tuple((authorization | map_header(request)).items())
 
 
 def _encode(request: AnyRequest) -> tuple[str, bytes, _Decode]:
-    """Return method, message, and the function that reads the answer."""
+    """Return the method, the message, and the function that reads the answer."""
     match request:
         case Localize():
             message = localize_message(request).SerializeToString()
-            return f"{_SERVICE}/Localize", message, _read_localize
+            return f"{_SERVICE}/Localize", message, _reads(wire.LocalizeResponse)
         case LocalizeRig():
             message = rig_message(request).SerializeToString()
-            return f"{_SERVICE}/LocalizeRig", message, _read_instant
+            return f"{_SERVICE}/LocalizeRig", message, _reads(wire.InstantAnswer)
         case ListMaps():
             message = list_maps_message(request).SerializeToString()
-            return f"{_SERVICE}/ListMaps", message, _read_maps
+            return f"{_SERVICE}/ListMaps", message, _reads(wire.ListMapsResponse)
         case GetMap():
             message = wire.GetMapRequest(map=request.map).SerializeToString()
-            return f"{_SERVICE}/GetMap", message, _read_map
+            return f"{_SERVICE}/GetMap", message, _reads(wire.MapInfo)
         case GetVersion():
-            return f"{_MAPS}/GetVersion", _version_message(request), _read_map
+            return f"{_MAPS}/GetVersion", _version_message(request), _reads(wire.MapInfo)
         case UseVersion():
-            return f"{_MAPS}/SetCurrent", _version_message(request), _read_map
+            return f"{_MAPS}/SetCurrent", _version_message(request), _reads(wire.MapInfo)
         case DeleteVersion():
-            return f"{_MAPS}/DeleteVersion", _version_message(request), _read_nothing
+            return (
+                f"{_MAPS}/DeleteVersion",
+                _version_message(request),
+                _reads(wire.DeleteVersionResponse),
+            )
         case GetServer():
             return f"{_SERVICE}/ListMaps", b"", _read_server
         case CheckReady():
@@ -224,24 +218,8 @@ def _decoded(server: str, decode: _Decode, answer: bytes, metadata: Metadata) ->
         raise errors.not_understood(server, str(error)) from error
 
 
-def _read_localize(answer: bytes, _: Metadata) -> JsonObject:
-    return plain(wire.LocalizeResponse.FromString(answer))
-
-
-def _read_instant(answer: bytes, _: Metadata) -> JsonObject:
-    return plain(wire.InstantAnswer.FromString(answer))
-
-
-def _read_maps(answer: bytes, _: Metadata) -> JsonObject:
-    return plain(wire.ListMapsResponse.FromString(answer))
-
-
-def _read_map(answer: bytes, _: Metadata) -> JsonObject:
-    return plain(wire.MapInfo.FromString(answer))
-
-
-def _read_nothing(answer: bytes, _: Metadata) -> JsonObject:
-    return plain(wire.DeleteVersionResponse.FromString(answer))
+def _reads(kind: type[Message]) -> _Decode:
+    return lambda answer, _: plain(kind.FromString(answer))
 
 
 def _read_server(_: bytes, metadata: Metadata) -> JsonObject:

@@ -1,4 +1,4 @@
-"""Failures of gRPC as the exceptions of ``visloc.errors``."""
+"""Failures of gRPC as exceptions of ``visloc.errors``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FALLBACKS: Mapping[grpc.StatusCode, errors.Fallback] = {
     grpc.StatusCode.ALREADY_EXISTS: errors.CONFLICT,
     grpc.StatusCode.FAILED_PRECONDITION: errors.CONFLICT,
     grpc.StatusCode.ABORTED: errors.CONFLICT,
-    # Without our details it comes from gRPC itself: too many calls at once, or as below.
+    # Without our details it comes from gRPC itself: too many calls, or a message that is too large.
     grpc.StatusCode.RESOURCE_EXHAUSTED: errors.OVERLOADED,
 }
 
@@ -52,7 +52,7 @@ def grpc_failure(server: str, timeout_s: float, error: grpc.RpcError) -> VislocE
 
 
 def _error_info(error: grpc.RpcError) -> error_details_pb2.ErrorInfo | None:
-    # Read here rather than with grpcio-status, which has no function for both kinds of error.
+    # Not grpcio-status: it has no function for the errors of both grpc and grpc.aio.
     metadata = cast("Metadata", error.trailing_metadata() or ())
     for key, value in metadata:
         if key == _STATUS_KEY and isinstance(value, bytes):

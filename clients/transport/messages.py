@@ -1,9 +1,10 @@
-"""Requests as protobuf messages, and answers from them as the same plain JSON as over HTTP."""
+"""Requests as protobuf messages, and messages of answers as the JSON of HTTP."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 from google.protobuf.json_format import ParseDict
@@ -19,18 +20,17 @@ from clients.wire.rig_requests import (
     SentInstant,
     SequenceStart,
     camera_as_json,
-    near_as_json,
     odometry_as_json,
     rig_as_json,
+    search_as_json,
 )
 from clients.wire.rigs import Rig
 from visloc.geometry import Camera
-from visloc.types import Near
 from visloc_api.v1 import localization_pb2 as wire
 
 
 def localize_message(request: Localize) -> wire.LocalizeRequest:
-    """Write a LocalizeRequest."""
+    """Return the message of ``Localize``."""
     message = wire.LocalizeRequest()
     _set_search(message, request.search)
     _set_query(message, request.query, request.camera)
@@ -40,7 +40,7 @@ def localize_message(request: Localize) -> wire.LocalizeRequest:
 
 
 def rig_message(request: LocalizeRig) -> wire.LocalizeRigRequest:
-    """Write a LocalizeRigRequest."""
+    """Return the message of ``LocalizeRig``."""
     message = wire.LocalizeRigRequest()
     _set_search(message, request.search)
     _set_rig(message, request.rig)
@@ -49,7 +49,7 @@ def rig_message(request: LocalizeRig) -> wire.LocalizeRigRequest:
 
 
 def start_message(start: SequenceStart) -> wire.LocalizeSequenceRequest:
-    """Write the first message of a sequence."""
+    """Return the first message of a sequence."""
     message = wire.LocalizeSequenceRequest()
     message.start.SetInParent()
     _set_search(message.start, start.search)
@@ -63,36 +63,32 @@ def start_message(start: SequenceStart) -> wire.LocalizeSequenceRequest:
 
 
 def instant_message(instant: SentInstant) -> wire.LocalizeSequenceRequest:
-    """Write any further message of a sequence."""
+    """Return any further message of a sequence."""
     message = wire.LocalizeSequenceRequest()
     message.instant.timestamp = instant.timestamp
     message.instant.images.extend(_image_messages(instant.images))
     if instant.odometry is not None:
         ParseDict(odometry_as_json(instant.odometry), message.instant.odometry)
     if instant.priors is not None:
-        # Also when they are empty: they replace those of the start.
+        # Also when empty: they replace the priors of the start.
         message.instant.priors.SetInParent()
         ParseDict(priors_as_json(instant.priors), message.instant.priors)
     return message
 
 
 def list_maps_message(request: ListMaps) -> wire.ListMapsRequest:
-    """Write a ListMapsRequest."""
-    if request.near is None:
-        return wire.ListMapsRequest()
+    """Return the message of ``ListMaps``."""
     near = request.near
-    return wire.ListMapsRequest(
-        near=wire.Near(latitude=near.latitude, longitude=near.longitude, radius=near.radius)
-    )
+    return wire.ListMapsRequest(near=None if near is None else wire.Near(**asdict(near)))
 
 
 def version_message(map_id: str, version: str) -> wire.VersionRef:
-    """Write a VersionRef."""
+    """Return the message that names a version."""
     return wire.VersionRef(map=map_id, version=version)
 
 
 def plain(message: Message) -> dict[str, Any]:
-    """Return a message as JSON has it: every field in its place, null for what is absent."""
+    """Return a message as the JSON of HTTP: every field is there, null when it is absent."""
     return {field.name: _plain_field(message, field) for field in message.DESCRIPTOR.fields}
 
 
@@ -103,7 +99,7 @@ def _plain_field(message: Message, field: Any) -> Any:  # a FieldDescriptor
     if field.is_repeated:
         kind = field.message_type
         if kind is not None and kind.GetOptions().map_entry:
-            return dict(value)  # of numbers, wherever an answer has one
+            return dict(value)  # every map of an answer has numbers as values
         return [plain(item) for item in value] if kind is not None else list(value)
     if isinstance(value, bytes):
         return base64.b64encode(value).decode()
@@ -113,23 +109,7 @@ def _plain_field(message: Message, field: Any) -> Any:  # a FieldDescriptor
 def _set_search(
     message: wire.LocalizeRequest | wire.LocalizeRigRequest | wire.SequenceStart, search: Search
 ) -> None:
-    maps = search.maps
-    if isinstance(maps, Near):
-        message.near.SetInParent()
-        ParseDict(near_as_json(maps), message.near)
-    elif len(maps) == 1:
-        message.map = maps[0]
-    else:
-        message.maps.extend(maps)
-    if search.ypr:
-        message.ypr = True
-    for name, value in search.options.given().items():
-        if isinstance(value, Mapping):
-            getattr(message.options, name).update(value)
-        else:
-            setattr(message.options, name, value)
-    if priors := priors_as_json(search.priors):
-        ParseDict(priors, message.priors)
+    ParseDict(search_as_json(search), message)
     if search.request_id is not None:
         message.request_id = search.request_id
 

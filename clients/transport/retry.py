@@ -1,4 +1,4 @@
-"""What clients do so that several servers behind a balancer are as good as one."""
+"""Retries and routing for several servers behind a balancer."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from clients.wire.requests import DeleteVersion, GetMap, GetVersion, Localize, U
 from clients.wire.rig_requests import AnyRequest, LocalizeRig, SequenceStart
 from visloc.types import Near
 
-# Header of HTTP and metadata of gRPC. A balancer that chooses by it finds the map open.
+# Header of HTTP and metadata of gRPC. A balancer that routes by it finds the map already open.
 MAP_HEADER = "x-visloc-map"
-# Before a request is sent once more. Only once: what ended one server may end the next.
+# Before a request is sent a second time. Never a third: it may have ended both servers.
 RESEND_PAUSE_S = 0.1
-# How gRPC does the same, of itself. Its servers say INTERNAL where nothing is to be sent again.
+# gRPC retries by itself. Its servers answer INTERNAL when a request must not be sent again.
 GRPC_OPTIONS = (
     (
         "grpc.service_config",
@@ -40,13 +40,13 @@ GRPC_OPTIONS = (
             }
         ),
     ),
-    # A larger request would not be kept to be sent again. The default is 256 KiB.
+    # gRPC cannot resend a request that is larger than this buffer. The default is 256 KiB.
     ("grpc.per_rpc_retry_buffer_size", 128 * 2**20),
 )
 
 
 def map_header(request: AnyRequest | SequenceStart | Upload) -> dict[str, str]:
-    """Return the header that names the map of a request, without its version; of several one."""
+    """Return the header that names the map of a request, or its first map, without version."""
     match request:
         case Localize() | LocalizeRig() | SequenceStart():
             maps = request.search.maps
@@ -63,10 +63,10 @@ def map_header(request: AnyRequest | SequenceStart | Upload) -> dict[str, str]:
 
 
 def may_resend(request: AnyRequest, got: httpx.Response | httpx.HTTPError) -> bool:
-    """Tell whether a request is to be sent once more over HTTP.
+    """Return whether a request is sent again over HTTP.
 
-    Only what changes nothing on the server, and only when the connection broke, a balancer says
-    so, or the server is being stopped: that is, when another server may answer.
+    Only a request that changes nothing on the server, and only when another server may answer:
+    the connection broke, a balancer answered, or the server is being stopped.
     """
     if isinstance(request, UseVersion | DeleteVersion):
         return False

@@ -1,4 +1,4 @@
-"""Sending a packed map, piece by piece: it may be larger than memory."""
+"""Sending a packed map in pieces, since it may be larger than memory."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ OnProgress = Callable[[int], None]
 
 _PIECE_BYTES = 512 * 1024
 _MAX_MANIFEST_BYTES = 16 * 2**20
-# The slowest that a server takes a body, and about the slowest that it verifies one.
+# The slowest rate at which a server takes a body, and about the slowest at which it verifies one.
 _SLOWEST_BYTES_PER_S = 100_000
 _SLOWEST_VERIFIED_BYTES_PER_S = 10_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Upload:
-    """A packed map and the names under which it is published; see ``upload_request``."""
+    """A packed map and its names on the server; see ``upload_request``."""
 
     path: Path
     map_id: str
@@ -33,20 +33,19 @@ class Upload:
     size_bytes: int
 
     def verified_within_s(self, timeout_s: float) -> float:
-        """Longest wait for the answer once everything is sent."""
+        """Longest wait for the answer after everything is sent, seconds."""
         return timeout_s + self.size_bytes / _SLOWEST_VERIFIED_BYTES_PER_S
 
     def done_within_s(self, timeout_s: float) -> float:
-        """Longest wait for the answer from the first byte on."""
+        """Longest wait for the answer from the first byte on, seconds."""
         return self.verified_within_s(timeout_s) + self.size_bytes / _SLOWEST_BYTES_PER_S
 
 
 def upload_request(path: Path, map_id: str | None, version: str | None) -> Upload:
-    """Look at a packed map; names that are None are read from its manifest.
+    """Check a packed map; names that are None are read from its manifest.
 
     Raises:
-        InvalidInput: ``map.id``, ``packed.unreadable``, or ``packed.manifest`` for a file that
-            is no packed map.
+        InvalidInput: ``map.id``, ``packed.unreadable``, or ``packed.manifest`` for another file.
     """
     try:
         with path.open("rb") as file:
@@ -68,7 +67,7 @@ def pieces(upload: Upload, on_progress: OnProgress) -> Generator[bytes]:
     """Read the file.
 
     Raises:
-        InvalidInput: ``packed.changed`` when it has become shorter.
+        InvalidInput: ``packed.changed`` when it has become shorter meanwhile.
     """
     left = upload.size_bytes
     with upload.path.open("rb") as file:
@@ -88,7 +87,7 @@ def pieces(upload: Upload, on_progress: OnProgress) -> Generator[bytes]:
 
 
 async def pieces_async(upload: Upload, on_progress: OnProgress) -> AsyncGenerator[bytes]:
-    """As ``pieces``, read in threads."""
+    """Read the file in threads; ``on_progress`` is called in the event loop."""
     reading = pieces(upload, lambda _: None)
     try:
         while (piece := await asyncio.to_thread(next, reading, None)) is not None:

@@ -18,7 +18,7 @@ from clients.evaluation.results import (
     write_poses,
     write_whole,
 )
-from clients.evaluation.running import Outcome
+from clients.evaluation.run import Outcome
 from visloc.errors import DatasetError, InvalidInput
 
 

@@ -603,19 +603,22 @@ def answering(lines: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the HTTP transport receive these chunks."""
     import httpx
 
+    async def chunks() -> AsyncIterator[bytes]:
+        for line in lines:
+            yield line
+
     def stream(*_: Any, **__: Any) -> Any:
         handler = httpx.MockTransport(
             lambda _: httpx.Response(
-                200, headers={"content-type": "application/x-ndjson"}, content=iter(lines)
+                200, headers={"content-type": "application/x-ndjson"}, content=chunks()
             )
         )
-        return httpx.Client(transport=handler, base_url="http://server").stream("POST", "/")
+        return httpx.AsyncClient(transport=handler, base_url="http://server").stream("POST", "/")
 
     original = HttpTransport.__init__
 
     def init(self: Any, connection: Any) -> None:
         original(self, connection)
-        self._http.close()
         self._http.stream = stream
 
     monkeypatch.setattr(HttpTransport, "__init__", init)

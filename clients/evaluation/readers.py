@@ -1,4 +1,4 @@
-"""What is sent of a query: the photo, or its ready-made features."""
+"""Readers of what is sent for a query: the photo, or its ready-made features."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class FeatureReader:
     """Reads the ready-made features of a dataset's photos.
 
     Attributes:
-        kind: what the map calls the local features.
+        kind: the map's name for the local features.
         keypoints: of the dataset.
         descriptors: of these keypoints.
-        global_features: by what the map calls them.
-        origin: what the keypoints count from.
+        global_features: by the map's names for them.
+        origin: of the keypoints.
     """
 
     kind: str
@@ -75,7 +75,7 @@ class FeatureReader:
 
 
 def takes_features(info: MapInfo) -> bool:
-    """Whether a map has ready-made features, and so takes no photos."""
+    """Return whether a map has ready-made features, and so takes no photos."""
     names = (info.local_features, *info.global_features)
     return any(name.startswith(READY_MADE_PREFIX) for name in names)
 
@@ -83,12 +83,12 @@ def takes_features(info: MapInfo) -> bool:
 def choose_reader(
     source: Path, info: MapInfo, features_dir: Path | None, origin: PixelOrigin
 ) -> Reader:
-    """Return what reads of a query that which this map takes.
+    """Return the reader of what a map takes.
 
     A map with ready-made features, local or global, takes features of the same types, from the
-    dataset or from ``features_dir``; any other takes photos. Local features that the server could
-    find itself are then read from the folder of their name, as ``mapping export-features``
-    writes them: photos and features do not go together in one request.
+    dataset or from ``features_dir``; any other takes photos. A request has either a photo or
+    features. If only the global features are ready-made, the local ones are read from the folder
+    of their name, as ``mapping export-features`` writes them.
 
     Raises:
         InvalidInput: ``queries.no_features`` for a list of photos and a map that takes features;

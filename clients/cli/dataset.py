@@ -1,0 +1,251 @@
+"""``localize batch`` and ``localize benchmark``."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from clients.cli.display import print_batch, print_failed, print_report, unit_of
+from clients.cli.options import (
+    Connection,
+    MapRef,
+    Photos,
+    QueryOptions,
+    Thresholds,
+    spread,
+    thresholds_of,
+)
+from clients.cli.progress import run_with_progress
+from clients.client import AsyncClient
+from clients.evaluation.batch import Batch, finish_batch, open_batch, run_batch
+from clients.evaluation.benchmark import Run, known_poses, make_report
+from clients.evaluation.modes import DEFAULT_MAX_GAP_S, Arrangement, Mode, arrange, parse_modes
+from clients.evaluation.queries import QuerySet
+from clients.evaluation.results import check_can_be_written, write_poses, write_whole
+from clients.evaluation.run import InstantOutcome, Outcome, QueryClient, localize_all
+from visloc.sequences.filling import TimeUnit
+from visloc_api.words.answers import PoseEstimate
+from visloc_api.words.maps import MapInfo
+
+_out = Console()
+_err = Console(stderr=True)
+
+_MODES = (
+    "single: each photo on its own. rig: a photo without a pose takes it from the best camera of "
+    "its rig at the same instant. seq: it takes it from between the instants before and after, or "
+    "from the nearest one. rig+seq: both. gp3p: the photos of a rig and instant solve one pose, "
+    "which also fills the photos that did not contribute to it."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetRun(Photos, QueryOptions):
+    """The options of the commands that localize a dataset in modes."""
+
+    map_ref: MapRef
+    concurrency: Annotated[int, typer.Option(min=1, max=1024, help="Photos sent at once.")] = 1
+    time_unit: Annotated[
+        TimeUnit | None,
+        typer.Option(
+            help="For seq: the unit of the dataset's timestamps; without it, inferred from their "
+            "size."
+        ),
+    ] = None
+    max_gap: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            metavar="SECONDS",
+            help="For seq: longest time between the poses that others are filled from.",
+        ),
+    ] = DEFAULT_MAX_GAP_S
+    rig: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ID",
+            help="For gp3p: a rig that the map knows, instead of the dataset's own rigs.txt.",
+        ),
+    ] = None
+
+    def arrange(self, queries: QuerySet, modes: Sequence[Mode], info: MapInfo) -> Arrangement:
+        """Group the photos as the modes need it; raises as ``arrange``."""
+        return arrange(
+            *(queries, modes, info),
+            rig_id=self.rig,
+            time_unit=self.time_unit,
+            max_gap_s=self.max_gap,
+        )
+
+    def of_mode(self, mode: Mode, arrangement: Arrangement) -> dict[str, object]:
+        """Return the options that count for a mode, for the description of a run."""
+        if mode is Mode.GP3P:
+            return {"rig": self.rig}
+        if mode.fills_sequences:
+            return {"time_unit": arrangement.time_unit, "max_gap_s": arrangement.max_gap_s}
+        return {}
+
+
+@spread
+def localize_batch(
+    *,
+    run: DatasetRun,
+    output: Annotated[Path, typer.Option(help="Folder for results.jsonl and poses.")],
+    mode: Annotated[Mode, typer.Option(help=_MODES)] = Mode.SINGLE,
+    restart: Annotated[
+        bool, typer.Option("--restart", help="Remove the results in the folder and begin again.")
+    ] = False,
+    connection: Connection,
+) -> None:
+    """Localize all photos of a dataset or list, or their features for a map of ready-made ones.
+
+    Writes results.jsonl, one answer per line, and at the end poses.txt with lines
+    'name qw qx qy qz tx ty tz' (cam_from_world) of the localized photos, where a blank in a name
+    is %20. The same command resumes a stopped run. A photo that cannot be answered is recorded
+    and skipped; if that was the server's fault, the same command sends it again.
+
+    All modes except single fill photos without a pose of their own: their status is filled,
+    source says from what, and their poses are in poses_filled.txt. poses.txt has measured poses
+    only.
+
+    Exits with 0 when every photo has its line, 1 on an error, 130 when stopped.
+    """
+    options, queries = run.options, run.read()
+    with connection.client() as client:
+        info = client.map(run.map_ref)
+    arrangement = run.arrange(queries, [mode], info)
+    read = run.reader(info)
+    batch = Batch(
+        *(output, run.source, run.features_dir, run.pixel_origin, info.ref, options, mode),
+        run.of_mode(mode, arrangement),
+    )
+    done = open_batch(batch, restart=restart)
+    photos = queries.photos
+    waiting = [query for query in photos if query.name not in done]
+    # An instant is sent again as a whole.
+    instants = [i for i in arrangement.asked if not all(q.name in done for q in i.photos)]
+    if len(waiting) < len(photos):
+        _err.print(f"{len(photos) - len(waiting)} of {len(photos)} are done already")
+    failed: list[Outcome] = []
+
+    async def work(advance: Callable[[], None]) -> None:
+        def count(outcome: Outcome | InstantOutcome) -> None:
+            advance()
+            failed.extend(photo for photo in outcome.photos if photo.error is not None)
+
+        async with connection.async_client() as client:
+            asked = QueryClient(client, info.ref, options, read)
+            if mode is Mode.GP3P:
+                await run_batch(batch, instants, asked.localize_instant, run.concurrency, count)
+            else:
+                await run_batch(batch, waiting, asked.localize, run.concurrency, count)
+
+    what = ("instants", len(instants)) if mode is Mode.GP3P else ("photos", len(waiting))
+    run_with_progress(_err, work, *what, "the same command resumes the run")
+    counts = finish_batch(batch, arrangement)
+    print_failed(_err, failed)
+    print_batch(_out, counts, len(photos), mode is not Mode.SINGLE)
+
+
+@spread
+def benchmark(
+    *,
+    run: DatasetRun,
+    report: Annotated[Path, typer.Option(metavar="FILE.json", help="File for the figures.")],
+    mode: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="MODE[,MODE...]",
+            help=f"Columns of the table; can be repeated; all for all. {_MODES}",
+        ),
+    ] = None,
+    threshold: Thresholds = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Write the measured poses of the first mode, as localize batch does in "
+            "poses.txt. No file has the filled ones.",
+        ),
+    ] = None,
+    connection: Connection,
+) -> None:
+    """Measure how fast and, where the dataset has true poses, how well photos are localized.
+
+    Recall counts all photos with a true pose; those without a pose of their own or a filled one
+    are failures. The errors are those of the photos that have a pose. Latencies are what this
+    client sees. Photos are sent once, whatever the number of modes, and once more for gp3p.
+
+    Exits with 0 when done, 1 on an error, 130 when stopped; then there is no report.
+    """
+    options, modes, thresholds = run.options, parse_modes(mode or ()), thresholds_of(threshold)
+    check_can_be_written([report] if poses is None else [report, poses])
+    queries = run.read()
+    with connection.client() as client:
+        info, about = client.map(run.map_ref), client.server_info()
+    arrangement = run.arrange(queries, modes, info)
+    read = run.reader(info)
+    ask = partial(QueryClient, map_ref=info.ref, options=options, read=read)
+    timed = {
+        in_instants: _timed(connection, ask, arrangement, run.concurrency, in_instants=in_instants)
+        for in_instants in sorted({mode is Mode.GP3P for mode in modes})
+    }
+    runs = {mode: timed[mode is Mode.GP3P] for mode in modes}
+    poses_of = {mode: arrangement.fill(mode, known_poses(each)) for mode, each in runs.items()}
+    figures = make_report(runs, poses_of, thresholds, about, info)
+    write_whole(report, [json.dumps(figures, indent=2, allow_nan=False).encode() + b"\n"])
+    if poses is not None:
+        write_poses(poses, _measured_poses(runs[modes[0]]))
+    # By name: a photo that fails on its own mostly fails in its rig as well.
+    outcomes = (outcome for each in timed.values() for outcome in each.outcomes)
+    failed = {o.query.name: o for o in outcomes if o.error is not None}
+    num_with_truth = sum(query.truth is not None for query in queries.photos)
+    print_report(_out, figures, num_with_truth, len(failed), unit_of(info))
+    print_failed(_err, list(failed.values()))
+
+
+def _timed(
+    connection: Connection,
+    ask: Callable[[AsyncClient], QueryClient],
+    arrangement: Arrangement,
+    concurrency: int,
+    *,
+    in_instants: bool,
+) -> Run:
+    """Localize a dataset and measure how long it takes."""
+    answers: list[Outcome | InstantOutcome] = []
+    seconds = 0.0
+
+    async def work(advance: Callable[[], None]) -> None:
+        nonlocal seconds
+
+        def keep(answer: Outcome | InstantOutcome) -> None:
+            answers.append(answer)
+            advance()
+
+        async with connection.async_client() as client:
+            asked = ask(client)
+            started = time.perf_counter()
+            if in_instants:
+                await localize_all(arrangement.asked, asked.localize_instant, concurrency, keep)
+            else:
+                await localize_all(arrangement.photos, asked.localize, concurrency, keep)
+            seconds = time.perf_counter() - started
+
+    total = len(arrangement.asked if in_instants else arrangement.photos)
+    what = "instants" if in_instants else "photos"
+    run_with_progress(_err, work, what, total, "no report was written")
+    return Run.of(answers, arrangement.photos, seconds)
+
+
+def _measured_poses(run: Run) -> Iterator[tuple[str, PoseEstimate]]:
+    for outcome in run.outcomes:
+        if outcome.result is not None and outcome.result.pose is not None:
+            yield outcome.query.name, outcome.result.pose
