@@ -6,6 +6,7 @@ import asyncio
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +23,12 @@ from service.http.slow_clients import Arrivals, http_protocol
 from service.security.access import open_access
 from service.security.tls import TlsConfig, check_tls, tls_config
 from service.settings import ServiceSettings, SettingsError
+from service.telemetry.logs import configure_logging
 from service.telemetry.metrics import Metrics, ServiceState
 from service.telemetry.metrics_port import metrics_app
 from service.telemetry.observer import Observer
 from service.telemetry.tracing import open_spans
-from service.workers.process import WorkerSettings
+from service.values import WorkerSettings
 from visloc.types import Inference
 
 # When it stops: so long a request may be on its way over a connection that is open already. It is
@@ -69,8 +71,7 @@ class Server:
                 max_instants=settings.max_instants,
                 max_image_bytes=settings.max_image_bytes,
                 max_image_pixels=settings.max_image_pixels,
-                log_level=settings.log_level,
-                log_format=settings.log_format,
+                configure_logging=partial(configure_logging, settings),
             ),
             workers=settings.workers,
             max_queue=settings.max_queue,

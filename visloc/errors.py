@@ -20,6 +20,11 @@ A photo that cannot be localized is not an error: it is an answer (``visloc.type
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from copy import copy
+from typing import Self
+
 
 class VislocError(Exception):
     """Base of every error that a caller may want to catch.
@@ -56,6 +61,21 @@ class VislocError(Exception):
             if value is not None
         ]
         return f"{text} ({', '.join(details)})" if details else text
+
+    def within(self, place: str) -> Self:
+        """Return the same error of a larger message: field ``width`` becomes ``PLACE.width``."""
+        moved = copy(self)
+        moved.field = ".".join(part for part in (place, self.field) if part) or None
+        return moved
+
+
+@contextmanager
+def inside(place: str) -> Iterator[None]:
+    """Prefix the field of errors raised in the block with ``place``."""
+    try:
+        yield
+    except VislocError as error:
+        raise error.within(place) from None
 
 
 class InvalidInput(VislocError):

@@ -127,19 +127,18 @@ class LocalizeResponse(BaseModel):
     @staticmethod
     def from_localization(found: Localization, request_id: str) -> LocalizeResponse:
         """Say it in the API's words."""
-        answer, evidence = found.answer, found.answer.evidence
-        localized = isinstance(answer, visloc.types.Localized)
-        cam_from_world = (
-            answer.cam_from_world if isinstance(answer, visloc.types.Localized) else None
-        )
+        (image,), pose, refusal = found.answer.images, found.answer.pose, found.answer.refusal
+        evidence = image.evidence
+        assert evidence is not None  # a photo that cannot be used is an error
+        cam_from_world = None if pose is None else pose.rig_from_world  # a rig of one camera
         geopose, geopose_ypr = geoposes_to_words(cam_from_world, found.geodetic, ypr=found.ypr)
         return LocalizeResponse(
             request_id=request_id,
-            status="localized" if localized else "not_localized",
-            pose=_pose_estimate(answer) if isinstance(answer, visloc.types.Localized) else None,
+            status="not_localized" if pose is None else "localized",
+            pose=None if pose is None else _pose_estimate(pose),
             refusal=None
-            if isinstance(answer, visloc.types.Localized)
-            else Refusal(stage=answer.stage, reason=answer.reason, message=answer.message),
+            if refusal is None
+            else Refusal(stage=refusal.stage, reason=refusal.reason, message=refusal.message),
             keypoints=evidence.num_keypoints,
             correspondences=evidence.num_correspondences,
             inliers=evidence.num_inliers,
@@ -148,7 +147,7 @@ class LocalizeResponse(BaseModel):
             camera=CameraUsed.of(evidence),
             orientation=Orientation.of(evidence),
             map=MapRef(id=found.map_id, version=found.map_version),
-            seconds=dict(evidence.seconds),
+            seconds=dict(found.answer.seconds),
             geopose=geopose,
             geopose_ypr=geopose_ypr,
             debug=None if found.debug is None else Debug.of(found.debug),
@@ -156,13 +155,13 @@ class LocalizeResponse(BaseModel):
         )
 
 
-def _pose_estimate(answer: visloc.types.Localized) -> PoseEstimate:
-    cam_from_world = answer.cam_from_world
+def _pose_estimate(pose: visloc.types.RigPose) -> PoseEstimate:
+    cam_from_world = pose.rig_from_world
     return PoseEstimate(
         cam_from_world=Transform.from_core(cam_from_world),
         position=cam_from_world.center.tolist(),
         orientation=cam_from_world.inverse().rotation_wxyz.tolist(),
-        covariance=answer.covariance.ravel().tolist(),
-        position_std=answer.position_std.tolist(),
-        orientation_std_deg=np.degrees(answer.orientation_std).tolist(),
+        covariance=pose.covariance.ravel().tolist(),
+        position_std=pose.position_std.tolist(),
+        orientation_std_deg=np.degrees(pose.orientation_std).tolist(),
     )

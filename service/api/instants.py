@@ -19,7 +19,7 @@ from service.api.evidence import (
 )
 from service.api.geometry import Transform
 from service.api.geopose import GeoPose, GeoPoseYpr, geoposes_to_words
-from service.values import InstantLocalization
+from service.values import Localization
 from visloc.errors import VislocError
 from visloc.sequences.filling import PoseSource
 
@@ -139,7 +139,7 @@ class InstantAnswer(BaseModel):
     tile: TileRef = None
 
     @staticmethod
-    def from_localization(found: InstantLocalization, request_id: str) -> InstantAnswer:
+    def from_localization(found: Localization, request_id: str) -> InstantAnswer:
         """Say it in the API's words."""
         answer = found.answer
         pose, correspondences = answer.pose, answer.num_correspondences

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field
 
 import visloc.archive
 from service.api.message import IncomingMessage
+from service.values import ServedMap
 from visloc.types import Fusion
-
-if TYPE_CHECKING:
-    from service.engine.listing import ServedMap
 
 
 class Extent(BaseModel):

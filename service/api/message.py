@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 from pydantic import (
@@ -159,28 +158,12 @@ def _located(error: InvalidInput) -> PydanticCustomError:
     return PydanticCustomError(_REFUSED, "refused", {"error": error})
 
 
-@contextmanager
-def inside(place: str) -> Iterator[None]:
-    """Place what is found wrong: ``camera.width`` becomes ``PLACE.camera.width``."""
-    try:
-        yield
-    except VislocError as error:
-        raise placed(error, place) from None
-
-
-def placed(error: VislocError, place: str) -> VislocError:
-    """Return the error of a field within a larger message."""
-    field = ".".join(part for part in (place, error.field) if part)
-    return type(error)(
-        error.code, error.message, field=field or None, expected=error.expected, got=error.got
-    )
-
-
 def refusal_of(complaint: Mapping[str, Any], path: str = "") -> VislocError:
     """Say one of pydantic's complaints in our words. Never echoes a large value."""
     kind, message, location = complaint["type"], complaint["msg"], complaint["loc"]
     if kind == _REFUSED:
-        return placed(complaint["ctx"]["error"], (path + _joined(location[:-1])).rstrip("."))
+        error: VislocError = complaint["ctx"]["error"]
+        return error.within((path + _joined(location[:-1])).rstrip("."))
     if kind == _UNKNOWN_FIELD:
         name, expected = complaint["ctx"]["name"], complaint["ctx"]["expected"]
         field = path + _joined([*location, name])

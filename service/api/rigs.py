@@ -13,11 +13,11 @@ from service.api.features import GivenFeatures, GivenImage, query_to_core
 from service.api.geometry import GivenCamera, Transform
 from service.api.geopose import GivenNear, GivenYpr
 from service.api.localize import GivenMaps, where_to_core
-from service.api.message import IncomingMessage, converted, counted, inside
+from service.api.message import IncomingMessage, converted, counted
 from service.api.options import GivenOptions, LocalizeOptions
 from service.api.priors import GivenPriors, priors_to_core
 from service.values import ONLY_SENSOR, ImageJob, RigJob
-from visloc.errors import InvalidInput, TooLarge
+from visloc.errors import InvalidInput, TooLarge, inside
 
 # More than any rig has: it bounds what a request can make the server look at.
 MAX_SENSORS = 256

@@ -12,7 +12,7 @@ import visloc.sequences.filling
 from service.api.geometry import Numbers, Transform, covariance_to_core
 from service.api.geopose import GivenNear, GivenYpr
 from service.api.localize import GivenMaps, where_to_core
-from service.api.message import IncomingMessage, counted, inside
+from service.api.message import IncomingMessage, counted
 from service.api.options import GivenOptions, LocalizeOptions
 from service.api.priors import GivenPriors, priors_to_core
 from service.api.rigs import (
@@ -26,7 +26,7 @@ from service.api.rigs import (
     rig_to_core,
 )
 from service.values import DEFAULT_MAX_GAP_S
-from visloc.errors import InvalidInput, TooLarge
+from visloc.errors import InvalidInput, TooLarge, inside
 from visloc.sequences.filling import TimeUnit
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from service.api.message import inside
-from service.values import Instant, InstantLocalization, SequenceStart, check_order
+from service.values import Instant, Localization, SequenceStart, check_order
 from service.workers.instants import Target, check_images, check_options, check_priors
 from service.workers.judging import judged
-from visloc.errors import InvalidInput, TooLarge
+from visloc.errors import InvalidInput, TooLarge, inside
 from visloc.localization.solving import SeenImage, Solved
 from visloc.priors import Priors
 from visloc.sequences.filling import TimeUnit, guess_time_unit
@@ -135,7 +134,7 @@ class SequenceRun:
         self._keep(placed[0] if placed else 0)
         return self._released()
 
-    def localization(self, answer: InstantAnswer) -> InstantLocalization:
+    def localization(self, answer: InstantAnswer) -> Localization:
         """Return an answer of ``add`` or ``finish`` with the map that gave it."""
         return self.targets[0].localization(answer, ypr=self._start.ypr)
 

@@ -54,8 +54,8 @@ def refused(inliers: int, reason: Reason = Reason.TOO_FEW_INLIERS) -> NotLocaliz
     return NotLocalized(localized(inliers).evidence, "gate", reason, "refused")
 
 
-def of_rig(inliers: int, center: Any = (0, 0, 0)) -> InstantAnswer:
-    one = localized(inliers, center)
+def of_rig(inliers: int, center: Any = (0, 0, 0), std: float = 0.01) -> InstantAnswer:
+    one = localized(inliers, center, std=std)
     rig = RigPose(
         one.cam_from_world,
         one.covariance,

@@ -19,7 +19,7 @@ from service.api import InstantAnswer as AnswerWords
 from service.api.message import MAX_INSTANT_VALUES, IncomingMessage
 from service.grpc.messages import instant_of, rig_job_of, sequence_start_of
 from service.settings import ServiceSettings
-from service.values import ONLY_SENSOR, InstantLocalization, RigJob
+from service.values import ONLY_SENSOR, Localization, RigJob
 from visloc.errors import InvalidInput, TooLarge
 from visloc.geometry import Camera, Pose
 from visloc.sequences.filling import TimeUnit
@@ -477,7 +477,7 @@ def test_an_image_of_an_instant_lists_the_best_twenty_photos() -> None:
     seen = ImageAnswer("camera", Pose.identity(), evidence, None)
     answer = InstantAnswer(None, (seen,), None, None, {})
 
-    message = AnswerWords.from_localization(InstantLocalization(answer, "room", "1"), "id")
+    message = AnswerWords.from_localization(Localization(answer, "room", "1"), "id")
 
     names = [photo.image for photo in message.images[0].retrieved]
     assert names == [f"{i}.jpg" for i in range(20)]
