@@ -15,7 +15,7 @@ from starlette.applications import Starlette
 
 from service.descriptors import METRICS_CONNECTIONS
 from service.engine.engine import Engine
-from service.engine.stores import open_store
+from service.engine.stores import Store, open_store
 from service.grpc.localization import GrpcServer
 from service.http.acceptor import Acceptor, OpenConnections
 from service.http.app import create_app
@@ -57,7 +57,7 @@ class Server:
             raise SettingsError(f"weights_dir: {settings.weights_dir} is no folder")
         access = open_access(settings)
         self._arrivals = Arrivals(settings.arrival_timeout_s, settings.max_buffered_bytes)
-        self._store = open_store(settings)
+        self._store = _open_store(settings)
         self._spans = open_spans(settings)
         self.observer = Observer(Metrics(), self._spans)
         self.engine = Engine(
@@ -255,3 +255,10 @@ def _listen(host: str, port: int) -> socket.socket:
     # that was used before waits 40 ms for an acknowledgement.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return listener
+
+
+def _open_store(settings: ServiceSettings) -> Store:
+    try:
+        return open_store(settings.maps_dir, settings.cache_dir, settings.max_cache_bytes)
+    except ValueError as error:
+        raise SettingsError(f"maps_dir: {error}") from None

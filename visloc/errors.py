@@ -22,8 +22,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from copy import copy
-from typing import Self
 
 
 class VislocError(Exception):
@@ -61,21 +59,6 @@ class VislocError(Exception):
             if value is not None
         ]
         return f"{text} ({', '.join(details)})" if details else text
-
-    def within(self, place: str) -> Self:
-        """Return the same error of a larger message: field ``width`` becomes ``PLACE.width``."""
-        moved = copy(self)
-        moved.field = ".".join(part for part in (place, self.field) if part) or None
-        return moved
-
-
-@contextmanager
-def inside(place: str) -> Iterator[None]:
-    """Prefix the field of errors raised in the block with ``place``."""
-    try:
-        yield
-    except VislocError as error:
-        raise error.within(place) from None
 
 
 class InvalidInput(VislocError):
@@ -133,3 +116,20 @@ class StorageFull(Unavailable):
 def _short(value: object, limit: int = 200) -> str:
     text = value if isinstance(value, str) else repr(value)
     return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+@contextmanager
+def inside(place: str) -> Iterator[None]:
+    """Prefix the fields of errors in the block: ``camera.width`` becomes ``PLACE.camera.width``."""
+    try:
+        yield
+    except VislocError as error:
+        raise placed(error, place) from None
+
+
+def placed(error: VislocError, place: str) -> VislocError:
+    """Return the error of a field within a larger message."""
+    field = ".".join(part for part in (place, error.field) if part)
+    return type(error)(
+        error.code, error.message, field=field or None, expected=error.expected, got=error.got
+    )

@@ -15,7 +15,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from visloc.errors import InvalidInput, TooLarge, VislocError
+from visloc.errors import InvalidInput, TooLarge, VislocError, placed
 
 _NOT_AN_OBJECT, _UNKNOWN_FIELD, _REFUSED = "not_an_object", "unknown_field", "refused"
 _MAX_NAME = 100  # characters of a name from outside
@@ -162,8 +162,7 @@ def refusal_of(complaint: Mapping[str, Any], path: str = "") -> VislocError:
     """Say one of pydantic's complaints in our words. Never echoes a large value."""
     kind, message, location = complaint["type"], complaint["msg"], complaint["loc"]
     if kind == _REFUSED:
-        error: VislocError = complaint["ctx"]["error"]
-        return error.within((path + _joined(location[:-1])).rstrip("."))
+        return placed(complaint["ctx"]["error"], (path + _joined(location[:-1])).rstrip("."))
     if kind == _UNKNOWN_FIELD:
         name, expected = complaint["ctx"]["name"], complaint["ctx"]["expected"]
         field = path + _joined([*location, name])

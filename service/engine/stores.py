@@ -7,7 +7,6 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Protocol
 
-from service.settings import ServiceSettings, SettingsError
 from visloc.archive import MapOutline, MapStore, SetOutline
 
 logger = logging.getLogger(__name__)
@@ -74,22 +73,22 @@ class Store(Protocol):
         ...
 
 
-def open_store(settings: ServiceSettings) -> Store:
-    """Return the store that ``maps_dir`` names.
+def open_store(maps_dir: str, cache_dir: Path, max_cache_bytes: int) -> Store:
+    """Return the store in a folder or at a URL; the cache is for a URL.
 
     Raises:
-        SettingsError: the URL cannot be used, or the path is not a folder.
+        ValueError: the URL cannot be used, or the path is not a folder.
     """
-    if "://" in settings.maps_dir:
+    if "://" in maps_dir:
         from visloc.archive.remote_store import RemoteMapStore  # its libraries take long to load
 
         try:
-            return RemoteMapStore(settings.maps_dir, settings.cache_dir, settings.max_cache_bytes)
+            return RemoteMapStore(maps_dir, cache_dir, max_cache_bytes)
         except (ImportError, ValueError) as error:  # a protocol that is not known or not installed
-            raise SettingsError(f"maps_dir: the URL cannot be used: {error}") from None
-    folder = Path(settings.maps_dir)
-    if not settings.maps_dir or (folder.exists() and not folder.is_dir()):
-        raise SettingsError(f"maps_dir: {settings.maps_dir!r} is no folder")
+            raise ValueError(f"the URL cannot be used: {error}") from None
+    folder = Path(maps_dir)
+    if not maps_dir or (folder.exists() and not folder.is_dir()):
+        raise ValueError(f"{maps_dir!r} is no folder")
     if not folder.exists():
         logger.warning("maps_dir: %s is not there yet; it is made with the first map", folder)
     return MapStore(folder)
