@@ -163,12 +163,7 @@ class Catalog:
 
     @asynccontextmanager
     async def reading(self, ref: str) -> AsyncIterator[MapFolder]:
-        """Give ``id@version``, to be read in this process; it stays until the block ends.
-
-        Raises:
-            NotFound: ``map.version``.
-            VislocError: errors of the store.
-        """
+        """Give ``id@version``, to be read in this process; it stays until the block ends."""
         version = await self._hold(ref)
         try:
             yield version
@@ -186,12 +181,7 @@ class Catalog:
         self._serve(map_id, opened)
 
     async def delete(self, map_id: str, version: str, limit_s: float) -> None:
-        """Delete a version that is not in use, after the requests that use it have ended.
-
-        Args:
-            map_id: the map.
-            version: its version.
-            limit_s: longest time to wait for those requests.
+        """Delete a version that is not in use; wait at most ``limit_s`` for requests that use it.
 
         Raises:
             NotFound: ``map.unknown``, ``map.version``.

@@ -53,9 +53,7 @@ class Scenes:
         They are packed as in docs/api.md.
 
         Raises:
-            NotFound: ``map.version``.
-            MapCorrupt: ``map.array``, ``map.range``.
-            VislocError: errors of the store.
+            VislocError: ``map.version``, ``map.array``, ``map.range``, errors of the store.
         """
         manifest = outline.manifest
         order = await self._orders.get(manifest.content_hash, lambda: self._order(outline))
@@ -68,9 +66,8 @@ class Scenes:
         """Return the mapping photos of a version.
 
         Raises:
-            NotFound: ``map.version``.
-            MapCorrupt: ``map.json``, ``map.images``, ``map.array``.
-            VislocError: errors of the store.
+            VislocError: ``map.version``, ``map.json``, ``map.images``, ``map.array``, errors of the
+                store.
         """
 
         async def read() -> MappingPhotos:

@@ -96,11 +96,7 @@ class SetSequence:
         self._held = AsyncExitStack()  # holds the tile of the leg
 
     def check(self, instants: Sequence[Instant]) -> None:
-        """Refuse instants that no tile can take, before any work.
-
-        Raises:
-            InvalidInput: ``sequence.timestamps``, ``priors.maps``.
-        """
+        """Refuse instants that no tile can take, before any work."""
         for index, (before, instant) in enumerate(pairwise(instants), start=1):
             with inside(f"instants[{index}]"):
                 check_order(before.timestamp, instant.timestamp)
@@ -110,9 +106,7 @@ class SetSequence:
     async def answers(self, instants: AsyncIterator[Instant]) -> AsyncGenerator[Localization]:
         """Answer instants in order, each as soon as its answer is final.
 
-        Raises:
-            InvalidInput: as ``Engine.localize_sequence``.
-            Unavailable: as ``SetSearch.search``.
+        Errors are those of ``Engine.localize_sequence`` and ``SetSearch.search``.
         """
         self._within = await self._search.within(self._outline, self._start.maps)
         self._check_tiles(self._start.priors)
@@ -327,11 +321,7 @@ class SetSequence:
         )
 
     async def _begin(self, pending: _Pending) -> list[Localization]:
-        """Begin a leg with an instant, and hold the tile until the leg ends.
-
-        Raises:
-            Unavailable: ``set.tile_unavailable`` when the tile is gone again.
-        """
+        """Begin a leg with an instant, and hold the tile until the leg ends."""
         tile = self._outline.tiles[pending.leg.row]
         using = self._catalog.using((tile.ref,))
         try:

@@ -90,12 +90,11 @@ class SetSearch:
         )
 
     async def localize(self, job: RigJob, map_set: MapFolder) -> Localization:
-        """Localize a photo, or the images of a rig at one instant, in a set.
+        """Localize a photo, or the images of a rig, in a set.
 
         Raises:
-            InvalidInput: ``priors.*``, and errors of the tiles' maps.
             NotFound: ``set.no_tile`` when the priors allow no tile.
-            Unavailable: ``set.tile_unavailable``, ``server.worker_died``.
+            VislocError: errors of ``search`` and of the tiles' maps.
         """
         outline = self._catalog.set_outline(map_set)
         allowed = allowed_tiles(outline, job.priors, await self.within(outline, job.maps))
@@ -200,7 +199,7 @@ class SetSearch:
 
 
 def tile_unavailable(tile: TileRecord, error: VislocError) -> Unavailable:
-    """``set.tile_unavailable``."""
+    """Return the error for a tile that cannot be opened."""
     return Unavailable(
         "set.tile_unavailable",
         f"a tile of the set that may show this cannot be opened: {error.message}",
@@ -240,11 +239,7 @@ async def answers_of(searches: Sequence[Coroutine[Any, Any, Localization]]) -> l
 def parted(
     maps: Sequence[MapFolder], priors: Priors
 ) -> tuple[tuple[MapFolder, ...], tuple[MapFolder, ...]]:
-    """Separate sets of maps from maps on their own.
-
-    Raises:
-        InvalidInput: ``priors.maps`` when it names tiles for maps on their own.
-    """
+    """Separate sets of maps from maps on their own, for which priors must not name tiles."""
     sets = tuple(each for each in maps if each.is_set)
     alone = tuple(each for each in maps if not each.is_set)
     if alone:
@@ -253,11 +248,7 @@ def parted(
 
 
 def check_no_tiles(maps: Sequence[MapFolder], priors: Priors) -> None:
-    """Refuse priors that name tiles for maps that have none.
-
-    Raises:
-        InvalidInput: ``priors.maps``.
-    """
+    """Refuse priors that name tiles for maps that have none."""
     if priors.maps is not None:
         raise InvalidInput(
             "priors.maps",

@@ -55,15 +55,8 @@ class Target:
     ) -> SeenImage:
         """Look at one image of an instant; an unusable image is returned with its error.
 
-        Args:
-            image: says which camera took it.
-            decoded: its photo, or why it cannot be decoded.
-            options: of the request.
-            priors: of the rig.
-            seconds: wall time by stage that the image took before.
-
-        Raises:
-            VislocError: errors of more than this image.
+        Errors of the whole request are raised. ``seconds`` is the wall time, by stage, that the
+        image took before.
         """
         sensor = self.rig.get(image.sensor) or RigSensor(Pose.identity(), None)
         camera = image.camera or sensor.camera
@@ -91,11 +84,7 @@ class Target:
 
 
 def rig_in_map(rig: Rig | None, opened: Map) -> Mapping[str, RigSensor]:
-    """Return a rig's cameras by sensor id; for None, one camera at the identity.
-
-    Raises:
-        NotFound: ``rig.unknown`` for the id of a rig that the map does not know.
-    """
+    """Return a rig's cameras by sensor id; for None, one camera at the identity."""
     if rig is None:
         return {ONLY_SENSOR: RigSensor(Pose.identity(), None)}
     if not isinstance(rig, str):
@@ -120,17 +109,9 @@ def rig_in_map(rig: Rig | None, opened: Map) -> Mapping[str, RigSensor]:
 def check_images(
     images: Sequence[ImageJob], rig: Collection[str] | None, max_images: int, where: str
 ) -> None:
-    """Refuse images that cannot be one instant of a rig.
+    """Refuse images, of the field ``where``, that cannot be one instant of a rig.
 
-    Args:
-        images: of one instant.
-        rig: its sensors; None when every instant is one image.
-        max_images: most images of an instant.
-        where: the field that holds them, for errors.
-
-    Raises:
-        InvalidInput: ``rig.sensor``, ``rig.duplicate`` or ``sequence.rig``.
-        TooLarge: ``rig.too_many_images``.
+    The rig is None when every instant is one image.
     """
     if len(images) > max_images:
         raise TooLarge(
@@ -171,10 +152,8 @@ def check_images(
 def check_options(targets: Sequence[Target], options: LocalizeOptions) -> None:
     """Refuse options that do not fit all maps, before any image is decoded.
 
-    Raises:
-        InvalidInput: as ``Localizer.check``; among several maps, it names those that refuse the
-            options, and says why the first of them does.
-        WeightsError: likewise.
+    The error is that of ``Localizer.check``. Among several maps, it names those that refuse the
+    options, and says why the first of them does.
     """
     refused: dict[str, InvalidInput] = {}
     for target in targets:
@@ -198,11 +177,7 @@ def check_options(targets: Sequence[Target], options: LocalizeOptions) -> None:
 
 
 def check_priors(targets: Sequence[Target], priors: Priors) -> None:
-    """Refuse priors that a map cannot apply, before anything is computed.
-
-    Raises:
-        InvalidInput: ``priors.*``.
-    """
+    """Refuse priors that a map cannot apply, before anything is computed."""
     for target in targets:
         Constraints(target.localizer.geometry, priors)
 

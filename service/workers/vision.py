@@ -102,16 +102,8 @@ class Vision:
         """Localize a photo on its own in the best of the maps.
 
         One task does it all: a photo is decoded where it is solved, and nothing of it travels.
-
-        Args:
-            job: of one image.
-            maps: where to search.
-            submitted: when the main process queued the task, by ``time.time``, which the clocks of
-                two processes share.
-
-        Raises:
-            InvalidInput: errors of the image, among others.
-            VislocError: errors of maps and of ``Localizer``.
+        The main process queued the task when it was ``submitted`` (``time.time``, which is the same
+        in all processes).
         """
         started, queued = perf_counter(), time() - submitted
         targets = self._targets(maps, job.rig)
@@ -133,12 +125,7 @@ class Vision:
         return replace(best, debug=_picture(decoded.query, targets[row], look, best, solved))
 
     def check_rig(self, job: RigJob, maps: Sequence[MapFolder]) -> None:
-        """Refuse a rig's images, which come without their photos, or options that do not fit.
-
-        Raises:
-            InvalidInput: ``rig.*``, ``options.*``, ``priors.*``.
-            VislocError: errors of maps.
-        """
+        """Refuse a rig's images, which come without their photos, or options that do not fit."""
         targets = self._targets(maps, job.rig)
         for target in targets:
             check_images(job.images, target.rig, self._settings.max_images, "images")
@@ -154,11 +141,7 @@ class Vision:
         priors: Priors,
         submitted: float,
     ) -> PackedLooks:
-        """Look at one image for every map; an image that cannot be used fails alone.
-
-        Raises:
-            VislocError: errors of more than this image.
-        """
+        """Look at one image for every map; an image that cannot be used fails alone."""
         seconds = {"queued": max(0.0, time() - submitted)}
         self._step()
         targets = self._targets(maps, rig)
@@ -174,13 +157,7 @@ class Vision:
     def solve_rig(
         self, job: RigJob, maps: Sequence[MapFolder], looks: Sequence[PackedLooks]
     ) -> Localization:
-        """Estimate one pose of a rig in the best of the maps.
-
-        Args:
-            job: without its photos.
-            maps: where to search.
-            looks: of each image, in order.
-        """
+        """Estimate one pose of a rig, given without its photos, in the best of the maps."""
         targets = self._targets(maps, job.rig)
         return self._solve(job, targets, _by_map(looks, len(maps)))[1]
 
@@ -209,15 +186,8 @@ class Vision:
     ) -> RankedTiles:
         """Decode a photo, find its features, and rank tiles of a set by them.
 
-        Args:
-            query: the photo; one that cannot be used comes back as it is, and ranks nothing.
-            map_set: the set.
-            options: how features are found.
-            allowed: (T,) the tiles to rank; None to rank none.
-            submitted: as in ``localize``.
-
-        Raises:
-            VislocError: errors of sets that cannot be opened.
+        A photo that cannot be used comes back as it is, and ranks nothing. The tiles to rank are
+        ``allowed`` (T,); None ranks none.
         """
         queued, started = max(0.0, time() - submitted), perf_counter()
         self._step()
@@ -232,12 +202,6 @@ class Vision:
         return RankedTiles(pack(decoded), scores)
 
     def open_sequence(self, start: SequenceStart, maps: Sequence[MapFolder]) -> PackedSequence:
-        """Begin a sequence.
-
-        Raises:
-            InvalidInput: ``sequence.*``, ``rig.*``, ``options.*``, ``priors.*``.
-            VislocError: errors of maps.
-        """
         settings = self._settings
         targets = self._targets(maps, start.rig)
         return _packed(SequenceRun(start, targets, settings.max_images, settings.max_instants))
@@ -249,12 +213,7 @@ class Vision:
         first: int,
         instants: Sequence[Instant],
     ) -> tuple[PackedSequence, list[Priors]]:
-        """Refuse instants, without their photos, that cannot be solved; return each one's priors.
-
-        Raises:
-            InvalidInput: ``sequence.*``, ``rig.*``, ``priors.*``.
-            TooLarge: ``sequence.too_many_instants``, ``rig.too_many_images``.
-        """
+        """Refuse instants, without their photos, that cannot be solved; return their priors."""
         run = self._sequence(sequence, maps)
         priors = [run.check(first + i, instant) for i, instant in enumerate(instants)]
         return _packed(run), priors
