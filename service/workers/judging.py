@@ -14,7 +14,6 @@ from visloc.localization.judge import (
     TIE_REACH_SHARE,
     Candidate,
     Tie,
-    inliers_of,
     judge,
     measured_pose,
 )
@@ -48,7 +47,7 @@ def judged(found: Sequence[Localization], priors: Priors = NO_PRIORS) -> tuple[i
     )
     if not isinstance(verdict, Refusal):
         return rows[verdict], asked[verdict]
-    row = max(rows, key=lambda row: inliers_of(found[row].answer))
+    row = max(rows, key=lambda row: found[row].answer.num_inliers)
     refused = replace(found[row].answer, pose=None, refusal=verdict)
     return row, replace(found[row], answer=refused)
 
