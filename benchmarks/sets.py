@@ -24,13 +24,12 @@ import typer
 from mapping.maps.sets import publish_set
 from service.engine.engine import Engine
 from service.telemetry.metrics import Metrics
-from service.values import Localization, LocalizeJob
-from service.workers.process import WorkerSettings
+from service.values import Localization, RigJob, WorkerSettings, photo_job
 from visloc.archive import MapStore
 from visloc.geometry import Similarity
 from visloc.images import ImageLimits
 from visloc.kapture import read_dataset
-from visloc.types import Localized, LocalizeOptions, Reason
+from visloc.types import LocalizeOptions, Reason
 
 APART_M = 10_000.0
 OPTIONS = LocalizeOptions()
@@ -52,13 +51,14 @@ class Tally:
         """Count the two answers to a photo."""
         self.own_s.append(own_s)
         self.set_s.append(set_s)
-        is_localized = isinstance(own.answer, Localized)
+        is_localized = own.answer.pose is not None
         self.localized += is_localized
-        if isinstance(found.answer, Localized):
+        refusal = found.answer.refusal
+        if refusal is None:
             tile = (found.tile or "").partition("@")[0]
             outcome = "right" if tile == map_id else "wrong"
         else:
-            outcome = "ambiguous" if found.answer.reason is Reason.AMBIGUOUS else "refused"
+            outcome = "ambiguous" if refusal.reason is Reason.AMBIGUOUS else "refused"
         (self.in_set if is_localized else self.others)[outcome] += 1
 
     def row(self, map_id: str) -> str:
@@ -71,11 +71,11 @@ class Tally:
         return f"| {' | '.join(map(str, cells))} | {times} |"
 
 
-def jobs_of(dataset: Path, map_id: str) -> list[LocalizeJob]:
+def jobs_of(dataset: Path, map_id: str) -> list[RigJob]:
     """Make a job of each photo, with its camera where the dataset knows it."""
     queries = read_dataset(dataset)
     return [
-        LocalizeJob(
+        photo_job(
             (map_id,),
             queries.path_of(record).read_bytes(),
             queries.sensors[record.sensor_id].camera,
@@ -85,14 +85,14 @@ def jobs_of(dataset: Path, map_id: str) -> list[LocalizeJob]:
     ]
 
 
-async def timed(engine: Engine, job: LocalizeJob) -> tuple[Localization, float]:
+async def timed(engine: Engine, job: RigJob) -> tuple[Localization, float]:
     """Ask, and say how long it took."""
     started = perf_counter()
     found = await engine.localize(job)
     return found, perf_counter() - started
 
 
-async def compare(engine: Engine, set_id: str, datasets: dict[str, list[LocalizeJob]]) -> None:
+async def compare(engine: Engine, set_id: str, datasets: dict[str, list[RigJob]]) -> None:
     """Ask about all photos, and print a row for each dataset."""
     await engine.start()
     try:

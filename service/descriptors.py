@@ -1,4 +1,4 @@
-"""File descriptors: enough of them for the connections, or fewer connections."""
+"""File descriptors: raises the limit for the connections, or lowers their number."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from service.settings import ServiceSettings, SettingsError
 
 logger = logging.getLogger(__name__)
 
-# Connections of the port for metrics: a scraper or two.
+# Connections of the metrics port.
 METRICS_CONNECTIONS = 32
-# Libraries, logs, keys, maps, uploads, the store and its connections, and what few connections
-# there are beyond a limit until they are closed.
+# Libraries, logs, keys, maps, uploads, the store, and connections beyond the limit until they are
+# closed.
 _OWN = 192
-# Fewer connections than these are no service.
+# A service with fewer connections is refused.
 _LEAST_CONNECTIONS = 10
 # Pipes to and from a worker process.
 _PER_WORKER = 16
@@ -23,11 +23,10 @@ _PER_WORKER = 16
 def fit_connections(settings: ServiceSettings) -> ServiceSettings:
     """Raise the soft limit of open files as needed, or lower ``max_connections``.
 
-    HTTP and gRPC have ``max_connections`` each. Call this before any process is started that
-    shall inherit the limit.
+    HTTP and gRPC have ``max_connections`` each. Processes that are started later inherit the limit.
 
     Raises:
-        SettingsError: when the hard limit leaves next to none for connections.
+        SettingsError: the hard limit leaves too few for connections.
     """
     own = _OWN + _PER_WORKER * settings.workers + METRICS_CONNECTIONS
     needed = own + 2 * settings.max_connections

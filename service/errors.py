@@ -1,4 +1,4 @@
-"""What both doors share: one table of statuses, and request ids."""
+"""Errors as both transports report them: the table of statuses, and request ids."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ STATUSES: Mapping[type[VislocError], tuple[HTTPStatus, grpc.StatusCode]] = {
     Forbidden: (HTTPStatus.FORBIDDEN, grpc.StatusCode.PERMISSION_DENIED),
 }
 
-# Of which the status is not their kind's. Balancers and gRPC clients send what is Unavailable once
-# more, to the next server: a photo that ended one process there would end another one here.
+# Codes with another status than their class. Balancers and gRPC clients retry what is Unavailable
+# on the next server: a photo that killed one process here would kill another one there.
 _STATUSES_OF_CODES = {
     "server.worker_died": (HTTPStatus.INTERNAL_SERVER_ERROR, grpc.StatusCode.INTERNAL)
 }
@@ -60,14 +60,14 @@ def statuses_of(error: VislocError) -> tuple[HTTPStatus, grpc.StatusCode]:
 
 
 def internal_error() -> VislocError:
-    """Return what a caller is told when something broke that should not have."""
+    """Return the error for a bug of the server."""
     return VislocError(
         "server.internal", "the server made a mistake; its log has the request id and the cause"
     )
 
 
 def stopping_error() -> Unavailable:
-    """Return what a caller is told whose request the end of the server cuts off."""
+    """Return the error for a request that the end of the server interrupts."""
     return Unavailable("server.stopping", "the server is being stopped; ask another, or later")
 
 

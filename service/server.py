@@ -6,6 +6,7 @@ import asyncio
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from starlette.applications import Starlette
 
 from service.descriptors import METRICS_CONNECTIONS
 from service.engine.engine import Engine
-from service.engine.stores import open_store
+from service.engine.stores import Store, open_store
 from service.grpc.localization import GrpcServer
 from service.http.acceptor import Acceptor, OpenConnections
 from service.http.app import create_app
@@ -22,11 +23,12 @@ from service.http.slow_clients import Arrivals, http_protocol
 from service.security.access import open_access
 from service.security.tls import TlsConfig, check_tls, tls_config
 from service.settings import ServiceSettings, SettingsError
+from service.telemetry.logs import configure_logging
 from service.telemetry.metrics import Metrics, ServiceState
 from service.telemetry.metrics_port import metrics_app
 from service.telemetry.observer import Observer
 from service.telemetry.tracing import open_spans
-from service.workers.process import WorkerSettings
+from service.values import WorkerSettings
 from visloc.types import Inference
 
 # When it stops: so long a request may be on its way over a connection that is open already. It is
@@ -55,7 +57,7 @@ class Server:
             raise SettingsError(f"weights_dir: {settings.weights_dir} is no folder")
         access = open_access(settings)
         self._arrivals = Arrivals(settings.arrival_timeout_s, settings.max_buffered_bytes)
-        self._store = open_store(settings)
+        self._store = _open_store(settings)
         self._spans = open_spans(settings)
         self.observer = Observer(Metrics(), self._spans)
         self.engine = Engine(
@@ -69,8 +71,7 @@ class Server:
                 max_instants=settings.max_instants,
                 max_image_bytes=settings.max_image_bytes,
                 max_image_pixels=settings.max_image_pixels,
-                log_level=settings.log_level,
-                log_format=settings.log_format,
+                configure_logging=partial(configure_logging, settings),
             ),
             workers=settings.workers,
             max_queue=settings.max_queue,
@@ -254,3 +255,10 @@ def _listen(host: str, port: int) -> socket.socket:
     # that was used before waits 40 ms for an acknowledgement.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return listener
+
+
+def _open_store(settings: ServiceSettings) -> Store:
+    try:
+        return open_store(settings.maps_dir, settings.cache_dir, settings.max_cache_bytes)
+    except ValueError as error:
+        raise SettingsError(f"maps_dir: {error}") from None

@@ -1,91 +1,60 @@
-"""What can be asked of the engine, and what it answers."""
+"""Jobs for the engine, its answers, and the values that it shares with worker processes."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.archive import Geodetic
+from visloc.archive import Geodetic, MapOutline, SetOutline
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera
 from visloc.priors import NO_PRIORS, Priors
 from visloc.sequences.filling import Odometry, TimeUnit
+from visloc.sets.choosing import TileScore
 from visloc.types import (
-    Answer,
+    Inference,
     InstantAnswer,
     LocalizeOptions,
     Near,
     QueryFeatures,
+    RigPose,
     RigSensor,
 )
 
 # The longest time between two measured instants across which gaps are filled, by default.
 DEFAULT_MAX_GAP_S = 1.0
-# The sensor of the only image of an instant, when no rig is named.
+# The sensor of a photo that comes without a rig.
 ONLY_SENSOR = "camera"
 
 
-# Where to search: one or several maps, each ``id``, for its current version, or ``id@version``; or
-# the anchored maps that reach into a circle.
+# Where to search: maps, each ``id`` (its current version) or ``id@version``; or the anchored maps
+# that reach into a circle.
 Where = tuple[str, ...] | Near
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ReadQuery:
-    """A photo, or what was found in it, as a worker process has read it; no other one needs to.
-
-    Attributes:
-        data: the pixels, the features found in them, and how long that took, for worker processes
-            only.
-    """
+class PackedQuery:
+    """A decoded photo and the features found so far, pickled by one worker for another."""
 
     data: bytes
 
 
-# An encoded photo, or the features that were found in it; once tiles of a set were chosen by them,
-# what was read.
-Query = bytes | QueryFeatures | ReadQuery
+# An encoded photo, or features that were sent instead of it; packed once tiles were ranked by it.
+Query = bytes | QueryFeatures | PackedQuery
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LocalizeJob:
-    """One photo to localize.
-
-    Attributes:
-        maps: where to search.
-        query: the photo.
-        camera: its intrinsics for the pixels as stored; None when unknown.
-        options: thresholds and the like.
-        priors: what is known of the camera.
-        ypr: whether to say its GeoPose in angles too.
-        debug: whether to show what was matched; needs a photo.
-    """
-
-    maps: Where
-    query: Query
-    camera: Camera | None
-    options: LocalizeOptions
-    priors: Priors = NO_PRIORS
-    ypr: bool = False
-    debug: bool = False
-
-
-# The id of a rig that the map knows, or a rig as it is.
+# The id of a rig that the map knows, or the cameras by sensor id.
 Rig = str | Mapping[str, RigSensor]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageJob:
-    """One image of an instant.
-
-    Attributes:
-        sensor: the camera of the rig.
-        query: the photo.
-        camera: its intrinsics, instead of those of the rig; None for those.
-    """
+    """One image of an instant. A camera replaces the rig's for this sensor."""
 
     sensor: str
     query: Query
@@ -94,16 +63,14 @@ class ImageJob:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigJob:
-    """The images of one instant.
+    """The images of one instant, each of another sensor.
+
+    A photo on its own is a rig of one camera (``photo_job``).
 
     Attributes:
-        maps: where to search.
-        rig: how the cameras sit; None for one image of one camera.
-        images: each of another sensor.
-        timestamp: of all of them; None when unknown.
-        options: thresholds and the like.
-        priors: what is known of the rig.
-        ypr: whether to say its GeoPose in angles too.
+        rig: None for a photo on its own.
+        ypr: also return the GeoPose as angles.
+        debug: also return the matches; for a photo on its own.
     """
 
     maps: Where
@@ -113,6 +80,22 @@ class RigJob:
     options: LocalizeOptions
     priors: Priors = NO_PRIORS
     ypr: bool = False
+    debug: bool = False
+
+
+def photo_job(
+    maps: Where,
+    query: Query,
+    camera: Camera | None,
+    options: LocalizeOptions,
+    priors: Priors = NO_PRIORS,
+    *,
+    ypr: bool = False,
+    debug: bool = False,
+) -> RigJob:
+    """Return the job of localizing one photo, or its features."""
+    image = ImageJob(ONLY_SENSOR, query, camera)
+    return RigJob(maps, None, (image,), None, options, priors, ypr, debug)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,10 +103,9 @@ class Instant:
     """One instant of a sequence.
 
     Attributes:
-        timestamp: greater than that of the instant before.
-        images: each of another sensor; there may be none when there is odometry.
-        odometry: None when there is none.
-        priors: of this instant; None for those of the sequence.
+        timestamp: greater than the one before.
+        images: each of another sensor; may be empty when there is odometry.
+        priors: None for those of the sequence.
     """
 
     timestamp: int
@@ -137,13 +119,11 @@ class SequenceStart:
     """What all instants of a sequence share.
 
     Attributes:
-        maps: where to search; of several maps, one is kept once it alone explains an instant.
-        rig: how the cameras sit; None when every instant is one image of one camera.
-        time_unit: of the timestamps; None to tell by their size.
+        maps: of several maps, the first that alone explains an instant is kept.
+        rig: None when every instant is one image of one camera.
+        time_unit: of the timestamps; None to infer it from their size.
         max_gap_s: longest time between measured instants across which gaps are filled; 0: none.
-        options: thresholds and the like.
-        priors: what is known of the rig at every instant.
-        ypr: whether to say its GeoPose in angles too.
+        ypr: also return the GeoPose as angles.
     """
 
     maps: Where
@@ -157,12 +137,12 @@ class SequenceStart:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchPicture:
-    """What the solver was given for a photo, and what it made of it.
+    """The correspondences of a photo, and a picture of them.
 
     Attributes:
         keypoints: (n, 2) pixels of the photo as stored.
         points: (n, 3) in the world.
-        inliers: (n,) whether the pose agrees.
+        inliers: (n,) whether the best pose explains the match.
         overlay: JPEG of the photo with its matches, beside the retrieved photos.
     """
 
@@ -174,19 +154,18 @@ class MatchPicture:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Localization:
-    """An answer and the map that gave it.
+    """The answer to an instant, and the map that gave it.
 
     Attributes:
-        map_id: of the map, or of the set of maps, in whose frame the answer is.
+        map_id: the map, or the set of maps, in whose frame the answer is.
         geodetic: where that map lies on Earth, when it is known.
-        ypr: whether the caller wants the GeoPose in angles too.
-        debug: when the caller wants it.
+        ypr: whether the caller wants the GeoPose as angles too.
         tile: of a set, ``id@version`` of the map in it that gave the answer.
         reach: how far that map's photos see, in units of the answer's frame (median).
-        anchor_rms: how far off its place on Earth the frame may be, in its unit; 0 when unknown.
+        anchor_rms: rms error of the map's anchor on Earth, in its unit; 0 when unknown.
     """
 
-    answer: Answer
+    answer: InstantAnswer
     map_id: str
     map_version: str
     geodetic: Geodetic | None = None
@@ -198,26 +177,7 @@ class Localization:
 
     @property
     def ref(self) -> str:
-        """``id@version`` of the map that gave the answer."""
-        return self.tile or f"{self.map_id}@{self.map_version}"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class InstantLocalization:
-    """The answer to an instant and the map that gave it; attributes as of ``Localization``."""
-
-    answer: InstantAnswer
-    map_id: str
-    map_version: str
-    geodetic: Geodetic | None = None
-    ypr: bool = False
-    tile: str | None = None
-    reach: float = 0.0
-    anchor_rms: float = 0.0
-
-    @property
-    def ref(self) -> str:
-        """``id@version`` of the map that gave the answer."""
+        """``id@version`` of the map, of a set of the tile, that gave the answer."""
         return self.tile or f"{self.map_id}@{self.map_version}"
 
 
@@ -235,3 +195,93 @@ def check_order(before: int, timestamp: int) -> None:
             expected=f"more than {before}, that of the instant before",
             got=timestamp,
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ServedMap:
+    """A version of a map, or of a set of maps.
+
+    Attributes:
+        current: whether it is the version in use.
+        versions: all published versions of the map, oldest first, and whether each is in use.
+    """
+
+    outline: MapOutline | SetOutline
+    current: bool
+    versions: tuple[tuple[str, bool], ...]
+
+
+class MapFolder(NamedTuple):
+    """A version of a map, or of a set, on this machine's disk; ``ref`` is ``id@version``."""
+
+    ref: str
+    folder: Path
+    is_set: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerSettings:
+    """What a worker process needs to know.
+
+    Attributes:
+        threads: processor threads for one photo.
+        max_loaded_bytes: maps that stay open.
+        max_images: of one instant.
+        max_instants: of one sequence.
+        max_image_bytes: of an encoded photo.
+        max_image_pixels: of a photo.
+        configure_logging: runs first in every process, which pickles it; None to log as Python
+            does.
+    """
+
+    weights_dir: Path | None
+    threads: int
+    max_loaded_bytes: int
+    max_images: int
+    max_instants: int
+    max_image_bytes: int
+    max_image_pixels: int
+    inference: Inference = Inference.AUTO
+    configure_logging: Callable[[], None] | None = None
+
+
+class OpenMap(NamedTuple):
+    """A map, or a set, that a worker process has open: ``id@version`` and its bytes."""
+
+    ref: str
+    size: int
+
+
+class RankedTiles(NamedTuple):
+    """The tiles of a set ranked by a photo.
+
+    Attributes:
+        query: packed where it could be decoded, else as it came.
+        scores: of the most similar tiles, best first; empty when none were to be ranked, or the
+            photo shows nothing.
+    """
+
+    query: Query
+    scores: tuple[TileScore, ...] = ()
+
+
+# What an image shows of the maps, by map. Pickled: only worker processes read it.
+PackedLooks = bytes
+# A sequence between two of its instants. Pickled: it lives in the main process, so that any worker
+# can take its next step, and one that dies loses no more than that step.
+PackedSequence = bytes
+
+
+class SequenceStep(NamedTuple):
+    """What an instant makes of a sequence.
+
+    Attributes:
+        maps: references of those that are still searched.
+        answers: those that are final.
+        pose: what the instant's own images measured; None when they do not localize it.
+    """
+
+    sequence: PackedSequence
+    maps: tuple[str, ...]
+    answers: list[Localization]
+    pose: RigPose | None

@@ -9,9 +9,8 @@ import numpy as np
 
 import visloc.types
 from service.api.geopose import geoposes_to_words
-from service.values import InstantLocalization, Localization, MatchPicture
+from service.values import Localization, MatchPicture
 from visloc.errors import VislocError
-from visloc.geometry import Pose
 from visloc.types import PoseSource
 from visloc_api.words.answers import (
     MAX_RETRIEVED,
@@ -32,15 +31,16 @@ from visloc_api.words.answers import (
 
 def localize_response(found: Localization, request_id: str) -> LocalizeResponse:
     """Answer a photo."""
-    answer, evidence = found.answer, found.answer.evidence
-    localized = answer if isinstance(answer, visloc.types.Localized) else None
-    cam_from_world = None if localized is None else localized.cam_from_world
+    (image,), pose, refusal = found.answer.images, found.answer.pose, found.answer.refusal
+    evidence = image.evidence
+    assert evidence is not None  # a photo that cannot be used is an error
+    cam_from_world = None if pose is None else pose.rig_from_world  # a rig of one camera
     geopose, geopose_ypr = geoposes_to_words(cam_from_world, found.geodetic, ypr=found.ypr)
     return LocalizeResponse(
         request_id=request_id,
-        status="not_localized" if localized is None else "localized",
-        pose=None if localized is None else _pose_estimate(localized),
-        refusal=_refusal(answer) if isinstance(answer, visloc.types.NotLocalized) else None,
+        status="not_localized" if pose is None else "localized",
+        pose=None if pose is None else _pose_estimate(pose),
+        refusal=None if refusal is None else _refusal(refusal),
         keypoints=evidence.num_keypoints,
         correspondences=evidence.num_correspondences,
         inliers=evidence.num_inliers,
@@ -49,7 +49,7 @@ def localize_response(found: Localization, request_id: str) -> LocalizeResponse:
         camera=_camera(evidence),
         orientation=_orientation(evidence),
         map=MapRef(id=found.map_id, version=found.map_version),
-        seconds=dict(evidence.seconds),
+        seconds=dict(found.answer.seconds),
         geopose=geopose,
         geopose_ypr=geopose_ypr,
         debug=None if found.debug is None else _debug(found.debug),
@@ -57,7 +57,7 @@ def localize_response(found: Localization, request_id: str) -> LocalizeResponse:
     )
 
 
-def instant_answer(found: InstantLocalization, request_id: str) -> InstantAnswer:
+def instant_answer(found: Localization, request_id: str) -> InstantAnswer:
     """Answer the images of one instant."""
     answer = found.answer
     pose, correspondences = answer.pose, answer.num_correspondences
@@ -86,20 +86,16 @@ def instant_answer(found: InstantLocalization, request_id: str) -> InstantAnswer
     )
 
 
-def _pose_estimate(localized: visloc.types.Localized) -> PoseEstimate:
-    pose = localized.cam_from_world
-    return PoseEstimate.model_validate({"cam_from_world": pose, **_uncertain(pose, localized)})
+def _pose_estimate(pose: visloc.types.RigPose) -> PoseEstimate:
+    return PoseEstimate.model_validate({"cam_from_world": pose.rig_from_world, **_uncertain(pose)})
 
 
 def _rig_pose(pose: visloc.types.RigPose) -> RigPose:
-    return RigPose.model_validate(
-        {"rig_from_world": pose.rig_from_world, **_uncertain(pose.rig_from_world, pose)}
-    )
+    return RigPose.model_validate({"rig_from_world": pose.rig_from_world, **_uncertain(pose)})
 
 
-def _uncertain(
-    pose: Pose, measured: visloc.types.Localized | visloc.types.RigPose
-) -> dict[str, Any]:
+def _uncertain(measured: visloc.types.RigPose) -> dict[str, Any]:
+    pose = measured.rig_from_world
     return {
         "position": pose.center,
         "orientation": pose.inverse().rotation_wxyz,
@@ -109,7 +105,7 @@ def _uncertain(
     }
 
 
-def _refusal(refused: visloc.types.NotLocalized | visloc.types.Refusal) -> Refusal:
+def _refusal(refused: visloc.types.Refusal) -> Refusal:
     return Refusal(stage=refused.stage, reason=refused.reason, message=refused.message)
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import FailFast, Field
 
 from service.api.geopose import GivenNear, GivenYpr, Near, flag_from_text
-from service.values import LocalizeJob, Where
+from service.values import RigJob, Where, photo_job
 from visloc.errors import InvalidInput
 from visloc_api.words.features import GivenFeatures, GivenImage, query_to_core
 from visloc_api.words.geometry import GivenCamera
@@ -113,7 +113,7 @@ class LocalizeRequest(IncomingMessage):
     ypr: GivenYpr = None
     debug: GivenDebug = None
 
-    def to_job(self) -> LocalizeJob:
+    def to_job(self) -> RigJob:
         """Return the work to do.
 
         Raises:
@@ -128,7 +128,7 @@ class LocalizeRequest(IncomingMessage):
                 expected="false or left out with features",
                 got="true",
             )
-        return LocalizeJob(
+        return photo_job(
             where_to_core(self.map, self.maps, self.near),
             query_to_core(self.image, self.features),
             None if self.camera is None else self.camera.to_core(),

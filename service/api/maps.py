@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import visloc.archive
+from service.values import ServedMap
 from visloc.archive import MapOutline, SetOutline
 from visloc.archive.photos import MappingPhotos
 from visloc_api.words.answers import MapRef
 from visloc_api.words.maps import MapInfo
 from visloc_api.words.scenes import MapCamera, MapImage, MapImages
-
-if TYPE_CHECKING:
-    from service.engine.listing import ServedMap
 
 
 def map_info(served: ServedMap, *, in_list: bool = False) -> MapInfo:

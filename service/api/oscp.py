@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from service.api.oscp_images import image_bytes
-from service.values import ImageJob, LocalizeJob, RigJob
+from service.values import ImageJob, RigJob, photo_job
 from visloc.errors import InvalidInput, TooLarge, inside
 from visloc.geometry import Camera, Pose
 from visloc.types import MAX_RADIUS_M, LocalizeOptions, Near, RigSensor
@@ -172,7 +172,7 @@ class GeoPoseRequest(_Read):
         except ValidationError as refused:
             raise refusal_of(_in_its_words(refused)) from None
 
-    def to_job(self, *, max_image_bytes: int, max_images: int) -> LocalizeJob | RigJob:
+    def to_job(self, *, max_image_bytes: int, max_images: int) -> RigJob:
         """Return the work to do: of one photo, or of those of a rig at one instant.
 
         Photos that do not belong to the rig and the instant of the first are passed over: its
@@ -216,7 +216,7 @@ class GeoPoseRequest(_Read):
                 image = image_bytes(
                     reading.imageBytes, reading.imageFormat, _size(reading), max_image_bytes
                 )
-                return LocalizeJob(near, image, _camera(reading, sensor), options)
+                return photo_job(near, image, _camera(reading, sensor), options)
         mounted: dict[str, RigSensor] = {}
         images = []
         for number, reading, sensor in rig:

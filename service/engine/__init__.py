@@ -1,1 +1,1 @@
-"""Maps served, work queued. Knows neither HTTP nor gRPC."""
+"""The engine in the main process: maps, sets of maps, uploads, and tasks for workers."""

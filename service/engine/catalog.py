@@ -1,26 +1,22 @@
-"""Which maps there are and which versions of them are served, in the main process."""
+"""The maps and versions that are served, in the main process."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections import Counter
-from collections.abc import AsyncIterator, Coroutine, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import AsyncIterator, Coroutine, Mapping
 from contextlib import asynccontextmanager, suppress
 from copy import copy
 from dataclasses import dataclass
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from service.engine.gather import together
+from service.engine.fetching import Fetcher
 from service.engine.listing import Listing
 from service.engine.stores import Store
-from service.values import Where
-from service.workers import process as worker
+from service.values import MapFolder, Where
 from service.workers.pool import Workers
-from service.workers.process import MapFolder
+from service.workers.tasks import Vision
 from visloc.archive import SetOutline, read_any_outline
 from visloc.archive.set_rules import refuse_if_tile
 from visloc.archive.store import version_in_use
@@ -31,23 +27,20 @@ logger = logging.getLogger(__name__)
 
 # How long a version that could not be opened is left alone before it is tried again.
 RETRY_AFTER_S = 10.0
-# How often the store is asked what has become current, besides by requests.
+# How often the store is asked for new versions, besides by requests.
 FOLLOW_S = 1.0
-# How often it is looked whether the last request of a version has ended, and how long at most
-# before it is closed all the same.
+# How often a version is checked for requests that still use it, and the longest time before it is
+# closed anyway.
 _UNUSED_POLL_S = 0.05
 _FORGET_LIMIT_S = 600.0
-# Maps that are fetched at once.
-_MAX_FETCHES = 4
 
 
 @dataclass(frozen=True, slots=True)
 class _Refused:
-    """What is current in the store and could not be loaded.
+    """A version that is current in the store and could not be loaded.
 
     Attributes:
-        ref: ``id@version``; ``id`` when the map does not say which version is current.
-        error: why.
+        ref: ``id@version``; ``id`` when the store cannot tell which version is current.
         at: when, by ``perf_counter``.
     """
 
@@ -55,86 +48,106 @@ class _Refused:
     error: VislocError
     at: float
 
+    @property
+    def is_recent(self) -> bool:
+        return perf_counter() < self.at + RETRY_AFTER_S
 
-class Catalog:
-    """Knows what is served. Used from one event loop; what may block runs in threads.
 
-    The store is asked every time which version is current, so that a map that was published a
-    moment ago is served without a restart. It takes over when a worker process has it open and
-    warm; until then, and when it cannot be opened, the version before it stays in service.
+@dataclass(slots=True, eq=False)
+class _Served:
+    """A map: the version in service, and what became of the one that is current in the store."""
 
-    Args:
-        store: where the maps are.
+    version: MapFolder | None = None
+    refused: _Refused | None = None
+    taking_over: asyncio.Task[None] | None = None
+
+
+@dataclass(slots=True, eq=False)
+class _Version:
+    """A version that is used, or may be open in worker processes.
+
+    Attributes:
+        folder: None until it is on this machine and read.
+        outline: of a set; None of a map.
+        users: requests under way.
+        is_leaving: it is being deleted.
     """
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
-        # Fetching a map may take minutes, in which everything else that needs a thread goes on.
-        self._fetchers = ThreadPoolExecutor(_MAX_FETCHES, thread_name_prefix="fetch")
-        self._fetching: dict[str, asyncio.Future[Path]] = {}  # by id@version
-        self._serving: dict[str, MapFolder] = {}  # by map id
-        self.listing = Listing(store, self._serving)
-        self._refused: dict[str, _Refused] = {}  # by map id
-        self._taking_over: dict[str, asyncio.Task[None]] = {}  # by map id
-        self._sets: dict[str, SetOutline | None] = {}  # by id@version; None: it is a map
-        self._known: dict[str, MapFolder] = {}  # by id@version, what was asked for and may be open
-        self._users: Counter[str] = Counter()  # requests under way, by id@version
-        self._leaving: set[str] = set()  # id@version of what is being deleted
+    folder: MapFolder | None = None
+    outline: SetOutline | None = None
+    users: int = 0
+    is_leaving: bool = False
+
+
+class Catalog:
+    """Tracks the versions that are served. Used from one event loop; blocking work runs in threads.
+
+    Every request asks the store which version is current, so that a map that was published a moment
+    ago is served without a restart. The new version takes over when a worker process has it open
+    and warm; until then, and when it cannot be opened, the previous one stays in service.
+    """
+
+    def __init__(self, store: Store, workers: Workers) -> None:
+        self._store, self._workers = store, workers
+        self.fetcher = Fetcher(store)
+        self.listing = Listing(store, self._served_ref)
+        self._maps: dict[str, _Served] = {}  # by id
+        self._versions: dict[str, _Version] = {}  # by id@version
         self._background: set[asyncio.Task[None]] = set()
 
     @property
     def known(self) -> tuple[MapFolder, ...]:
-        """What may be open: what is served, and versions that were asked for, as sets do."""
-        return tuple(self._known.values())
+        """The versions that may be open: current ones, and others that requests or sets name."""
+        return tuple(one.folder for one in self._versions.values() if one.folder is not None)
 
     @property
     def not_loaded(self) -> Mapping[str, VislocError]:
         """Why the current version of a map cannot be served, by map id."""
-        return {map_id: refused.error for map_id, refused in sorted(self._refused.items())}
+        refused = [(map_id, one.refused) for map_id, one in sorted(self._maps.items())]
+        return {map_id: one.error for map_id, one in refused if one is not None}
 
-    async def load_all(self, workers: Workers, max_bytes: int) -> None:
-        """Open all current maps, as far as there is room; others are opened when asked for.
+    async def load_all(self, max_bytes: int) -> None:
+        """Open current maps until ``max_bytes`` are open; requests open the others.
 
-        Sets come first, and their tiles last, the first ones only. One that is broken does not
-        keep back the others.
+        Sets come first, and the first tiles of sets last. A broken map does not stop the others.
         """
         for ref in await asyncio.to_thread(self.listing.opened_at_start):
-            if sum(workers.loaded.values()) >= max_bytes:
-                logger.info("max_loaded_bytes is full: other maps are opened when they are asked")
+            if sum(self._workers.loaded.values()) >= max_bytes:
+                logger.info("max_loaded_bytes is reached: requests open the other maps")
                 break
             try:
                 if "@" in ref:
-                    of = await self._open(ref, workers)
-                    self._in_background(workers.run_everywhere(worker.load, of))
+                    version = await self._open(ref)
+                    self._in_background(self._workers.run_everywhere(Vision.load, version))
                 else:
-                    await self._resolve(ref, workers)
+                    await self._resolve(ref)
             except VislocError as error:
                 logger.error("map %s is not loaded: %s", ref, error)  # noqa: TRY400
         if self._background:
             await asyncio.wait(self._background)  # in every process, not only in the first
 
-    async def follow(self, workers: Workers) -> None:
-        """Let versions that become current take over, and forget maps that go, for ever."""
+    async def follow(self) -> None:
+        """Let new current versions take over, and drop maps that were deleted; never returns."""
         while True:
             await asyncio.sleep(FOLLOW_S)
             try:
                 ids = set(await asyncio.to_thread(self._store.ids))
-            except (VislocError, OSError) as error:  # of this task, nobody asks what became
+            except (VislocError, OSError) as error:  # nobody awaits this task
                 logger.warning("the maps cannot be listed: %s", error)
                 continue
-            for map_id in (self._serving.keys() | self._refused.keys()) - ids:
-                self._gone(map_id, workers)
-            for map_id in self._serving.keys() & ids:
+            for map_id in self._maps.keys() - ids:
+                self._gone(map_id)
+            for map_id in [one for one in ids if self._served_ref(one) is not None]:
                 with suppress(VislocError):  # noted in not_loaded
-                    await self._resolve(map_id, workers)
+                    await self._resolve(map_id)
 
     @asynccontextmanager
-    async def using(self, where: Where, workers: Workers) -> AsyncIterator[tuple[MapFolder, ...]]:
-        """Give the maps to search; they stay until the block ends, whatever takes over.
+    async def using(self, where: Where) -> AsyncIterator[tuple[MapFolder, ...]]:
+        """Give the maps to search; they stay until the block ends, even if others take over.
 
         Raises:
             NotFound: ``map.unknown``, ``map.version``, ``map.none_near``.
-            VislocError: what the store and ``worker.load`` raise.
+            VislocError: errors of the store and of ``Vision.load``.
         """
         if isinstance(where, Near):
             refs = await asyncio.to_thread(self.listing.searched_near, where)
@@ -143,72 +156,33 @@ class Catalog:
         taken: list[MapFolder] = []
         try:
             for ref in refs:
-                taken.append(await self._take(ref, workers))
+                taken.append(await self._take(ref))
             yield tuple(taken)
         finally:
-            for of in taken:
-                self._give_back(of.ref)
-
-    async def away(self, refs: Sequence[str]) -> tuple[str, ...]:
-        """Say which versions are to be fetched before they can be used."""
-
-        def away(ref: str) -> bool:
-            try:
-                return self._store.at_hand(ref) is None
-            except VislocError:
-                return False  # using it says what is wrong
-
-        return tuple([ref for ref in refs if await asyncio.to_thread(away, ref)])
-
-    async def fetch(self, refs: Sequence[str]) -> dict[str, VislocError]:
-        """Bring versions to this machine; say of which that failed."""
-
-        async def fetched(ref: str) -> VislocError | None:
-            try:
-                await self._folder(ref)
-            except VislocError as error:
-                return error
-            return None
-
-        errors = await together(fetched(ref) for ref in refs)
-        return {ref: error for ref, error in zip(refs, errors, strict=True) if error is not None}
+            for version in taken:
+                self._release(version.ref)
 
     @asynccontextmanager
     async def reading(self, ref: str) -> AsyncIterator[MapFolder]:
-        """Give ``id@version``, to be read in this process; it stays until the block ends.
-
-        Raises:
-            NotFound: ``map.version``.
-            VislocError: what the store raises.
-        """
-        of = await self._hold(ref)
+        """Give ``id@version``, to be read in this process; it stays until the block ends."""
+        version = await self._hold(ref)
         try:
-            yield of
+            yield version
         finally:
-            self._give_back(of.ref)
+            self._release(ref)
 
-    async def activate(self, map_id: str, version: str, workers: Workers) -> None:
+    async def activate(self, map_id: str, version: str) -> None:
         """Put a version into use, once a worker process has it open and warm.
 
         Raises:
-            VislocError: as ``using``; then nothing has changed.
+            VislocError: as in ``using``; then nothing has changed.
         """
-        of = await self._open(f"{map_id}@{version}", workers)
+        opened = await self._open(f"{map_id}@{version}")
         await asyncio.to_thread(self._store.set_current, map_id, version)
-        self._serve(map_id, of, workers)
+        self._serve(map_id, opened)
 
-    def close(self) -> None:
-        """Let go of the threads."""
-        self._fetchers.shutdown(wait=False, cancel_futures=True)
-
-    async def delete(self, map_id: str, version: str, workers: Workers, limit_s: float) -> None:
-        """Delete a version that is not in use, after the requests that began with it.
-
-        Args:
-            map_id: the map.
-            version: of it.
-            workers: that may have it open.
-            limit_s: longest time to wait for those requests.
+    async def delete(self, map_id: str, version: str, limit_s: float) -> None:
+        """Delete a version that is not in use; wait at most ``limit_s`` for requests that use it.
 
         Raises:
             NotFound: ``map.unknown``, ``map.version``.
@@ -217,196 +191,201 @@ class Catalog:
         ref = f"{map_id}@{version}"
         # One that answers while the current one cannot be opened is in use too.
         others = set(await asyncio.to_thread(self._store.versions, map_id)) - {version}
-        if others and any(of.ref == ref for of in self._serving.values()):
+        if others and self._is_served(ref):
             raise version_in_use(map_id, version, sorted(others))
-        # Before anyone is turned away from it.
+        # Before new requests are refused.
         await asyncio.to_thread(self._refuse_if_tile, map_id, version)
-        self._leaving.add(ref)
+        leaving = self._versions.setdefault(ref, _Version())
+        leaving.is_leaving = True
         try:
             await self._until_unused(ref, limit_s)
-            if self._users[ref]:
+            if leaving.users:
                 raise version_in_use(map_id, version, sorted(others))
             await asyncio.to_thread(self._store.remove, map_id, version)
         finally:
-            self._leaving.discard(ref)
+            leaving.is_leaving = False
+            self._drop_if_idle(ref)
         self.listing.forget(ref)
-        if map_id in self._serving and not others:
-            del self._serving[map_id]
-        await self._close(ref, workers)
+        served = self._maps.get(map_id)
+        if served is not None and not others:
+            served.version = None
+        await self._close(ref)
 
-    def set_outline(self, of: MapFolder) -> SetOutline:
-        """Return what a set says about itself that ``using`` gave."""
-        outline = self._sets[of.ref]
+    def set_outline(self, version: MapFolder) -> SetOutline:
+        """Return the outline of a set that ``using`` gave."""
+        outline = self._versions[version.ref].outline
         assert outline is not None  # the caller has looked
         return outline
 
-    async def _take(self, ref: str, workers: Workers) -> MapFolder:
-        """Return a map, which stays until it is given back."""
+    def close(self) -> None:
+        self.fetcher.close()
+
+    async def _take(self, ref: str) -> MapFolder:
+        """Return a map, which stays until it is released."""
         while True:
-            found = ref if "@" in ref else (await self._resolve(ref, workers)).ref
+            found = ref if "@" in ref else (await self._resolve(ref)).ref
             try:
                 return await self._hold(found)
             except NotFound:
-                served = self._serving.get(ref)
-                if served is None or served.ref == found:
+                if self._served_ref(ref) in (None, found):
                     raise
                 # Another version took over meanwhile.
 
     async def _hold(self, ref: str) -> MapFolder:
-        """Return ``id@version``, which stays until it is given back."""
-        if ref in self._leaving:
+        """Return ``id@version``, which stays until it is released."""
+        version = self._versions.setdefault(ref, _Version())
+        if version.is_leaving:
             raise NotFound("map.version", "the version is being deleted", field="map", got=ref)
-        self._users[ref] += 1
+        version.users += 1
         try:
-            return await self._at_hand(ref)
+            return await self._prepare(ref)
         except BaseException:
-            self._give_back(ref)
+            self._release(ref)
             raise
 
-    def _give_back(self, ref: str) -> None:
-        self._users[ref] -= 1
-        if not self._users[ref]:
-            del self._users[ref]
+    def _release(self, ref: str) -> None:
+        self._versions[ref].users -= 1
+        self._drop_if_idle(ref)
+
+    def _drop_if_idle(self, ref: str) -> None:
+        version = self._versions[ref]
+        if version.folder is None and not version.users and not version.is_leaving:
+            del self._versions[ref]
 
     async def _until_unused(self, ref: str, limit_s: float) -> None:
         with suppress(TimeoutError):
             async with asyncio.timeout(limit_s):
-                while self._users[ref]:
+                while ref in self._versions and self._versions[ref].users:
                     await asyncio.sleep(_UNUSED_POLL_S)
 
-    async def _forget(self, ref: str, workers: Workers) -> None:
-        """Close a version that another one took over from, after its last request."""
+    async def _forget(self, ref: str) -> None:
+        """Close a version that another one replaced, after its last request."""
         await self._until_unused(ref, _FORGET_LIMIT_S)
-        if any(of.ref == ref for of in self._serving.values()) or self._sets_with(ref):
-            return
-        await self._close(ref, workers)
+        if not self._is_served(ref) and not self._sets_with(ref):
+            await self._close(ref)
 
-    async def _close(self, ref: str, workers: Workers) -> None:
-        """Close a version; of a set, later the tiles too that no other set names."""
-        outline = self._sets.pop(ref, None)
-        self._known.pop(ref, None)
-        for tile in () if outline is None else outline.tiles:
-            if tile.ref in self._known:
-                self._in_background(self._forget(tile.ref, workers))
-        await workers.run_everywhere(worker.forget, ref)
+    async def _close(self, ref: str) -> None:
+        """Close a version; of a set, also close the tiles that no other set names."""
+        version = self._versions.get(ref)
+        if version is not None:
+            tiles = () if version.outline is None else version.outline.tiles
+            version.folder = version.outline = None
+            self._drop_if_idle(ref)
+            for tile in tiles:
+                known = self._versions.get(tile.ref)
+                if known is not None and known.folder is not None:
+                    self._in_background(self._forget(tile.ref))
+        await self._workers.run_everywhere(Vision.forget, ref)
+
+    def _served_ref(self, map_id: str) -> str | None:
+        """``id@version`` of what is served of a map; also called in threads."""
+        served = self._maps.get(map_id)
+        return None if served is None or served.version is None else served.version.ref
+
+    def _is_served(self, ref: str) -> bool:
+        return self._served_ref(ref.partition("@")[0]) == ref
 
     def _sets_with(self, ref: str) -> list[SetOutline]:
-        """The sets that are served and name a version."""
-        sets = [self._sets.get(of.ref) for of in tuple(self._serving.values())]
-        return [of for of in sets if of and any(ref == tile.ref for tile in of.tiles)]
+        """The sets that are served and name a version; also called in threads."""
+        served = [self._versions.get(self._served_ref(one) or "") for one in tuple(self._maps)]
+        sets = [one.outline for one in served if one is not None and one.outline is not None]
+        return [one for one in sets if any(ref == tile.ref for tile in one.tiles)]
 
     def _refuse_if_tile(self, map_id: str, version: str) -> None:
         """Refuse to delete a tile of a set that is served and in use; in a thread."""
-        for of in self._sets_with(f"{map_id}@{version}"):
+        for each in self._sets_with(f"{map_id}@{version}"):
             with suppress(NotFound):  # the set was deleted a moment ago
-                if self._store.current_version(of.manifest.id) == of.manifest.version:
-                    refuse_if_tile(map_id, version, [(of.ref, of.manifest)])
+                if self._store.current_version(each.manifest.id) == each.manifest.version:
+                    refuse_if_tile(map_id, version, [(each.ref, each.manifest)])
 
-    async def _resolve(self, ref: str, workers: Workers) -> MapFolder:
-        """Return what ``id`` stands for: what is current, or the version before it."""
-        before, refused = self._serving.get(ref), self._refused.get(ref)
+    async def _resolve(self, map_id: str) -> MapFolder:
+        """Return the current version of a map, or the one before it."""
         try:
-            current = f"{ref}@{await asyncio.to_thread(self._store.current_version, ref)}"
+            current = f"{map_id}@{await asyncio.to_thread(self._store.current_version, map_id)}"
         except MapCorrupt as error:
-            self._refuse(ref, ref, error)
+            self._refuse(map_id, map_id, error)
+            before = self._maps[map_id].version
             if before is None:
                 raise
             return before
         except NotFound:
-            self._gone(ref, workers)
+            self._gone(map_id)
             raise
+        served = self._maps.setdefault(map_id, _Served())
+        before, refused = served.version, served.refused
         if before is not None and before.ref == current:
-            self._refused.pop(ref, None)
+            served.refused = None
             return before
-        if (
-            refused is not None
-            and refused.ref == current
-            and perf_counter() < refused.at + RETRY_AFTER_S
-        ):
+        if refused is not None and refused.ref == current and refused.is_recent:
             if before is not None:
                 return before
             if not isinstance(refused.error, Unavailable):
                 raise copy(refused.error)
-        task = self._taking_over.get(ref)
-        if task is None:
-            task = asyncio.create_task(self._take_over(ref, current, workers))
-            self._taking_over[ref] = task
-            task.add_done_callback(lambda _: self._taking_over.pop(ref, None))
+        if served.taking_over is None:
+            served.taking_over = asyncio.create_task(self._take_over(map_id, served, current))
         if before is not None:
-            return before  # warm, while the new one is made ready
-        await asyncio.shield(task)
-        found, refused = self._serving.get(ref), self._refused.get(ref)
-        if found is None:
-            raise copy(refused.error) if refused else _gone_meanwhile(ref)
-        return found
+            return before  # warm, while the new one is being opened
+        await asyncio.shield(served.taking_over)
+        if served.version is None:
+            raise copy(served.refused.error) if served.refused else _gone_meanwhile(map_id)
+        return served.version
 
-    async def _take_over(self, map_id: str, current: str, workers: Workers) -> None:
+    async def _take_over(self, map_id: str, served: _Served, current: str) -> None:
         try:
-            of = await self._open(current, workers)
+            version = await self._open(current)
         except VislocError as error:
             self._refuse(map_id, current, error)
         else:
-            self._serve(map_id, of, workers)
+            self._serve(map_id, version)
+        finally:
+            served.taking_over = None
 
-    def _serve(self, map_id: str, of: MapFolder, workers: Workers) -> None:
-        before = self._serving.get(map_id)
-        self._serving[map_id] = of
-        self._refused.pop(map_id, None)
-        if before is None or before.ref != of.ref:
-            logger.info("map %s is served", of.ref)
-            self._in_background(workers.run_everywhere(worker.load, of))
+    def _serve(self, map_id: str, version: MapFolder) -> None:
+        served = self._maps.setdefault(map_id, _Served())
+        before, served.version, served.refused = served.version, version, None
+        if before is None or before.ref != version.ref:
+            logger.info("map %s is served", version.ref)
+            self._in_background(self._workers.run_everywhere(Vision.load, version))
             if before is not None:
-                self._in_background(self._forget(before.ref, workers))
+                self._in_background(self._forget(before.ref))
 
     def _refuse(self, map_id: str, current: str, error: VislocError) -> None:
-        """Note that what is current cannot be served."""
-        before, known = self._serving.get(map_id), self._refused.get(map_id)
-        self._refused[map_id] = _Refused(current, error, perf_counter())
+        """Note that the current version cannot be served."""
+        served = self._maps.setdefault(map_id, _Served())
+        before, known = served.version, served.refused
+        served.refused = _Refused(current, error, perf_counter())
         if before is not None and (known is None or known.ref != current):
             logger.error(
                 "map %s cannot take over, %s stays in service: %s", current, before.ref, error
             )
 
-    def _gone(self, map_id: str, workers: Workers) -> None:
-        self._refused.pop(map_id, None)
-        before = self._serving.pop(map_id, None)
+    def _gone(self, map_id: str) -> None:
+        """Stop serving a map that was deleted."""
+        served = self._maps.get(map_id, _Served())
+        before, served.version, served.refused = served.version, None, None
+        if served.taking_over is None:
+            self._maps.pop(map_id, None)
         if before is not None:
-            self._in_background(self._forget(before.ref, workers))
+            self._in_background(self._forget(before.ref))
 
-    async def _open(self, ref: str, workers: Workers) -> MapFolder:
+    async def _open(self, ref: str) -> MapFolder:
         """Open a version in one of the processes, and warm it up."""
-        of = await self._at_hand(ref)
-        await workers.run(worker.load, of)
-        return of
+        version = await self._prepare(ref)
+        await self._workers.run(Vision.load, version)
+        return version
 
-    async def _at_hand(self, ref: str) -> MapFolder:
+    async def _prepare(self, ref: str) -> MapFolder:
         """Return a version on this machine's disk, and whether it is a set."""
         # Asked every time: copies of a remote store come and go by their use.
-        folder = await self._folder(ref)
-        if ref not in self._sets:
+        folder = await self.fetcher.folder(ref)
+        version = self._versions.get(ref)
+        outline: object = None if version is None else version.outline
+        if version is None or version.folder is None:
             outline = await asyncio.to_thread(read_any_outline, folder)
-            self._sets[ref] = outline if isinstance(outline, SetOutline) else None
-        self._known[ref] = MapFolder(ref, folder, self._sets[ref] is not None)
-        return self._known[ref]
-
-    async def _folder(self, ref: str) -> Path:
-        """Return where a version lies on this machine, fetched once for all who wait for it."""
-        at_hand = await asyncio.to_thread(self._store.at_hand, ref)
-        if at_hand is not None:
-            return at_hand
-        fetching = self._fetching.get(ref)
-        if fetching is None:
-            loop = asyncio.get_running_loop()
-            fetching = loop.run_in_executor(self._fetchers, self._store.folder, ref)
-            self._fetching[ref] = fetching
-
-            def fetched(done: asyncio.Future[Path]) -> None:
-                self._fetching.pop(ref, None)
-                if not done.cancelled():
-                    done.exception()  # seen, also when nobody waits for it any more
-
-            fetching.add_done_callback(fetched)
-        return await asyncio.shield(fetching)
+            version = self._versions.setdefault(ref, _Version())
+        version.outline = outline if isinstance(outline, SetOutline) else None
+        version.folder = MapFolder(ref, folder, version.outline is not None)
+        return version.folder
 
     def _in_background(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(work)

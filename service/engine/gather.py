@@ -1,4 +1,4 @@
-"""Several things at once: when one fails, the others are given up."""
+"""Concurrent work: when one part fails, the others are cancelled."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ T = TypeVar("T")
 
 
 async def together(work: Iterable[Coroutine[Any, Any, T]]) -> list[T]:
-    """Do all at once and return what they return, in order.
+    """Run coroutines concurrently, and return their results in order.
 
     Raises:
-        Exception: what the first of them raises that fails; the others are given up, and hold
-            nothing any more.
+        Exception: the first error; the other coroutines have been cancelled and have ended.
     """
     tasks = [asyncio.ensure_future(each) for each in work]
     try:

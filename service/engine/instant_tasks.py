@@ -1,4 +1,4 @@
-"""What the main process has workers do about the images of an instant."""
+"""The tasks that localize the images of one instant in maps."""
 
 from __future__ import annotations
 
@@ -7,27 +7,28 @@ from dataclasses import replace
 from time import time
 
 from service.engine.gather import together
-from service.values import ImageJob, Instant, InstantLocalization, Rig, RigJob
-from service.workers import process as worker
+from service.values import ImageJob, Localization, MapFolder, PackedLooks, Rig, RigJob
 from service.workers.pool import Workers
-from service.workers.process import MapFolder, Seen
+from service.workers.tasks import Vision
 from visloc.priors import Priors
 from visloc.types import LocalizeOptions
 
 
-async def solve_rig(
-    workers: Workers, job: RigJob, maps: tuple[MapFolder, ...]
-) -> InstantLocalization:
-    """Localize the images of one instant together; one that cannot be used fails alone.
+async def localize_in(workers: Workers, job: RigJob, maps: tuple[MapFolder, ...]) -> Localization:
+    """Localize a photo in one task; the images of a rig each in its own, then all together.
+
+    An image of a rig that cannot be used fails alone.
 
     Raises:
-        InvalidInput: ``rig.*``, ``options.*``, ``priors.*``.
+        InvalidInput: ``rig.*``, ``options.*``, ``priors.*``; errors of a photo on its own.
         Unavailable: ``server.worker_died``.
     """
-    bare = replace(job, images=tuple(without_photo(image) for image in job.images))
-    await workers.run(worker.check_rig, bare, maps)
-    seen = await look(workers, maps, job.rig, job.images, job.options, job.priors)
-    return await workers.run(worker.solve_rig, bare, maps, seen)
+    if job.rig is None:
+        return await workers.run(Vision.localize, job, maps, time())
+    bare = replace(job, images=without_photos(job.images))
+    await workers.run(Vision.check_rig, bare, maps)
+    looks = await look(workers, maps, job.rig, job.images, job.options, job.priors)
+    return await workers.run(Vision.solve_rig, bare, maps, looks)
 
 
 async def look(
@@ -37,20 +38,15 @@ async def look(
     images: Sequence[ImageJob],
     options: LocalizeOptions,
     priors: Priors,
-) -> list[Seen]:
-    """Look at all images of an instant."""
+) -> list[PackedLooks]:
+    """Look at all images of an instant, concurrently."""
     now = time()
     return await together(
-        workers.run(worker.look_at_image, image, maps, rig, options, priors, now)
+        workers.run(Vision.look_at_image, image, maps, rig, options, priors, now)
         for image in images
     )
 
 
-def without_photo(image: ImageJob) -> ImageJob:
-    """Return an image as far as it is checked."""
-    return replace(image, query=b"")
-
-
-def without_photos(instant: Instant) -> Instant:
-    """Return an instant as far as it is checked."""
-    return replace(instant, images=tuple(without_photo(image) for image in instant.images))
+def without_photos(images: Sequence[ImageJob]) -> tuple[ImageJob, ...]:
+    """Return images for checks that do not need their photos."""
+    return tuple(replace(image, query=b"") for image in images)

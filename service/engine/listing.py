@@ -1,14 +1,13 @@
-"""What maps and sets say about themselves, and which of them lie in a circle on Earth."""
+"""Descriptions of maps and sets, and which of them lie in a circle on Earth."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 
 from service.engine.stores import Store
-from service.workers.process import MapFolder
+from service.values import ServedMap
 from visloc.archive import MapOutline, SetOutline
 from visloc.errors import InvalidInput, MapCorrupt, NotFound, VislocError
 from visloc.priors import MAX_TILES
@@ -19,39 +18,23 @@ logger = logging.getLogger(__name__)
 
 # Most maps that one request may search.
 MAX_MAPS = 16
-# Descriptions of so many versions stay in memory, about 20 kB each; their arrays stay on disk. All
-# tiles of a set are listed again and again.
+# Descriptions that stay in memory, about 20 kB each; their arrays stay on disk. All tiles of a set
+# are listed repeatedly.
 _MAX_DESCRIBED = MAX_TILES + 1000
-# Tiles of sets that are opened at the start; others are when they are asked for. A set may have
-# thousands.
+# Tiles of sets that are opened at the start; requests open the others. A set may have thousands.
 _MAX_TILES_AT_START = 100
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ServedMap:
-    """A version of a map.
-
-    Attributes:
-        outline: what it, or a set of maps, says about itself.
-        current: whether it is the one in use.
-        versions: all published ones of the map, oldest first, and which is in use.
-    """
-
-    outline: MapOutline | SetOutline
-    current: bool
-    versions: tuple[tuple[str, bool], ...]
-
-
 class Listing:
-    """Describes what a store has. All of it blocks; safe to use from several threads.
+    """Describes the maps of a store. All methods block, and are safe in several threads.
 
     Args:
         store: where the maps are.
-        serving: what is served, by map id.
+        served_ref: returns ``id@version`` of what is served of a map; None for nothing.
     """
 
-    def __init__(self, store: Store, serving: Mapping[str, MapFolder]) -> None:
-        self._store, self._serving = store, serving
+    def __init__(self, store: Store, served_ref: Callable[[str], str | None]) -> None:
+        self._store, self._served_ref = store, served_ref
         self._described: dict[str, MapOutline | SetOutline] = {}  # by id@version
         self._set_ids = set[str]()  # of the maps that were described as sets
 
@@ -59,7 +42,7 @@ class Listing:
         """Describe ``id``, in the version that is served, or ``id@version``.
 
         Raises:
-            VislocError: what the store raises.
+            VislocError: errors of the store.
         """
         map_id, at, version = ref.partition("@")
         try:
@@ -67,8 +50,8 @@ class Listing:
         except (NotFound, MapCorrupt):
             current = ""
         if not at:
-            served = self._serving.get(map_id)
-            version = current if served is None else served.ref.partition("@")[2]
+            served = self._served_ref(map_id)
+            version = current if served is None else served.partition("@")[2]
             if not current:
                 self._store.current_version(map_id)  # raises what is wrong
         wanted = f"{map_id}@{version}"
@@ -99,7 +82,7 @@ class Listing:
         return found
 
     def forget(self, ref: str) -> None:
-        """Keep nothing of ``id@version``, which was deleted."""
+        """Drop the description of ``id@version``, which was deleted."""
         self._described.pop(ref, None)
 
     def searched_near(self, near: Near) -> tuple[str, ...]:
@@ -110,9 +93,9 @@ class Listing:
             InvalidInput: ``request.map`` when there are too many.
         """
         sets, alone = self._sets_and_others()
-        found = [of.manifest.id for of in sets if _reaches(of, near)]
+        found = [one.manifest.id for one in sets if _reaches(one, near)]
         for map_id in alone:
-            with suppress(VislocError):  # what cannot be read is nowhere
+            with suppress(VislocError):  # an unreadable map is nowhere
                 if _reaches(self.describe(map_id).outline, near):
                     found.append(map_id)
         if not found:
@@ -134,21 +117,19 @@ class Listing:
         return tuple(sorted(found))
 
     def opened_at_start(self) -> tuple[str, ...]:
-        """Say what to open at the start, and in which order.
+        """Return what to open at the start, in this order.
 
-        Returns:
-            The ids of sets and of maps that are in none; then tiles, each ``id@version``, for a
-            set names versions, whatever has become current since.
+        First the ids of sets, then of maps that are in none. Tiles come last, each ``id@version``:
+        a set names versions, which need not be current.
         """
         sets, alone = self._sets_and_others()
-        tiles = list(dict.fromkeys(tile.ref for of in sets for tile in of.tiles))
-        return (*(of.manifest.id for of in sets), *alone, *tiles[:_MAX_TILES_AT_START])
+        tiles = list(dict.fromkeys(tile.ref for one in sets for tile in one.tiles))
+        return (*(one.manifest.id for one in sets), *alone, *tiles[:_MAX_TILES_AT_START])
 
     def _sets_and_others(self) -> tuple[list[SetOutline], list[str]]:
         """Return the sets, and the ids of maps that are in none.
 
-        What a set names needs no look of its own: once the sets are known, of thousands of tiles
-        nothing is read.
+        Sets that are known come first. Their tiles, which may be thousands, are then not read.
         """
         sets, maps, tiles = list[SetOutline](), list[str](), set[str]()
         for map_id in sorted(self._store.ids(), key=lambda one: one not in self._set_ids):
@@ -171,6 +152,6 @@ def _reaches(outline: MapOutline | SetOutline, near: Near) -> bool:
     place = outline.place
     if place is None or place.distance_to(near.latitude, near.longitude) > near.radius:
         return False
-    if isinstance(outline, SetOutline):  # between its tiles, there is none of it
+    if isinstance(outline, SetOutline):  # its circle spans the gaps between its tiles
         return bool(tiles_near(outline, near.latitude, near.longitude, near.radius).any())
     return True

@@ -1,7 +1,7 @@
-"""Points and photos of maps, to be drawn: read, ordered and kept, in the main process.
+"""Points and photos of maps for drawing: read, ordered and cached in the main process.
 
-This process answers everybody, so nothing of a map is mapped into its memory: a file that is cut
-short meanwhile is an error of one request.
+Files are read, not mapped into memory: one that is truncated meanwhile is an error of one request,
+where a mapped one would end the process that answers everybody.
 """
 
 from __future__ import annotations
@@ -22,78 +22,68 @@ from visloc.archive.photos import MappingPhotos, read_photos
 from visloc.drawing.detail_levels import detail_order, read_landmarks, read_points
 from visloc.errors import VislocError
 
-# So many requests are read at once.
+# Requests that read at once.
 _THREADS = 2
-# Of the last maps that were drawn, whatever their size: to make the order of a large map again
-# takes much longer than that of a small one. Four bytes per landmark, some hundred per photo.
+# Maps whose orders and photos are kept, whatever their size: a large map takes much longer to order
+# again than a small one. Four bytes per landmark, some hundred per photo.
 _MAX_ORDERS, _MAX_PHOTOS = 4, 4
 
 T = TypeVar("T")
 
 
 class Scenes:
-    """Gives points and photos of maps. For one event loop; what takes time runs in threads.
+    """Points and photos of maps. Used from one event loop; slow work runs in threads.
 
-    A version never changes, so that what was computed of one holds as long as it is kept.
-
-    Args:
-        catalog: of the maps.
+    A version never changes, so cached results stay valid.
     """
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="scene")
-        # One order at a time, which bounds their memory, and in a thread of its own: those of
-        # large maps take long, and other maps are drawn meanwhile.
+        # One order at a time bounds the memory, and a thread of its own lets other maps be drawn
+        # while a large one is ordered.
         self._one_order = asyncio.Lock()
         self._order_thread = ThreadPoolExecutor(1, thread_name_prefix="order")
         self._orders = _Kept[NDArray[np.uint32]](_MAX_ORDERS)
         self._photos = _Kept[MappingPhotos](_MAX_PHOTOS)
 
     async def points(self, outline: MapOutline, first: int, count: int) -> bytes:
-        """Return landmarks in their order of detail, packed (docs/api.md).
+        """Return ``count`` landmarks from place ``first`` of the level-of-detail order.
 
-        Args:
-            outline: of the version.
-            first: place in the order to begin at.
-            count: most landmarks to return.
+        They are packed as in docs/api.md.
 
         Raises:
-            NotFound: ``map.version``.
-            MapCorrupt: ``map.array``, ``map.range``.
-            VislocError: what the store raises.
+            VislocError: ``map.version``, ``map.array``, ``map.range``, errors of the store.
         """
         manifest = outline.manifest
         order = await self._orders.get(manifest.content_hash, lambda: self._order(outline))
         rows = order[first : first + count].copy()  # a view would keep the whole order
-        async with self._catalog.reading(outline.ref) as of:
-            work = partial(read_points, of.folder, manifest, rows, first)
+        async with self._catalog.reading(outline.ref) as version:
+            work = partial(read_points, version.folder, manifest, rows, first)
             return await _in(self._threads, work)
 
     async def photos(self, outline: MapOutline) -> MappingPhotos:
         """Return the mapping photos of a version.
 
         Raises:
-            NotFound: ``map.version``.
-            MapCorrupt: ``map.json``, ``map.images``, ``map.array``.
-            VislocError: what the store raises.
+            VislocError: ``map.version``, ``map.json``, ``map.images``, ``map.array``, errors of the
+                store.
         """
 
         async def read() -> MappingPhotos:
-            async with self._catalog.reading(outline.ref) as of:
-                return await _in(self._threads, partial(read_photos, of.folder, outline))
+            async with self._catalog.reading(outline.ref) as version:
+                return await _in(self._threads, partial(read_photos, version.folder, outline))
 
         return await self._photos.get(outline.manifest.content_hash, read)
 
     def close(self) -> None:
-        """Let go of the threads."""
         for threads in (self._threads, self._order_thread):
             threads.shutdown(wait=False, cancel_futures=True)
 
     async def _order(self, outline: MapOutline) -> NDArray[np.uint32]:
         async with self._one_order:
-            async with self._catalog.reading(outline.ref) as of:
-                work = partial(read_landmarks, of.folder, outline.manifest)
+            async with self._catalog.reading(outline.ref) as version:
+                work = partial(read_landmarks, version.folder, outline.manifest)
                 landmarks = await _in(self._threads, work)
             return await _in(self._order_thread, partial(detail_order, landmarks))
 
@@ -103,19 +93,15 @@ async def _in(threads: Executor, work: Callable[[], T]) -> T:
 
 
 class _Kept(Generic[T]):
-    """Values by key, each made once for all who ask; the last used ones are kept.
-
-    Args:
-        most: of them.
-    """
+    """The ``most`` recently used values by key, each made once for all who wait for it."""
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self._values: dict[str, T] = {}  # the last used one is the last
+        self._values: dict[str, T] = {}  # the most recently used last
         self._making: dict[str, asyncio.Task[T]] = {}
 
     async def get(self, key: str, make: Callable[[], Awaitable[T]]) -> T:
-        """Return a value, made if need be; it goes on being made when nobody waits any more."""
+        """Return a value, made if need be. A cancelled caller does not stop it being made."""
         if key in self._values:
             self._values[key] = self._values.pop(key)
             return self._values[key]
@@ -127,7 +113,7 @@ class _Kept(Generic[T]):
         try:
             return await asyncio.shield(task)
         except VislocError as error:
-            raise copy(error) from error  # each who waits gets one of his own
+            raise copy(error) from error  # every waiting caller gets its own
 
     async def _make(self, key: str, make: Callable[[], Awaitable[T]]) -> T:
         try:

@@ -1,4 +1,4 @@
-"""The photos of a request to a set of maps, in the main process: how many are in memory at once."""
+"""The photos of a request to a set of maps; they limit how many decoded photos are in memory."""
 
 from __future__ import annotations
 
@@ -11,21 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.engine.gather import together
-from service.values import Query, ReadQuery
-from service.workers import process as worker
+from service.values import MapFolder, PackedQuery, Query
 from service.workers.pool import Workers
-from service.workers.process import MapFolder
+from service.workers.tasks import Vision
 from visloc.sets.choosing import TileScore
 from visloc.types import LocalizeOptions
 
 T = TypeVar("T")
 
 
-class Places:
-    """Room for photos that were read, which take much more memory than those that wait.
-
-    Args:
-        count: photos that may be in memory at once; a rig of more has all places.
+class Slots:
+    """Room for decoded photos, which take much more memory than encoded ones.
 
     Attributes:
         waiting: photos that wait for room.
@@ -38,11 +34,11 @@ class Places:
         self.waiting = 0
 
     async def take(self, photos: int) -> int:
-        """Wait for room; return how many places were taken."""
+        """Wait for room; return how many slots were taken, all of them for a larger rig."""
         taken = 0
         self.waiting += photos
         try:
-            # One request after the other: two that each have half of what they need wait for ever.
+            # One request after the other: two that each hold half of their slots would deadlock.
             async with self._turn:
                 while taken < min(photos, self._count):
                     await self._free.acquire()
@@ -54,38 +50,30 @@ class Places:
             self.waiting -= photos
         return taken
 
-    def give_back(self, places: int) -> None:
-        """Let other requests in."""
-        for _ in range(places):
+    def give_back(self, slots: int) -> None:
+        for _ in range(slots):
             self._free.release()
 
 
 class SetPhotos:
-    """The photos of a request to a set, which hold room from when they are read to the end.
-
-    Args:
-        places: where room is taken.
-        workers: read them.
-        of: the set.
-        queries: the photos as they came.
-        options: how features are found.
+    """The photos of a request to a set. Within ``async with``, they hold slots.
 
     Attributes:
-        queries: the photos, read where they could be.
+        queries: the photos, packed where they could be decoded.
     """
 
     def __init__(
         self,
-        places: Places,
+        slots: Slots,
         workers: Workers,
-        of: MapFolder,
+        map_set: MapFolder,
         queries: Sequence[Query],
         options: LocalizeOptions,
     ) -> None:
-        self._places, self._workers, self._of, self._options = places, workers, of, options
-        self._asked = self.queries = tuple(queries)
+        self._slots, self._workers, self._set, self._options = slots, workers, map_set, options
+        self._sent = self.queries = tuple(queries)
         self._submitted = time()
-        self._places_held = 0
+        self._num_slots = 0
 
     async def __aenter__(self) -> SetPhotos:
         await self._enter()
@@ -95,38 +83,37 @@ class SetPhotos:
         self._leave()
 
     @property
-    def seen(self) -> bool:
-        """Whether any of the photos could be read."""
-        return any(isinstance(query, ReadQuery) for query in self.queries)
+    def any_decoded(self) -> bool:
+        return any(isinstance(query, PackedQuery) for query in self.queries)
 
     async def rank(self, allowed: NDArray[np.bool_] | None) -> list[tuple[TileScore, ...]]:
-        """Read the photos, unless they are, and rank tiles by each.
+        """Decode the photos, unless they are, and rank tiles by each.
 
         Args:
             allowed: (T,) the tiles to rank; None to rank none.
         """
-        chosen = await together(
+        ranked = await together(
             self._workers.run(
-                worker.choose_tiles, query, self._of, self._options, allowed, self._submitted
+                Vision.rank_tiles, query, self._set, self._options, allowed, self._submitted
             )
             for query in self.queries
         )
-        self.queries = tuple(one.query for one in chosen)
+        self.queries = tuple(one.query for one in ranked)
         self._submitted = time()  # the next wait begins here
-        return [one.scores for one in chosen]
+        return [one.scores for one in ranked]
 
     async def aside(self, work: Awaitable[T]) -> T:
-        """Wait for something long; meanwhile no photo is kept, they are read again after it."""
-        self.queries = self._asked
+        """Give the slots back during long work; decode the photos again after it."""
+        self.queries = self._sent
         self._leave()
-        found = await work
+        result = await work
         await self._enter()
         await self.rank(None)
-        return found
+        return result
 
     async def _enter(self) -> None:
-        self._places_held = await self._places.take(len(self._asked))
+        self._num_slots = await self._slots.take(len(self._sent))
 
     def _leave(self) -> None:
-        held, self._places_held = self._places_held, 0
-        self._places.give_back(held)
+        held, self._num_slots = self._num_slots, 0
+        self._slots.give_back(held)

@@ -1,7 +1,7 @@
-"""A sequence through a set of maps, in the main process: in legs, each of one tile.
+"""A sequence through a set of maps, in the main process: in legs, each in one tile.
 
-A leg begins with an instant that the tile localizes, and lasts as long as no other tile has to.
-Instants of two legs know nothing of each other: gaps are filled within a leg.
+A leg begins with an instant that the tile localizes, and ends when another tile takes over. Gaps
+are filled within a leg, never across two.
 """
 
 from __future__ import annotations
@@ -22,21 +22,25 @@ from service.engine.sets import (
     Choice,
     SetSearch,
     in_set,
+    priors_in,
     rig_in,
     tile_unavailable,
     with_queries,
 )
 from service.values import (
     Instant,
-    InstantLocalization,
+    Localization,
+    MapFolder,
+    PackedLooks,
+    PackedSequence,
     Query,
     RigJob,
     SequenceStart,
+    SequenceStep,
     check_order,
 )
-from service.workers import process as worker
 from service.workers.pool import Workers
-from service.workers.process import MapFolder, Seen
+from service.workers.tasks import Vision
 from visloc.archive import SetOutline
 from visloc.errors import InvalidInput, NotFound, Unavailable, VislocError, inside
 from visloc.pose.centre import moved_pose
@@ -49,48 +53,31 @@ from visloc.types import RigPose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Leg:
-    """A run of instants in one tile.
-
-    Attributes:
-        row: of the tile.
-        folder: where the tile lies.
-        start: what its instants share, in the tile's frame.
-        state: what only worker processes read.
-    """
+    """A run of instants in the tile of this row; ``start`` is in the tile's frame."""
 
     row: int
     folder: MapFolder
     start: SequenceStart
-    state: bytes
+    sequence: PackedSequence
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Looked:
-    """An instant that was looked at in a tile, not added to the leg yet.
+class _Pending:
+    """An instant that was looked at in a tile, and is not added to the leg yet.
 
     Attributes:
-        leg: as it was checked with the instant.
         instant: without photos.
-        seen: what its images show.
         priors: in the tile's frame.
     """
 
     leg: _Leg
     instant: Instant
-    seen: list[Seen]
+    looks: list[PackedLooks]
     priors: Priors
 
 
 class SetSequence:
-    """One sequence that is localized in a set.
-
-    Args:
-        search: of sets.
-        catalog: gives the tiles.
-        workers: do the work.
-        start: what all instants share.
-        of: the set.
-    """
+    """One sequence that is localized in a set."""
 
     def __init__(
         self,
@@ -98,36 +85,28 @@ class SetSequence:
         catalog: Catalog,
         workers: Workers,
         start: SequenceStart,
-        of: MapFolder,
+        map_set: MapFolder,
     ) -> None:
         self._search, self._catalog, self._workers = search, catalog, workers
-        self._start, self._of = start, of
-        self._outline: SetOutline = catalog.set_outline(of)
+        self._start, self._set = start, map_set
+        self._outline: SetOutline = catalog.set_outline(map_set)
         self._within: NDArray[np.bool_] | None = None
         self._leg: _Leg | None = None
         self._track: Track | None = None
-        self._held = AsyncExitStack()  # keeps the tile of the leg
+        self._held = AsyncExitStack()  # holds the tile of the leg
 
     def check(self, instants: Sequence[Instant]) -> None:
-        """Refuse what can be told of instants before any is worked on, whatever their tiles.
-
-        Raises:
-            InvalidInput: ``sequence.timestamps``, ``priors.maps``.
-        """
+        """Refuse instants that no tile can take, before any work."""
         for index, (before, instant) in enumerate(pairwise(instants), start=1):
             with inside(f"instants[{index}]"):
                 check_order(before.timestamp, instant.timestamp)
         for index, instant in enumerate(instants):
             self._check_names(index, instant)
 
-    async def answers(
-        self, instants: AsyncIterator[Instant]
-    ) -> AsyncGenerator[InstantLocalization]:
+    async def answers(self, instants: AsyncIterator[Instant]) -> AsyncGenerator[Localization]:
         """Answer instants in order, each as soon as its answer is final.
 
-        Raises:
-            InvalidInput: as ``Engine.localize_sequence``.
-            Unavailable: as ``SetSearch.search``.
+        Errors are those of ``Engine.localize_sequence`` and ``SetSearch.search``.
         """
         self._within = await self._search.within(self._outline, self._start.maps)
         self._check_tiles(self._start.priors)
@@ -145,7 +124,7 @@ class SetSequence:
             if index == 0:
                 raise InvalidInput("sequence.empty", "there is no instant", field="instants")
         except VislocError:
-            # What is wrong with one instant does not take the answers of those before it along.
+            # An error of one instant does not discard the answers before it.
             for answer in await self._finish():
                 yield answer
             raise
@@ -155,25 +134,25 @@ class SetSequence:
         finally:
             await self._held.aclose()
 
-    async def _add(self, index: int, instant: Instant) -> AsyncGenerator[InstantLocalization]:
-        """Take one more instant; give the answers that are final now."""
+    async def _add(self, index: int, instant: Instant) -> AsyncGenerator[Localization]:
+        """Take the next instant; give the answers that are final now."""
         if self._track is not None:
             self._track = self._track.moved(instant.odometry)
         self._check_names(index, instant)
         queries = [image.query for image in instant.images]
         leg = self._leg
-        async with self._search.reading(self._of, queries, self._start.options) as photos:
+        async with self._search.decoding(self._set, queries, self._start.options) as photos:
             if leg is None:
                 begins = await self._anywhere(index, instant, photos)
             else:
                 await photos.rank(None)
                 images = with_queries(instant.images, photos.queries)
-                looked = await self._look(index, replace(instant, images=images), leg)
-                added = await self._added(looked)
+                pending = await self._look(index, replace(instant, images=images), leg)
+                added = await self._added(pending)
                 begins = None
                 if added.pose is None:
                     begins = await self._elsewhere(index, instant, photos, leg)
-        if isinstance(begins, InstantLocalization):
+        if isinstance(begins, Localization):
             yield begins
         elif begins is not None:
             for answer in await self._finish():
@@ -181,14 +160,14 @@ class SetSequence:
             for answer in await self._begin(begins):
                 yield answer
         elif leg is not None:
-            self._leg = replace(leg, state=added.state)
+            self._leg = replace(leg, sequence=added.sequence)
             if added.pose is not None:
                 self._follow(leg, instant, added.pose)
             for answer in self._in_set(leg, added.answers):
                 yield answer
 
     def _check_names(self, index: int, instant: Instant) -> None:
-        """Refuse names of tiles that the set does not have, also while a leg goes on."""
+        """Refuse names of tiles that the set does not have, also within a leg."""
         if instant.priors is not None:
             with inside(f"instants[{index}]"):
                 self._check_tiles(instant.priors)
@@ -198,14 +177,14 @@ class SetSequence:
             allowed_tiles(self._outline, Priors(maps=priors.maps))
 
     def _priors_in(self, row: int, priors: Priors) -> Priors:
-        """Say what priors mean in a tile, which may be none of those that they name."""
-        found = self._search.priors_in(self._outline, self._outline.tiles[row], priors)
-        return replace(found, maps=priors.maps)
+        """Move priors to a tile's frame; the tile may be none of those that they name."""
+        moved = priors_in(self._outline, self._outline.tiles[row], priors)
+        return replace(moved, maps=priors.maps)
 
     async def _anywhere(
         self, index: int, instant: Instant, photos: SetPhotos
-    ) -> _Looked | InstantLocalization:
-        """Search the first instant of a leg: looked at in a tile that localizes it, or why not."""
+    ) -> _Pending | Localization:
+        """Search all tiles for the first instant of a leg; return the refusal if none has it."""
         priors = self._start.priors if instant.priors is None else instant.priors
         with inside(f"instants[{index}]"):
             try:
@@ -215,22 +194,22 @@ class SetSequence:
                 allowed = np.zeros(len(self._outline.tiles), np.bool_)
                 allowed[nearest_tile(self._outline, priors, self._within)] = True
         choice = await self._search.choose(photos, allowed)
-        looked, found = await self._searched(index, instant, photos, choice)
-        return found if found.answer.pose is None else looked
+        pending, found = await self._searched(index, instant, photos, choice)
+        return found if found.answer.pose is None else pending
 
     async def _elsewhere(
         self, index: int, instant: Instant, photos: SetPhotos, leg: _Leg
-    ) -> _Looked | None:
-        """Search an instant in the tiles but that of the leg, which does not localize it.
+    ) -> _Pending | None:
+        """Search an instant that the leg's tile does not localize in the other tiles.
 
         Returns:
-            It, looked at in a tile that begins a new leg with it; None when it stays in the leg:
-            no other tile may be where the device is, or says so clearly enough.
+            The instant in a tile that begins a new leg with it. None when it stays in the leg,
+            because no other tile is allowed, or none localizes it clearly enough.
         """
         track, priors = self._track, instant.priors or self._start.priors
         seconds = self._seconds_since(track, instant)
         if seconds > self._start.max_gap_s:
-            track = None  # nothing is known of it any more
+            track = None  # too old to say anything
         with inside(f"instants[{index}]"):
             try:
                 allowed = allowed_tiles(self._outline, priors, self._within)
@@ -240,15 +219,15 @@ class SetSequence:
             except NotFound:
                 return None
         allowed[leg.row] = False
-        if not photos.seen or not allowed.any():
+        if not photos.any_decoded or not allowed.any():
             return None
         choice = await self._search.choose(photos, allowed)
         if choice.blind:
             return None
         try:
-            looked, found = await self._searched(index, instant, photos, choice)
+            pending, found = await self._searched(index, instant, photos, choice)
         except (InvalidInput, NotFound):
-            return None  # the leg's tile takes what they do not, say a rig that only it knows
+            return None  # the leg's tile takes the instant, say because only it knows the rig
         except Unavailable as error:
             if error.code != "set.tile_unavailable":
                 raise
@@ -257,37 +236,37 @@ class SetSequence:
         if pose is None:
             return None
         if track is None or (is_clear(found.answer) and not track.knows_motion):
-            return looked
-        reach = float(self._outline.reaches[[leg.row, looked.leg.row]].max())
+            return pending
+        reach = float(self._outline.reaches[[leg.row, pending.leg.row]].max())
         if track.allows(pose.rig_from_world, pose.covariance, seconds, reach):
-            return looked
+            return pending
         return None
 
     async def _searched(
         self, index: int, instant: Instant, photos: SetPhotos, choice: Choice
-    ) -> tuple[_Looked, InstantLocalization]:
-        """Search an instant in tiles: looked at in one, and what the set says of it."""
-        looked: dict[int, _Looked] = {}
+    ) -> tuple[_Pending, Localization]:
+        """Search an instant in tiles; return it in the best one, with the answer."""
+        pending: dict[int, _Pending] = {}
 
-        async def ask(row: int, folder: MapFolder, queries: Sequence[Query]) -> InstantLocalization:
+        async def ask(row: int, folder: MapFolder, queries: Sequence[Query]) -> Localization:
             asked = replace(instant, images=with_queries(instant.images, queries))
-            seen = looked[row] = await self._look(index, asked, await self._leg_in(row, folder))
+            one = pending[row] = await self._look(index, asked, await self._leg_in(row, folder))
             job = RigJob(
                 self._start.maps,
-                seen.leg.start.rig,
-                seen.instant.images,
+                one.leg.start.rig,
+                one.instant.images,
                 instant.timestamp,
                 self._start.options,
-                seen.priors,
+                one.priors,
                 ypr=self._start.ypr,
             )
-            return await self._workers.run(worker.solve_rig, job, (folder,), seen.seen)
+            return await self._workers.run(Vision.solve_rig, job, (folder,), one.looks)
 
         row, found = await self._search.search(self._outline, choice, photos, ask)
-        return looked[row], found
+        return pending[row], found
 
     def _seconds_since(self, track: Track | None, instant: Instant) -> float:
-        """Time since the device was last measured; endless when it never was."""
+        """Return the time since the last measured pose; infinite without one."""
         if track is None:
             return math.inf
         unit = self._start.time_unit or guess_time_unit([track.timestamp])
@@ -295,7 +274,7 @@ class SetSequence:
         return (instant.timestamp - track.timestamp) * unit.seconds
 
     def _follow(self, leg: _Leg, instant: Instant, measured: RigPose) -> None:
-        """Note where the device was measured, unless that contradicts how it moved."""
+        """Update the track with a measured pose, unless the known motion contradicts it."""
         tile = self._outline.tiles[leg.row]
         moved = tile.set_from_tile.similarity
         pose, covariance = moved_pose(measured.rig_from_world, measured.covariance, moved)
@@ -306,72 +285,66 @@ class SetSequence:
                 return
         metre = 1.0 if self._outline.manifest.world.metric else None
         if instant.odometry is not None:
-            metre = moved.scale  # of a metric map, else it would have been refused
+            metre = moved.scale  # the map is metric: others refuse odometry
         self._track = Track.begun(instant.timestamp, pose, covariance, metre, instant.odometry)
 
     async def _leg_in(self, row: int, folder: MapFolder) -> _Leg:
-        """Begin a leg that has no instant yet."""
+        """Return a leg without instants."""
         tile = self._outline.tiles[row]
         priors = self._priors_in(row, self._start.priors)
         start = replace(self._start, rig=rig_in(tile, self._start.rig), priors=priors)
-        state = await self._workers.run(worker.open_sequence, start, (folder,))
-        return _Leg(row, folder, start, state)
+        sequence = await self._workers.run(Vision.open_sequence, start, (folder,))
+        return _Leg(row, folder, start, sequence)
 
-    async def _look(self, index: int, instant: Instant, leg: _Leg) -> _Looked:
+    async def _look(self, index: int, instant: Instant, leg: _Leg) -> _Pending:
         """Look at the images of an instant in the tile of a leg."""
-        bare = without_photos(instant)
+        bare = replace(instant, images=without_photos(instant.images))
         if bare.priors is not None:
             bare = replace(bare, priors=self._priors_in(leg.row, bare.priors))
         maps = (leg.folder,)
-        state, known = await self._workers.run(
-            worker.check_instants, leg.state, maps, index, [bare]
+        sequence, (priors,) = await self._workers.run(
+            Vision.check_instants, leg.sequence, maps, index, [bare]
         )
         options = self._start.options
-        seen = await look(self._workers, maps, leg.start.rig, instant.images, options, known[0])
-        return _Looked(replace(leg, state=state), bare, seen, known[0])
+        looks = await look(self._workers, maps, leg.start.rig, instant.images, options, priors)
+        return _Pending(replace(leg, sequence=sequence), bare, looks, priors)
 
-    async def _added(self, looked: _Looked) -> worker.Added:
-        leg = looked.leg
+    async def _added(self, pending: _Pending) -> SequenceStep:
+        leg = pending.leg
         return await self._workers.run(
-            worker.add_instant,
-            leg.state,
+            Vision.add_instant,
+            leg.sequence,
             (leg.folder,),
-            looked.instant,
-            looked.seen,
-            looked.priors,
+            pending.instant,
+            pending.looks,
+            pending.priors,
         )
 
-    async def _begin(self, looked: _Looked) -> list[InstantLocalization]:
-        """Begin a leg with an instant; the tile stays until the leg ends.
-
-        Raises:
-            Unavailable: ``set.tile_unavailable`` when the tile is gone again.
-        """
-        tile = self._outline.tiles[looked.leg.row]
-        using = self._catalog.using((tile.ref,), self._workers)
+    async def _begin(self, pending: _Pending) -> list[Localization]:
+        """Begin a leg with an instant, and hold the tile until the leg ends."""
+        tile = self._outline.tiles[pending.leg.row]
+        using = self._catalog.using((tile.ref,))
         try:
             (folder,) = await self._held.enter_async_context(using)
         except NotFound as error:
             raise tile_unavailable(tile, error) from error
-        leg = replace(looked.leg, folder=folder)
-        added = await self._added(replace(looked, leg=leg))
-        self._leg = replace(leg, state=added.state)
+        leg = replace(pending.leg, folder=folder)
+        added = await self._added(replace(pending, leg=leg))
+        self._leg = replace(leg, sequence=added.sequence)
         self._track = None
         if added.pose is not None:
-            self._follow(leg, looked.instant, added.pose)
+            self._follow(leg, pending.instant, added.pose)
         return self._in_set(leg, added.answers)
 
-    async def _finish(self) -> list[InstantLocalization]:
-        """End the leg; return the answers that waited for instants which will not come."""
+    async def _finish(self) -> list[Localization]:
+        """End the leg, and return its remaining answers."""
         leg, self._leg = self._leg, None
         if leg is None:
             return []
-        answers = await self._workers.run(worker.finish_sequence, leg.state, (leg.folder,))
+        answers = await self._workers.run(Vision.finish_sequence, leg.sequence, (leg.folder,))
         await self._held.aclose()
         return self._in_set(leg, answers)
 
-    def _in_set(
-        self, leg: _Leg, answers: Sequence[InstantLocalization]
-    ) -> list[InstantLocalization]:
+    def _in_set(self, leg: _Leg, answers: Sequence[Localization]) -> list[Localization]:
         tile = self._outline.tiles[leg.row]
         return [in_set(answer, self._outline, tile) for answer in answers]

@@ -1,7 +1,8 @@
-"""Sets of maps, in the main process: which tiles are searched, and one answer of theirs.
+"""Sets of maps, in the main process: which tiles are searched, and the judged answer.
 
-A worker process reads a photo once and ranks the tiles that the priors allow; the best are searched
-as any map is, with what was read; what they say is put into the set's frame and judged together.
+A worker process decodes a photo once, finds its features, and ranks the tiles that the priors
+allow. The best tiles are searched like any map, with those features. Their answers are moved to the
+set's frame and judged together.
 """
 
 from __future__ import annotations
@@ -10,66 +11,41 @@ import asyncio
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from dataclasses import dataclass, replace
-from time import time
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.engine.catalog import Catalog
 from service.engine.gather import together
-from service.engine.instant_tasks import solve_rig
-from service.engine.set_photos import Places, SetPhotos
+from service.engine.instant_tasks import localize_in
+from service.engine.set_photos import SetPhotos, Slots
 from service.telemetry.metrics import Metrics
-from service.values import (
-    ImageJob,
-    InstantLocalization,
-    Localization,
-    LocalizeJob,
-    Query,
-    Rig,
-    RigJob,
-    Where,
-)
-from service.workers import process as worker
-from service.workers.judging import AnyLocalization, judged
+from service.values import ImageJob, Localization, MapFolder, Query, Rig, RigJob, Where
+from service.workers.judging import judged
 from service.workers.pool import Workers
-from service.workers.process import MapFolder
 from visloc.archive import SetOutline, TileRecord
 from visloc.archive.places import anchor_rms
-from visloc.errors import (
-    Conflict,
-    InvalidInput,
-    MapCorrupt,
-    NotFound,
-    Unavailable,
-    VislocError,
-)
+from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound, Unavailable, VislocError
 from visloc.priors import Priors
-from visloc.sets.choosing import (
-    TileScore,
-    allowed_tiles,
-    is_clear,
-    plan,
-    tiles_near,
-)
+from visloc.sets.choosing import TileScore, allowed_tiles, is_clear, plan, tiles_near
 from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
-from visloc.types import Localized, LocalizeOptions, Near
+from visloc.types import LocalizeOptions, Near
 
-T = TypeVar("T")
-
-# Codes that begin so say that a map cannot be had, when nothing is wrong with the map itself.
+# Errors of reaching a map, not of the map itself, have codes that begin so.
 _OF_A_MAP = ("map.", "maps.")
+
+# Searches one tile, given by its row and folder, in the tile's own frame.
+AskTile = Callable[[int, MapFolder, Sequence[Query]], Awaitable[Localization]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Choice:
-    """Where to look for what a caller asked of a set.
+    """The tiles to search, by row.
 
     Attributes:
-        first: rows of the tiles to search.
-        rest: those to search when none of the first has a clear answer.
-        blind: whether the photos say nothing of where that is.
+        rest: to search when none of the first has a clear answer.
+        blind: whether the photos ranked no tile.
     """
 
     first: tuple[int, ...]
@@ -78,85 +54,60 @@ class Choice:
 
 
 class SetSearch:
-    """Searches sets of maps. Used from one event loop.
-
-    Args:
-        catalog: gives the tiles.
-        workers: do the work.
-        metrics: count the tiles that were searched.
-    """
+    """Searches sets of maps. Used from one event loop."""
 
     def __init__(self, catalog: Catalog, workers: Workers, metrics: Metrics) -> None:
         self._catalog, self._workers, self._metrics = catalog, workers, metrics
-        self._places = Places(workers.count + 1)
+        self._slots = Slots(workers.count + 1)
 
     @property
     def waiting(self) -> int:
-        """Photos that nobody has read yet."""
-        return self._places.waiting
+        """Photos that wait for room to be decoded."""
+        return self._slots.waiting
 
-    def reading(
-        self, of: MapFolder, queries: Sequence[Query], options: LocalizeOptions
+    def decoding(
+        self, map_set: MapFolder, queries: Sequence[Query], options: LocalizeOptions
     ) -> SetPhotos:
-        """Make room for photos, within a block ``async with``."""
-        return SetPhotos(self._places, self._workers, of, queries, options)
+        """Return photos that hold room to be decoded within ``async with``."""
+        return SetPhotos(self._slots, self._workers, map_set, queries, options)
 
     async def within(self, outline: SetOutline, where: Where) -> NDArray[np.bool_] | None:
-        """Tell which tiles (T,) are asked for; None for all."""
+        """Return which tiles (T,) lie near the place that is named; None without a place."""
         if not isinstance(where, Near):
             return None
-        # Of ten thousand tiles, it takes a moment.
+        # With ten thousand tiles, it takes a moment.
         return await asyncio.to_thread(
             tiles_near, outline, where.latitude, where.longitude, where.radius
         )
 
-    async def localize(self, job: LocalizeJob, of: MapFolder) -> Localization:
-        """Localize a photo, or its features, in a set.
+    async def localize(self, job: RigJob, map_set: MapFolder) -> Localization:
+        """Localize a photo, or the images of a rig, in a set.
 
         Raises:
-            InvalidInput: ``priors.*``, and what the tiles' maps raise.
             NotFound: ``set.no_tile`` when the priors allow no tile.
-            Unavailable: ``set.tile_unavailable``, ``server.worker_died``.
+            VislocError: errors of ``search`` and of the tiles' maps.
         """
-        outline = self._catalog.set_outline(of)
+        outline = self._catalog.set_outline(map_set)
         allowed = allowed_tiles(outline, job.priors, await self.within(outline, job.maps))
 
         async def ask(row: int, folder: MapFolder, queries: Sequence[Query]) -> Localization:
-            priors = self.priors_in(outline, outline.tiles[row], job.priors)
-            asked = replace(job, query=queries[0], priors=priors)
-            return await self._workers.run(worker.localize, asked, (folder,), time())
-
-        async with self.reading(of, [job.query], job.options) as photos:
-            choice = await self.choose(photos, allowed)
-            _, found = await self.search(outline, choice, photos, ask)
-            return found
-
-    async def localize_rig(self, job: RigJob, of: MapFolder) -> InstantLocalization:
-        """Localize the images of one instant together in a set; errors as of ``localize``."""
-        outline = self._catalog.set_outline(of)
-        allowed = allowed_tiles(outline, job.priors, await self.within(outline, job.maps))
-
-        async def ask(row: int, folder: MapFolder, queries: Sequence[Query]) -> InstantLocalization:
             tile = outline.tiles[row]
             asked = replace(
                 job,
                 images=with_queries(job.images, queries),
                 rig=rig_in(tile, job.rig),
-                priors=self.priors_in(outline, tile, job.priors),
+                priors=priors_in(outline, tile, job.priors),
             )
-            return await solve_rig(self._workers, asked, (folder,))
+            return await localize_in(self._workers, asked, (folder,))
 
         queries = [image.query for image in job.images]
-        async with self.reading(of, queries, job.options) as photos:
+        async with self.decoding(map_set, queries, job.options) as photos:
             choice = await self.choose(photos, allowed)
             _, found = await self.search(outline, choice, photos, ask)
             return found
 
     async def choose(self, photos: SetPhotos, allowed: NDArray[np.bool_]) -> Choice:
-        """Read photos, and say which of the allowed tiles to search.
-
-        Photos of one instant count together: by the sum of what they say of a tile.
-        """
+        """Decode photos, and choose among the allowed tiles by the sum of the photos' scores."""
         rows = np.flatnonzero(allowed)
         scores: dict[int, float] = defaultdict(float)
         for ranked in await photos.rank(allowed if len(rows) > 1 else None):
@@ -165,40 +116,30 @@ class SetSearch:
         best_first = sorted(scores, key=lambda tile: -scores[tile])
         if best_first:
             return Choice(*plan([TileScore(tile, scores[tile]) for tile in best_first]))
-        # What shows nothing is told so by any tile.
-        return Choice((int(rows[0]),), (), blind=len(rows) > 1 or not photos.seen)
-
-    def priors_in(self, outline: SetOutline, tile: TileRecord, priors: Priors) -> Priors:
-        """Say what priors of the set's frame mean in that of a tile."""
-        return priors_in_tile(priors, tile.set_from_tile.similarity, outline.gravity)
+        # Any tile can report that a photo shows nothing.
+        return Choice((int(rows[0]),), (), blind=len(rows) > 1 or not photos.any_decoded)
 
     async def search(
         self,
         outline: SetOutline,
         choice: Choice,
         photos: SetPhotos,
-        ask: Callable[[int, MapFolder, Sequence[Query]], Awaitable[AnyLocalization]],
-    ) -> tuple[int, AnyLocalization]:
-        """Search tiles, and judge what they say.
+        ask: AskTile,
+    ) -> tuple[int, Localization]:
+        """Search tiles, and judge their answers.
 
-        A tile that cannot be asked what is asked, say for a rig that it does not know, does not
-        count as long as others answer.
-
-        Args:
-            outline: of the set.
-            choice: where to look.
-            photos: what to look for.
-            ask: searches one tile, given by its row, in its own frame.
+        A tile that refuses the query, say because it does not know the rig, is ignored as long as
+        others answer.
 
         Returns:
-            The row of a tile, and one answer, in the set's frame.
+            The row of a tile, and its answer in the set's frame.
 
         Raises:
             Unavailable: ``set.tile_unavailable`` for a tile that cannot be opened, unless another
                 one has a clear answer.
-            VislocError: what ``ask`` raises of every tile.
+            VislocError: the error of ``ask`` when every tile raises one.
         """
-        found: list[tuple[int, AnyLocalization]] = []
+        found: list[tuple[int, Localization]] = []
         missing: list[tuple[TileRecord, VislocError]] = []
         unfit: list[VislocError] = []
         for rows in (choice.first, choice.rest):
@@ -224,18 +165,19 @@ class SetSearch:
         outline: SetOutline,
         rows: Sequence[int],
         photos: SetPhotos,
-        ask: Callable[[int, MapFolder, Sequence[Query]], Awaitable[AnyLocalization]],
-    ) -> list[tuple[int, AnyLocalization | VislocError]]:
-        """Search tiles at once; of one that cannot be asked, say why."""
-        away = await self._catalog.away([outline.tiles[row].ref for row in rows])
-        failed = await photos.aside(self._catalog.fetch(away)) if away else {}
+        ask: AskTile,
+    ) -> list[tuple[int, Localization | VislocError]]:
+        """Search tiles concurrently; return the error of one that cannot be searched."""
+        fetcher = self._catalog.fetcher
+        away = await fetcher.away([outline.tiles[row].ref for row in rows])
+        failed = await photos.aside(fetcher.fetch(away)) if away else {}
 
-        async def of(row: int) -> tuple[int, AnyLocalization | VislocError]:
+        async def search(row: int) -> tuple[int, Localization | VislocError]:
             tile = outline.tiles[row]
             if tile.ref in failed:
                 return row, failed[tile.ref]
             try:
-                async with self._catalog.using((tile.ref,), self._workers) as (folder,):
+                async with self._catalog.using((tile.ref,)) as (folder,):
                     return row, in_set(await ask(row, folder, photos.queries), outline, tile)
             except (InvalidInput, NotFound) as error:
                 return row, error
@@ -244,11 +186,11 @@ class SetSearch:
                     raise
                 return row, error
 
-        return await together(of(row) for row in rows)
+        return await together(search(row) for row in rows)
 
 
 def tile_unavailable(tile: TileRecord, error: VislocError) -> Unavailable:
-    """``set.tile_unavailable``."""
+    """Return the error for a tile that cannot be opened."""
     return Unavailable(
         "set.tile_unavailable",
         f"a tile of the set that may show this cannot be opened: {error.message}",
@@ -262,14 +204,14 @@ def _says_tile_is_away(error: VislocError) -> bool:
     return isinstance(error, MapCorrupt | Conflict) or error.code.startswith(_OF_A_MAP)
 
 
-async def answers_of(searches: Sequence[Coroutine[Any, Any, T]]) -> list[T]:
-    """Search maps and sets at once; a set of which the priors leave nothing does not count.
+async def answers_of(searches: Sequence[Coroutine[Any, Any, Localization]]) -> list[Localization]:
+    """Search maps and sets concurrently; ignore sets of which the priors allow no tile.
 
     Raises:
         NotFound: ``set.no_tile`` when nothing else is searched.
     """
 
-    async def of(search: Coroutine[Any, Any, T]) -> T | NotFound:
+    async def answer_of(search: Coroutine[Any, Any, Localization]) -> Localization | NotFound:
         try:
             return await search
         except NotFound as error:
@@ -277,7 +219,7 @@ async def answers_of(searches: Sequence[Coroutine[Any, Any, T]]) -> list[T]:
                 raise
             return error
 
-    found = await together(of(search) for search in searches)
+    found = await together(answer_of(search) for search in searches)
     answers = [each for each in found if not isinstance(each, NotFound)]
     nothing = [each for each in found if isinstance(each, NotFound)]
     if not answers:
@@ -288,39 +230,35 @@ async def answers_of(searches: Sequence[Coroutine[Any, Any, T]]) -> list[T]:
 def parted(
     maps: Sequence[MapFolder], priors: Priors
 ) -> tuple[tuple[MapFolder, ...], tuple[MapFolder, ...]]:
-    """Part sets of maps from maps on their own.
-
-    Raises:
-        InvalidInput: ``priors.maps`` when it names tiles where there is none.
-    """
-    sets = tuple(of for of in maps if of.is_set)
-    alone = tuple(of for of in maps if not of.is_set)
+    """Separate sets of maps from maps on their own, for which priors must not name tiles."""
+    sets = tuple(each for each in maps if each.is_set)
+    alone = tuple(each for each in maps if not each.is_set)
     if alone:
         check_no_tiles(alone, priors)
     return sets, alone
 
 
 def check_no_tiles(maps: Sequence[MapFolder], priors: Priors) -> None:
-    """Refuse priors that name tiles for maps that have none.
-
-    Raises:
-        InvalidInput: ``priors.maps``.
-    """
+    """Refuse priors that name tiles for maps that have none."""
     if priors.maps is not None:
         raise InvalidInput(
             "priors.maps",
             "only a set of maps has tiles",
             field="priors.maps",
             expected="a set of maps, or none of this",
-            got=", ".join(of.ref for of in maps),
+            got=", ".join(each.ref for each in maps),
         )
 
 
-def in_set(found: AnyLocalization, outline: SetOutline, tile: TileRecord) -> AnyLocalization:
-    """Move what a tile answered to the set's frame, and name both."""
-    moved = tile.set_from_tile.similarity
-    found = replace(
+def in_set(found: Localization, outline: SetOutline, tile: TileRecord) -> Localization:
+    """Move a tile's answer to the set's frame, and name both."""
+    moved, debug = tile.set_from_tile.similarity, found.debug
+    if debug is not None:
+        debug = replace(debug, points=moved.apply(debug.points))
+    return replace(
         found,
+        answer=answer_in_set(found.answer, moved),
+        debug=debug,
         map_id=outline.manifest.id,
         map_version=outline.manifest.version,
         geodetic=outline.geodetic,
@@ -328,18 +266,15 @@ def in_set(found: AnyLocalization, outline: SetOutline, tile: TileRecord) -> Any
         reach=tile.reach,
         anchor_rms=anchor_rms(outline.manifest.world),
     )
-    if isinstance(found, InstantLocalization):
-        return replace(found, answer=answer_in_set(found.answer, moved))
-    debug = found.debug
-    if debug is not None:
-        debug = replace(debug, points=moved.apply(debug.points))
-    if isinstance(found.answer, Localized):
-        return replace(found, answer=answer_in_set(found.answer, moved), debug=debug)
-    return replace(found, debug=debug)
+
+
+def priors_in(outline: SetOutline, tile: TileRecord, priors: Priors) -> Priors:
+    """Move priors from the set's frame to a tile's."""
+    return priors_in_tile(priors, tile.set_from_tile.similarity, outline.gravity)
 
 
 def rig_in(tile: TileRecord, rig: Rig | None) -> Rig | None:
-    """Return a rig in the unit of a tile; one that the tile itself knows is in that already."""
+    """Return a rig in the unit of a tile, which a rig known to the tile already has."""
     if rig is None or isinstance(rig, str):
         return rig
     unit = tile.set_from_tile.similarity.inverse().scale
@@ -350,5 +285,5 @@ def rig_in(tile: TileRecord, rig: Rig | None) -> Rig | None:
 
 
 def with_queries(images: Sequence[ImageJob], queries: Sequence[Query]) -> tuple[ImageJob, ...]:
-    """Return images that were read."""
+    """Return images with other queries: their photos, decoded."""
     return tuple(replace(image, query=query) for image, query in zip(images, queries, strict=True))

@@ -1,4 +1,4 @@
-"""Where maps come from: a folder, or a URL that fsspec knows."""
+"""The store of maps: a folder, or a URL that fsspec supports."""
 
 from __future__ import annotations
 
@@ -7,22 +7,21 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Protocol
 
-from service.settings import ServiceSettings, SettingsError
 from visloc.archive import MapOutline, MapStore, SetOutline
 
 logger = logging.getLogger(__name__)
 
 
 class Store(Protocol):
-    """What a place of maps can do. All of it blocks; safe to use from several threads.
+    """A store of maps. All methods block, and are safe in several threads.
 
-    Docstrings of ``visloc.archive.MapStore`` say what each raises. A store that is not on this
-    machine raises Unavailable ``maps.storage_away`` too.
+    ``visloc.archive.MapStore`` documents the errors. A remote store also raises Unavailable
+    ``maps.storage_away``.
     """
 
     @property
     def reachable(self) -> bool:
-        """Whether the place answered when it was last asked."""
+        """Whether the store answered the last request."""
         ...
 
     def ids(self) -> list[str]:
@@ -33,67 +32,63 @@ class Store(Protocol):
         """Published versions of a map, oldest first."""
         ...
 
-    def current_version(self, map_id: str) -> str:
-        """The version in use."""
-        ...
+    def current_version(self, map_id: str) -> str: ...
 
     def outline(self, ref: str) -> MapOutline | SetOutline:
-        """What ``id`` or ``id@version`` says about itself; quick, wherever the store is."""
+        """The description of ``id`` or ``id@version``; quick, also in a remote store."""
         ...
 
     def at_hand(self, ref: str) -> Path | None:
-        """``folder`` of ``id@version`` if it is quick, None when it is to be fetched first."""
+        """The folder of ``id@version``; None when it must be fetched first."""
         ...
 
     def folder(self, ref: str) -> Path:
         """The local folder ``.../<id>/<version>`` of ``id`` or ``id@version``.
 
-        A store that is not on this machine fetches it first, which can take minutes.
+        A remote store fetches it first, which can take minutes.
         """
         ...
 
     def publish(
         self, incoming: Path, map_id: str, version: str, *, make_current: bool = True
     ) -> Path:
-        """Verify every byte of a map, give it its place, and make it current; the local folder.
+        """Verify every byte of a map, move it into the store, and return its local folder.
 
-        ``incoming`` is a folder within what ``incoming()`` gave.
+        ``incoming`` is a folder within the one that ``incoming()`` gave.
         """
         ...
 
-    def set_current(self, map_id: str, version: str) -> None:
-        """Make a published version the one in use."""
-        ...
+    def set_current(self, map_id: str, version: str) -> None: ...
 
     def remove(self, map_id: str, version: str) -> None:
         """Remove a version; with the last one, the map."""
         ...
 
     def incoming(self) -> AbstractContextManager[Path]:
-        """Give an empty folder where a map can be received, deleted in the end."""
+        """Give an empty folder to receive a map in; it is deleted in the end."""
         ...
 
     def sweep(self) -> None:
-        """Delete what uploads left behind whose process was killed; for the start."""
+        """Delete what uploads of killed processes left behind; for the start."""
         ...
 
 
-def open_store(settings: ServiceSettings) -> Store:
-    """Return the store that ``maps_dir`` names.
+def open_store(maps_dir: str, cache_dir: Path, max_cache_bytes: int) -> Store:
+    """Return the store in a folder or at a URL; the cache is for a URL.
 
     Raises:
-        SettingsError: for a URL that cannot be used, and for what is no folder.
+        ValueError: the URL cannot be used, or the path is not a folder.
     """
-    if "://" in settings.maps_dir:
+    if "://" in maps_dir:
         from visloc.archive.remote_store import RemoteMapStore  # its libraries take long to load
 
         try:
-            return RemoteMapStore(settings.maps_dir, settings.cache_dir, settings.max_cache_bytes)
+            return RemoteMapStore(maps_dir, cache_dir, max_cache_bytes)
         except (ImportError, ValueError) as error:  # a protocol that is not known or not installed
-            raise SettingsError(f"maps_dir: the URL cannot be used: {error}") from None
-    folder = Path(settings.maps_dir)
-    if not settings.maps_dir or (folder.exists() and not folder.is_dir()):
-        raise SettingsError(f"maps_dir: {settings.maps_dir!r} is no folder")
+            raise ValueError(f"the URL cannot be used: {error}") from None
+    folder = Path(maps_dir)
+    if not maps_dir or (folder.exists() and not folder.is_dir()):
+        raise ValueError(f"{maps_dir!r} is no folder")
     if not folder.exists():
         logger.warning("maps_dir: %s is not there yet; it is made with the first map", folder)
     return MapStore(folder)

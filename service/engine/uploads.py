@@ -1,4 +1,4 @@
-"""Packed maps that come in: written to disk as they come, verified, published."""
+"""Uploads of packed maps: written to disk as they arrive, verified, published."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from visloc.errors import Conflict, InvalidInput, MapCorrupt, TooLarge
 
 # Uploads that are written or verified at once.
 MAX_UPLOADS = 4
-# What is taken from an upload before it is written to disk.
+# Bytes that are buffered before they are written to disk.
 _WRITE_BYTES = 4 * 2**20
 
 P = ParamSpec("P")
@@ -25,29 +25,24 @@ T = TypeVar("T")
 
 
 class Uploads:
-    """Takes versions of maps into a store; used from one event loop.
-
-    Args:
-        store: where they go.
-        max_bytes: largest packed map.
-    """
+    """Publishes uploaded maps of at most ``max_bytes``. Used from one event loop."""
 
     def __init__(self, store: Store, max_bytes: int) -> None:
         self._store, self._max_bytes = store, max_bytes
-        # Verifying gigabytes takes minutes, in which all else that needs a thread goes on.
+        # Verifying gigabytes takes minutes; other work has threads of its own meanwhile.
         self._threads = ThreadPoolExecutor(MAX_UPLOADS, thread_name_prefix="upload")
         self._running: set[str] = set()
 
     async def publish(self, map_id: str, version: str, chunks: AsyncIterator[bytes]) -> None:
-        """Publish a packed map, verified byte by byte; it is not put into use.
+        """Publish a packed map, verified byte by byte, without putting it into use.
 
-        Nothing is taken of one that cannot be published. Whatever happens, cancelling included,
-        its files are gone in the end, and either the whole version is there or nothing of it.
+        Nothing is read of a map that cannot be published. In the end, even if cancelled, temporary
+        files are deleted, and the version is published whole or not at all.
 
         Raises:
             Conflict: ``map.version_exists``, ``map.upload_runs``.
             TooLarge: ``request.too_large``, ``packed.too_large``.
-            InvalidInput: ``map.id``, ``packed.*``, and what ``verify_map`` finds.
+            InvalidInput: ``map.id``, ``packed.*``, and errors of ``verify_map``.
             StorageFull: ``maps.storage_full``.
             Forbidden: ``maps.read_only``.
         """
@@ -125,16 +120,16 @@ class Uploads:
                 )
             self._store.publish(target, map_id, version, make_current=False)
         except MapCorrupt as error:
-            # Damaged before it came here; and the caller need not know where "here" is.
+            # Damaged before it arrived; and the caller must not learn the server's folders.
             field = None if error.field is None else error.field.removeprefix(f"{target}/")
             raise InvalidInput(
                 error.code, error.message, field=field, expected=error.expected, got=error.got
             ) from error
 
     async def _to_end(self, work: Callable[P, T], *given: P.args, **named: P.kwargs) -> T:
-        """Run in a thread, and wait for its end also when cancelled.
+        """Run in a thread, and wait for its end even if cancelled.
 
-        Or what it works on would be deleted under its hands.
+        Otherwise its files would be deleted while it uses them.
         """
         loop = asyncio.get_running_loop()
         task = loop.run_in_executor(self._threads, partial(work, *given, **named))

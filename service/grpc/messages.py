@@ -16,7 +16,7 @@ from service.api import (
 from service.api import Instant as InstantWords
 from service.api import SequenceStart as SequenceStartWords
 from service.api.geopose import Near as NearWords
-from service.values import Instant, LocalizeJob, RigJob, SequenceStart
+from service.values import Instant, RigJob, SequenceStart
 from visloc.errors import InvalidInput, TooLarge, inside
 from visloc.types import Near
 from visloc_api.v1 import localization_pb2 as pb2
@@ -45,7 +45,7 @@ def near_of(request: pb2.ListMapsRequest) -> Near | None:
     return NearWords.read(_plain(request.near)).to_core() if request.HasField("near") else None
 
 
-def localize_job_of(request: pb2.LocalizeRequest, max_bytes: int) -> LocalizeJob:
+def localize_job_of(request: pb2.LocalizeRequest, max_bytes: int) -> RigJob:
     """Return the work of ``Localize``.
 
     Raises:

@@ -52,7 +52,7 @@ from service.settings import ServiceSettings
 from service.telemetry.metrics import ServiceState
 from service.telemetry.metrics_port import metrics_response
 from service.telemetry.observer import Observer, route_of
-from service.values import Instant, InstantLocalization, SequenceStart
+from service.values import Instant, Localization, SequenceStart
 from visloc.errors import InvalidInput, NotFound, Overloaded, VislocError
 from visloc_api.words.message import refusal_of
 from visloc_api.words.wire import NDJSON, TIMEOUT_HEADER
@@ -300,13 +300,13 @@ def _ambiguous() -> InvalidInput:
     )
 
 
-async def _next_of(answers: AsyncGenerator[InstantLocalization]) -> InstantLocalization:
+async def _next_of(answers: AsyncGenerator[Localization]) -> Localization:
     return await anext(answers)
 
 
 async def _texts_of(
-    answers: AsyncGenerator[InstantLocalization],
-    message: Callable[[InstantLocalization], InstantAnswer],
+    answers: AsyncGenerator[Localization],
+    message: Callable[[Localization], InstantAnswer],
 ) -> list[bytes]:
     # As text, each takes a seventh of the memory.
     async with aclosing(answers):
@@ -325,7 +325,7 @@ def _wants_lines(request: Request) -> bool:
 
 async def _admitted(
     engine: Engine, start: SequenceStart, instants: Sequence[Instant]
-) -> AsyncGenerator[InstantLocalization]:
+) -> AsyncGenerator[Localization]:
     with engine.admit_batch():
         async with aclosing(engine.localize_sequence(start, instants)) as answers:
             async for answer in answers:
@@ -333,8 +333,8 @@ async def _admitted(
 
 
 async def _observed(
-    answers: AsyncGenerator[InstantLocalization], timeout_s: float, observer: Observer
-) -> AsyncGenerator[InstantLocalization]:
+    answers: AsyncGenerator[Localization], timeout_s: float, observer: Observer
+) -> AsyncGenerator[Localization]:
     """Give answers on, each within its time, and take note of them."""
     async with aclosing(answers), aclosing(each_within(timeout_s, answers)) as timed:
         async for answer in timed:

@@ -22,7 +22,7 @@ from service.api import (
 )
 from service.http.slow_clients import arrivals_of
 from service.settings import REQUEST_OVERHEAD_BYTES, ServiceSettings
-from service.values import Instant, LocalizeJob, RigJob, SequenceStart
+from service.values import Instant, RigJob, SequenceStart
 from visloc.errors import InvalidInput
 from visloc_api.words.message import MAX_INSTANT_VALUES
 
@@ -82,7 +82,7 @@ class _Form:
     files: dict[str, bytes] = field(default_factory=dict)
 
 
-async def read_localize_job(request: Request, settings: ServiceSettings) -> LocalizeJob:
+async def read_localize_job(request: Request, settings: ServiceSettings) -> RigJob:
     """Read the body of ``POST /localize``, as a form or as JSON.
 
     Raises:
@@ -90,7 +90,7 @@ async def read_localize_job(request: Request, settings: ServiceSettings) -> Loca
         InvalidInput: ``request...``, or a code of the field that is wrong.
     """
 
-    def from_form(body: bytes) -> LocalizeJob:
+    def from_form(body: bytes) -> RigJob:
         form = _parse_form(
             request.headers,
             body,

@@ -26,9 +26,8 @@ from service.telemetry.tracing import (
     stages_until,
     started_trace,
 )
-from service.values import InstantLocalization, Localization
+from service.values import Localization
 from visloc.errors import VislocError
-from visloc.types import Localized
 
 access_log = logging.getLogger("service.security.access")
 
@@ -108,29 +107,28 @@ class Observer:
 
     def localization(self, found: Localization) -> None:
         """Note the answer to a photo."""
-        answer, evidence = found.answer, found.answer.evidence
-        localized = isinstance(answer, Localized)
-        reason = None if isinstance(answer, Localized) else answer.reason.value
-        self.metrics.observe_localization(
-            found.map_id, localized, reason, evidence.num_inliers, evidence.seconds
-        )
+        self._answer(found)
         record = current_request()
         if record is not None:
-            record.map, record.outcome = found.map_id, reason or LOCALIZED
-            record.stages = stages_until(time_ns(), evidence.seconds)
+            record.stages = stages_until(time_ns(), found.answer.seconds)
 
-    def instant(self, found: InstantLocalization) -> None:
+    def instant(self, found: Localization) -> None:
         """Note the answer to an instant; a pose that others lent it does not count as its own."""
-        refusal = found.answer.refusal
-        reason = None if refusal is None else refusal.reason.value
+        self._answer(found)
+        record = current_request()
+        if record is not None:
+            record.instants += 1
+            record.localized += found.answer.refusal is None
+
+    def _answer(self, found: Localization) -> None:
+        answer = found.answer
+        reason = None if answer.refusal is None else answer.refusal.reason.value
         self.metrics.observe_localization(
-            found.map_id, refusal is None, reason, found.answer.num_inliers, found.answer.seconds
+            found.map_id, reason is None, reason, answer.num_inliers, answer.seconds
         )
         record = current_request()
         if record is not None:
             record.map, record.outcome = found.map_id, reason or LOCALIZED
-            record.instants += 1
-            record.localized += refusal is None
 
 
 def route_of(scope: Scope) -> str:

@@ -1,7 +1,4 @@
-"""What the process does that worker processes are forked from, before the first of them.
-
-It is imported there and nowhere else.
-"""
+"""Preparation of the process that worker processes are forked from; imported only there."""
 
 from __future__ import annotations
 
@@ -9,5 +6,5 @@ import signal
 
 import service.workers.vision  # noqa: F401  loaded once, for all of them
 
-# Who stops the service by its group of processes means the main process: it lets requests end.
+# A signal to the group of processes is for the main process, which lets requests end.
 signal.signal(signal.SIGTERM, signal.SIG_IGN)

@@ -1,43 +1,41 @@
-"""The images of one instant: checked, looked at, solved. Runs in worker processes."""
+"""The images of one instant, in worker processes: checked, and looked at in each map."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from service.values import ONLY_SENSOR, ImageJob, InstantLocalization, Query, Rig
-from service.workers.tiles import Read, summed
+from service.values import ONLY_SENSOR, ImageJob, Localization, Rig
+from service.workers.photos import DecodedQuery, summed
 from visloc.archive import Map
 from visloc.archive.places import anchor_rms
 from visloc.errors import InvalidInput, NotFound, TooLarge
 from visloc.geometry import Pose
-from visloc.images import Photo
 from visloc.localization.constraints import Constraints
-from visloc.localization.feature_cache import FeatureCache
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import Look, Matches, SeenImage
 from visloc.priors import Priors
 from visloc.types import InstantAnswer, LocalizeOptions, QueryFeatures, Reason, Refusal, RigSensor
 
 _MAX_LISTED = 500  # characters of names from outside
-# Codes that begin so say what is wrong with all images: that is wrong with the request.
+# Errors of the request, not of one image, have codes that begin so.
 _OF_ALL_IMAGES = ("features.required", "options.", "priors.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
-    """A map to search, and the rig as it is known there."""
+    """A map to search, and the rig's cameras as that map knows them."""
 
     localizer: Localizer
     rig: Mapping[str, RigSensor]
 
-    def localization(self, answer: InstantAnswer, *, ypr: bool) -> InstantLocalization:
+    def localization(self, answer: InstantAnswer, *, ypr: bool) -> Localization:
         """Return an answer with the map that gave it."""
         opened = self.localizer.map
-        return InstantLocalization(
+        return Localization(
             answer,
             opened.manifest.id,
             opened.manifest.version,
@@ -47,13 +45,46 @@ class Target:
             anchor_rms=anchor_rms(opened.manifest.world),
         )
 
+    def look(
+        self,
+        image: ImageJob,
+        decoded: DecodedQuery | InvalidInput,
+        options: LocalizeOptions,
+        priors: Priors,
+        seconds: Mapping[str, float],
+    ) -> SeenImage:
+        """Look at one image of an instant; an unusable image is returned with its error.
+
+        Errors of the whole request are raised. ``seconds`` is the wall time, by stage, that the
+        image took before.
+        """
+        sensor = self.rig.get(image.sensor) or RigSensor(Pose.identity(), None)
+        camera = image.camera or sensor.camera
+        try:
+            if isinstance(decoded, InvalidInput):
+                raise decoded
+            query = decoded.query
+            if isinstance(query, QueryFeatures):
+                look = self.localizer.look_at_features(query, camera, options, priors)
+            else:
+                look = self.localizer.look(query, camera, options, priors, decoded.found)
+        except InvalidInput as error:
+            if error.code.startswith(_OF_ALL_IMAGES):
+                raise
+            return SeenImage(image.sensor, sensor.cam_from_rig, None, error)
+        if look.refusal is None and not self._is_named(priors):
+            look = _nothing_here(look)
+        evidence = replace(look.evidence, seconds=summed(seconds, look.evidence.seconds))
+        return SeenImage(image.sensor, sensor.cam_from_rig, replace(look, evidence=evidence))
+
+    def _is_named(self, priors: Priors) -> bool:
+        """Whether this tile is one of those that the priors name, if they name tiles."""
+        opened = self.localizer.map
+        return priors.maps is None or not {opened.manifest.id, opened.ref}.isdisjoint(priors.maps)
+
 
 def rig_in_map(rig: Rig | None, opened: Map) -> Mapping[str, RigSensor]:
-    """Return a rig's cameras; of None, one camera on its own.
-
-    Raises:
-        NotFound: ``rig.unknown`` when it is the id of a rig that the map does not know.
-    """
+    """Return a rig's cameras by sensor id; for None, one camera at the identity."""
     if rig is None:
         return {ONLY_SENSOR: RigSensor(Pose.identity(), None)}
     if not isinstance(rig, str):
@@ -78,17 +109,9 @@ def rig_in_map(rig: Rig | None, opened: Map) -> Mapping[str, RigSensor]:
 def check_images(
     images: Sequence[ImageJob], rig: Collection[str] | None, max_images: int, where: str
 ) -> None:
-    """Refuse images that are not those of one instant of a rig.
+    """Refuse images, of the field ``where``, that cannot be one instant of a rig.
 
-    Args:
-        images: of one instant.
-        rig: its cameras; None when every instant is one image.
-        max_images: most images of an instant.
-        where: the field that holds them, for errors.
-
-    Raises:
-        InvalidInput: ``rig.sensor``, ``rig.duplicate`` or ``sequence.rig``.
-        TooLarge: ``rig.too_many_images``.
+    The rig is None when every instant is one image.
     """
     if len(images) > max_images:
         raise TooLarge(
@@ -127,12 +150,10 @@ def check_images(
 
 
 def check_options(targets: Sequence[Target], options: LocalizeOptions) -> None:
-    """Refuse options that do not fit all maps, before any image is looked at.
+    """Refuse options that do not fit all maps, before any image is decoded.
 
-    Raises:
-        InvalidInput: as ``Localizer.check``; of several maps, with the names of those that the
-            options do not fit, and what is wrong in the first of them.
-        WeightsError: likewise.
+    The error is that of ``Localizer.check``. Among several maps, it names those that refuse the
+    options, and says why the first of them does.
     """
     refused: dict[str, InvalidInput] = {}
     for target in targets:
@@ -156,85 +177,13 @@ def check_options(targets: Sequence[Target], options: LocalizeOptions) -> None:
 
 
 def check_priors(targets: Sequence[Target], priors: Priors) -> None:
-    """Refuse priors that mean nothing in a map, before anything is computed.
-
-    Raises:
-        InvalidInput: ``priors.*``.
-    """
+    """Refuse priors that a map cannot apply, before anything is computed."""
     for target in targets:
         Constraints(target.localizer.geometry, priors)
 
 
-def look_at(
-    image: ImageJob,
-    targets: Sequence[Target],
-    options: LocalizeOptions,
-    priors: Priors,
-    read: Callable[[Query], Read],
-    queued_s: float,
-) -> list[SeenImage]:
-    """Look at one image for every target. One that is unusable fails alone.
-
-    Args:
-        image: of an instant.
-        targets: the maps.
-        options: thresholds and the like.
-        priors: what is known of the rig.
-        read: reads a photo, or what was found in it.
-        queued_s: how long it waited.
-
-    Raises:
-        VislocError: what concerns more than this image.
-    """
-    seconds = {"queued": queued_s}
-    photo: Photo | QueryFeatures | InvalidInput
-    found: FeatureCache = {}
-    try:
-        known = read(image.query)
-        photo, found = known.query, known.found
-        seconds = summed(seconds, known.seconds)
-    except InvalidInput as error:
-        photo = error
-    return [_look(image, photo, target, options, priors, found, seconds) for target in targets]
-
-
-def _look(
-    image: ImageJob,
-    photo: Photo | QueryFeatures | InvalidInput,
-    target: Target,
-    options: LocalizeOptions,
-    priors: Priors,
-    found: FeatureCache,
-    seconds: Mapping[str, float],
-) -> SeenImage:
-    sensor = target.rig.get(image.sensor) or RigSensor(Pose.identity(), None)
-    camera = image.camera or sensor.camera
-    try:
-        look: Look
-        if isinstance(photo, InvalidInput):
-            raise photo
-        if isinstance(photo, QueryFeatures):
-            look = target.localizer.look_at_features(photo, camera, options, priors)
-        else:
-            look = target.localizer.look(photo, camera, options, priors, found)
-    except InvalidInput as error:
-        if error.code.startswith(_OF_ALL_IMAGES):
-            raise
-        return SeenImage(image.sensor, sensor.cam_from_rig, None, error)
-    if look.refusal is None and not _is_named(target, priors):
-        look = _nothing_here(look)
-    evidence = replace(look.evidence, seconds=summed(seconds, look.evidence.seconds))
-    return SeenImage(image.sensor, sensor.cam_from_rig, replace(look, evidence=evidence))
-
-
-def _is_named(target: Target, priors: Priors) -> bool:
-    """Whether the device may be in a map, of a set whose tiles the priors name."""
-    opened = target.localizer.map
-    return priors.maps is None or not {opened.manifest.id, opened.ref}.isdisjoint(priors.maps)
-
-
 def _nothing_here(look: Look) -> Look:
-    """What an image shows of a tile that the priors exclude."""
+    """Return what an image shows of a tile that the priors exclude."""
     return Look(
         replace(look.evidence, num_correspondences=0, retrieved=()),
         Matches.none(),

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeVar
 
-from service.values import InstantLocalization, Localization
+from service.values import Localization
 from visloc.archive.places import similarity_on_earth
 from visloc.geometry import Similarity
 from visloc.localization.judge import (
@@ -15,30 +14,23 @@ from visloc.localization.judge import (
     TIE_REACH_SHARE,
     Candidate,
     Tie,
-    inliers_of,
     judge,
     measured_pose,
 )
 from visloc.priors import NO_PRIORS, Priors
-from visloc.types import NotLocalized, Refusal
-
-AnyLocalization = TypeVar("AnyLocalization", Localization, InstantLocalization)
+from visloc.types import Refusal
 
 
-def judged(
-    found: Sequence[AnyLocalization], priors: Priors = NO_PRIORS
-) -> tuple[int, AnyLocalization]:
-    """Choose one answer of several, or refuse the query as ambiguous.
-
-    The rule is that of ``visloc.localization.judge``.
+def judged(found: Sequence[Localization], priors: Priors = NO_PRIORS) -> tuple[int, Localization]:
+    """Choose one answer of several by ``visloc.localization.judge``, or refuse all as ambiguous.
 
     Args:
-        found: at least one, of maps, of sets, or of the tiles of one set. Of several poses that one
-            map gave, by itself and as a tile, the first counts.
-        priors: those that they obey.
+        found: at least one, of maps, of sets, or of the tiles of one set. When one map gave several
+            poses, by itself and as a tile, the first counts.
+        priors: of the query.
 
     Returns:
-        Its row and the answer. A refusal carries the evidence of the place with the most inliers.
+        The row and the answer. A refusal carries the evidence of the place with the most inliers.
     """
     measured: set[str] = set()
     rows = []
@@ -55,23 +47,18 @@ def judged(
     )
     if not isinstance(verdict, Refusal):
         return rows[verdict], asked[verdict]
-    row = max(rows, key=lambda row: inliers_of(found[row].answer))
-    best = found[row]
-    if isinstance(best, InstantLocalization):
-        return row, replace(best, answer=replace(best.answer, pose=None, refusal=verdict))
-    evidence = best.answer.evidence
-    refused = NotLocalized(evidence, verdict.stage, verdict.reason, verdict.message)
-    return row, replace(best, answer=refused)
+    row = max(rows, key=lambda row: found[row].answer.num_inliers)
+    refused = replace(found[row].answer, pose=None, refusal=verdict)
+    return row, replace(found[row], answer=refused)
 
 
-def _tie(a: AnyLocalization, b: AnyLocalization, priors: Priors) -> Tie | None:
-    """Say how the frames of two answers lie to each other; None where nothing ties them.
+def _tie(a: Localization, b: Localization, priors: Priors) -> Tie | None:
+    """Return the transform between the frames of two answers; None where it is unknown.
 
-    Tiles of one set share its frame. Anchored maps are compared on Earth. Of maps that are not
-    anchored, versions of one map are taken to share a frame, and so are all maps where the caller
-    says, in one frame, where the device is. Other maps cannot be compared: their coordinates may
-    be alike where their places are not, as on two floors that were both mapped from the lift
-    onwards.
+    Tiles of one set share its frame. Anchored maps are compared on Earth. Versions of one map are
+    taken to share a frame when they are not both anchored. So are all maps when the caller's priors
+    locate the device in one frame. Other maps cannot be compared: equal coordinates do not mean
+    equal places, as on two floors that were both mapped from the lift onwards.
     """
     same_map = a.map_id == b.map_id
     if (same_map and a.map_version == b.map_version) or a.geodetic is None or b.geodetic is None:

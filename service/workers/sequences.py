@@ -1,11 +1,11 @@
-"""One sequence on its way through the engine. Runs in worker processes."""
+"""A sequence that is being solved, in worker processes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 
-from service.values import Instant, InstantLocalization, SequenceStart, check_order
+from service.values import Instant, Localization, SequenceStart, check_order
 from service.workers.instants import Target, check_images, check_options, check_priors
 from service.workers.judging import judged
 from visloc.errors import InvalidInput, TooLarge, inside
@@ -17,19 +17,10 @@ from visloc.types import InstantAnswer, Reason, Refusal, RigPose
 
 
 class SequenceRun:
-    """Solves a sequence in each of its maps until one of them is settled on.
-
-    Args:
-        start: what all instants share.
-        targets: the maps.
-        max_images: of one instant.
-        max_instants: of the sequence.
+    """Solves a sequence in each of its maps until one map is settled on.
 
     Attributes:
         targets: the maps that are still searched.
-
-    Raises:
-        InvalidInput: ``sequence.max_gap``, ``options.*``, ``priors.*``.
     """
 
     def __init__(
@@ -47,13 +38,9 @@ class SequenceRun:
         self._held: list[list[InstantAnswer]] = [[] for _ in targets]
 
     def check(self, index: int, instant: Instant) -> Priors:
-        """Refuse an instant that cannot be solved, and return what is known of the rig there.
+        """Refuse an instant that cannot be solved, and return its priors.
 
-        Instants are checked in order; to begin again with the first is fine.
-
-        Raises:
-            InvalidInput: ``sequence.*``, ``rig.*``, ``priors.*``, with the instant in the field.
-            TooLarge: ``sequence.too_many_instants``, ``rig.too_many_images``.
+        Instants are checked in order, which may begin again with the first.
         """
         if index >= self._max_instants:
             raise TooLarge(
@@ -79,16 +66,7 @@ class SequenceRun:
     def add(
         self, instant: Instant, images: Sequence[tuple[SeenImage, ...]], priors: Priors
     ) -> list[InstantAnswer]:
-        """Solve an instant; return the answers that are final now.
-
-        Args:
-            instant: the next one.
-            images: by target.
-            priors: what ``check`` returned.
-
-        Raises:
-            InvalidInput: ``sequence.time_unit`` when the first timestamp does not tell the unit.
-        """
+        """Solve an instant, given its images by target; return the answers that are final now."""
         if not self._solvers:
             unit = self._start.time_unit or _guessed_unit(instant.timestamp)
             self._solvers = [self._solver(target, unit) for target in self.targets]
@@ -109,23 +87,19 @@ class SequenceRun:
 
     @property
     def pose(self) -> RigPose | None:
-        """What its own images measured of the newest instant, in the map that was settled on.
+        """The pose that the newest instant's own images measured.
 
         None when they do not localize it, or while several maps are searched.
         """
         return self._solvers[0].newest if len(self._solvers) == 1 else None
 
     def finish(self) -> list[InstantAnswer]:
-        """Return the answers that waited for instants which will not come.
-
-        Raises:
-            InvalidInput: ``sequence.empty`` when there was no instant.
-        """
+        """Return the answers that waited for further instants."""
         if not self._solvers:
             raise InvalidInput("sequence.empty", "there is no instant", field="instants")
         for held, solver in zip(self._held, self._solvers, strict=True):
             held += solver.finish()
-        # Motion may place instants that no image localizes; in several maps, it tells nothing.
+        # Motion may place instants that no image localizes, but not in several maps.
         placed = [
             i for i, held in enumerate(self._held) if any(each.pose is not None for each in held)
         ]
@@ -134,14 +108,13 @@ class SequenceRun:
         self._keep(placed[0] if placed else 0)
         return self._released()
 
-    def localization(self, answer: InstantAnswer) -> InstantLocalization:
-        """Return an answer of ``add`` or ``finish`` with the map that gave it."""
+    def localization(self, answer: InstantAnswer) -> Localization:
         return self.targets[0].localization(answer, ypr=self._start.ypr)
 
     def _judged(self, solved: list[Solved], priors: Priors) -> tuple[int | None, list[Solved]]:
-        """Say which map to settle on, if any, and what each map makes of an instant.
+        """Return the map to settle on, if any, and the instant's solution in each map.
 
-        An instant that several maps explain counts in none of them.
+        An instant that several maps explain has a pose in none of them.
         """
         if len(self.targets) == 1:
             return None, solved
@@ -158,7 +131,7 @@ class SequenceRun:
         return None, [one if one.pose is None else one.refused(refusal) for one in solved]
 
     def _keep(self, index: int) -> None:
-        """Search only one of the maps from now on."""
+        """Search only this map from now on."""
         self.targets = [self.targets[index]]
         self._solvers = [self._solvers[index]]
         self._held = [self._held[index]]
@@ -178,7 +151,7 @@ class SequenceRun:
 
 
 def _unplaced(answer: InstantAnswer) -> InstantAnswer:
-    """Take a pose back that another map contradicts."""
+    """Remove a pose that another map contradicts."""
     if answer.pose is None:
         return answer
     refusal = answer.refusal or Refusal(

@@ -1,16 +1,14 @@
-"""What worker processes do: maps opened, photos looked at, poses solved."""
+"""The work of a worker process: opening maps, looking at photos, solving for poses."""
 
 from __future__ import annotations
 
 import ctypes
 import io
 import logging
+import os
 import pickle
-from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from time import perf_counter, time
 from typing import Any
 
@@ -22,59 +20,46 @@ from numpy.typing import NDArray
 from service.values import (
     ImageJob,
     Instant,
-    InstantLocalization,
     Localization,
-    LocalizeJob,
+    MapFolder,
     MatchPicture,
+    OpenMap,
+    PackedLooks,
+    PackedSequence,
     Query,
+    RankedTiles,
     Rig,
     RigJob,
     SequenceStart,
-)
-from service.workers.instants import (
-    Target,
-    check_images,
-    check_options,
-    check_priors,
-    look_at,
-    rig_in_map,
-)
-from service.workers.judging import judged
-from service.workers.process import (
-    Abandoned,
-    Added,
-    Chosen,
-    Loaded,
-    MapFolder,
-    Seen,
+    SequenceStep,
     WorkerSettings,
 )
+from service.workers.instants import Target, check_images, check_options, check_priors, rig_in_map
+from service.workers.judging import judged
+from service.workers.open_maps import OpenMaps
+from service.workers.photos import DecodedQuery, decode, pack, summed
 from service.workers.sequences import SequenceRun
-from service.workers.tiles import Read, TileChooser, read_query, summed, written
-from visloc.archive.places import anchor_rms
-from visloc.archive.store import open_published, open_published_set
 from visloc.drawing.matches_picture import draw_overlay
-from visloc.errors import Conflict, InvalidInput, MapCorrupt, VislocError
-from visloc.features import (
-    GlobalDescriptor,
-    LocalFeatureExtractor,
-    make_global_descriptor,
-    make_local_features,
-)
-from visloc.features.local.readymade import is_ready_made
-from visloc.features.networks.lightglue.model import make_lightglue
+from visloc.errors import InvalidInput, VislocError
 from visloc.images import ImageLimits, Photo
 from visloc.localization.constraints import MapGeometry
 from visloc.localization.localizer import Localizer
-from visloc.localization.solving import Look, SeenImage
+from visloc.localization.solving import Look, SeenImage, Solved
 from visloc.priors import Priors
-from visloc.types import Answer, LocalizeOptions, QueryFeatures
+from visloc.types import LocalizeOptions
 
 logger = logging.getLogger(__name__)
 
 
+class Abandoned(Exception):
+    """Nobody waits for the task any more."""
+
+
 class Vision:
-    """Localizes in maps that stay open. Its methods are the tasks of ``service.workers.process``.
+    """The maps that stay open in a worker process, and its tasks.
+
+    The main process names the tasks by ``service.workers.tasks``; it pickles their arguments and
+    what they return.
 
     Args:
         settings: of the process.
@@ -87,166 +72,60 @@ class Vision:
         self._settings = settings
         self._limits = ImageLimits(settings.max_image_bytes, settings.max_image_pixels)
         self._abandoned = abandoned
-        # Maps and sets, the most recently used last.
-        self._opened: OrderedDict[str, Localizer | TileChooser] = OrderedDict()
-        # By name, shared by all maps.
-        self._extractors: dict[str, LocalFeatureExtractor] = {}
-        self._descriptors: dict[str, GlobalDescriptor] = {}
+        self._maps = OpenMaps(settings)
 
     @property
-    def loaded(self) -> tuple[Loaded, ...]:
-        """Maps that are open."""
-        return tuple(Loaded(ref, _size_of(one)) for ref, one in self._opened.items())
+    def open_maps(self) -> tuple[OpenMap, ...]:
+        return self._maps.refs
 
-    def _step(self) -> None:
-        """Stop here when nobody waits any more."""
-        if self._abandoned.value:
-            raise Abandoned
+    def ping(self) -> int:
+        """Return the id of the process, which shows that it is alive."""
+        return os.getpid()
 
-    def localizer(self, of: MapFolder) -> Localizer:
-        """Return the localizer of a map, opened now if it was not before.
+    def load(self, version: MapFolder) -> None:
+        """Open a map, or a set without its tiles; errors as in ``OpenMaps.open``."""
+        self._maps.open(version)
 
-        Raises:
-            Conflict: for a map of features that are not here.
-            MapCorrupt: when it cannot be used.
-        """
-        found = self.open(of)
-        assert isinstance(found, Localizer)  # a set has no localizer
-        return found
-
-    def chooser(self, of: MapFolder) -> TileChooser:
-        """Return what ranks the tiles of a set; as ``localizer``."""
-        found = self.open(of)
-        assert isinstance(found, TileChooser)
-        return found
-
-    def open(self, of: MapFolder) -> Localizer | TileChooser:
-        """Open a map or a set, if it is not open yet, and close what was not used for longest.
-
-        Raises:
-            Conflict: for a map of features that are not here.
-            MapCorrupt: when it cannot be used.
-        """
-        found = self._opened.get(of.ref)
-        if found is None:
-            found = self._opened[of.ref] = self._open(of)
-        self._opened.move_to_end(of.ref)
-        while len(self._opened) > 1 and self._size > self._settings.max_loaded_bytes:
-            ref, _ = self._opened.popitem(last=False)
-            logger.info("map %s closed, to keep to max_loaded_bytes", ref)
-        return found
+    def warm(self, maps: Sequence[MapFolder]) -> None:
+        """Open maps; log those that cannot be used."""
+        for version in maps:
+            try:
+                self._maps.open(version)
+            except VislocError as error:
+                logger.error("map %s is not loaded: %s", version.ref, error)  # noqa: TRY400
 
     def forget(self, ref: str) -> None:
         """Close a map that is no longer served."""
-        self._opened.pop(ref, None)
+        self._maps.close(ref)
 
-    @property
-    def _size(self) -> int:
-        return sum(_size_of(one) for one in self._opened.values())
+    def localize(self, job: RigJob, maps: Sequence[MapFolder], submitted: float) -> Localization:
+        """Localize a photo on its own in the best of the maps.
 
-    def _open(self, of: MapFolder) -> Localizer | TileChooser:
-        start = perf_counter()
-        with _damage_named(of.ref):
-            try:
-                opened = self._opened_set(of) if of.is_set else self._opened_map(of)
-            except InvalidInput as error:  # features that are not here: not the caller's mistake
-                raise Conflict(
-                    error.code,
-                    error.message,
-                    field=error.field,
-                    expected=error.expected,
-                    got=error.got,
-                ) from error
-            opened.warm_up()
-        logger.info("map %s loaded in %.1f s", of.ref, perf_counter() - start)
-        return opened
-
-    def _opened_map(self, of: MapFolder) -> Localizer:
-        opened = open_published(of.folder)
-        name = opened.manifest.local_features.fingerprint.name
-        extractor = None if is_ready_made(name) else self._extractor(name)
-        matcher = partial(make_lightglue, weights_dir=self._settings.weights_dir)
-        return Localizer(opened, extractor, self._descriptor, matcher)
-
-    def _opened_set(self, of: MapFolder) -> TileChooser:
-        return TileChooser(open_published_set(of.folder), self._extractor)
-
-    def _extractor(self, name: str) -> LocalFeatureExtractor:
-        if name not in self._extractors:
-            s = self._settings
-            made = make_local_features(name, s.weights_dir, s.inference, s.threads)
-            self._extractors[name] = made
-        return self._extractors[name]
-
-    def _descriptor(self, name: str) -> GlobalDescriptor:
-        if name not in self._descriptors:
-            s = self._settings
-            made = make_global_descriptor(name, s.weights_dir, s.inference, s.threads)
-            self._descriptors[name] = made
-        return self._descriptors[name]
-
-    def localize(
-        self, job: LocalizeJob, maps: Sequence[MapFolder], submitted: float
-    ) -> Localization:
-        """As ``worker.localize``."""
+        One task does it all: a photo is decoded where it is solved, and nothing of it travels.
+        The main process queued the task when it was ``submitted`` (``time.time``, which is the same
+        in all processes).
+        """
         started, queued = perf_counter(), time() - submitted
-        targets = self._targets(maps, None)
+        targets = self._targets(maps, job.rig)
         check_options(targets, job.options)
-        loaded = perf_counter()
-        looks: list[tuple[Look, NDArray[np.bool_]]] = []
-        found: list[Localization] = []
-        read = self._read(job.query)
-        query = read.query
-        before = summed({"queued": max(0.0, queued), "open_map": loaded - started}, read.seconds)
+        seconds = {"queued": max(0.0, queued), "open_map": perf_counter() - started}
+        (image,) = job.images
+        decoded = self._decode(image.query)
+        seconds, seen = summed(seconds, decoded.seconds), list[SeenImage]()
         for target in targets:
             self._step()
-            localizer = target.localizer
-            if isinstance(query, QueryFeatures):
-                look = localizer.look_at_features(query, job.camera, job.options, job.priors)
-            else:
-                look = localizer.look(query, job.camera, job.options, job.priors, read.found)
-            self._step()
-            answer, inliers = localizer.solve_look(look, job.options, job.priors)
-            looks.append((look, inliers))
-            found.append(_localization(localizer, answer, ypr=job.ypr))
-        row, best = judged(found, job.priors)
-        localizer, answer, (look, inliers) = targets[row].localizer, best.answer, looks[row]
-        picture = None
-        if job.debug and isinstance(query, Photo):
-            self._step()
-            picture = MatchPicture(
-                look.matches.pixels,
-                look.matches.points + localizer.geometry.origin,
-                inliers,
-                draw_overlay(query, localizer.map, look, answer, inliers),
-            )
-        evidence = replace(answer.evidence, seconds=summed(before, answer.evidence.seconds))
-        return replace(best, answer=replace(answer, evidence=evidence), debug=picture)
-
-    def choose_tiles(
-        self,
-        query: Query,
-        of: MapFolder,
-        options: LocalizeOptions,
-        allowed: NDArray[np.bool_] | None,
-        submitted: float,
-    ) -> Chosen:
-        """As ``worker.choose_tiles``."""
-        queued, started = max(0.0, time() - submitted), perf_counter()
+            seen.append(target.look(image, decoded, job.options, job.priors, seconds))
+            if seen[-1].error is not None:
+                raise seen[-1].error
+        row, best, solved = self._solve(job, targets, [(one,) for one in seen])
+        look = seen[row].look
+        if not job.debug or look is None or not isinstance(decoded.query, Photo):
+            return best
         self._step()
-        chooser = self.chooser(of)
-        loaded = perf_counter()
-        try:
-            read = self._read(query)
-        except InvalidInput:
-            return Chosen(query)  # the tile that is asked says it
-        seconds = {"queued": queued, "open_map": loaded - started}
-        read = replace(read, seconds=summed(seconds, read.seconds))
-        scores = chooser.choose(read, options, allowed)
-        return Chosen(written(read), scores)
+        return replace(best, debug=_picture(decoded.query, targets[row], look, best, solved))
 
     def check_rig(self, job: RigJob, maps: Sequence[MapFolder]) -> None:
-        """As ``worker.check_rig``."""
+        """Refuse a rig's images, which come without their photos, or options that do not fit."""
         targets = self._targets(maps, job.rig)
         for target in targets:
             check_images(job.images, target.rig, self._settings.max_images, "images")
@@ -261,80 +140,129 @@ class Vision:
         options: LocalizeOptions,
         priors: Priors,
         submitted: float,
-    ) -> Seen:
-        """As ``worker.look_at_image``."""
-        queued = max(0.0, time() - submitted)
+    ) -> PackedLooks:
+        """Look at one image for every map; an image that cannot be used fails alone."""
+        seconds = {"queued": max(0.0, time() - submitted)}
         self._step()
         targets = self._targets(maps, rig)
-        return pickle.dumps(
-            look_at(image, targets, options, priors, self._read, queued), pickle.HIGHEST_PROTOCOL
-        )
+        decoded: DecodedQuery | InvalidInput
+        try:
+            decoded = self._decode(image.query)
+            seconds = summed(seconds, decoded.seconds)
+        except InvalidInput as error:
+            decoded = error
+        looks = [target.look(image, decoded, options, priors, seconds) for target in targets]
+        return pickle.dumps(looks, pickle.HIGHEST_PROTOCOL)
 
     def solve_rig(
-        self, job: RigJob, maps: Sequence[MapFolder], seen: Sequence[Seen]
-    ) -> InstantLocalization:
-        """As ``worker.solve_rig``."""
-        found = []
-        for target, images in zip(
-            self._targets(maps, job.rig), _by_map(seen, len(maps)), strict=True
-        ):
-            self._step()
-            solved = target.localizer.solve(images, job.options, job.priors, job.timestamp)
-            found.append(target.localization(solved.answer, ypr=job.ypr))
-        return judged(found, job.priors)[1]
+        self, job: RigJob, maps: Sequence[MapFolder], looks: Sequence[PackedLooks]
+    ) -> Localization:
+        """Estimate one pose of a rig, given without its photos, in the best of the maps."""
+        targets = self._targets(maps, job.rig)
+        return self._solve(job, targets, _by_map(looks, len(maps)))[1]
 
-    def open_sequence(self, start: SequenceStart, maps: Sequence[MapFolder]) -> bytes:
-        """As ``worker.open_sequence``."""
+    def _solve(
+        self, job: RigJob, targets: Sequence[Target], seen: Sequence[tuple[SeenImage, ...]]
+    ) -> tuple[int, Localization, Solved]:
+        """Solve for a pose in every map; return the judged answer and the row that it rests on."""
+        solved = []
+        for target, images in zip(targets, seen, strict=True):
+            self._step()
+            solved.append(target.localizer.solve(images, job.options, job.priors, job.timestamp))
+        found = [
+            target.localization(one.answer, ypr=job.ypr)
+            for target, one in zip(targets, solved, strict=True)
+        ]
+        row, best = judged(found, job.priors)
+        return row, best, solved[row]
+
+    def rank_tiles(
+        self,
+        query: Query,
+        map_set: MapFolder,
+        options: LocalizeOptions,
+        allowed: NDArray[np.bool_] | None,
+        submitted: float,
+    ) -> RankedTiles:
+        """Decode a photo, find its features, and rank tiles of a set by them.
+
+        A photo that cannot be used comes back as it is, and ranks nothing. The tiles to rank are
+        ``allowed`` (T,); None ranks none.
+        """
+        queued, started = max(0.0, time() - submitted), perf_counter()
+        self._step()
+        ranker = self._maps.ranker(map_set)
+        seconds = {"queued": queued, "open_map": perf_counter() - started}
+        try:
+            decoded = self._decode(query)
+        except InvalidInput:
+            return RankedTiles(query)  # the tile that is searched reports the error
+        decoded = replace(decoded, seconds=summed(seconds, decoded.seconds))
+        scores = ranker.rank(decoded, options, allowed)
+        return RankedTiles(pack(decoded), scores)
+
+    def open_sequence(self, start: SequenceStart, maps: Sequence[MapFolder]) -> PackedSequence:
         settings = self._settings
         targets = self._targets(maps, start.rig)
-        return _dumped(SequenceRun(start, targets, settings.max_images, settings.max_instants))
+        return _packed(SequenceRun(start, targets, settings.max_images, settings.max_instants))
 
     def check_instants(
-        self, state: bytes, maps: Sequence[MapFolder], first: int, instants: Sequence[Instant]
-    ) -> tuple[bytes, list[Priors]]:
-        """As ``worker.check_instants``."""
-        run = self._sequence(state, maps)
+        self,
+        sequence: PackedSequence,
+        maps: Sequence[MapFolder],
+        first: int,
+        instants: Sequence[Instant],
+    ) -> tuple[PackedSequence, list[Priors]]:
+        """Refuse instants, without their photos, that cannot be solved; return their priors."""
+        run = self._sequence(sequence, maps)
         priors = [run.check(first + i, instant) for i, instant in enumerate(instants)]
-        return _dumped(run), priors
+        return _packed(run), priors
 
     def add_instant(
         self,
-        state: bytes,
+        sequence: PackedSequence,
         maps: Sequence[MapFolder],
         instant: Instant,
-        seen: Sequence[Seen],
+        looks: Sequence[PackedLooks],
         priors: Priors,
-    ) -> Added:
-        """As ``worker.add_instant``."""
+    ) -> SequenceStep:
+        """Solve the next instant of a sequence, given without its photos."""
         self._step()
-        run = self._sequence(state, maps)
-        found = run.add(instant, _by_map(seen, len(maps)), priors)
+        run = self._sequence(sequence, maps)
+        found = run.add(instant, _by_map(looks, len(maps)), priors)
         answers = [run.localization(answer) for answer in found]
         kept = tuple(target.localizer.map.ref for target in run.targets)
-        return Added(_dumped(run), kept, answers, run.pose)
+        return SequenceStep(_packed(run), kept, answers, run.pose)
 
-    def finish_sequence(self, state: bytes, maps: Sequence[MapFolder]) -> list[InstantLocalization]:
-        """As ``worker.finish_sequence``."""
-        run = self._sequence(state, maps)
+    def finish_sequence(
+        self, sequence: PackedSequence, maps: Sequence[MapFolder]
+    ) -> list[Localization]:
+        """Return the answers that waited for instants which will not come."""
+        run = self._sequence(sequence, maps)
         return [run.localization(answer) for answer in run.finish()]
 
-    def _read(self, query: Query) -> Read:
-        read = read_query(query, self._limits, self._extractor)
-        self._step()
-        return read
-
-    def _sequence(self, state: bytes, maps: Sequence[MapFolder]) -> SequenceRun:
-        run = _Unpickler(state, {of.ref: self.localizer(of) for of in maps}).load()
+    def _sequence(self, state: PackedSequence, maps: Sequence[MapFolder]) -> SequenceRun:
+        run = _Unpickler(state, {one.ref: self._maps.localizer(one) for one in maps}).load()
         assert isinstance(run, SequenceRun)
         return run
 
+    def _step(self) -> None:
+        """Stop here when nobody waits any more."""
+        if self._abandoned.value:
+            raise Abandoned
+
+    def _decode(self, query: Query) -> DecodedQuery:
+        decoded = decode(query, self._limits, self._maps.extractor)
+        self._step()
+        return decoded
+
     def _targets(self, maps: Sequence[MapFolder], rig: Rig | None) -> list[Target]:
-        localizers = [self.localizer(of) for of in maps]
+        localizers = [self._maps.localizer(one) for one in maps]
         return [Target(found, rig_in_map(rig, found.map)) for found in localizers]
 
 
 class _Pickler(pickle.Pickler):
-    """Leaves maps where they are."""
+    """Pickles a sequence with references to its maps."""
 
     def persistent_id(self, obj: Any) -> Any:
         if isinstance(obj, Localizer):
@@ -345,7 +273,7 @@ class _Pickler(pickle.Pickler):
 
 
 class _Unpickler(pickle.Unpickler):
-    """Puts this process's maps back in. Reads only what ``_Pickler`` wrote, in this service."""
+    """Inserts this process's maps. Reads only what ``_Pickler`` wrote, in this service."""
 
     def __init__(self, state: bytes, localizers: Mapping[str, Localizer]) -> None:
         super().__init__(io.BytesIO(state))
@@ -357,51 +285,28 @@ class _Unpickler(pickle.Unpickler):
         return localizer if kind == "localizer" else localizer.geometry
 
 
-def _localization(localizer: Localizer, answer: Answer, *, ypr: bool) -> Localization:
-    opened = localizer.map
-    return Localization(
-        answer,
-        opened.manifest.id,
-        opened.manifest.version,
-        opened.geodetic,
-        ypr,
-        reach=localizer.geometry.reach,
-        anchor_rms=anchor_rms(opened.manifest.world),
-    )
-
-
-def _size_of(opened: Localizer | TileChooser) -> int:
-    return opened.size_bytes if isinstance(opened, TileChooser) else opened.map.size_bytes
-
-
-def _dumped(run: SequenceRun) -> bytes:
+def _packed(run: SequenceRun) -> PackedSequence:
     buffer = io.BytesIO()
     _Pickler(buffer, pickle.HIGHEST_PROTOCOL).dump(run)
     return buffer.getvalue()
 
 
-def _by_map(seen: Sequence[Seen], num_maps: int) -> list[tuple[SeenImage, ...]]:
-    """Return what ``look_at_image`` of this service found in the images of an instant, by map."""
-    looks: list[list[SeenImage]] = [pickle.loads(each) for each in seen]
-    return [tuple(look[i] for look in looks) for i in range(num_maps)]
+def _by_map(looks: Sequence[PackedLooks], num_maps: int) -> list[tuple[SeenImage, ...]]:
+    """Return the looks of an instant's images by map; only ``look_at_image`` pickled them."""
+    images: list[list[SeenImage]] = [pickle.loads(each) for each in looks]
+    return [tuple(image[i] for image in images) for i in range(num_maps)]
 
 
-@contextmanager
-def _damage_named(ref: str) -> Iterator[None]:
-    """Turn what should not happen while a map is opened into MapCorrupt ``map.unusable``.
-
-    A damaged map can break the code that reads it in any way, and must not stop the others. Nor
-    must a plug-in that exits when it is first used.
-    """
-    try:
-        yield
-    except VislocError:
-        raise
-    except (Exception, SystemExit) as error:
-        logger.exception("map %s cannot be used", ref)
-        raise MapCorrupt(
-            "map.unusable",
-            "the map cannot be used; rebuild it, or see the server's log for the cause",
-            field=ref,
-            got=type(error).__name__,
-        ) from error
+def _picture(
+    photo: Photo, target: Target, look: Look, found: Localization, solved: Solved
+) -> MatchPicture:
+    localizer, answer, matches = target.localizer, found.answer, look.matches
+    outcome = answer.refusal or answer.pose
+    assert outcome is not None  # an answer has one of both
+    inliers = solved.inliers[0] if solved.inliers else np.zeros(len(matches.pixels), np.bool_)
+    return MatchPicture(
+        matches.pixels,
+        matches.points + localizer.geometry.origin,
+        inliers,
+        draw_overlay(photo, localizer.map, look, outcome, inliers),
+    )

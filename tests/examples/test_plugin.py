@@ -16,9 +16,8 @@ PLUGIN = Path(__file__).parents[2] / "examples" / "plugin"
 LOCALIZE = """
 import ctypes, sys
 from pathlib import Path
-from service.values import LocalizeJob
+from service.values import MapFolder, WorkerSettings, photo_job
 from service.workers.vision import Vision
-from service.workers.process import MapFolder, WorkerSettings
 from visloc.archive import MapStore
 from visloc.kapture import read_dataset
 from visloc.types import LocalizeOptions
@@ -28,13 +27,13 @@ opened = MapStore(maps_dir).open("room")
 served = MapFolder(opened.ref, MapStore(maps_dir).folder("room"))
 settings = WorkerSettings(None, 1, 10**9, 8, 8, 10**8, 10**8)
 record = queries.images[0]
-job = LocalizeJob(
+job = photo_job(
     (), queries.path_of(record).read_bytes(), queries.sensors[record.sensor_id].camera,
     LocalizeOptions(),
 )
 answer = Vision(settings, ctypes.c_bool()).localize(job, [served], 0.0).answer
-print(*answer.cam_from_world.center - queries.pose(record).center)
-print(*answer.evidence.retrieved[0].similarities)
+print(*answer.pose.rig_from_world.center - queries.pose(record).center)
+print(*answer.images[0].evidence.retrieved[0].similarities)
 """
 
 

@@ -15,7 +15,7 @@ from google.protobuf.message import DecodeError
 
 from service.api import BatchLimits, LocalizeRequest, LocalizeRigRequest
 from service.grpc.messages import localize_job_of, rig_job_of
-from service.values import LocalizeJob, RigJob
+from service.values import RigJob
 from tests.fuzz.target import holds, refusal
 from tests.fuzz.tiny_map import GLOBAL_DIM, LOCAL_DIM, write_tiny_map
 from visloc.archive import open_map
@@ -44,12 +44,9 @@ class Features:
         """Read a request; features that are accepted can be matched."""
         try:
             job = _read(data[0] % 5 if data else 0, data[1:])
-            queries = [(job.query, job.camera)] if isinstance(job, LocalizeJob) else []
-            if isinstance(job, RigJob):
-                queries = [(image.query, image.camera) for image in job.images]
-            for query, camera in queries:
-                if isinstance(query, QueryFeatures):
-                    self._check(query, camera or _CAMERA)
+            for image in job.images:
+                if isinstance(image.query, QueryFeatures):
+                    self._check(image.query, image.camera or _CAMERA)
         except DecodeError:
             return "not protobuf"
         except InvalidInput as error:
@@ -132,7 +129,7 @@ def _check_unit(rows: np.ndarray) -> None:
         np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1.0, atol=1e-5)
 
 
-def _read(kind: int, data: bytes) -> LocalizeJob | RigJob:
+def _read(kind: int, data: bytes) -> RigJob:
     if kind == _JSON:
         return LocalizeRequest.read_json(data).to_job()
     if kind == _PROTOBUF:

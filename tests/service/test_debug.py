@@ -12,8 +12,16 @@ from service.api.answers import localize_response
 from service.grpc.envelope import message_of
 from service.values import Localization, MatchPicture
 from visloc.errors import InvalidInput
-from visloc.geometry import Camera
-from visloc.types import CameraSource, Evidence, NotLocalized, ReadAs, Reason
+from visloc.geometry import Camera, Pose
+from visloc.types import (
+    CameraSource,
+    Evidence,
+    ImageAnswer,
+    InstantAnswer,
+    ReadAs,
+    Reason,
+    Refusal,
+)
 from visloc_api.v1 import localization_pb2 as pb2
 
 PHOTO = base64.b64encode(b"photo").decode()
@@ -28,7 +36,9 @@ def job(**fields: Any) -> Any:
 def answer(debug: MatchPicture | None) -> LocalizeResponse:
     camera = Camera("SIMPLE_PINHOLE", 64, 48, (50.0, 32.0, 24.0))
     evidence = Evidence(camera, CameraSource.GIVEN, 1, ReadAs.STORED)
-    refused = NotLocalized(evidence, "gate", Reason.TOO_FEW_INLIERS, "no")
+    image = ImageAnswer("camera", Pose.identity(), evidence, None)
+    refusal = Refusal("gate", Reason.TOO_FEW_INLIERS, "no")
+    refused = InstantAnswer(None, (image,), None, refusal, {})
     return localize_response(Localization(refused, "room", "v1", debug=debug), "id")
 
 

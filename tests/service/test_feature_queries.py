@@ -372,11 +372,12 @@ def test_an_array_is_read_without_a_copy_of_its_bytes() -> None:
 
 def test_features_become_the_job_that_they_say() -> None:
     job = LocalizeRequest.read_json(json.dumps(example("features_request"))).to_job()
-    assert isinstance(job.query, QueryFeatures)
-    assert job.query.kind == "xfeat"
-    np.testing.assert_array_equal(job.query.keypoints, [[12.5, 25.0], [32.0, 18.0]])
-    assert job.query.descriptors.shape == (2, 64)
-    assert job.query.descriptors.dtype == np.int8
+    query = job.images[0].query
+    assert isinstance(query, QueryFeatures)
+    assert query.kind == "xfeat"
+    np.testing.assert_array_equal(query.keypoints, [[12.5, 25.0], [32.0, 18.0]])
+    assert query.descriptors.shape == (2, 64)
+    assert query.descriptors.dtype == np.int8
 
 
 # Maps of ready-made features

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,18 +15,19 @@ from visloc.types import (
     Evidence,
     ImageAnswer,
     InstantAnswer,
-    Localized,
-    NotLocalized,
     PoseSource,
     ReadAs,
     Reason,
+    Refusal,
     RigPose,
 )
 
 CAMERA = Camera("PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
 
 
-def localized(inliers: int, center: Any = (0, 0, 0), turn: float = 0.0, std: float = 0.01) -> Any:
+def localized(
+    inliers: int, center: Any = (0, 0, 0), turn: float = 0.0, std: float = 0.01
+) -> InstantAnswer:
     rotation = Rotation.from_rotvec([0, 0, turn]).as_matrix()
     pose = Pose(rotation, -rotation @ np.asarray(center, dtype=np.float64))
     # Of the centre, as large in all directions.
@@ -39,29 +41,11 @@ def localized(inliers: int, center: Any = (0, 0, 0), turn: float = 0.0, std: flo
         num_inliers=inliers,
     )
     spread = np.sqrt(np.diag(position_covariance(pose, covariance)))
-    return Localized(
-        evidence,
-        pose,
-        covariance,
-        spread,
-        np.full(3, 1e-4),
-        np.zeros((0, 2), np.float32),
-        np.zeros((0, 3)),
-    )
+    rig = RigPose(pose, covariance, spread, np.full(3, 1e-4), PoseSource.ESTIMATED)
+    image = ImageAnswer("camera", Pose.identity(), evidence, None)
+    return InstantAnswer(None, (image,), rig, None, {})
 
 
-def refused(inliers: int, reason: Reason = Reason.TOO_FEW_INLIERS) -> NotLocalized:
-    return NotLocalized(localized(inliers).evidence, "gate", reason, "refused")
-
-
-def of_rig(inliers: int, center: Any = (0, 0, 0)) -> InstantAnswer:
-    one = localized(inliers, center)
-    rig = RigPose(
-        one.cam_from_world,
-        one.covariance,
-        one.position_std,
-        one.orientation_std,
-        PoseSource.ESTIMATED,
-    )
-    image = ImageAnswer("cam", Pose.identity(), one.evidence, None)
-    return InstantAnswer(0, (image,), rig, None, {})
+def refused(inliers: int, reason: Reason = Reason.TOO_FEW_INLIERS) -> InstantAnswer:
+    refusal = Refusal("gate", reason, "refused")
+    return replace(localized(inliers), pose=None, refusal=refusal)

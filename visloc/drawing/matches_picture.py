@@ -18,9 +18,11 @@ from visloc.archive.schema import MAX_PHOTO_BYTES, MAX_PHOTO_SIDE
 from visloc.errors import InvalidInput, MapCorrupt
 from visloc.images import ImageLimits, Photo, read_photo, turn_of, upright, upright_from_stored
 from visloc.localization.solving import Look
-from visloc.types import Answer, Localized, NotLocalized, ReadAs
+from visloc.types import Answer, NotLocalized, ReadAs, Refusal, RigPose
 
 Canvas = NDArray[np.uint8]
+# A pose with its uncertainty, or why there is none.
+Outcome = Answer | RigPose | Refusal
 Color = tuple[int, int, int]
 
 _WIDTH = 1600
@@ -114,7 +116,7 @@ class _Shown:
 
 
 def draw_overlay(
-    photo: Photo, opened: Map, look: Look, answer: Answer, inliers: NDArray[np.bool_]
+    photo: Photo, opened: Map, look: Look, answer: Outcome, inliers: NDArray[np.bool_]
 ) -> bytes:
     """Draw a photo's matches beside the photos of the map that they were found in.
 
@@ -282,11 +284,11 @@ def _caption(canvas: Canvas, shown: _Shown, inliers: NDArray[np.bool_]) -> None:
 
 
 def _headline(
-    canvas: Canvas, opened: Map, look: Look, answer: Answer, inliers: NDArray[np.bool_]
+    canvas: Canvas, opened: Map, look: Look, answer: Outcome, inliers: NDArray[np.bool_]
 ) -> None:
     counts = f"{int(inliers.sum())} of {len(inliers)} matches agree with"
     room = _WIDTH - 2 * _MARGIN
-    if isinstance(answer, NotLocalized):
+    if isinstance(answer, NotLocalized | Refusal):
         title = f"not localized: {answer.reason}, {counts} the best pose"
         _write(canvas, title, (_MARGIN, 40), _OUTLIER, 0.9, room)
         detail = f"{answer.message} (stage {answer.stage})"
@@ -302,8 +304,9 @@ def _headline(
     _write(canvas, facts, (_MARGIN, 90), _DIM, 0.5, room)
 
 
-def _legend(canvas: Canvas, answer: Answer, num_hidden: int) -> None:
-    pose = "the pose" if isinstance(answer, Localized) else "the best pose, which was refused,"
+def _legend(canvas: Canvas, answer: Outcome, num_hidden: int) -> None:
+    is_refused = isinstance(answer, NotLocalized | Refusal)
+    pose = "the best pose, which was refused," if is_refused else "the pose"
     text = (
         f"green ring: {pose} explains the match; red cross: it does not; "
         f"lines: up to {_MAX_LINES} of the inliers that a photo of the map sees"

@@ -12,11 +12,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from visloc.geometry import Pose, Similarity, rotation_angle
+from visloc.geometry import Similarity, rotation_angle
 from visloc.pose.centre import largest_std, moved_pose, position_covariance
-from visloc.types import Answer, InstantAnswer, Localized, NotLocalized, Reason, Refusal
+from visloc.types import InstantAnswer, Reason, Refusal, RigPose
 
 # Of the most inliers: answers of this share must agree with each other, or the answer is
 # ambiguous; of those of this share, the most certain counts.
@@ -38,7 +37,7 @@ class Candidate:
     """
 
     ref: str
-    answer: Answer | InstantAnswer
+    answer: InstantAnswer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,9 +78,12 @@ def judge(candidates: Sequence[Candidate], ties: Ties) -> int | Refusal:
     answers = [candidate.answer for candidate in candidates]
     explains = [i for i, answer in enumerate(answers) if _explains(answer)]
     if not explains:
-        return max(range(len(answers)), key=lambda i: _progress(answers[i]))
-    most = max(inliers_of(answers[i]) for i in explains)
-    rivals = [i for i in explains if inliers_of(answers[i]) >= _RIVAL_SHARE * most]
+        return max(
+            range(len(answers)),
+            key=lambda i: (answers[i].num_inliers, answers[i].num_correspondences),
+        )
+    most = max(answers[i].num_inliers for i in explains)
+    rivals = [i for i in explains if answers[i].num_inliers >= _RIVAL_SHARE * most]
     for i in rivals:
         if measured_pose(answers[i]) is None:
             return i
@@ -89,7 +91,7 @@ def judge(candidates: Sequence[Candidate], ties: Ties) -> int | Refusal:
         tie = ties(i, j)
         if tie is None or not _agree(answers[i], answers[j], tie):
             return _ambiguous(candidates[i], candidates[j], tied=tie is not None)
-    similar = [i for i in rivals if inliers_of(answers[i]) >= _SIMILAR_SHARE * most]
+    similar = [i for i in rivals if answers[i].num_inliers >= _SIMILAR_SHARE * most]
     first = similar[0]
 
     def spread(i: int) -> float:
@@ -100,48 +102,32 @@ def judge(candidates: Sequence[Candidate], ties: Ties) -> int | Refusal:
     return min(similar, key=spread)
 
 
-def measured_pose(answer: Answer | InstantAnswer) -> tuple[Pose, NDArray[np.float64]] | None:
-    """Return the pose that an answer's own images measured, and its covariance."""
-    if isinstance(answer, Localized):
-        return answer.cam_from_world, answer.covariance
-    if isinstance(answer, InstantAnswer) and answer.pose is not None and answer.refusal is None:
-        return answer.pose.rig_from_world, answer.pose.covariance
-    return None
+def measured_pose(answer: InstantAnswer) -> RigPose | None:
+    """Return the pose that an answer's own images measured."""
+    return answer.pose if answer.refusal is None else None
 
 
-def inliers_of(answer: Answer | InstantAnswer) -> int:
-    """Return the inliers of the best pose, accepted or not."""
-    if isinstance(answer, InstantAnswer):
-        return answer.num_inliers
-    return answer.evidence.num_inliers
-
-
-def _explains(answer: Answer | InstantAnswer) -> bool:
-    if isinstance(answer, NotLocalized):
-        return answer.reason is Reason.AMBIGUOUS
-    if isinstance(answer, InstantAnswer) and answer.refusal is not None:
+def _explains(answer: InstantAnswer) -> bool:
+    if answer.refusal is not None:
         return answer.refusal.reason is Reason.AMBIGUOUS
-    return measured_pose(answer) is not None
+    return answer.pose is not None
 
 
-def _progress(answer: Answer | InstantAnswer) -> tuple[int, int]:
-    if isinstance(answer, InstantAnswer):
-        return answer.num_inliers, answer.num_correspondences
-    return answer.evidence.num_inliers, answer.evidence.num_correspondences
-
-
-def _spread(answer: Answer | InstantAnswer) -> float:
+def _spread(answer: InstantAnswer) -> float:
     """Variance of the position, along all axes together."""
-    known = measured_pose(answer)
-    return math.inf if known is None else float(position_covariance(*known).trace())
+    pose = measured_pose(answer)
+    if pose is None:
+        return math.inf
+    return float(position_covariance(pose.rig_from_world, pose.covariance).trace())
 
 
-def _agree(a: Answer | InstantAnswer, b: Answer | InstantAnswer, tie: Tie) -> bool:
+def _agree(a: InstantAnswer, b: InstantAnswer, tie: Tie) -> bool:
     """Whether two poses are those of one place, seen from two maps."""
     known_a, known_b = measured_pose(a), measured_pose(b)
     assert known_a is not None  # the caller has looked
     assert known_b is not None
-    (pose_a, covariance_a), (pose_b, covariance_b) = known_a, moved_pose(*known_b, tie.a_from_b)
+    pose_a, covariance_a = known_a.rig_from_world, known_a.covariance
+    pose_b, covariance_b = moved_pose(known_b.rig_from_world, known_b.covariance, tie.a_from_b)
     away = float(np.linalg.norm(pose_a.center - pose_b.center))
     turned = rotation_angle(pose_a.rotation @ pose_b.rotation.T)
     turn_std = math.sqrt(covariance_a[:3, :3].trace() + covariance_b[:3, :3].trace())
@@ -159,6 +145,6 @@ def _ambiguous(a: Candidate, b: Candidate, *, tied: bool) -> Refusal:
     return Refusal(
         "gate",
         Reason.AMBIGUOUS,
-        f"{a.ref} and {b.ref} both explain it, {where}, with {inliers_of(a.answer)} and "
-        f"{inliers_of(b.answer)} inliers; {advice}",
+        f"{a.ref} and {b.ref} both explain it, {where}, with {a.answer.num_inliers} and "
+        f"{b.answer.num_inliers} inliers; {advice}",
     )

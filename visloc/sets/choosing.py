@@ -12,11 +12,11 @@ from visloc.archive import SetOutline
 from visloc.archive.places import circles_of
 from visloc.errors import InvalidInput, NotFound
 from visloc.geodesy import ground_distances
-from visloc.localization.judge import inliers_of, measured_pose
+from visloc.localization.judge import measured_pose
 from visloc.pose.centre import largest_std
 from visloc.priors import HEIGHT_REACH, POSE_PRIOR_STDS, REACH, Priors
 from visloc.sets.frame import down_in_set
-from visloc.types import Answer, InstantAnswer
+from visloc.types import InstantAnswer
 
 # Tiles that a query is searched in, at most.
 MAX_SEARCHED = 5
@@ -164,9 +164,9 @@ def plan(scores: Sequence[TileScore]) -> tuple[tuple[int, ...], tuple[int, ...]]
     return tuple(first), tuple(s.tile for s in searched[len(first) :])
 
 
-def is_clear(answer: Answer | InstantAnswer) -> bool:
+def is_clear(answer: InstantAnswer) -> bool:
     """Tell whether no other tile needs to be searched: a pose of many inliers."""
-    return measured_pose(answer) is not None and inliers_of(answer) >= CLEAR_INLIERS
+    return measured_pose(answer) is not None and answer.num_inliers >= CLEAR_INLIERS
 
 
 def _named(outline: SetOutline, names: Sequence[str]) -> NDArray[np.bool_]:

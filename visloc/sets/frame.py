@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,30 +11,17 @@ from visloc.errors import InvalidInput
 from visloc.geometry import Pose, Similarity
 from visloc.pose.centre import moved_pose, position_covariance
 from visloc.priors import HeightBand, PosePrior, PositionPrior, Priors
-from visloc.types import InstantAnswer, Localized, NotLocalized, RigPose
-
-AnyAnswer = TypeVar("AnyAnswer", Localized, NotLocalized, InstantAnswer)
+from visloc.types import InstantAnswer, RigPose
 
 
-def answer_in_set(answer: AnyAnswer, set_from_tile: Similarity) -> AnyAnswer:
-    """Move an answer of a tile to the set's frame and unit: poses, covariances, points."""
-    if isinstance(answer, Localized):
-        pose, covariance = moved_pose(answer.cam_from_world, answer.covariance, set_from_tile)
-        return replace(
-            answer,
-            cam_from_world=pose,
-            covariance=covariance,
-            position_std=_position_std(answer.cam_from_world, answer.covariance, set_from_tile),
-            inlier_points=set_from_tile.apply(answer.inlier_points),
-        )
-    if isinstance(answer, InstantAnswer):
-        images = tuple(
-            replace(image, cam_from_rig=scaled_device(image.cam_from_rig, set_from_tile.scale))
-            for image in answer.images
-        )
-        rig = None if answer.pose is None else _moved_rig(answer.pose, set_from_tile)
-        return replace(answer, images=images, pose=rig)
-    return answer
+def answer_in_set(answer: InstantAnswer, set_from_tile: Similarity) -> InstantAnswer:
+    """Move an answer of a tile to the set's frame and unit: its pose, and the rig."""
+    images = tuple(
+        replace(image, cam_from_rig=scaled_device(image.cam_from_rig, set_from_tile.scale))
+        for image in answer.images
+    )
+    rig = None if answer.pose is None else _moved_rig(answer.pose, set_from_tile)
+    return replace(answer, images=images, pose=rig)
 
 
 def down_in_set(priors: Priors, down: NDArray[np.float64] | None) -> NDArray[np.float64] | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
 from http import HTTPStatus
 from time import time
 
@@ -28,12 +27,10 @@ from service.http.responses import json_response, problem_response, while_connec
 from service.http.slow_clients import arrivals_of
 from service.settings import ServiceSettings
 from service.telemetry.observer import Observer
-from service.values import InstantLocalization, Localization, LocalizeJob, RigJob
-from visloc.archive import Geodetic
+from service.values import Localization, RigJob
 from visloc.errors import InvalidInput, NotFound
 from visloc.geometry import Pose
 from visloc.geopose import accuracy_of
-from visloc.types import Localized
 from visloc_api.words.wire import TIMEOUT_HEADER
 
 OSCP = "application/vnd.oscp+json"
@@ -128,17 +125,7 @@ def answer_kind(accept: list[str]) -> str:
     return best
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Found:
-    """The pose of the camera of the first reading."""
-
-    cam_from_world: Pose
-    covariance: NDArray[np.float64]
-    geodetic: Geodetic | None
-    map_ref: str
-
-
-def _read(body: bytes, settings: ServiceSettings) -> tuple[GeoPoseRequest, LocalizeJob | RigJob]:
+def _read(body: bytes, settings: ServiceSettings) -> tuple[GeoPoseRequest, RigJob]:
     asked = GeoPoseRequest.read_json(body)
     return asked, asked.to_job(
         max_image_bytes=settings.max_image_bytes, max_images=settings.max_rig_images
@@ -149,30 +136,30 @@ async def _answer(
     engine: Engine,
     observer: Observer,
     asked: GeoPoseRequest,
-    job: LocalizeJob | RigJob,
+    job: RigJob,
     request_id: str,
 ) -> GeoPoseResponse:
-    if isinstance(job, RigJob):
-        with engine.admit_batch():
-            instant = await engine.localize_rig(job)
-        observer.instant(instant)
-        found = _of_rig(instant)
+    if job.rig is None:
+        found = await engine.localize(job)
+        observer.localization(found)
     else:
-        localization = await engine.localize(job)
-        observer.localization(localization)
-        found = _of_photo(localization)
-    geopose, _ = geoposes_to_words(found.cam_from_world, found.geodetic, ypr=False)
+        with engine.admit_batch():
+            found = await engine.localize_rig(job)
+        observer.instant(found)
+    cam_from_world, covariance = _first_camera(found)
+    map_ref = f"{found.map_id}@{found.map_version}"
+    geopose, _ = geoposes_to_words(cam_from_world, found.geodetic, ypr=False)
     if geopose is None or found.geodetic is None:
         # Found by its anchor, and replaced by a version without one in that moment.
         raise NotFound(
             "geopose.not_anchored",
-            f"map {found.map_ref} localizes the photo and is not anchored to the Earth",
+            f"map {map_ref} localizes the photo and is not anchored to the Earth",
         )
     # Of a place that was simply given, nobody knows how exact it is.
-    anchor = (await engine.map(found.map_ref)).outline.manifest.world.anchor
+    anchor = (await engine.map(map_ref)).outline.manifest.world.anchor
     accuracy = accuracy_of(
-        found.cam_from_world,
-        found.covariance,
+        cam_from_world,
+        covariance,
         found.geodetic,
         None if anchor is None else anchor.rms,
     )
@@ -187,27 +174,15 @@ async def _answer(
     )
 
 
-def _of_photo(found: Localization) -> _Found:
-    answer = found.answer
-    if not isinstance(answer, Localized):
-        raise _not_localized(answer.stage, answer.reason, answer.message)
-    ref = f"{found.map_id}@{found.map_version}"
-    return _Found(answer.cam_from_world, answer.covariance, found.geodetic, ref)
-
-
-def _of_rig(found: InstantLocalization) -> _Found:
+def _first_camera(found: Localization) -> tuple[Pose, NDArray[np.float64]]:
+    """Return the pose and covariance (6, 6) of the camera of the first reading."""
     pose, refusal = found.answer.pose, found.answer.refusal
     if pose is None:
         assert refusal is not None  # an instant has one of both
-        raise _not_localized(refusal.stage, refusal.reason, refusal.message)
+        raise NotFound(
+            "geopose.not_localized", refusal.message, got=f"{refusal.stage}: {refusal.reason}"
+        )
     cam_from_rig = found.answer.images[0].cam_from_rig
-    cam_from_world = cam_from_rig @ pose.rig_from_world
     # C Exp(w) R = Exp(C w) C R and C (t + dt) + c: both parts turn with the camera.
     turn = np.kron(np.eye(2), cam_from_rig.rotation)
-    covariance = turn @ pose.covariance @ turn.T
-    ref = f"{found.map_id}@{found.map_version}"
-    return _Found(cam_from_world, covariance, found.geodetic, ref)
-
-
-def _not_localized(stage: str, reason: str, message: str) -> NotFound:
-    return NotFound("geopose.not_localized", message, got=f"{stage}: {reason}")
+    return cam_from_rig @ pose.rig_from_world, turn @ pose.covariance @ turn.T

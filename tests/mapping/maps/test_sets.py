@@ -34,11 +34,12 @@ from visloc.kapture import read_dataset
 from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.judge import TIE_REACH_SHARE, Candidate, Tie, judge
 from visloc.localization.localizer import Localizer
+from visloc.localization.solving import SeenImage
 from visloc.priors import NO_PRIORS, HeightBand, PositionPrior, Priors
 from visloc.sets.choosing import allowed_tiles, plan
 from visloc.sets.coarse import rank_tiles
 from visloc.sets.frame import answer_in_set, priors_in_tile
-from visloc.types import Localized, LocalizeOptions, Reason, Refusal
+from visloc.types import LocalizeOptions, Reason, Refusal
 
 TURN = Pose.from_quaternion([0.8, 0.1, -0.5, 0.3], [0, 0, 0]).rotation
 ELSEWHERE = Similarity(1.0, TURN, np.array([300.0, -40.0, 7.0]))
@@ -278,12 +279,10 @@ def localize_in(store: MapStore, set_id: str, photo: Any, camera: Any, priors: P
         tile = opened.tiles[row]
         set_from_tile = tile.set_from_tile.similarity
         localizer = Localizer(store.open(tile.ref), extractor)
-        answer = localizer.localize(
-            photo,
-            camera,
-            LocalizeOptions(),
-            priors_in_tile(priors, set_from_tile, opened.gravity),
-        )
+        options, in_tile = LocalizeOptions(), priors_in_tile(priors, set_from_tile, opened.gravity)
+        look = localizer.look(photo, camera, options, in_tile)
+        seen = SeenImage("camera", Pose.identity(), look)
+        answer = localizer.solve([seen], options, in_tile).answer
         found.append(Candidate(tile.ref, answer_in_set(answer, set_from_tile)))
     tie = Tie(Similarity.identity(), TIE_REACH_SHARE * float(opened.reaches.max()))
     chosen = judge(found, lambda *_: tie)
@@ -293,8 +292,8 @@ def localize_in(store: MapStore, set_id: str, photo: Any, camera: Any, priors: P
 def test_photos_are_localized_in_a_split_map(store: MapStore, hall_sample: Path) -> None:
     for photo, camera, truth in queries_of(hall_sample):
         found = localize_in(store, "halls", photo, camera, NO_PRIORS)
-        assert isinstance(found.answer, Localized)
-        metres, degrees = pose_error(found.answer.cam_from_world, truth)
+        assert found.answer.pose is not None
+        metres, degrees = pose_error(found.answer.pose.rig_from_world, truth)
         assert metres < 0.1
         assert degrees < 2.0
 
@@ -313,12 +312,12 @@ def test_a_tile_moved_by_a_similarity_gives_the_same_answer(
         near = Priors(position=PositionPrior(truth.center, 1.0))
         for priors in (NO_PRIORS, near):
             here, away = (
-                localize_in(store, set_id, photo, camera, priors).answer
+                localize_in(store, set_id, photo, camera, priors).answer.pose
                 for set_id in ("one", "other")
             )
-            assert isinstance(here, Localized)
-            assert isinstance(away, Localized)
-            metres, degrees = pose_error(here.cam_from_world, away.cam_from_world)
+            assert here is not None
+            assert away is not None
+            metres, degrees = pose_error(here.rig_from_world, away.rig_from_world)
             assert metres < 1e-3
             assert degrees < 0.02
             np.testing.assert_allclose(here.position_std, away.position_std, rtol=0.02)
@@ -350,7 +349,7 @@ def test_one_place_in_two_tiles_apart_is_refused(store: MapStore, hall_sample: P
     # A prior settles it.
     known = localize_in(store, "twins", photo, camera, Priors(maps=("twin",)))
     assert known.ref.startswith("twin@")
-    assert pose_error(known.answer.cam_from_world, BESIDE.move(truth))[0] < 0.1
+    assert pose_error(known.answer.pose.rig_from_world, BESIDE.move(truth))[0] < 0.1
 
 
 # Where maps lie

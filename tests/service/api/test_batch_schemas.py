@@ -18,7 +18,7 @@ from service.api import (
 from service.api.answers import instant_answer
 from service.grpc.messages import instant_of, rig_job_of, sequence_start_of
 from service.settings import ServiceSettings
-from service.values import ONLY_SENSOR, InstantLocalization, RigJob
+from service.values import ONLY_SENSOR, Localization, RigJob
 from visloc.errors import InvalidInput, TooLarge
 from visloc.geometry import Camera, Pose
 from visloc.sequences.filling import TimeUnit
@@ -480,7 +480,7 @@ def test_an_image_of_an_instant_lists_the_best_twenty_photos() -> None:
     refusal = Refusal("pose", Reason.NO_POSE, "no pose")
     answer = InstantAnswer(None, (seen,), None, refusal, {})
 
-    message = instant_answer(InstantLocalization(answer, "room", "1"), "id")
+    message = instant_answer(Localization(answer, "room", "1"), "id")
 
     names = [photo.image for photo in message.images[0].retrieved]
     assert names == [f"{i}.jpg" for i in range(20)]

@@ -55,9 +55,9 @@ def test_a_full_request_becomes_the_job_that_it_says() -> None:
 
     job = LocalizeRequest.read_json(json.dumps(request(camera=CAMERA, options=options))).to_job()
 
-    assert (job.maps, job.query) == (("room",), b"photo")
-    assert job.camera is not None
-    assert job.camera.params == (525.0, 525.5, 320.0, 240.0)
+    assert (job.maps, job.images[0].query) == (("room",), b"photo")
+    assert job.images[0].camera is not None
+    assert job.images[0].camera.params == (525.0, 525.5, 320.0, 240.0)
     assert job.options == CoreOptions(
         *("config1", 5, 8.0, 12, 0.5, ReadAs.UPRIGHT, Extraction.FAST, Fusion.MEAN),
         fusion_weights={"densevlad": 1.0, "kapture:AP-GeM": 0.5},
@@ -70,15 +70,15 @@ def test_a_full_request_becomes_the_job_that_it_says() -> None:
 def test_what_is_left_out_or_null_takes_the_default() -> None:
     for message in (request(), request(camera=None, options={"top_k": None})):
         job = LocalizeRequest.read_json(json.dumps(message)).to_job()
-        assert job.camera is None
+        assert job.images[0].camera is None
         assert job.options == CoreOptions()
 
 
 @pytest.mark.parametrize("text", ["PINHOLE,640,480,525,525.5,320,240", json.dumps(CAMERA)])
 def test_a_camera_may_be_text(text: str) -> None:
     assert (
-        LocalizeRequest.read(request(camera=text)).to_job().camera
-        == LocalizeRequest.read(request(camera=CAMERA)).to_job().camera
+        LocalizeRequest.read(request(camera=text)).to_job().images[0].camera
+        == LocalizeRequest.read(request(camera=CAMERA)).to_job().images[0].camera
     )
 
 

@@ -22,12 +22,12 @@ from service.telemetry.metrics import Metrics
 from service.values import (
     ImageJob,
     Instant,
-    InstantLocalization,
-    LocalizeJob,
+    Localization,
     RigJob,
     SequenceStart,
+    WorkerSettings,
+    photo_job,
 )
-from service.workers.process import WorkerSettings
 from visloc.archive import MapStore
 from visloc.errors import (
     Conflict,
@@ -45,7 +45,7 @@ from visloc.images import ImageLimits
 from visloc.kapture import read_dataset
 from visloc.priors import NO_PRIORS, GravityPrior, PositionPrior, Priors
 from visloc.sequences.filling import Odometry, TimeUnit
-from visloc.types import Localized, LocalizeOptions, PoseSource, Reason, RigSensor
+from visloc.types import LocalizeOptions, PoseSource, Reason, RigSensor
 
 T = TypeVar("T")
 
@@ -129,8 +129,8 @@ def with_two_workers(built_maps: Path) -> Iterator[WithEngine]:
         yield with_engine
 
 
-def job_for(query: Query, ref: str = "room") -> LocalizeJob:
-    return LocalizeJob((ref,), query.image, query.camera, LocalizeOptions())
+def job_for(query: Query, ref: str = "room") -> RigJob:
+    return photo_job((ref,), query.image, query.camera, LocalizeOptions())
 
 
 def publish(maps_dir: Path, version: str, map_id: str = "room") -> None:
@@ -150,10 +150,10 @@ def test_an_answer_names_its_map_and_times_every_stage(
     async def play(engine: Engine) -> None:
         found = await engine.localize(job_for(query))
 
-        assert isinstance(found.answer, Localized)
+        assert found.answer.pose is not None
         assert found.map_id == "room"
         assert found.map_version == MapStore(built_maps).current_version("room")
-        seconds = found.answer.evidence.seconds
+        seconds = found.answer.seconds
         assert list(seconds)[:4] == ["queued", "open_map", "decode", "local_features"]
         assert all(value >= 0 for value in seconds.values())
 
@@ -443,7 +443,7 @@ def test_one_photo_too_many_is_refused_at_once(with_engine: WithEngine, query: Q
         answers = await asyncio.gather(*accepted)
         assert len(answers) == 3
         # The sleep began before the third was accepted: it waited most of it, not all.
-        assert answers[2].answer.evidence.seconds["queued"] > 0.05
+        assert answers[2].answer.seconds["queued"] > 0.05
         await engine.localize(job_for(query))  # there is room again
 
     with_engine(play)
@@ -513,9 +513,9 @@ def test_a_worker_that_dies_fails_its_own_request_and_is_replaced(
         assert died.code == "server.worker_died"
         for each in found:
             if not isinstance(each, BaseException):
-                assert isinstance(each.answer, Localized)
-                assert isinstance(alone.answer, Localized)
-                assert np.array_equal(each.answer.covariance, alone.answer.covariance)
+                assert each.answer.pose is not None
+                assert alone.answer.pose is not None
+                assert np.array_equal(each.answer.pose.covariance, alone.answer.pose.covariance)
         await until(lambda: engine.workers.alive == 2)
         assert other in engine.workers.pids
         assert one not in engine.workers.pids
@@ -663,9 +663,9 @@ def test_of_several_maps_the_one_with_the_best_answer_is_named(
         for maps in (("hall", "room"), ("room", "hall")):
             found = await engine.localize(replace(job_for(query), maps=maps, options=FAST))
             assert found.map_id == "room"
-            assert isinstance(found.answer, Localized)
-            assert isinstance(alone.answer, Localized)
-            assert np.array_equal(found.answer.covariance, alone.answer.covariance)
+            assert found.answer.pose is not None
+            assert alone.answer.pose is not None
+            assert np.array_equal(found.answer.pose.covariance, alone.answer.pose.covariance)
 
         both = await engine.localize_rig(rig_job(rig_photos, maps=("hall", "room")))
         assert (both.map_id, both.answer.timestamp) == ("room", 5)
@@ -673,7 +673,7 @@ def test_of_several_maps_the_one_with_the_best_answer_is_named(
 
         lost = await engine.localize(replace(job_for(query), maps=("hall",), options=FAST))
         assert lost.map_id == "hall"
-        assert not isinstance(lost.answer, Localized)
+        assert lost.answer.pose is None
 
     with_two_maps(play)
 
@@ -782,7 +782,7 @@ START = SequenceStart(("room",), None, None, 1.0, FAST)
 
 async def answers_of(
     engine: Engine, start: SequenceStart, instants: Sequence[Instant]
-) -> list[InstantLocalization]:
+) -> list[Localization]:
     """Sent one by one, as a stream is."""
 
     async def sent() -> AsyncIterator[Instant]:

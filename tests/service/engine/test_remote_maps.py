@@ -19,7 +19,6 @@ import pytest
 from moto.server import ThreadedMotoServer
 
 from service.engine.stores import open_store
-from service.settings import ServiceSettings, SettingsError
 from visloc.archive import MapStore, open_map, remote_store, verify_map
 from visloc.archive.checks import json_text, manifest_hash
 from visloc.archive.remote_store import RemoteMapStore
@@ -560,8 +559,8 @@ def test_credentials_are_never_told(
 
 
 def test_a_folder_and_a_url_are_told_apart(bucket: str, tmp_path: Path) -> None:
-    folder = open_store(ServiceSettings(maps_dir=str(tmp_path)))
-    url = open_store(ServiceSettings(maps_dir=f"s3://{bucket}", cache_dir=tmp_path))
+    folder = open_store(str(tmp_path), tmp_path, LARGE)
+    url = open_store(f"s3://{bucket}", tmp_path, LARGE)
 
     assert isinstance(folder, MapStore)
     assert isinstance(url, RemoteMapStore)
@@ -579,10 +578,10 @@ def test_a_bucket_that_does_not_exist_is_not_created(
 
 
 def test_a_url_within_a_url_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match="several parts"):
-        open_store(ServiceSettings(maps_dir="simplecache::s3://bucket", cache_dir=tmp_path))
+    with pytest.raises(ValueError, match="several parts"):
+        open_store("simplecache::s3://bucket", tmp_path, LARGE)
 
 
-def test_a_url_of_an_unknown_protocol_is_refused_by_name() -> None:
-    with pytest.raises(SettingsError, match=r"maps_dir.*nosuch"):
-        open_store(ServiceSettings(maps_dir="nosuch://maps"))
+def test_a_url_of_an_unknown_protocol_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="nosuch"):
+        open_store("nosuch://maps", tmp_path, LARGE)

@@ -25,7 +25,7 @@ from mapping.frames.georeference import given_place, publish_anchored
 from mapping.maps.sets import publish_set
 from service.engine.catalog import Catalog
 from service.engine.listing import Listing
-from service.engine.set_photos import Places
+from service.engine.set_photos import Slots
 from service.engine.set_sequences import SetSequence
 from service.telemetry.metrics import ServiceState
 from service.values import Near as Circle
@@ -203,11 +203,11 @@ def test_answers_of_a_leg_outlive_an_error_of_the_next(
 ) -> None:
     begin, begun = SetSequence._begin, list[Any]()
 
-    async def second_fails(self: SetSequence, looked: Any) -> Any:
-        begun.append(looked)
+    async def second_fails(self: SetSequence, pending: Any) -> Any:
+        begun.append(pending)
         if len(begun) == 2:
             raise Unavailable("server.worker_died", "died")
-        return await begin(self, looked)
+        return await begin(self, pending)
 
     monkeypatch.setattr(SetSequence, "_begin", second_fails)
     photos = [query.image, b"no photo", b"no photo", in_study[0][0]]
@@ -282,7 +282,7 @@ def test_a_tile_in_use_stays_in_service_when_its_deletion_is_refused(
     held, done = threading.Event(), threading.Event()
 
     async def hold() -> None:
-        async with engine._catalog.using((f"study@{version}",), engine.workers):
+        async with engine._catalog.using((f"study@{version}",)):
             held.set()
             await asyncio.to_thread(done.wait)
 
@@ -407,7 +407,7 @@ def test_tiles_of_a_set_that_was_replaced_are_closed(
         wait_until(lambda: not engine._catalog._background)
         assert room in engine.workers.loaded  # of the new set
         assert study not in engine.workers.loaded
-        assert study not in {of.ref for of in engine._catalog.known}
+        assert study not in {version.ref for version in engine._catalog.known}
         assert client.localize(query.image, "site", query.camera).tile == room
         # Of a set that was deleted, too.
         assert "copy@v1" in engine.workers.loaded
@@ -423,10 +423,10 @@ def test_a_tile_of_features_that_are_not_here_is_away(
     using = Catalog.using
 
     @asynccontextmanager
-    async def not_here(self: Catalog, where: Any, workers: Any) -> AsyncIterator[Any]:
+    async def not_here(self: Catalog, where: Any) -> AsyncIterator[Any]:
         if isinstance(where, tuple) and where[0].startswith("study@"):
             raise Conflict("weights.missing", "there are no weights", field="map")
-        async with using(self, where, workers) as maps:
+        async with using(self, where) as maps:
             yield maps
 
     monkeypatch.setattr(Catalog, "using", not_here)
@@ -438,25 +438,25 @@ def test_a_tile_of_features_that_are_not_here_is_away(
 
 def test_rooms_for_photos_are_taken_by_photos() -> None:
     async def in_turn() -> None:
-        places = Places(3)
-        assert await places.take(2) == 2
-        rigs = [asyncio.create_task(places.take(count)) for count in (16, 2, 2)]
+        slots = Slots(3)
+        assert await slots.take(2) == 2
+        rigs = [asyncio.create_task(slots.take(count)) for count in (16, 2, 2)]
         await asyncio.sleep(0)
         await asyncio.sleep(0)
-        assert (places.waiting, [rig.done() for rig in rigs]) == (20, [False] * 3)
+        assert (slots.waiting, [rig.done() for rig in rigs]) == (20, [False] * 3)
         rigs[1].cancel()  # a caller that hangs up
-        places.give_back(2)
+        slots.give_back(2)
         assert await rigs[0] == 3
         assert not rigs[2].done()
-        places.give_back(3)
+        slots.give_back(3)
         assert await rigs[2] == 2
         # One that ends while it waits for the rest gives back what it has.
-        last = asyncio.create_task(places.take(3))
+        last = asyncio.create_task(slots.take(3))
         await asyncio.sleep(0)
         last.cancel()
-        places.give_back(2)
-        assert await places.take(3) == 3
-        assert places.waiting == 0
+        slots.give_back(2)
+        assert await slots.take(3) == 3
+        assert slots.waiting == 0
 
     asyncio.run(in_turn())
 
@@ -470,7 +470,7 @@ def test_tiles_of_sets_are_not_read_to_find_what_is_near(site: Path) -> None:
             return super().outline(ref)
 
     room, study = (MapStore(site).current_version(name) for name in ("room", "study"))
-    listing = Listing(Counting(site), {})
+    listing = Listing(Counting(site), lambda _: None)
     assert listing.opened_at_start() == (
         *("model", "site", "twice"),
         *(f"room@{room}", f"study@{study}", "copy@v1"),

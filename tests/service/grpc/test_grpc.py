@@ -19,7 +19,7 @@ import visloc
 from clients.transport.messages import plain
 from service.grpc.localization import SERVICE_NAME
 from service.telemetry.metrics import Metrics, ServiceState
-from service.values import LocalizeJob
+from service.values import RigJob
 from visloc_api.v1 import localization_pb2 as pb2
 
 
@@ -323,7 +323,7 @@ def test_the_work_for_a_call_that_is_given_up_is_given_up(
 ) -> None:
     begun, dropped = threading.Event(), threading.Event()
 
-    async def for_ever(_: LocalizeJob) -> NoReturn:
+    async def for_ever(_: RigJob) -> NoReturn:
         begun.set()
         try:
             await asyncio.Event().wait()

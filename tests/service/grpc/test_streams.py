@@ -23,7 +23,7 @@ from google.rpc.error_details_pb2 import ErrorInfo
 from grpc_status import rpc_status
 
 from service.api import LocalizeSequenceResponse
-from service.values import Instant, InstantLocalization, SequenceStart
+from service.values import Instant, Localization, SequenceStart
 from visloc.errors import InvalidInput
 from visloc.types import InstantAnswer, Reason, Refusal
 from visloc_api.v1 import localization_pb2 as pb2
@@ -52,7 +52,7 @@ class Pretender:
 
     async def localize_sequence(
         self, start: SequenceStart, instants: AsyncIterator[Instant] | Sequence[Instant]
-    ) -> AsyncIterator[InstantLocalization]:
+    ) -> AsyncIterator[Localization]:
         """Stand in for the engine's."""
         try:
             async for instant in one_by_one(instants):
@@ -63,7 +63,7 @@ class Pretender:
                 self.taken += 1
                 refusal = Refusal("features", Reason.NO_USABLE_IMAGE, self.message)
                 answer = InstantAnswer(instant.timestamp, (), None, refusal, {})
-                yield InstantLocalization(answer, start.maps[0], "1")
+                yield Localization(answer, start.maps[0], "1")
         finally:
             self.ended.set()
 

@@ -28,7 +28,7 @@ from service.http.openapi import example
 from service.http.slow_clients import Arrivals
 from service.security.access import open_access
 from service.settings import ServiceSettings
-from service.values import LocalizeJob
+from service.values import RigJob
 from tests.turning import png, turned_camera, turned_pixels, turned_pose
 from visloc.geometry import Pose, rotation_angle
 from visloc.images import read_photo
@@ -342,7 +342,7 @@ def given_up(doors: Any, monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """Photos are never done; set when the work for one was dropped."""
     dropped = threading.Event()
 
-    async def for_ever(_: LocalizeJob) -> NoReturn:
+    async def for_ever(_: RigJob) -> NoReturn:
         try:
             await asyncio.Event().wait()
         finally:

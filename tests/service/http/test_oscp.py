@@ -16,7 +16,6 @@ from service.api.oscp import GeoPoseRequest
 from service.api.oscp_images import image_bytes
 from service.http.openapi import example
 from service.http.oscp.routes import answer_kind
-from service.values import LocalizeJob, RigJob
 from visloc.errors import InvalidInput, TooLarge, VislocError
 from visloc.types import Near
 
@@ -54,11 +53,11 @@ def version_2(
 @pytest.mark.parametrize("request_", [EXAMPLE_GEOPOSE_REQUEST_V1, EXAMPLE_GEOPOSE_REQUEST_V2])
 def test_both_versions_ask_the_same(request_: dict[str, Any]) -> None:
     job = job_of(request_)
-    assert isinstance(job, LocalizeJob)
-    assert job.query == PHOTO
-    assert job.camera is not None
-    assert (job.camera.model, job.camera.width, job.camera.height) == ("PINHOLE", 64, 48)
-    assert job.camera.params == (52.5, 52.5, 32.0, 24.0)
+    (image,) = job.images
+    assert (job.rig, image.query) == (None, PHOTO)
+    assert image.camera is not None
+    assert (image.camera.model, image.camera.width, image.camera.height) == ("PINHOLE", 64, 48)
+    assert image.camera.params == (52.5, 52.5, 32.0, 24.0)
     assert job.maps == Near(48.2743, 2.6974, 100.0)
 
 
@@ -74,29 +73,32 @@ def test_what_clients_add_leave_out_or_spell_in_their_way_is_read() -> None:
     request["sensorReadings"].append({"timestamp": 1, "sensorId": "imu", "reading": {"x": 1}})
     request["sensorReadings"].append({"timestamp": 1, "sensorId": "wifi", "reading": None})
     job = job_of(request)
-    assert job.query == PHOTO
-    assert job.camera.model == "PINHOLE"
+    assert job.images[0].query == PHOTO
+    assert job.images[0].camera.model == "PINHOLE"
 
     wifi = version_2(
         CAMERA, wiFiReadings=[{"BSSID": "a"}], wifiReadings=None, accelerometerReadings=[{}]
     )
-    assert job_of(wifi).query == PHOTO
+    assert job_of(wifi).images[0].query == PHOTO
     assert job_of(wifi).maps == EVERYWHERE
-    assert job_of({"sensorReadings": {"cameraReadings": [CAMERA]}}).query == PHOTO
+    assert job_of({"sensorReadings": {"cameraReadings": [CAMERA]}}).images[0].query == PHOTO
 
 
 @pytest.mark.parametrize("model", ["UNKNOWN", "unknown_camera", "", None])
 def test_an_unknown_camera_is_unknown(model: str | None) -> None:
     params = {"model": model, "modelParams": [1.0]}
-    assert job_of(version_2(CAMERA | {"params": params})).camera is None
-    assert job_of(version_2(CAMERA | {"params": {"model": "PINHOLE"}})).camera is None
+    assert job_of(version_2(CAMERA | {"params": params})).images[0].camera is None
+    assert job_of(version_2(CAMERA | {"params": {"model": "PINHOLE"}})).images[0].camera is None
 
 
 def test_intrinsics_of_the_reading_come_before_those_of_the_sensor() -> None:
     own = {"model": "SIMPLE_PINHOLE", "modelParams": [60, 32, 24]}
     sensor = {"id": "cam0", "params": {"model": "PINHOLE", "modelParams": [52, 52, 32, 24]}}
-    assert job_of(version_2(CAMERA | {"params": own}, sensors=[sensor])).camera.params[0] == 60
-    assert job_of(version_2(CAMERA, sensors=[sensor])).camera.params[0] == 52
+    assert (
+        job_of(version_2(CAMERA | {"params": own}, sensors=[sensor])).images[0].camera.params[0]
+        == 60
+    )
+    assert job_of(version_2(CAMERA, sensors=[sensor])).images[0].camera.params[0] == 52
 
 
 @pytest.mark.parametrize(
@@ -199,9 +201,8 @@ def test_photos_of_one_rig_and_instant_are_localized_together() -> None:
             sensors=sensors,
         )
     )
-    assert isinstance(job, RigJob)
     assert [image.sensor for image in job.images] == ["cam0", "cam1"]
-    assert not isinstance(job.rig, str)
+    assert isinstance(job.rig, dict)
     sits = job.rig["cam1"].cam_from_rig
     np.testing.assert_allclose(sits.translation, [0.5, 0, 0])
     np.testing.assert_allclose(sits.apply(np.array([1.0, 0, 0])), [0.5, 1, 0], atol=1e-12)
@@ -210,8 +211,8 @@ def test_photos_of_one_rig_and_instant_are_localized_together() -> None:
 def test_photos_of_a_burst_are_answered_by_the_first_and_depth_is_passed_over() -> None:
     second = CAMERA | {"imageBytes": base64.b64encode(b"\xff\xd8\xff2").decode()}
     job = job_of(version_2(CAMERA | {"imageFormat": "depth"}, second, CAMERA))
-    assert isinstance(job, LocalizeJob)
-    assert job.query == b"\xff\xd8\xff2"
+    assert job.rig is None
+    assert [image.query for image in job.images] == [b"\xff\xd8\xff2"]
 
 
 _FIRST = "sensorReadings.cameraReadings[0]"

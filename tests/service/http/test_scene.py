@@ -20,11 +20,10 @@ from starlette.responses import Response
 
 import service.engine.scenes
 from service.api import MapImages
-from service.engine.listing import ServedMap
 from service.engine.scenes import Scenes, _Kept
 from service.http.scenes import _of_version
 from service.security.key_file import Scope, edited_keys, new_key
-from service.workers.process import MapFolder
+from service.values import MapFolder, ServedMap
 from tests.service.conftest import Doors
 from visloc.archive import Map, MapOutline, MapStore
 from visloc.drawing.detail_levels import detail_order, packed_points

@@ -20,18 +20,19 @@ from service.telemetry.metrics import Metrics, ServiceState
 from service.telemetry.metrics_port import metrics_app
 from service.telemetry.observer import Observer, route_of
 from service.telemetry.tracing import RequestSpan, TraceContext
-from service.values import InstantLocalization, Localization
+from service.values import Localization
 from visloc.errors import InvalidInput, VislocError
 from visloc.geometry import Camera, Pose
 from visloc.types import (
     CameraSource,
     Evidence,
+    ImageAnswer,
     InstantAnswer,
-    Localized,
-    NotLocalized,
+    PoseSource,
     ReadAs,
     Reason,
     Refusal,
+    RigPose,
 )
 
 TRACE, SPAN = "0af7651916cd43dd8448eb211c80319c", "b7ad6b7169203331"
@@ -43,21 +44,19 @@ EVIDENCE = Evidence(
     1,
     ReadAs.STORED,
     num_inliers=80,
-    seconds={"queued": 0.25, "pose": 0.5},
 )
 POSE = Pose.from_quaternion((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+IMAGE = ImageAnswer("camera", Pose.identity(), EVIDENCE, None)
+RIG_POSE = RigPose(POSE, np.eye(6), np.ones(3), np.ones(3), PoseSource.ESTIMATED)
 YES = Localization(
-    Localized(
-        EVIDENCE, POSE, np.eye(6), np.ones(3), np.ones(3), np.zeros((0, 2)), np.zeros((0, 3))
-    ),
-    "hall",
-    "1",
+    InstantAnswer(None, (IMAGE,), RIG_POSE, None, {"queued": 0.25, "pose": 0.5}), "hall", "1"
 )
-NO = replace(YES, answer=NotLocalized(EVIDENCE, "pose", Reason.NO_POSE, "no pose"))
+REFUSAL = Refusal("pose", Reason.NO_POSE, "no pose")
+NO = replace(YES, answer=replace(YES.answer, pose=None, refusal=REFUSAL))
 
 
-def instant(refusal: Refusal | None) -> InstantLocalization:
-    return InstantLocalization(InstantAnswer(1, (), None, refusal, {"pose": 0.1}), "hall", "1")
+def instant(refusal: Refusal | None) -> Localization:
+    return Localization(InstantAnswer(1, (), None, refusal, {"pose": 0.1}), "hall", "1")
 
 
 class KeptSpans:

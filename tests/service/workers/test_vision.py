@@ -10,11 +10,19 @@ from typing import Any, NoReturn
 import numpy as np
 import pytest
 
-from service.values import ImageJob, LocalizeJob, RigJob, SequenceStart
+from service.values import (
+    ImageJob,
+    MapFolder,
+    RigJob,
+    SequenceStart,
+    WorkerSettings,
+    photo_job,
+)
+from service.workers import open_maps as opening
 from service.workers import vision
-from service.workers.process import Abandoned, MapFolder, WorkerSettings
-from service.workers.tiles import Read
-from service.workers.vision import Vision
+from service.workers.open_maps import OpenMaps
+from service.workers.photos import DecodedQuery
+from service.workers.vision import Abandoned, Vision
 from visloc.archive import MapStore
 from visloc.errors import Conflict, InvalidInput, WeightsError
 from visloc.features import GlobalDescriptor, make_global_descriptor
@@ -34,11 +42,11 @@ def test_global_descriptors_are_made_once_for_all_maps_with_the_settings(
         made.append(arguments)
         return make_global_descriptor(str(arguments[0]))
 
-    monkeypatch.setattr(vision, "make_global_descriptor", make)
-    process = Vision(SETTINGS, ctypes.c_bool())
+    monkeypatch.setattr(opening, "make_global_descriptor", make)
+    maps = OpenMaps(SETTINGS)
     folder = MapStore(built_maps).folder("room")
     for ref in ("room@1", "room@2"):
-        process.localizer(MapFolder(ref, folder))
+        maps.localizer(MapFolder(ref, folder))
     settings = (WEIGHTS, Inference.FP32, 1)
     assert made == [("densevlad", *settings), ("localvlad", *settings)]
 
@@ -49,11 +57,9 @@ def test_a_map_whose_descriptor_has_no_weights_here_is_a_conflict(
     def make(*_: object) -> GlobalDescriptor:
         raise WeightsError("weights.missing", "no weights")
 
-    monkeypatch.setattr(vision, "make_global_descriptor", make)
+    monkeypatch.setattr(opening, "make_global_descriptor", make)
     with pytest.raises(Conflict) as caught:
-        Vision(SETTINGS, ctypes.c_bool()).localizer(
-            MapFolder("room@1", MapStore(built_maps).folder("room"))
-        )
+        OpenMaps(SETTINGS).localizer(MapFolder("room@1", MapStore(built_maps).folder("room")))
     assert caught.value.code == "weights.missing"
 
 
@@ -64,11 +70,11 @@ def test_work_that_was_given_up_ends_when_its_photo_is_decoded(
     given_up = ctypes.c_bool()
     process = Vision(SETTINGS, given_up)
 
-    def decode(*_: object) -> Read:
+    def decode(*_: object) -> DecodedQuery:
         given_up.value = True
-        return Read(QueryFeatures("sift", *[np.empty((0, 2))] * 2, {}), {}, {})
+        return DecodedQuery(QueryFeatures("sift", *[np.empty((0, 2))] * 2, {}), {}, {})
 
-    monkeypatch.setattr(vision, "read_query", decode)
+    monkeypatch.setattr(vision, "decode", decode)
     image = ImageJob("left", IMAGE, None)
     with pytest.raises(Abandoned):
         process.look_at_image(image, maps, None, LocalizeOptions(), NO_PRIORS, 0.0)
@@ -101,7 +107,7 @@ IMAGE = b"no photo: options are looked at first"
 
 
 def ask_photo(process: Vision, maps: Sequence[MapFolder], options: LocalizeOptions) -> object:
-    return process.localize(LocalizeJob((), IMAGE, None, options), maps, 0.0)
+    return process.localize(photo_job((), IMAGE, None, options), maps, 0.0)
 
 
 def ask_rig(process: Vision, maps: Sequence[MapFolder], options: LocalizeOptions) -> object:
@@ -152,7 +158,7 @@ def test_weights_that_are_not_here_are_no_fault_of_an_image(
         raise WeightsError("weights.missing", "no weights")
 
     process, maps = open_maps
-    monkeypatch.setattr(process.localizer(maps[0]), "_make_matcher", make)
+    monkeypatch.setattr(process._maps.localizer(maps[0]), "_make_matcher", make)
     with pytest.raises(WeightsError):
         ask(process, maps[:1], LocalizeOptions(matcher=Matcher.LIGHTGLUE))
 

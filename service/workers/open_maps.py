@@ -1,0 +1,144 @@
+"""The maps and sets that stay open in a worker process, with the networks that they share."""
+
+from __future__ import annotations
+
+import logging
+from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from time import perf_counter
+
+from service.values import MapFolder, OpenMap, WorkerSettings
+from service.workers.tiles import TileRanker
+from visloc.archive.store import open_published, open_published_set
+from visloc.errors import Conflict, InvalidInput, MapCorrupt, VislocError
+from visloc.features import (
+    GlobalDescriptor,
+    LocalFeatureExtractor,
+    make_global_descriptor,
+    make_local_features,
+)
+from visloc.features.local.readymade import is_ready_made
+from visloc.features.networks.lightglue.model import make_lightglue
+from visloc.localization.localizer import Localizer
+
+logger = logging.getLogger(__name__)
+
+
+class OpenMaps:
+    """Opens maps and sets when they are asked for, and closes the least recently used ones."""
+
+    def __init__(self, settings: WorkerSettings) -> None:
+        self._settings = settings
+        # The most recently used last.
+        self._opened: OrderedDict[str, Localizer | TileRanker] = OrderedDict()
+        # By name, shared by all maps.
+        self._extractors: dict[str, LocalFeatureExtractor] = {}
+        self._descriptors: dict[str, GlobalDescriptor] = {}
+
+    @property
+    def refs(self) -> tuple[OpenMap, ...]:
+        return tuple(OpenMap(ref, _size_of(one)) for ref, one in self._opened.items())
+
+    def localizer(self, version: MapFolder) -> Localizer:
+        """Return the localizer of a map; errors as in ``open``."""
+        found = self.open(version)
+        assert isinstance(found, Localizer)  # a set has no localizer
+        return found
+
+    def ranker(self, version: MapFolder) -> TileRanker:
+        """Return the ranker of a set's tiles; errors as in ``open``."""
+        found = self.open(version)
+        assert isinstance(found, TileRanker)
+        return found
+
+    def open(self, version: MapFolder) -> Localizer | TileRanker:
+        """Open a map or a set, unless it is open, and warm it up.
+
+        Raises:
+            Conflict: the map's features are not installed.
+            MapCorrupt: the map cannot be used.
+        """
+        found = self._opened.get(version.ref)
+        if found is None:
+            found = self._opened[version.ref] = self._open(version)
+        self._opened.move_to_end(version.ref)
+        while len(self._opened) > 1 and self._size > self._settings.max_loaded_bytes:
+            ref, _ = self._opened.popitem(last=False)
+            logger.info("map %s closed, to keep to max_loaded_bytes", ref)
+        return found
+
+    def close(self, ref: str) -> None:
+        self._opened.pop(ref, None)
+
+    def extractor(self, name: str) -> LocalFeatureExtractor:
+        """Return the extractor of local features with this name."""
+        if name not in self._extractors:
+            s = self._settings
+            made = make_local_features(name, s.weights_dir, s.inference, s.threads)
+            self._extractors[name] = made
+        return self._extractors[name]
+
+    @property
+    def _size(self) -> int:
+        return sum(map(_size_of, self._opened.values()))
+
+    def _open(self, version: MapFolder) -> Localizer | TileRanker:
+        start = perf_counter()
+        with _damage_named(version.ref):
+            try:
+                opened = self._open_set(version) if version.is_set else self._open_map(version)
+            except InvalidInput as error:  # features that are not here: not the caller's mistake
+                raise Conflict(
+                    error.code,
+                    error.message,
+                    field=error.field,
+                    expected=error.expected,
+                    got=error.got,
+                ) from error
+            opened.warm_up()
+        logger.info("map %s loaded in %.1f s", version.ref, perf_counter() - start)
+        return opened
+
+    def _open_map(self, version: MapFolder) -> Localizer:
+        opened = open_published(version.folder)
+        name = opened.manifest.local_features.fingerprint.name
+        extractor = None if is_ready_made(name) else self.extractor(name)
+        matcher = partial(make_lightglue, weights_dir=self._settings.weights_dir)
+        return Localizer(opened, extractor, self._descriptor, matcher)
+
+    def _open_set(self, version: MapFolder) -> TileRanker:
+        return TileRanker(open_published_set(version.folder), self.extractor)
+
+    def _descriptor(self, name: str) -> GlobalDescriptor:
+        if name not in self._descriptors:
+            s = self._settings
+            made = make_global_descriptor(name, s.weights_dir, s.inference, s.threads)
+            self._descriptors[name] = made
+        return self._descriptors[name]
+
+
+def _size_of(opened: Localizer | TileRanker) -> int:
+    return opened.size_bytes if isinstance(opened, TileRanker) else opened.map.size_bytes
+
+
+@contextmanager
+def _damage_named(ref: str) -> Iterator[None]:
+    """Turn unexpected errors of opening a map into MapCorrupt ``map.unusable``.
+
+    A damaged map can break the code that reads it in any way, and a plug-in may exit when it is
+    first used; neither must stop the other maps.
+    """
+    try:
+        yield
+    except VislocError:
+        raise
+    except (Exception, SystemExit) as error:
+        logger.exception("map %s cannot be used", ref)
+        raise MapCorrupt(
+            "map.unusable",
+            "the map cannot be used; rebuild it, or see the server's log for the cause",
+            field=ref,
+            got=type(error).__name__,
+        ) from error
