@@ -76,3 +76,13 @@ def stopping_error() -> Unavailable:
 def request_id(given: str | None) -> str:
     """Return the caller's id when it is short and visible ASCII, else a new one."""
     return given if given and _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
+
+
+def too_slow(grace_s: float, got: str) -> TimedOut:
+    """Return the error of a request whose body or next message does not arrive in time."""
+    return TimedOut(
+        "request.too_slow",
+        "the request does not arrive",
+        expected=f"all within {grace_s:g} s, and a second more for every 100 kB",
+        got=got,
+    )

@@ -1,4 +1,4 @@
-"""What all methods of gRPC have in common: answers as messages, errors as statuses, the log."""
+"""What all gRPC methods share: answers as messages, errors as statuses, the log."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ import visloc
 from service.errors import internal_error, request_id, statuses_of
 from service.telemetry.logs import RequestRecord
 from service.telemetry.observer import Observer
+from service.telemetry.tracing import traceparent_of
 from visloc.errors import VislocError
 
 logger = logging.getLogger(__name__)
 
 ERROR_DOMAIN = "visloc"
-# The server's version goes with every answer, as a header.
+# A header of every answer: the server's version.
 VERSION_KEY = "visloc-version"
-# Details travel in a header, of which gRPC clients accept 8 kB by default.
+# Characters per detail: details are sent in headers, and clients accept 8 kB of headers.
 _MAX_DETAIL = 1000
 
 Context = grpc.aio.ServicerContext[Any, Any]
@@ -33,16 +34,15 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 
 def message_of(answer: BaseModel, message: MessageT) -> MessageT:
-    """Fill a message from the model with the same fields: HTTP and gRPC answer the same.
+    """Fill a message from the model with the same fields, so that HTTP and gRPC answer the same.
 
-    Straight from one to the other: by way of JSON, an answer with its matches takes several
-    times as long.
+    Copies field by field: through JSON, an answer with its matches takes several times as long.
     """
     for name in type(answer).model_fields:
         value = getattr(answer, name)
         if isinstance(value, BaseModel):
             part = getattr(message, name)
-            part.SetInParent()  # it is there, also when it is empty
+            part.SetInParent()  # present even if empty
             message_of(value, part)
         elif isinstance(value, Mapping):
             _fill_map(getattr(message, name), value)
@@ -70,11 +70,7 @@ def _fill_list(entries: Any, values: Sequence[Any]) -> None:
 
 
 class Envelope:
-    """Turns errors into statuses with details, and takes note of every call.
-
-    Args:
-        observer: is told what becomes of it.
-    """
+    """Turns errors into statuses with details, and reports every call to the observer."""
 
     def __init__(self, observer: Observer) -> None:
         self._observer = observer
@@ -85,8 +81,8 @@ class Envelope:
     ) -> AsyncIterator[None]:
         """Serve a call in the block.
 
-        The headers of a single answer go with it, not before: until something was answered, a
-        call that is cut off may be made again elsewhere, by the client's gRPC itself.
+        Headers are sent with a single answer, not before it: the client's gRPC may retry a call
+        elsewhere as long as nothing was answered.
 
         Args:
             method: its name.
@@ -100,7 +96,7 @@ class Envelope:
             record.status = grpc.StatusCode.CANCELLED.name
             headers = [(VERSION_KEY, visloc.__version__)]
             if record.trace is not None:
-                headers.append(("traceresponse", record.trace.traceparent))
+                headers.append(("traceresponse", traceparent_of(record.trace)))
             try:
                 if streams:
                     await context.send_initial_metadata(headers)
@@ -110,12 +106,12 @@ class Envelope:
                 record.status = grpc.StatusCode.OK.name
             except VislocError as error:
                 await self._refuse(error, id_, context, record)
-            except Exception:  # the last line of defence: gRPC would tell the caller what broke
+            except Exception:  # the last line of defence: gRPC would show the caller the exception
                 logger.exception("request %s broke", id_)
                 await self._refuse(internal_error(), id_, context, record)
 
     async def refuse(self, method: str, error: VislocError, context: Context) -> None:
-        """Answer a call with an error, before it is served."""
+        """Answer a call with an error before its method runs."""
         id_ = request_id(None)
         with self._observer.request("grpc", id_, route=method) as record:
             record.peer = context.peer()

@@ -17,7 +17,7 @@ import grpc
 import httpx
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
-from tests.service.test_tls import make_certificate
+from tests.service.security.test_tls import make_certificate
 
 from service.http.acceptor import Acceptor, Connection, OpenConnections
 

@@ -56,7 +56,7 @@ def test_equal_secrets_would_have_different_hashes() -> None:
     (first, _), (second, _) = (new_key("robot", frozenset(Scope)) for _ in range(2))
 
     assert first.salt != second.salt
-    assert first.digest != second.digest
+    assert first.sha256 != second.sha256
     assert first.id != second.id
 
 

@@ -1,4 +1,4 @@
-"""The port of its own for Prometheus: nothing but ``/metrics``, and no key needed."""
+"""The separate port for Prometheus: only ``/metrics``, without an API key."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ Render = Callable[[], Awaitable[tuple[bytes, str]]]
 
 
 def metrics_app(render: Render) -> Starlette:
-    """Make the application; ``render`` is asked for every scrape."""
+    """Make the app of the separate port."""
 
     async def metrics(request: Request) -> Response:
-        del request  # it says nothing
+        del request
         return await metrics_response(render)
 
     return Starlette(routes=[Route("/metrics", metrics)])
