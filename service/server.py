@@ -19,7 +19,7 @@ from service.grpc.server import GrpcServer
 from service.http.acceptor import Acceptor, OpenConnections
 from service.http.app import create_app
 from service.http.backend import Backend
-from service.http.metrics_port import metrics_app
+from service.http.health import metrics_app
 from service.http.slow_clients import Arrivals, http_protocol
 from service.security.access import open_access
 from service.security.tls import TlsConfig, check_tls, tls_config
@@ -85,7 +85,7 @@ class Server:
         return _HttpServer(app, listener, connections, grace_s, tls_config(self._settings))
 
     def _metrics_server(self, listener: socket.socket) -> _HttpServer:
-        app, connections = metrics_app(self._render), OpenConnections(METRICS_CONNECTIONS)
+        app, connections = metrics_app(self.backend), OpenConnections(METRICS_CONNECTIONS)
         return _HttpServer(app, listener, connections, self._settings.arrival_timeout_s, {})
 
     async def open(self) -> None:
@@ -144,9 +144,6 @@ class Server:
             max_buffered_bytes=settings.max_buffered_bytes,
             folders={"cache": settings.cache_dir} if remote else {"maps": Path(settings.maps_dir)},
         )
-
-    async def _render(self) -> tuple[bytes, str]:
-        return await asyncio.to_thread(self.observer.metrics.render, self.state())
 
 
 def _make_engine(settings: ServiceSettings, store: Store, observer: Observer) -> Engine:

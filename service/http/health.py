@@ -6,11 +6,12 @@ import asyncio
 
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import PlainTextResponse
+from starlette.applications import Starlette
+from starlette.routing import Route
 
 import visloc
 from service.api import Health, MapNotLoaded, Readiness
-from service.http.backend import backend_of
-from service.http.metrics_port import metrics_response
+from service.http.backend import Backend, backend_of
 from service.http.responses import json_response
 
 
@@ -23,6 +24,13 @@ def add_health_routes(app: FastAPI) -> None:
         response_class=PlainTextResponse,
         responses={200: {"content": {"text/plain": {}}, "description": "Prometheus metrics"}},
     )(metrics)
+
+
+def metrics_app(backend: Backend) -> Starlette:
+    """Make the app of the separate port for Prometheus: only ``/metrics``, without an API key."""
+    app = Starlette(routes=[Route("/metrics", metrics)])
+    app.state.backend = backend
+    return app
 
 
 async def healthz() -> Response:
@@ -44,8 +52,6 @@ async def readyz(request: Request) -> Response:
 async def metrics(request: Request) -> Response:
     """Report the state of the service to Prometheus."""
     backend = backend_of(request)
-
-    async def render() -> tuple[bytes, str]:
-        return await asyncio.to_thread(backend.observer.metrics.render, backend.state())
-
-    return await metrics_response(render)
+    render = backend.observer.metrics.render
+    body, content_type = await asyncio.to_thread(render, backend.state())
+    return Response(body, headers={"Content-Type": content_type, "Cache-Control": "no-store"})

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
 from prometheus_client.core import GaugeMetricFamily, Metric
@@ -27,6 +27,7 @@ LOCALIZED = "localized"
 MAX_MAPS = 200
 OTHER_MAPS = "(others)"
 
+_HELP = "help"
 LabelsT = TypeVar("LabelsT", bound=tuple[str, ...])
 
 _REQUEST_BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0)
@@ -34,41 +35,39 @@ _STAGE_BUCKETS = (0.001, 0.0025, 0.005, *_REQUEST_BUCKETS[:-1])
 _INLIER_BUCKETS = (0, 10, 20, 30, 50, 75, 100, 150, 250, 500, 1000, 2500)
 
 
+def _gauge_field(help_text: str) -> Any:
+    """Declare a number of ``ServiceState`` that is a gauge of the same name."""
+    return field(default=0, metadata={_HELP: help_text})
+
+
 @dataclass(frozen=True, slots=True)
 class ServiceState:
     """The service at one moment.
 
     Attributes:
-        ready: the answer of ``/readyz``.
-        photos_waiting: for a worker; at most ``max_queue``.
-        batches_running: rigs and sequences; at most ``max_batches``.
-        workers: the number of worker processes wanted; ``worker_pids`` has those alive.
+        worker_pids: of the worker processes alive.
         loaded_maps: bytes of each map that is open in a worker, by (id, version).
-        max_loaded_bytes: room for the open maps of one worker.
         unusable_maps: the error code of each map that exists and cannot be served, by id.
-        store_reachable: whether the store of the maps answers; a folder always does.
-        buffered_bytes: of requests that are arriving; at most ``max_buffered_bytes``.
-        connections: open HTTP connections; at most ``max_connections``.
         folders: on disks that may fill up, by purpose: ``maps``, ``cache``.
     """
 
-    ready: bool
-    draining: bool = False
-    photos_waiting: int = 0
-    max_queue: int = 0
-    photos_running: int = 0
-    batches_running: int = 0
-    max_batches: int = 0
-    workers: int = 0
+    ready: bool = _gauge_field("1 when maps and networks are warm.")
+    draining: bool = _gauge_field("1 while running requests end and no new ones are accepted.")
+    photos_waiting: int = _gauge_field("Photos waiting for a worker.")
+    max_queue: int = _gauge_field("Limit of photos waiting.")
+    photos_running: int = _gauge_field("Photos being processed.")
+    batches_running: int = _gauge_field("Rigs and sequences being served.")
+    max_batches: int = _gauge_field("Limit of rigs and sequences served at once.")
+    workers: int = _gauge_field("Worker processes wanted.")
+    max_loaded_bytes: int = _gauge_field("Limit of bytes of open maps per worker.")
+    store_reachable: bool = _gauge_field("1 when the store of the maps answers.")
+    buffered_bytes: int = _gauge_field("Bytes of requests that are arriving.")
+    max_buffered_bytes: int = _gauge_field("Limit of bytes of arriving requests.")
+    connections: int = _gauge_field("Open HTTP connections.")
+    max_connections: int = _gauge_field("Limit of open connections.")
     worker_pids: tuple[int, ...] = ()
     loaded_maps: Mapping[tuple[str, str], int] = field(default_factory=dict)
-    max_loaded_bytes: int = 0
     unusable_maps: Mapping[str, str] = field(default_factory=dict)
-    store_reachable: bool = True
-    buffered_bytes: int = 0
-    max_buffered_bytes: int = 0
-    connections: int = 0
-    max_connections: int = 0
     folders: Mapping[str, Path] = field(default_factory=dict)
 
 
@@ -225,24 +224,10 @@ def _gauges_of(state: ServiceState) -> Iterator[Metric]:
     yield _gauge(
         "build_info", "Always 1; the version is a label.", {(visloc.__version__,): 1}, "version"
     )
-    for name, help_text, value in (
-        ("ready", "1 when maps and networks are warm.", state.ready),
-        ("draining", "1 while running requests end and no new ones are accepted.", state.draining),
-        ("photos_waiting", "Photos waiting for a worker.", state.photos_waiting),
-        ("max_queue", "Limit of photos waiting.", state.max_queue),
-        ("photos_running", "Photos being processed.", state.photos_running),
-        ("batches_running", "Rigs and sequences being served.", state.batches_running),
-        ("max_batches", "Limit of rigs and sequences served at once.", state.max_batches),
-        ("workers", "Worker processes wanted.", state.workers),
-        ("workers_alive", "Worker processes alive.", len(state.worker_pids)),
-        ("max_loaded_bytes", "Limit of bytes of open maps.", state.max_loaded_bytes),
-        ("store_reachable", "1 when the store of the maps answers.", state.store_reachable),
-        ("buffered_bytes", "Bytes of requests that are arriving.", state.buffered_bytes),
-        ("max_buffered_bytes", "Limit of bytes of arriving requests.", state.max_buffered_bytes),
-        ("connections", "Open HTTP connections.", state.connections),
-        ("max_connections", "Limit of open connections.", state.max_connections),
-    ):
-        yield _gauge(name, help_text, {(): value})
+    for number in fields(state):
+        if help_text := number.metadata.get(_HELP):
+            yield _gauge(number.name, help_text, {(): getattr(state, number.name)})
+    yield _gauge("workers_alive", "Worker processes alive.", {(): len(state.worker_pids)})
     yield _gauge(
         "loaded_map_bytes",
         "Bytes of a map that is open in a worker, most of them mapped and shared.",

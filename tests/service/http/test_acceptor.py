@@ -17,9 +17,9 @@ import grpc
 import httpx
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
-from tests.service.security.test_tls import make_certificate
 
 from service.http.acceptor import Acceptor, Connection, OpenConnections
+from tests.service.security.test_tls import make_certificate
 
 LIMIT = 20
 PROBED = ("/healthz", "/openapi.json")

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -12,9 +13,10 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from service.http.envelope import route_of
-from service.http.metrics_port import metrics_app
+from service.http.health import metrics_app
 from service.telemetry.logs import UNMATCHED
 from service.telemetry.metrics import Metrics, ServiceState
+from service.telemetry.observer import Observer
 
 
 def ask(app: Any, method: str, path: str) -> httpx.Response:
@@ -65,12 +67,10 @@ def test_plain_routes_of_starlette_have_templates_too() -> None:
 
 
 def test_the_port_of_metrics_answers_nothing_else() -> None:
-    metrics = Metrics()
-
-    async def render() -> tuple[bytes, str]:
-        return await asyncio.to_thread(metrics.render, ServiceState(ready=True))
-
-    app = metrics_app(render)
+    backend: Any = SimpleNamespace(
+        observer=Observer(Metrics()), state=lambda: ServiceState(ready=True)
+    )
+    app = metrics_app(backend)
     found = ask(app, "GET", "/metrics")
     assert found.status_code == 200
     assert found.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
