@@ -96,7 +96,7 @@ class Server:
     async def load(self) -> None:
         """Open the maps, warm up, and accept photos."""
         await self.engine.start()
-        await self._grpc.set_serving()
+        await self._grpc.set_serving(True)
 
     async def close(self, grace_s: float) -> None:
         """Stop: for ``drain_delay_s`` only readiness says so, then new requests are refused.
@@ -104,7 +104,7 @@ class Server:
         Running requests get ``grace_s`` seconds to finish.
         """
         self.engine.withdraw()
-        await self._grpc.set_not_serving()
+        await self._grpc.set_serving(False)
         await asyncio.sleep(self._settings.drain_delay_s)
         self.engine.drain()
         for server in self._http:

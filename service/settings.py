@@ -59,7 +59,7 @@ class ServiceSettings(BaseModel):
     max_cache_bytes: Count = 50 * 2**30
     """limit of the local copies, bytes; the least recently used are deleted first"""
     max_loaded_bytes: Count = 8 * 2**30
-    """limit of the open maps, bytes; the least recently used are closed first"""
+    """limit of the open maps of each worker, bytes; the least recently used are closed first"""
     max_upload_bytes: Count = 20 * 2**30
     """largest packed map accepted for upload, bytes"""
     weights_dir: Path | None = None
@@ -80,8 +80,8 @@ class ServiceSettings(BaseModel):
     )
     """processor threads per worker; default: cores / workers"""
     keys_file: Path | None = None
-    """file of API keys that `python -m service.keys` wrote; without keys, every caller may do
-    everything, and the service accepts callers on this machine only"""
+    """file of API keys that `python -m service.keys` wrote; without keys, the service
+    accepts only callers on this machine, and these may do everything"""
     tls_cert: Path | None = None
     """PEM file of the certificate chain; turns on TLS for HTTP and gRPC"""
     tls_key: Path | None = None
@@ -96,14 +96,14 @@ class ServiceSettings(BaseModel):
     max_queue: Annotated[int, Field(ge=0)] = 64
     """photos that may wait for a worker; further requests are refused"""
     max_connections: Count = 1000
-    """open connections of HTTP and of gRPC, each, and running calls of gRPC; at the limit (gRPC: at
-    three quarters), the longest idle connection is closed for a new one; lowered if the system
-    allows too few open files"""
+    """limit of open HTTP connections, of open gRPC connections, and of running gRPC calls. At the
+    limit (gRPC: at three quarters of it), the longest idle connection is closed for a new one. The
+    limit is lowered if the system allows too few open files"""
     max_buffered_bytes: Count = 512 * 2**20
     """memory for requests that are arriving, bytes; further requests are refused"""
     request_timeout_s: Seconds = 60.0
-    """longest time from when a request has arrived to its answer; callers may ask for less.
-    Sequences: to the next answer"""
+    """longest time from the arrival of a request to its answer, or to the next answer of a
+    sequence; callers may ask for less"""
     arrival_timeout_s: Seconds = 20.0
     """longest time for the head of a request to arrive, and again for its body, plus a second for
     every 100 kB of it; also the longest silence within a stream"""
@@ -219,13 +219,13 @@ def _parser() -> argparse.ArgumentParser:
         help=f"TOML file with settings (also {CONFIG_VARIABLE})",
     )
     for name, field in ServiceSettings.model_fields.items():
-        default = "" if field.default_factory else f" (default: {field.default})"
+        has_default = field.default_factory is None and field.default not in (None, ())
         parser.add_argument(
             _flag(name),
             dest=name,
             metavar="N" if field.annotation is int else name.rsplit("_", 1)[-1].upper(),
             default=argparse.SUPPRESS,
-            help=f"{field.description}{'' if field.default is None else default}",
+            help=str(field.description) + (f" (default: {field.default})" if has_default else ""),
         )
     return parser
 

@@ -76,22 +76,18 @@ class GrpcServer:
 
     async def start(self) -> None:
         """Accept calls."""
-        await self._set_health(health_pb2.HealthCheckResponse.NOT_SERVING)
+        await self.set_serving(False)
         await self._server.start()
         self._watching = asyncio.create_task(self._connections.watch(self.port))
 
-    async def set_serving(self) -> None:
-        await self._set_health(health_pb2.HealthCheckResponse.SERVING)
-
-    async def set_not_serving(self) -> None:
-        await self._set_health(health_pb2.HealthCheckResponse.NOT_SERVING)
+    async def set_serving(self, serving: bool) -> None:
+        """Let health say SERVING or NOT_SERVING."""
+        status = health_pb2.HealthCheckResponse
+        for name in ("", *SERVICE_NAMES):
+            await self._health.set(name, status.SERVING if serving else status.NOT_SERVING)
 
     async def stop(self, grace_s: float) -> None:
         """Refuse new calls, and give running ones ``grace_s`` seconds to finish."""
         await self._health.enter_graceful_shutdown()
         await self._server.stop(grace_s)
         self._watching.cancel()
-
-    async def _set_health(self, status: health_pb2.HealthCheckResponse.ServingStatus) -> None:
-        for name in ("", *SERVICE_NAMES):
-            await self._health.set(name, status)
