@@ -1,9 +1,7 @@
-"""What both doors share: one table of statuses, and request ids."""
+"""Errors as both transports report them: the table of statuses."""
 
 from __future__ import annotations
 
-import re
-import uuid
 from collections.abc import Mapping
 from http import HTTPStatus
 
@@ -51,8 +49,6 @@ _STATUSES_OF_CODES = {
 
 RETRY_AFTER_S = 1
 
-_REQUEST_ID = re.compile(r"[\x21-\x7e]{1,128}")
-
 
 def statuses_of(error: VislocError) -> tuple[HTTPStatus, grpc.StatusCode]:
     """Return the HTTP and the gRPC status of an error, by the nearest class in the table."""
@@ -71,11 +67,6 @@ def internal_error() -> VislocError:
 def stopping_error() -> Unavailable:
     """Return what a caller is told whose request the end of the server cuts off."""
     return Unavailable("server.stopping", "the server is being stopped; ask another, or later")
-
-
-def request_id(given: str | None) -> str:
-    """Return the caller's id when it is short and visible ASCII, else a new one."""
-    return given if given and _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
 
 
 def too_slow(grace_s: float, got: str) -> TimedOut:

@@ -15,7 +15,8 @@ from google.rpc.status_pb2 import Status
 from pydantic import BaseModel
 
 import visloc
-from service.errors import internal_error, request_id, statuses_of
+from service.api.request_ids import request_id
+from service.errors import internal_error, statuses_of
 from service.telemetry.logs import RequestRecord
 from service.telemetry.observer import Observer
 from service.telemetry.tracing import traceparent_of

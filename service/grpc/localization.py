@@ -8,8 +8,8 @@ from contextlib import aclosing
 
 from service.api import BatchLimits, InstantAnswer, ListMapsResponse, LocalizeResponse, MapInfo
 from service.api.deadlines import within
+from service.api.request_ids import request_id
 from service.engine.engine import Engine
-from service.errors import request_id
 from service.grpc.envelope import Context, Envelope, message_of
 from service.grpc.messages import (
     instant_of,

@@ -6,8 +6,8 @@ from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing
 
 from service.api import MapInfo
+from service.api.request_ids import request_id
 from service.engine.engine import Engine
-from service.errors import request_id
 from service.grpc.envelope import Context, Envelope, message_of
 from service.telemetry.observer import Observer
 from visloc.errors import InvalidInput
