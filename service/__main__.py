@@ -1,4 +1,4 @@
-"""``python -m service``: settings, logging, signals."""
+"""``python -m service``: reads the settings, sets up logging, handles signals."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger("service")
 
-# Pause before what is needed for the start is asked for again.
+# The pause before the next try to start.
 RETRY_S = 5.0
 
 
@@ -35,14 +35,14 @@ def main() -> None:
         settings = fit_connections(settings)
     except SettingsError as error:
         sys.exit(f"visloc-service: {error}")
-    # What libraries read once, when they are loaded: hence the late import below.
+    # Libraries read these once when they are loaded: hence the late import below.
     os.environ.setdefault("OMP_NUM_THREADS", str(settings.threads_per_worker))
-    # What takes long is computed by torch and OpenVINO. OpenBLAS's threads would wait for each
-    # other at full speed, on the cores that those need.
+    # torch and OpenVINO do the heavy work. OpenBLAS's threads would spin while they wait for each
+    # other, on cores that torch and OpenVINO need.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(settings.max_image_pixels))
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # damaged photos are answered, not logged
-    # The fork server loads the same libraries as this process, at the same time.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # damaged photos get an answer, no log line
+    # The fork server loads its libraries while this process loads the same ones.
     context = get_context("forkserver")
     context.set_forkserver_preload(["service.workers.forkserver"])
     forkserver.ensure_running()
@@ -50,7 +50,7 @@ def main() -> None:
         asyncio.run(_serve(settings))
     except (OSError, SettingsError) as error:
         sys.exit(f"visloc-service: {error}")
-    # A thread that still fetches or verifies a map leaves nothing half-done, and is not waited for.
+    # Threads that still fetch or verify a map can be cut off: they leave nothing half-done.
     logging.shutdown()
     os._exit(0)
 
@@ -64,7 +64,7 @@ async def _serve(settings: ServiceSettings) -> None:
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     stopping = asyncio.create_task(stop.wait())
 
-    # The doors open first, so that /readyz can be asked while the maps are loaded.
+    # The ports open first, so that /readyz answers while the maps are loaded.
     await server.open()
     loading = asyncio.create_task(_load(server))
     tidying = asyncio.create_task(give_back_memory())
@@ -85,14 +85,14 @@ async def _serve(settings: ServiceSettings) -> None:
 
 
 async def _load(server: Server) -> None:
-    """Load until it works: what is away now, such as the storage of the maps, comes back."""
+    """Retry until it works: the storage of the maps, for example, may be down for a while."""
     from visloc.errors import Unavailable
 
     while True:
         try:
             await server.load()
         except Unavailable as error:
-            logger.error("cannot start yet, trying again in %g s: %s", RETRY_S, error)  # noqa: TRY400
+            logger.error("cannot start yet; trying again in %g s: %s", RETRY_S, error)  # noqa: TRY400
             await asyncio.sleep(RETRY_S)
         else:
             return

@@ -1,8 +1,7 @@
-"""Errors as both transports report them: the table of statuses, and request ids."""
+"""Errors as both transports report them: the table of statuses."""
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Mapping
 from http import HTTPStatus
 
@@ -24,7 +23,6 @@ from visloc.errors import (
     VislocError,
     WeightsError,
 )
-from visloc_api.words.wire import REQUEST_ID
 
 STATUSES: Mapping[type[VislocError], tuple[HTTPStatus, grpc.StatusCode]] = {
     VislocError: (HTTPStatus.INTERNAL_SERVER_ERROR, grpc.StatusCode.INTERNAL),
@@ -71,6 +69,11 @@ def stopping_error() -> Unavailable:
     return Unavailable("server.stopping", "the server is being stopped; ask another, or later")
 
 
-def request_id(given: str | None) -> str:
-    """Return the caller's id when it is short and visible ASCII, else a new one."""
-    return given if given and REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
+def too_slow(grace_s: float, got: str) -> TimedOut:
+    """Return the error of a request whose body or next message does not arrive in time."""
+    return TimedOut(
+        "request.too_slow",
+        "the request does not arrive",
+        expected=f"all within {grace_s:g} s, and a second more for every 100 kB",
+        got=got,
+    )

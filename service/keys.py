@@ -1,4 +1,4 @@
-"""``python -m service.keys``: make, list and remove API keys."""
+"""``python -m service.keys``: create, list, limit and remove API keys."""
 
 from __future__ import annotations
 
@@ -80,9 +80,11 @@ def _place(keys: Sequence[Key], key: str) -> int:
 
 
 def _tell(key: Key, token: str) -> None:
-    # Apart from what is said about it, so that a script can take it.
+    # The token alone goes to stdout, so that scripts can read it.
     _say(token)
-    sys.stderr.write(f"{_line(key)}\nThe key above is shown this once: only its hash is kept.\n")
+    sys.stderr.write(
+        f"{_line(key)}\nStore the key above: it is not shown again, the file has only its hash.\n"
+    )
 
 
 def _line(key: Key) -> str:
@@ -99,37 +101,39 @@ def _say(text: str) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m service.keys",
-        description="API keys of the service. A running service sees changes by itself.",
+        description="Manage the API keys of the service. A running service notices changes.",
         allow_abbrev=False,
     )
     parser.add_argument(
-        "--file", type=Path, default=Path("keys.json"), help="of keys (default: %(default)s)"
+        "--file", type=Path, default=Path("keys.json"), help="the key file (default: %(default)s)"
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    init = commands.add_parser("init", help="make a key with all scopes, where there is no key yet")
+    init = commands.add_parser("init", help="create a key with all scopes, if the file has none")
     init.add_argument("--name", default="admin", help="(default: %(default)s)")
     init.set_defaults(run=_init)
 
-    add = commands.add_parser("add", help="make a key and print it, once")
-    add.add_argument("name", help=f"whose it is: {NAME_RULE}")
+    add = commands.add_parser("add", help="create a key and print it once")
+    add.add_argument("name", help=f"its owner: {NAME_RULE}")
     add.add_argument(
         "--scope",
         action="append",
         required=True,
         type=Scope,
         choices=tuple(Scope),
-        help="can be repeated; localize: photos; read: maps and metrics; manage: change maps",
+        help="repeatable; localize: photos; read: maps and metrics; manage: change maps",
     )
     _add_limits(add)
     add.set_defaults(run=_add)
 
-    limit = commands.add_parser("limit", help="give a key other limits; those left out are lifted")
+    limit = commands.add_parser(
+        "limit", help="replace the limits of a key; a limit left out is removed"
+    )
     limit.add_argument("key", help="id or name")
     _add_limits(limit)
     limit.set_defaults(run=_limit)
 
-    remove = commands.add_parser("remove", help="make a key useless")
+    remove = commands.add_parser("remove", help="revoke a key")
     remove.add_argument("key", help="id or name")
     remove.set_defaults(run=_remove)
 
@@ -140,7 +144,7 @@ def _parser() -> argparse.ArgumentParser:
 def _add_limits(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rate", type=float, metavar="N", help="requests per second")
     parser.add_argument(
-        "--burst", type=int, metavar="N", help="requests at once after a rest (default: the rate)"
+        "--burst", type=int, metavar="N", help="requests at once after a pause (default: the rate)"
     )
     parser.add_argument("--concurrency", type=int, metavar="N", help="requests served at once")
 

@@ -1,11 +1,11 @@
-"""Both doors and the engine behind them, in one event loop."""
+"""HTTP, gRPC and the engine behind them, in one event loop."""
 
 from __future__ import annotations
 
 import asyncio
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,38 +16,33 @@ from starlette.applications import Starlette
 from service.descriptors import METRICS_CONNECTIONS
 from service.engine.engine import Engine
 from service.engine.stores import Store, open_store
-from service.grpc.localization import GrpcServer
+from service.grpc.server import GrpcServer
 from service.http.acceptor import Acceptor, OpenConnections
 from service.http.app import create_app
+from service.http.backend import Backend
+from service.http.health import metrics_app
 from service.http.slow_clients import Arrivals, http_protocol
 from service.security.access import open_access
 from service.security.tls import TlsConfig, check_tls, tls_config
 from service.settings import ServiceSettings, SettingsError
 from service.telemetry.logs import configure_logging
 from service.telemetry.metrics import Metrics, ServiceState
-from service.telemetry.metrics_port import metrics_app
 from service.telemetry.observer import Observer
 from service.telemetry.tracing import open_spans
 from service.values import WorkerSettings
 from visloc.types import Inference
 
-# When it stops: so long a request may be on its way over a connection that is open already. It is
-# answered with 503; then idle connections are closed.
+# When the server stops: the time in which requests that are already on their way over open
+# connections still get an answer, 503. After it, idle connections are closed.
 _LAST_WORDS_S = 0.3
 
 
 class Server:
-    """Listens as soon as it is made, answers after ``open``, localizes after ``load``.
-
-    Attributes:
-        engine: what is behind the doors.
-        http_port: where HTTP listens.
-        grpc_port: where gRPC listens.
-        metrics_port: where Prometheus may ask without a key; None for nowhere.
+    """Listens once constructed, answers after ``open``, localizes after ``load``.
 
     Raises:
         OSError: when an address cannot be listened on.
-        SettingsError: when a setting cannot be used after all.
+        SettingsError: when a setting cannot be used.
     """
 
     def __init__(self, settings: ServiceSettings) -> None:
@@ -56,88 +51,62 @@ class Server:
         if settings.weights_dir is not None and not settings.weights_dir.is_dir():
             raise SettingsError(f"weights_dir: {settings.weights_dir} is no folder")
         access = open_access(settings)
-        self._arrivals = Arrivals(settings.arrival_timeout_s, settings.max_buffered_bytes)
         self._store = _open_store(settings)
         self._spans = open_spans(settings)
         self.observer = Observer(Metrics(), self._spans)
-        self.engine = Engine(
-            self._store,
-            WorkerSettings(
-                weights_dir=settings.weights_dir,
-                inference=Inference(settings.inference),
-                threads=settings.threads_per_worker,
-                max_loaded_bytes=settings.max_loaded_bytes,
-                max_images=settings.max_rig_images,
-                max_instants=settings.max_instants,
-                max_image_bytes=settings.max_image_bytes,
-                max_image_pixels=settings.max_image_pixels,
-                configure_logging=partial(configure_logging, settings),
-            ),
-            workers=settings.workers,
-            max_queue=settings.max_queue,
-            max_batches=settings.max_batches,
-            max_upload_bytes=settings.max_upload_bytes,
-            limit_s=settings.request_timeout_s,
-            metrics=self.observer.metrics,
-        )
-        self._listeners = [_listen(settings.host, settings.http_port)]
-        self.http_port: int = self._listeners[0].getsockname()[1]
-        self.metrics_port: int | None = None
-        try:
-            if settings.metrics_port is not None:
-                self._listeners.append(_listen(settings.host, settings.metrics_port))
-                self.metrics_port = self._listeners[1].getsockname()[1]
-            self._grpc = GrpcServer(self.engine, settings, self.observer, access)
-        except (RuntimeError, OSError) as error:
-            for listener in self._listeners:
-                listener.close()
-            if isinstance(error, OSError):
-                raise
-            address = f"{settings.host}:{settings.grpc_port}"
-            raise OSError(f"cannot listen on {address}: {error}") from None
-        self.grpc_port = self._grpc.port
-        self._connections = OpenConnections(settings.max_connections)
-        app = create_app(
+        self.engine = _make_engine(settings, self._store, self.observer)
+        self.backend = Backend(
             self.engine,
             settings,
-            observer=self.observer,
-            access=access,
-            arrivals=self._arrivals,
-            connections=self._connections,
-            state=self.state,
+            self.observer,
+            access,
+            Arrivals(settings.arrival_timeout_s, settings.max_buffered_bytes),
+            OpenConnections(settings.max_connections),
+            self.state,
         )
-        grace_s = settings.arrival_timeout_s
-        self._http = [
-            _HttpServer(app, self._listeners[0], self._connections, grace_s, tls_config(settings))
-        ]
-        if settings.metrics_port is not None:
-            self._http.append(
-                _HttpServer(
-                    metrics_app(self._render),
-                    self._listeners[1],
-                    OpenConnections(METRICS_CONNECTIONS),
-                    grace_s,
-                    {},
-                )
-            )
+        with ExitStack() as opened:
+            listener = opened.enter_context(_listen(settings.host, settings.http_port))
+            self._http = [self._http_server(listener)]
+            self.http_port: int = listener.getsockname()[1]
+            self.metrics_port: int | None = None
+            if settings.metrics_port is not None:
+                listener = opened.enter_context(_listen(settings.host, settings.metrics_port))
+                self._http.append(self._metrics_server(listener))
+                self.metrics_port = listener.getsockname()[1]
+            try:
+                self._grpc = GrpcServer(self.engine, settings, self.observer, access)
+            except RuntimeError as error:
+                address = f"{settings.host}:{settings.grpc_port}"
+                raise OSError(f"cannot listen on {address}: {error}") from None
+            opened.pop_all()  # the acceptors close the sockets from here on
+        self.grpc_port = self._grpc.port
+
+    def _http_server(self, listener: socket.socket) -> _HttpServer:
+        app, connections = create_app(self.backend), self.backend.connections
+        grace_s = self._settings.arrival_timeout_s
+        return _HttpServer(app, listener, connections, grace_s, tls_config(self._settings))
+
+    def _metrics_server(self, listener: socket.socket) -> _HttpServer:
+        app, connections = metrics_app(self.backend), OpenConnections(METRICS_CONNECTIONS)
+        return _HttpServer(app, listener, connections, self._settings.arrival_timeout_s, {})
 
     async def open(self) -> None:
-        """Answer. Before ``load`` is done, /readyz and gRPC's health say that it is not ready."""
+        """Answer requests. Until ``load`` is done, /readyz and gRPC's health say not ready."""
         await self._grpc.start()
         self._serving = [asyncio.create_task(server.serve()) for server in self._http]
 
     async def load(self) -> None:
         """Open the maps, warm up, and accept photos."""
         await self.engine.start()
-        await self._grpc.set_serving()
+        await self._grpc.set_serving(True)
 
     async def close(self, grace_s: float) -> None:
-        """Accept nothing new, and give running requests ``grace_s`` seconds to end.
+        """Stop: for ``drain_delay_s`` only readiness says so, then new requests are refused.
 
-        For ``drain_delay_s`` before that, new requests are taken although it is not ready.
+        Running requests get ``grace_s`` seconds to finish.
         """
         self.engine.withdraw()
-        await self._grpc.set_not_serving()
+        await self._grpc.set_serving(False)
         await asyncio.sleep(self._settings.drain_delay_s)
         self.engine.drain()
         for server in self._http:
@@ -149,7 +118,7 @@ class Server:
             await asyncio.to_thread(self._spans.close)
 
     def state(self) -> ServiceState:
-        """How the service is doing."""
+        """Return the current state for the metrics."""
         engine, workers, settings = self.engine, self.engine.workers, self._settings
         status = engine.status
         loaded = {
@@ -170,26 +139,47 @@ class Server:
             loaded_maps=loaded,
             max_loaded_bytes=settings.max_loaded_bytes,
             unusable_maps={map_id: error.code for map_id, error in status.not_loaded.items()},
-            connections=len(self._connections),
+            connections=len(self.backend.connections),
             max_connections=settings.max_connections,
             store_reachable=self._store.reachable,
-            buffered_bytes=self._arrivals.bytes_held,
+            buffered_bytes=self.backend.arrivals.bytes_held,
             max_buffered_bytes=settings.max_buffered_bytes,
             folders={"cache": settings.cache_dir} if remote else {"maps": Path(settings.maps_dir)},
         )
 
-    async def _render(self) -> tuple[bytes, str]:
-        return await asyncio.to_thread(self.observer.metrics.render, self.state())
+
+def _make_engine(settings: ServiceSettings, store: Store, observer: Observer) -> Engine:
+    worker = WorkerSettings(
+        weights_dir=settings.weights_dir,
+        inference=Inference(settings.inference),
+        threads=settings.threads_per_worker,
+        max_loaded_bytes=settings.max_loaded_bytes,
+        max_images=settings.max_rig_images,
+        max_instants=settings.max_instants,
+        max_image_bytes=settings.max_image_bytes,
+        max_image_pixels=settings.max_image_pixels,
+        configure_logging=partial(configure_logging, settings),
+    )
+    return Engine(
+        store,
+        worker,
+        workers=settings.workers,
+        max_queue=settings.max_queue,
+        max_batches=settings.max_batches,
+        max_upload_bytes=settings.max_upload_bytes,
+        limit_s=settings.request_timeout_s,
+        metrics=observer.metrics,
+    )
 
 
 class _HttpServer(uvicorn.Server):
-    """uvicorn, which gets its connections from an ``Acceptor``.
+    """uvicorn with connections from an ``Acceptor``.
 
     Args:
         app: answers.
         listener: the listening socket.
-        connections: their bound.
-        grace_s: longest time for a handshake of TLS, a head, or a body that nobody wants.
+        connections: at most so many, and not too slow.
+        grace_s: the longest TLS handshake, head, or body of a refused request.
         tls: settings of uvicorn.
     """
 
@@ -208,7 +198,7 @@ class _HttpServer(uvicorn.Server):
                 log_level="warning",
                 access_log=False,
                 ws="none",
-                proxy_headers=False,  # whoever is on this machine could make them up
+                proxy_headers=False,  # any local process could forge them
                 http=http_protocol(grace_s, connections),
                 **tls,
             )
@@ -218,7 +208,6 @@ class _HttpServer(uvicorn.Server):
         self._grace_s = grace_s
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to accept."""
         del sockets
         await super().startup(sockets=[])  # uvicorn itself listens nowhere
         self._acceptor = Acceptor(
@@ -226,16 +215,16 @@ class _HttpServer(uvicorn.Server):
         )
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Accept nothing more, and end when all requests have."""
+        """Accept no more connections, and return when all requests have ended."""
         del sockets
         self._acceptor.close()
         await asyncio.sleep(_LAST_WORDS_S)
-        self._open.close_unopened()  # of which uvicorn knows nothing
+        self._open.close_unopened()  # uvicorn does not know them yet
         await super().shutdown()
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Leave signals, which end HTTP and gRPC alike, to ``main``."""
+        """Leave signals to ``main``, because they end gRPC too."""
         yield
 
     def _make_protocol(self) -> Any:
@@ -250,9 +239,9 @@ def _listen(host: str, port: int) -> socket.socket:
         listener = socket.create_server((host, port), family=family, backlog=2048)
     except OSError as error:
         raise OSError(f"cannot listen on {host}:{port}: {error}") from None
-    # Connections inherit it. Left to itself, asyncio sets it on sockets only that were made with
-    # the number of TCP, which create_server does not do; and then every answer on a connection
-    # that was used before waits 40 ms for an acknowledgement.
+    # Connections inherit it. asyncio sets it only on sockets made with TCP's protocol number, which
+    # create_server does not do. Without it, every later answer on a connection waits 40 ms for an
+    # acknowledgement.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return listener
 

@@ -1,8 +1,8 @@
-"""Every setting of the service, once: flag, environment, file and default, in that order.
+"""All settings of the service. Precedence: flag, environment, file, default.
 
-Plain pydantic instead of pydantic-settings, which lets a misspelt ``VISLOC_`` variable pass and
-cannot say where a refused value came from. This module imports nothing of visloc, so that
-``main`` can set the thread counts of libraries before they are loaded.
+This is plain pydantic: pydantic-settings accepts misspelt ``VISLOC_`` variables and cannot say
+where a refused value came from. This module imports nothing of visloc, so that ``main`` can set the
+thread counts of libraries before they are loaded.
 """
 
 from __future__ import annotations
@@ -17,11 +17,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from visloc_api.words.message import MAX_INSTANT_VALUES
-
 PREFIX = "VISLOC_"
 CONFIG_VARIABLE = "VISLOC_CONFIG"
-# The clients': where the service runs too, it is no mistake.
+# Belongs to the clients, which may run in the same environment.
 KEY_VARIABLE = "VISLOC_API_KEY"
 
 Port = Annotated[int, Field(ge=0, le=65535)]
@@ -37,123 +35,117 @@ def _names_of(value: object) -> object:
 
 Names = Annotated[tuple[str, ...], BeforeValidator(_names_of)]
 
-# Room in a request for everything but the photo.
+# Room in a request for everything except the photo.
 REQUEST_OVERHEAD_BYTES = 64 * 1024
-# Largest message with a piece of a packed map: 1 MiB, and a little around it.
+# The largest message with a piece of a packed map: 1 MiB and some overhead.
 PIECE_BYTES = 2**20 + 64 * 1024
-# Room in a sequence for the numbers of one photo: its camera, a pinhole, and its share of the
-# instant's. An instant of few photos needs more: odometry with its covariance, and a pose prior.
-VALUES_PER_IMAGE, LEAST_PER_INSTANT = 16, 150
+# Clients that send or take less than this are disconnected after ``arrival_timeout_s``.
+SLOWEST_BYTES_PER_S = 100_000
 
 
 class SettingsError(ValueError):
-    """A setting that cannot be used; the message names it and where it was given."""
+    """A setting that cannot be used; the message names it and its source."""
 
 
 class ServiceSettings(BaseModel):
-    """Read once in ``main``, then passed as arguments; nothing below reads the environment."""
+    """Read once in ``main`` and passed on; nothing else reads the environment."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     maps_dir: Annotated[str, BeforeValidator(str)] = "maps"
-    """folder of maps, as `mapping build` writes it, or a URL of one, such as s3://bucket/maps"""
+    """folder of maps that `mapping build` wrote, or its URL, such as s3://bucket/maps"""
     cache_dir: Path = Path("maps-cache")
-    """folder for local copies of the maps of a URL"""
+    """folder for local copies of maps, when maps_dir is a URL"""
     max_cache_bytes: Count = 50 * 2**30
-    """room for local copies; the least recently used go first"""
+    """limit of the local copies, bytes; the least recently used are deleted first"""
     max_loaded_bytes: Count = 8 * 2**30
-    """room for open maps; the least recently used are closed first"""
+    """limit of the open maps of each worker, bytes; the least recently used are closed first"""
     max_upload_bytes: Count = 20 * 2**30
-    """largest packed map that may be uploaded, bytes"""
+    """largest packed map accepted for upload, bytes"""
     weights_dir: Path | None = None
     """folder of network weights, for maps whose features need them"""
     inference: Literal["auto", "int8", "fp32", "torch"] = "auto"
-    """how networks are computed; auto: torch where there is a CUDA GPU, else 8 bits where the
-    processor is made for them"""
+    """how networks run; auto: torch on a CUDA GPU, else int8 on processors with instructions for
+    it, else fp32"""
     host: str = "127.0.0.1"
-    """address to listen on; 0.0.0.0 serves other machines, and then needs keys_file"""
+    """address to listen on; others than this machine's own, such as 0.0.0.0, need keys_file"""
     http_port: Port = 8000
-    """port of the HTTP API; 0 lets the system choose"""
+    """port of the HTTP API; 0 picks a free one"""
     grpc_port: Port = 50051
-    """port of the gRPC API; 0 lets the system choose"""
+    """port of the gRPC API; 0 picks a free one"""
     workers: Annotated[int, Field(ge=1, le=256)] = 1
-    """photos that are worked on at the same time"""
+    """worker processes; each localizes one photo at a time"""
     threads_per_worker: Count = Field(
         default_factory=lambda data: max(1, (os.cpu_count() or 1) // data.get("workers", 1)),
     )
-    """processor threads for one photo; default: cores / workers"""
+    """processor threads per worker; default: cores / workers"""
     keys_file: Path | None = None
-    """API keys, as `python -m service.keys` writes them; without, whoever reaches the service may
-    do everything, so that it listens on this machine only"""
+    """file of API keys that `python -m service.keys` wrote; without keys, the service
+    accepts only callers on this machine, and these may do everything"""
     tls_cert: Path | None = None
-    """PEM file of the certificate chain: HTTPS and gRPC over TLS"""
+    """PEM file of the certificate chain; turns on TLS for HTTP and gRPC"""
     tls_key: Path | None = None
     """PEM file of the certificate's private key"""
     cors_origins: Names = ()
-    """comma-separated origins of web pages that may call the HTTP API; none by default"""
+    """comma-separated origins of other web pages that may call the HTTP API; none by default"""
     page: bool = True
-    """whether / is a web page that shows maps and localizes photos; its files need no key"""
+    """whether to serve the web page at /, which shows maps and localizes photos; its files need no
+    key"""
     metrics_port: Port | None = None
-    """a port of its own for /metrics, without a key, for a scraper in a private network"""
+    """separate port for /metrics that needs no key, for Prometheus in a private network"""
     max_queue: Annotated[int, Field(ge=0)] = 64
-    """photos that may wait for a worker; beyond it a request is refused"""
+    """photos that may wait for a worker; further requests are refused"""
     max_connections: Count = 1000
-    """connections that HTTP and gRPC each have open at once, and calls of gRPC; for one more, the
-    longest idle is closed, by gRPC from three quarters on. Lowered where the system allows too few
-    open files"""
+    """limit of open HTTP connections, of open gRPC connections, and of running gRPC calls. At the
+    limit (gRPC: at three quarters of it), the longest idle connection is closed for a new one. The
+    limit is lowered if the system allows too few open files"""
     max_buffered_bytes: Count = 512 * 2**20
-    """bytes of requests held while they arrive; beyond it a request is refused"""
+    """memory for requests that are arriving, bytes; further requests are refused"""
     request_timeout_s: Seconds = 60.0
-    """longest time from when a request has arrived to its answer; callers may ask for less.
-    Sequences: to the next answer"""
+    """longest time from the arrival of a request to its answer, or to the next answer of a
+    sequence; callers may ask for less"""
     arrival_timeout_s: Seconds = 20.0
-    """longest time for the head of a request to arrive, and for its body, to which a second is
-    added for every 100 kB; also the longest silence within a stream"""
+    """longest time for the head of a request to arrive, and again for its body, plus a second for
+    every 100 kB of it; also the longest silence within a stream"""
     drain_delay_s: Annotated[float, Field(ge=0, le=3600)] = 0.0
-    """time after SIGTERM in which new requests are still taken, and /readyz says no already: for
-    balancers to notice"""
+    """time after SIGTERM during which /readyz already says no but new requests are still served,
+    so that load balancers notice"""
     drain_timeout_s: Seconds = 30.0
-    """time for running requests to end after SIGTERM"""
+    """time for running requests to finish after SIGTERM"""
     max_image_bytes: Count = 20 * 2**20
     """largest encoded photo, bytes"""
     max_image_pixels: Count = 50_000_000
-    """largest photo, width times height"""
+    """largest photo, width times height in pixels"""
     max_batches: Count = 8
-    """rigs and sequences that are served at once; one more is refused"""
+    """rigs and sequences served at once; further ones are refused"""
     max_batch_bytes: Count = 64 * 2**20
-    """largest request with several photos, bytes: over HTTP as it comes, base64 included; over gRPC
-    one message, that is a rig's photos or those of one instant of a sequence"""
+    """largest request with several photos, bytes; over HTTP the whole body, base64 included; over
+    gRPC one message: the photos of a rig, or of one instant of a sequence"""
     max_rig_images: Count = 16
-    """photos of one instant of a rig"""
+    """photos per instant"""
     max_instants: Count = 1000
-    """instants of one sequence"""
+    """instants per sequence"""
     log_format: Literal["text", "json"] = "text"
-    """how it is logged: lines for people, or one JSON object per line"""
+    """format of the log: lines for people, or one JSON object per line"""
     otlp_endpoint: str | None = None
-    """URL of an OpenTelemetry collector (OTLP over HTTP) that gets spans"""
+    """URL of an OpenTelemetry collector for spans (OTLP over HTTP)"""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
-    """what is logged to stderr: debug, info, warning or error"""
+    """least severe level that is logged to stderr: debug, info, warning or error"""
 
     @property
     def max_request_bytes(self) -> int:
-        """Largest request that carries one photo as it is: multipart and gRPC."""
+        """Largest request with one photo in binary form: multipart or gRPC."""
         return self.max_image_bytes + REQUEST_OVERHEAD_BYTES
 
     @property
     def max_json_bytes(self) -> int:
-        """Largest request with one photo in JSON: base64 makes four bytes of three."""
+        """Largest request with one photo in JSON, where base64 turns 3 bytes into 4."""
         return self.max_image_bytes * 4 // 3 + REQUEST_OVERHEAD_BYTES
 
     @property
     def max_message_bytes(self) -> int:
-        """Largest message of gRPC: of one photo, an instant's, or a piece of a packed map."""
+        """Largest gRPC message: one photo, one instant, or a piece of a packed map."""
         return max(self.max_request_bytes, self.max_batch_bytes, PIECE_BYTES)
-
-    @property
-    def max_sequence_values(self) -> int:
-        """Values in the JSON of a sequence: each takes about a microsecond and 100 bytes."""
-        per_instant = max(LEAST_PER_INSTANT, VALUES_PER_IMAGE * (self.max_rig_images + 1))
-        return max(MAX_INSTANT_VALUES, per_instant * (self.max_instants + 1))
 
 
 def read_settings(arguments: Sequence[str], environment: Mapping[str, str]) -> ServiceSettings:
@@ -181,7 +173,7 @@ def read_settings(arguments: Sequence[str], environment: Mapping[str, str]) -> S
 
 
 def _from_environment(environment: Mapping[str, str]) -> dict[str, str]:
-    # An empty variable counts as absent, as compose files leave them behind.
+    # An empty variable counts as absent: compose files set them.
     variables = {
         name: value for name, value in environment.items() if name.startswith(PREFIX) and value
     }
@@ -197,7 +189,7 @@ def _from_file(path: Path) -> dict[str, object]:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise SettingsError(f"{path}: the file of settings cannot be read: {error}") from None
-    except ValueError as error:  # of TOML and of UTF-8
+    except ValueError as error:  # no TOML, no UTF-8
         raise SettingsError(f"{path}: not a TOML file: {error}") from None
     _refuse_unknown(values, ServiceSettings.model_fields, str(path))
     return values
@@ -227,13 +219,13 @@ def _parser() -> argparse.ArgumentParser:
         help=f"TOML file with settings (also {CONFIG_VARIABLE})",
     )
     for name, field in ServiceSettings.model_fields.items():
-        default = "" if field.default_factory else f" (default: {field.default})"
+        has_default = field.default_factory is None and field.default not in (None, ())
         parser.add_argument(
             _flag(name),
             dest=name,
             metavar="N" if field.annotation is int else name.rsplit("_", 1)[-1].upper(),
             default=argparse.SUPPRESS,
-            help=f"{field.description}{'' if field.default is None else default}",
+            help=str(field.description) + (f" (default: {field.default})" if has_default else ""),
         )
     return parser
 

@@ -124,7 +124,7 @@ def _once_check(asked: Sequence[Asked], log: Path) -> Check:
     logged: Counter[str] = Counter()
     for line in log.read_text().splitlines():
         entry = json.loads(line)
-        if entry["logger"] == "service.security.access":
+        if entry["logger"] == "service.access":
             logged[entry["request_id"]] += 1
     lost = sum(one.outcome.is_lost for one in asked)
     others = sum(not one.outcome.own for one in asked)

@@ -1,4 +1,4 @@
-"""Access over gRPC."""
+"""Access control of gRPC calls."""
 
 from __future__ import annotations
 
@@ -11,23 +11,28 @@ import grpc
 
 from service.grpc.calls import Handler, behaviour_of, handler_like
 from service.grpc.envelope import Context, Envelope
-from service.http.access import tokens_of
-from service.security.access import NOTHING, Access, is_method, needed_over_grpc
+from service.security.access import (
+    NOTHING,
+    Access,
+    is_method,
+    needed_over_grpc,
+    tokens_of,
+)
 from service.security.key_file import Key
 from service.telemetry.logs import UNMATCHED
 from visloc.errors import Overloaded, TimedOut, VislocError
 
-# How long a call may stay open that needs no key (health). Its watchers ask again.
+# How long a call without a key, such as a health watch, may stay open. Watchers ask again.
 _KEYLESS_S = 300.0
 
 
 class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
-    """Lets a call through or refuses it, before any of its messages is read.
+    """Admits or refuses a call before any of its messages is read.
 
     Args:
         access: decides.
-        envelope: answers what is refused.
-        max_keyless: calls that need no key and are open at once; who has a key must find a place.
+        envelope: answers refused calls.
+        max_keyless: calls open at once that need no key, so that callers with a key find a slot.
     """
 
     def __init__(self, access: Access, envelope: Envelope, max_keyless: int) -> None:
@@ -41,7 +46,7 @@ class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         continuation: Callable[[grpc.HandlerCallDetails], Awaitable[Handler]],
         handler_call_details: grpc.HandlerCallDetails,
     ) -> Handler:
-        """Decide on one call."""
+        """Decide one call."""
         method = handler_call_details.method
         metadata: list[tuple[str, str | bytes]] = list(
             handler_call_details.invocation_metadata or ()
@@ -59,7 +64,7 @@ class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         if handler is not None and needed_over_grpc(method) is NOTHING:
             return self._few(handler, method)
         if key is None or handler is None:
-            return handler  # type: ignore[return-value]  # None: gRPC says that there is none
+            return handler  # type: ignore[return-value]  # None: gRPC answers that there is none
         return self._counted(handler, key, method)
 
     def _few(self, handler: Handler, method: str) -> Handler:
@@ -96,7 +101,7 @@ class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
 
     def _refusal(self, error: VislocError, method: str) -> Handler:
         async def refuse(messages: AsyncIterator[Any], context: Context) -> None:
-            del messages  # they are not read
+            del messages  # not read
             await self._envelope.refuse(_name(method), error, context)
 
         made: Handler = grpc.stream_stream_rpc_method_handler(refuse)
@@ -104,5 +109,5 @@ class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
 
 
 def _name(method: str) -> str:
-    """Return the name of a method that is there, else one word for all others."""
+    """Return the name of one of our methods, one word for all others."""
     return method.rpartition("/")[2] if is_method(method) else UNMATCHED

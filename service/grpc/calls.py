@@ -1,4 +1,4 @@
-"""Methods of gRPC in one form, so that one piece of code can stand before all of them."""
+"""All four kinds of gRPC methods in one form, so that an interceptor can wrap any of them."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import grpc
 from service.grpc.envelope import Context
 
 Handler: TypeAlias = "grpc.RpcMethodHandler[Any, Any]"
-# Reads its messages itself, writes its answers to the context or returns the only one.
+# Reads the messages; writes several answers to the context, or returns the only one.
 Behaviour = Callable[[AsyncIterator[Any], Context], Awaitable[Any]]
 
 
 def behaviour_of(handler: Handler) -> Behaviour:
-    """Return what a method does, whichever of gRPC's four kinds it is."""
+    """Return the code of a method in one form, whichever of the four kinds it is."""
     serve: Any = (
         handler.stream_stream or handler.stream_unary
         if handler.request_streaming
@@ -43,11 +43,11 @@ def behaviour_of(handler: Handler) -> Behaviour:
 
 
 def _forgetful(behaviour: Behaviour) -> Behaviour:
-    """Drop what a call held when it ends, its message above all.
+    """Release the memory of a call when it ends, above all its message.
 
-    gRPC's iterator over messages and the generator that it reads from hold each other, and so do
-    the exception of a refusal and the variables of the call, by its traceback. Only the garbage
-    collector would free them: it counts objects and not their bytes, and comes after gigabytes.
+    gRPC's iterator over messages and the generator behind it refer to each other. So do the
+    exception of a refusal and, through its traceback, the variables of the call. Only the garbage
+    collector would free them. It counts objects, not bytes, and comes after gigabytes.
     """
 
     async def serve(messages: AsyncIterator[Any], context: Context) -> Any:
@@ -69,10 +69,15 @@ def _forgetful(behaviour: Behaviour) -> Behaviour:
 def handler_like(
     handler: Handler, behaviour: Behaviour, parse: Callable[[bytes], Any] | None = None
 ) -> Handler:
-    """Return a method with the messages of another, unless ``parse`` is to read them.
+    """Return a handler that runs ``behaviour``, with the message types of another handler.
 
-    It is called as soon as the call begins, also where there is one message only: gRPC itself
-    would call it when that has arrived, however long that takes.
+    It runs as soon as the call begins. gRPC would run a method with a single message only when that
+    message has arrived, however long that takes.
+
+    Args:
+        handler: gives the types.
+        behaviour: the code to run.
+        parse: reads messages in place of the handler's own parser.
     """
     make: Any = (
         grpc.stream_stream_rpc_method_handler

@@ -1,4 +1,4 @@
-"""Idle connections of gRPC: closed before there are too many."""
+"""Idle gRPC connections: the longest idle are closed before there are too many."""
 
 from __future__ import annotations
 
@@ -13,27 +13,23 @@ from ipaddress import IPv6Address, ip_address
 from time import monotonic
 from urllib.parse import unquote
 
-# A client's address and port: which of our connections it is.
+# A client's address and port, which identify a connection.
 Peer = tuple[str, int]
 
-# How often the connections are counted, and how long that rests after it took a while: for so many
-# times that while.
+# The pause between two counts of the connections, and its least multiple of the time of a count.
 _PERIOD_S = 0.1
 _REST = 10
 _DESCRIPTORS = "/dev/fd"
 
 
 class GrpcConnections:
-    """Keeps a quarter of the places for connections free by closing those that are idle longest.
+    """Keeps a quarter of the connection slots free by closing the longest idle connections.
 
-    gRPC accepts connections by itself. ``grpc.max_allowed_incoming_connections`` makes it refuse
-    new ones at the limit, and there it never closes an idle one, so that silent connections would
-    shut everybody out. Nor does it tell which connections there are: they are found among the
-    descriptors of this process, and closed as a broken network would. A connection is in use while
-    a call runs on it.
-
-    Args:
-        limit: of the connections that are open at once.
+    gRPC accepts connections by itself. With ``grpc.max_allowed_incoming_connections`` it refuses
+    new ones at the limit, but never closes idle ones, so that silent clients could lock out all
+    others. gRPC does not list its connections either. So they are found among the descriptors of
+    this process, and shut down like a broken network would. A connection is in use while a call
+    runs on it.
     """
 
     def __init__(self, limit: int) -> None:
@@ -43,16 +39,12 @@ class GrpcConnections:
 
     @property
     def options(self) -> list[tuple[str, int]]:
-        """Arguments of the server with this limit."""
+        """Options of the gRPC server that set the limit."""
         return [("grpc.max_allowed_incoming_connections", self._limit)]
 
     @contextmanager
     def in_use(self, peer: str) -> Iterator[None]:
-        """Leave a connection open while a call runs on it.
-
-        Args:
-            peer: as of gRPC's ``context.peer()``.
-        """
+        """Keep a connection open while a call runs on it; ``peer`` is gRPC's ``context.peer()``."""
         caller = _peer_of(peer)
         self._idle.pop(caller, None)
         self._calls[caller] += 1
@@ -64,27 +56,27 @@ class GrpcConnections:
                 del self._calls[caller]
 
     async def watch(self, port: int) -> None:
-        """Count the connections of a port and close idle ones, for ever."""
+        """Count the connections of a port and close idle ones until cancelled."""
         took_s = 0.0
         while True:
             await asyncio.sleep(max(_PERIOD_S, _REST * took_s))
             started = monotonic()
-            with suppress(OSError):  # no descriptor is left to list the others with
+            with suppress(OSError):  # no descriptor is left to list the descriptors
                 self.close_idle(port)
             took_s = monotonic() - started
 
     def close_idle(self, port: int) -> None:
-        """Close the connections that are idle longest, if too few places are free."""
+        """Close the longest idle connections if too few slots are free."""
         free = max(1, self._limit // 4)
         with os.scandir(_DESCRIPTORS) as entries:
             names = [entry.name for entry in entries]
-        if len(names) <= self._limit // 2:  # fewer are connections, and none needs a closer look
+        if len(names) <= self._limit // 2:  # connections are even fewer
             self._idle.clear()
             return
         descriptors = dict(_connections_of(names, port))
         idle = descriptors.keys() - self._calls.keys()
         self._idle = {peer: None for peer in self._idle if peer in idle}
-        for peer in descriptors:  # in the order of descriptors, about that of their age
+        for peer in descriptors:  # descriptors are roughly ordered by age
             if peer in idle:
                 self._idle.setdefault(peer)
         for peer in list(self._idle)[: max(0, len(descriptors) - self._limit + free)]:
@@ -92,9 +84,9 @@ class GrpcConnections:
 
 
 def _connections_of(names: list[str], port: int) -> Iterator[tuple[Peer, int]]:
-    """Find the connections to a port among this process's descriptors."""
+    """Find the connections of a port among this process's descriptors."""
     for name in names:
-        with suppress(OSError):  # no socket, not connected, or closed meanwhile
+        with suppress(OSError):  # not connected, or closed meanwhile
             number = int(name)
             if stat.S_ISSOCK(os.fstat(number).st_mode):
                 found = socket.socket(fileno=number)
@@ -109,7 +101,7 @@ _FAMILIES = (socket.AF_INET, socket.AF_INET6)
 
 
 def _shut_down(descriptor: int, peer: Peer) -> None:
-    """Break a connection, unless the number means another by now."""
+    """Shut a connection down, unless its descriptor belongs to another by now."""
     with suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as connection:
         if _peer(*connection.getpeername()[:2]) == peer:
             connection.shutdown(socket.SHUT_RDWR)

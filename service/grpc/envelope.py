@@ -1,4 +1,4 @@
-"""What all methods of gRPC have in common: answers as messages, errors as statuses, the log."""
+"""What all gRPC methods share: answers as messages, errors as statuses, the log."""
 
 from __future__ import annotations
 
@@ -15,15 +15,17 @@ from google.rpc.status_pb2 import Status
 from pydantic import BaseModel
 
 import visloc
-from service.errors import internal_error, request_id, statuses_of
+from service.api.request_ids import request_id
+from service.errors import internal_error, statuses_of
 from service.telemetry.logs import RequestRecord
 from service.telemetry.observer import Observer
+from service.telemetry.tracing import traceparent_of
 from visloc.errors import VislocError
 from visloc_api.words.wire import ERROR_DOMAIN, VERSION_KEY
 
 logger = logging.getLogger(__name__)
 
-# Details travel in a header, of which gRPC clients accept 8 kB by default.
+# Characters per detail: details are sent in headers, and clients accept 8 kB of headers.
 _MAX_DETAIL = 1000
 
 Context = grpc.aio.ServicerContext[Any, Any]
@@ -31,7 +33,7 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 
 def message_of(answer: BaseModel, message: MessageT) -> MessageT:
-    """Fill a message from the model with the same fields: HTTP and gRPC answer the same."""
+    """Fill a message from the model with the same fields, so that HTTP and gRPC answer the same."""
     _fill(message, answer.model_dump())
     return message
 
@@ -41,7 +43,7 @@ def _fill(message: Message, values: Mapping[str, Any]) -> None:
         if isinstance(value, Mapping):
             part = getattr(message, name)
             if isinstance(part, Message):
-                part.SetInParent()  # it is there, also when it is empty
+                part.SetInParent()  # present even if empty
                 _fill(part, value)
             else:
                 part.update(value)
@@ -60,11 +62,7 @@ def _fill_list(entries: Any, values: Sequence[Any]) -> None:
 
 
 class Envelope:
-    """Turns errors into statuses with details, and takes note of every call.
-
-    Args:
-        observer: is told what becomes of it.
-    """
+    """Turns errors into statuses with details, and reports every call to the observer."""
 
     def __init__(self, observer: Observer) -> None:
         self._observer = observer
@@ -75,8 +73,8 @@ class Envelope:
     ) -> AsyncIterator[None]:
         """Serve a call in the block.
 
-        The headers of a single answer go with it, not before: until something was answered, a
-        call that is cut off may be made again elsewhere, by the client's gRPC itself.
+        Headers are sent with a single answer, not before it: the client's gRPC may retry a call
+        elsewhere as long as nothing was answered.
 
         Args:
             method: its name.
@@ -90,7 +88,7 @@ class Envelope:
             record.status = grpc.StatusCode.CANCELLED.name
             headers = [(VERSION_KEY, visloc.__version__)]
             if record.trace is not None:
-                headers.append(("traceresponse", record.trace.traceparent))
+                headers.append(("traceresponse", traceparent_of(record.trace)))
             try:
                 if streams:
                     await context.send_initial_metadata(headers)
@@ -100,12 +98,12 @@ class Envelope:
                 record.status = grpc.StatusCode.OK.name
             except VislocError as error:
                 await self._refuse(error, id_, context, record)
-            except Exception:  # the last line of defence: gRPC would tell the caller what broke
+            except Exception:  # the last line of defence: gRPC would show the caller the exception
                 logger.exception("request %s broke", id_)
                 await self._refuse(internal_error(), id_, context, record)
 
     async def refuse(self, method: str, error: VislocError, context: Context) -> None:
-        """Answer a call with an error, before it is served."""
+        """Answer a call with an error before its method runs."""
         id_ = request_id(None)
         with self._observer.request("grpc", id_, route=method) as record:
             record.peer = context.peer()

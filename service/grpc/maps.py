@@ -1,4 +1,4 @@
-"""Versions of maps over gRPC: they come, take over and go."""
+"""Versions of maps over gRPC: publish, activate and delete versions of maps."""
 
 from __future__ import annotations
 
@@ -6,15 +6,13 @@ from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing
 
 from service.api.maps import map_info
+from service.api.request_ids import request_id
 from service.engine.engine import Engine
-from service.errors import request_id
 from service.grpc.envelope import Context, Envelope, message_of
 from service.telemetry.observer import Observer
 from visloc.errors import InvalidInput
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.v1 import localization_pb2_grpc as pb2_grpc
-
-MAPS_SERVICE_NAME = pb2.DESCRIPTOR.services_by_name["Maps"].full_name
 
 
 class MapsServicer(pb2_grpc.MapsServicer):
@@ -26,7 +24,7 @@ class MapsServicer(pb2_grpc.MapsServicer):
     async def GetVersion(  # noqa: N802  the name in the proto
         self, request: pb2.VersionRef, context: Context
     ) -> pb2.MapInfo:
-        """Describe one version, published but not necessarily in use."""
+        """Describe one published version, current or not."""
         async with self._envelope("GetVersion", request_id(None), context):
             served = await self._engine.map(f"{request.map}@{request.version}")
             return message_of(map_info(served), pb2.MapInfo())
@@ -47,7 +45,7 @@ class MapsServicer(pb2_grpc.MapsServicer):
     async def DeleteVersion(  # noqa: N802
         self, request: pb2.VersionRef, context: Context
     ) -> pb2.DeleteVersionResponse:
-        """Delete a version that is not in use."""
+        """Delete a version that is not current."""
         async with self._envelope("DeleteVersion", request_id(None), context):
             await self._engine.delete(request.map, request.version)
             return pb2.DeleteVersionResponse()
@@ -55,7 +53,7 @@ class MapsServicer(pb2_grpc.MapsServicer):
     async def SetCurrent(  # noqa: N802
         self, request: pb2.VersionRef, context: Context
     ) -> pb2.MapInfo:
-        """Put a version into use."""
+        """Make a version current."""
         async with self._envelope("SetCurrent", request_id(None), context):
             served = await self._engine.set_current(request.map, request.version)
             return message_of(map_info(served), pb2.MapInfo())

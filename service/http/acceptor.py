@@ -1,4 +1,4 @@
-"""HTTP connections: how many are open at once, and which is closed to let a new one in."""
+"""HTTP connections: their limit, and which one is closed to let a new one in."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from typing import Any
 
 logger = logging.getLogger(__name__)
 
-# accept() fails so when the system has nothing left for any connection. Its other errors are those
-# of one connection that waited.
+# Errors of accept() when the system has no room for any connection. Its other errors concern only
+# the connection that was waiting.
 _SHORTAGES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
-# Accepted in one turn of the event loop, so that requests have their turn in a flood.
+# Connections accepted in one turn of the event loop, so that a flood leaves time for requests.
 _BATCH = 64
-# A new connection is not closed for the next before it had this long to send a request; a flood
-# waits in the backlog instead, in which nobody is passed over.
+# The time that a new connection has to send a request before it may be closed for the next. A flood
+# waits in the backlog, which is served in order.
 _LEAST_IDLE_S = 0.1
-# Pause before accepting again when the system has nothing left for a connection.
+# The pause before accepting again when the system has no room for a connection.
 _RETRY_S = 0.1
-# How long nothing of that kind may happen until the episode counts as over.
+# The time without such an error after which an episode is over.
 _EPISODE_S = 10.0
 
 
 class Connection(asyncio.Protocol, ABC):
-    """What must be known of a connection.
+    """A connection that ``OpenConnections`` can close.
 
     Attributes:
-        opening: makes the connection; waits for the handshake of TLS.
+        opening: the task that sets the connection up, with its TLS handshake.
     """
 
     opening: asyncio.Task[None] | None = None
@@ -41,59 +41,55 @@ class Connection(asyncio.Protocol, ABC):
     @property
     @abstractmethod
     def is_sending(self) -> bool:
-        """Whether a part of the last answer has not left yet."""
+        """Whether part of an answer is still waiting to be sent."""
 
     @abstractmethod
     def abandon(self) -> None:
-        """Close at once, even within the handshake of TLS."""
+        """Close at once, even during the TLS handshake."""
 
 
 class OpenConnections:
-    """The open connections of a port: at most ``limit``, and the longest idle goes first.
+    """The open connections of a port, at most ``limit``.
 
-    Attributes:
-        limit: of connections.
-
-    A connection is in use from the end of a request's head to the end of its answer. Before and
-    after, it is idle, and is closed when a new one needs its place.
+    A connection is in use from the end of a request's head to the end of its answer, else idle. At
+    the limit, the longest idle connection is closed for a new one.
     """
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self._reserve = min(max(1, limit // 10), limit - 1)
         self._open: set[Connection] = set()
-        self._idle: dict[Connection, float] = {}  # since when, the longest idle first
+        self._idle: dict[Connection, float] = {}  # the time it became idle; longest idle first
 
     def __len__(self) -> int:
         return len(self._open)
 
     @property
     def is_busy(self) -> bool:
-        """Whether all are in use but the last tenth, or one, which is for health and metrics."""
+        """Whether all connections are in use except the tenth reserved for health and metrics."""
         return len(self._open) - len(self._idle) > self.limit - self._reserve
 
     def add(self, connection: Connection) -> None:
-        """Count a new connection."""
+        """Count a new connection, idle at first."""
         self._open.add(connection)
         self._idle[connection] = monotonic()
 
     def remove(self, connection: Connection) -> None:
-        """Forget a connection that is closed."""
         self._open.discard(connection)
         self._idle.pop(connection, None)
 
     def note(self, connection: Connection, *, in_use: bool) -> None:
-        """Say whether a connection is in use. One that stays idle keeps its place in the order."""
+        """Record whether a connection is in use. One that stays idle keeps its rank."""
         if in_use:
             self._idle.pop(connection, None)
         elif connection in self._open:
             self._idle.setdefault(connection, monotonic())
 
     def make_room(self) -> float:
-        """Close the longest idle connection at the limit.
+        """At the limit, close the longest idle connection.
 
         Returns:
-            Seconds until there is room: 0 when there is room now, infinity when all are in use.
+            Seconds until there is room: 0 for now, infinity when all are in use.
         """
         if len(self._open) < self.limit:
             return 0.0
@@ -107,7 +103,7 @@ class OpenConnections:
         return 0.0
 
     def close_idle(self, most: int) -> None:
-        """Close the connections that are idle longest."""
+        """Close the longest idle connections."""
         for _ in range(most):
             idlest = self._idlest()
             if idlest is None:
@@ -115,7 +111,7 @@ class OpenConnections:
             self._close(idlest)
 
     def close_unopened(self) -> None:
-        """Close the connections whose handshake of TLS has not ended."""
+        """Close the connections that are still in their TLS handshake."""
         for each in list(self._open):
             if each.opening is not None and not each.opening.done():
                 self._close(each)
@@ -129,17 +125,17 @@ class OpenConnections:
 
 
 class Acceptor:
-    """Accepts the connections of a port, from when it is made until ``close``.
+    """Accepts the connections of a port, from construction until ``close``.
 
-    ``asyncio``'s own server accepts without a bound. When descriptors run out it writes thousands
-    of log lines per second and leaves no time for requests.
+    ``asyncio``'s own server has no limit: when descriptors run out, it writes thousands of log
+    lines per second and leaves no time for requests.
 
     Args:
         listener: the listening socket.
-        connections: those of this port.
+        connections: of this port.
         make: makes the protocol of a new connection.
-        context: of TLS; None for none.
-        handshake_s: longest handshake of TLS.
+        context: of TLS; None for plain HTTP.
+        handshake_s: the longest TLS handshake.
     """
 
     def __init__(
@@ -164,7 +160,7 @@ class Acceptor:
         self._resume()
 
     def close(self) -> None:
-        """Take in who has connected already, and nobody else."""
+        """Accept the connections that are already waiting, and stop."""
         self._take(self._connections.limit)
         for timer in (self._pausing, self._episode):
             if timer is not None:
@@ -185,10 +181,10 @@ class Acceptor:
             self._pausing = self._loop.call_later(pause_s, self._resume)
 
     def _take(self, most: int) -> float:
-        """Accept so many that have connected, or fewer.
+        """Accept up to ``most`` waiting connections.
 
         Returns:
-            After how many seconds to try again: 0 for when somebody connects.
+            Seconds to wait before the next try; 0 to wait for a connection.
         """
         for _ in range(most):
             try:
@@ -220,13 +216,13 @@ class Acceptor:
     async def _connect(self, connection: Connection, accepted: socket.socket) -> None:
         try:
             await self._loop.connect_accepted_socket(lambda: connection, accepted, **self._tls)
-        except OSError:  # TLS did not come about: the client's affair
+        except OSError:  # the client's TLS handshake failed
             self._connections.remove(connection)
 
     def _note_shortage(self, error: OSError) -> None:
-        """Log the beginning of an episode of this error, and its end later."""
+        """Log the start of an episode of this error, and later its end."""
         if self._episode is None:
-            logger.error("no connection can be accepted, idle ones are closed: %s", error)
+            logger.error("no connection can be accepted; idle ones are closed: %s", error)
         else:
             self._episode.cancel()
         self._episode = self._loop.call_later(_EPISODE_S, self._end_episode)

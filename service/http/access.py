@@ -1,8 +1,7 @@
-"""Access over HTTP."""
+"""Access control of HTTP requests."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from contextlib import ExitStack
 from http import HTTPStatus
 
@@ -13,22 +12,22 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.http.responses import problem_response
-from service.security.access import Access, needed_over_http
+from service.security.access import Access, needed_over_http, tokens_of
 from service.security.key_file import Key
 from service.telemetry.observer import Observer
 from visloc.errors import VislocError
 
 
 def add_access(app: Starlette, access: Access, observer: Observer, *, page: bool = False) -> None:
-    """Put access control before the routes, and CORS before it if some pages may call.
+    """Add access control to an app, and CORS around it if web pages of other origins may call.
 
-    Call this before the outermost middleware is added, which gives requests their ids.
+    Call this before the envelope is added, which must be outermost: it gives requests their ids.
 
     Args:
-        app: what is protected.
+        app: to protect.
         access: the rules.
-        observer: is told of refusals.
-        page: whether the files of our own page are served, to everyone.
+        observer: learns of refusals.
+        page: whether the app serves the files of the page, which need no key.
     """
     app.add_middleware(AccessControl, access=access, observer=observer, page=page)
     if access.origins:
@@ -45,7 +44,7 @@ def add_access(app: Starlette, access: Access, observer: Observer, *, page: bool
 
 
 class AccessControl:
-    """Lets a request through or refuses it, before any of its body is read."""
+    """Admits or refuses a request before any of its body is read."""
 
     def __init__(self, app: ASGIApp, access: Access, observer: Observer, *, page: bool) -> None:
         self._app = app
@@ -54,7 +53,6 @@ class AccessControl:
         self._page = page
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -82,13 +80,3 @@ class AccessControl:
         if response.status_code == HTTPStatus.TOO_MANY_REQUESTS:
             response.headers["Retry-After"] = str(self._access.wait_s(key))
         return response
-
-
-def tokens_of(authorizations: Iterable[str], api_keys: Iterable[str]) -> set[str]:
-    """Return what was sent as API keys. Authorizations of other kinds are for a proxy."""
-    tokens = set(api_keys)
-    for authorization in authorizations:
-        kind, _, token = authorization.partition(" ")
-        if kind.lower() == "bearer":
-            tokens.add(token.strip())
-    return tokens

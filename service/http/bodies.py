@@ -1,16 +1,13 @@
-"""Bodies of HTTP requests, read within limits and checked."""
+"""Reads the bodies of HTTP requests within limits and checks them."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from time import monotonic, sleep
 from typing import TypeVar
 
-from starlette.datastructures import Headers, UploadFile
-from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import Request
 
 from service.api import (
@@ -20,26 +17,31 @@ from service.api import (
     LocalizeSequenceRequest,
     UseVersionRequest,
 )
-from service.http.slow_clients import arrivals_of
+from service.http.backend import backend_of
+from service.http.forms import Form, FormLimits, parse_form
 from service.settings import REQUEST_OVERHEAD_BYTES, ServiceSettings
 from service.values import Instant, RigJob, SequenceStart
 from visloc.errors import InvalidInput
 from visloc_api.words.message import MAX_INSTANT_VALUES
 
-_CHUNK_BYTES = 64 * 1024
-# The parts of the form of one photo that are files, and how curl sends them.
+# The parts of the form of one photo that are files, and the file names in curl's examples.
 _FILES = {"image": "photo.jpg", "features": "photo.json"}
-_FORM = "multipart/form-data"
-_KINDS = (_FORM, "application/json")
+_FORM, _JSON = "multipart/form-data", "application/json"
+# Values in a sequence: each takes about a microsecond and 100 bytes to parse. A photo needs 16 for
+# its pinhole camera and its share of the instant's. An instant of few photos needs more: odometry
+# with its covariance, and a pose prior.
+_VALUES_PER_IMAGE, _LEAST_PER_INSTANT = 16, 150
 JobT = TypeVar("JobT")
+# Makes a job from the JSON of a batch and the files that it names.
+ToJob = Callable[[str | bytes, Mapping[str, bytes]], JobT]
 
 
 class _BatchParser:
-    """Parses the JSON of batches in a thread, one after the other.
+    """Parses the JSON of batches in one thread, one after the other.
 
-    Parsing keeps Python's lock, for some tenths of a second for the largest sequence. An answer to
-    anybody else takes several turns of the event loop, each of which would wait for one more
-    batch. So the thread rests after each for as long as it took.
+    Parsing holds Python's lock, for some tenths of a second for the largest sequence. Answering any
+    other request takes several turns of the event loop, and each turn would wait for one batch. So
+    the thread rests after each batch for as long as it took.
     """
 
     def __init__(self) -> None:
@@ -47,21 +49,13 @@ class _BatchParser:
         self._rests_until = 0.0
 
     async def parse(
-        self,
-        to_job: Callable[[str | bytes, Mapping[str, bytes]], JobT],
-        text: str | bytes,
-        files: Mapping[str, bytes],
+        self, to_job: ToJob[JobT], text: str | bytes, files: Mapping[str, bytes]
     ) -> JobT:
-        """Make the job of a batch; errors are those of ``to_job``."""
+        """Make the job of a batch; raises what ``to_job`` raises."""
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(self._thread, self._parsed, to_job, text, files)
 
-    def _parsed(
-        self,
-        to_job: Callable[[str | bytes, Mapping[str, bytes]], JobT],
-        text: str | bytes,
-        files: Mapping[str, bytes],
-    ) -> JobT:
+    def _parsed(self, to_job: ToJob[JobT], text: str | bytes, files: Mapping[str, bytes]) -> JobT:
         started = monotonic()
         if started < self._rests_until:
             sleep(self._rests_until - started)
@@ -76,76 +70,78 @@ class _BatchParser:
 _BATCHES = _BatchParser()
 
 
-@dataclass(frozen=True, slots=True)
-class _Form:
-    texts: dict[str, str] = field(default_factory=dict)
-    files: dict[str, bytes] = field(default_factory=dict)
-
-
-async def read_localize_job(request: Request, settings: ServiceSettings) -> RigJob:
-    """Read the body of ``POST /localize``, as a form or as JSON.
+async def read_localize_job(request: Request) -> RigJob:
+    """Read the body of ``POST /localize``, a form or JSON.
 
     Raises:
         TooLarge: ``request.too_large``, before the rest of the body is read.
-        InvalidInput: ``request...``, or a code of the field that is wrong.
+        InvalidInput: ``request...``, or a code of the wrong field.
     """
+    backend = backend_of(request)
+    content_type = request.headers.get("content-type", "")
 
     def from_form(body: bytes) -> RigJob:
-        form = _parse_form(
-            request.headers,
+        form = parse_form(
+            content_type,
             body,
-            max_files=len(_FILES),
-            max_texts=len(LocalizeRequest.model_fields),
-            max_text_bytes=REQUEST_OVERHEAD_BYTES,
+            FormLimits(len(_FILES), len(LocalizeRequest.model_fields), REQUEST_OVERHEAD_BYTES),
             expected="a form with a file image or features, and texts map, camera, options...",
         )
         _check_kinds(form)
         return LocalizeRequest.read({**form.texts, **form.files}).to_job()
 
-    return await _read(
-        request,
-        from_form=(from_form, settings.max_request_bytes),
-        from_json=(
-            lambda body: LocalizeRequest.read_json(body).to_job(),
-            settings.max_json_bytes,
-        ),
-    )
+    def from_json(body: bytes) -> RigJob:
+        return LocalizeRequest.read_json(body).to_job()
+
+    parse, limit = from_json, backend.settings.max_json_bytes
+    if checked_media_type(request, (_FORM, _JSON)) == _FORM:
+        parse, limit = from_form, backend.settings.max_request_bytes
+    async with backend.arrivals.body(request, limit) as body:
+        # Parsing and decoding take milliseconds: not on the event loop.
+        return await asyncio.to_thread(parse, body)
 
 
-async def read_rig_job(request: Request, settings: ServiceSettings) -> RigJob:
-    """Read the body of ``POST /localize/rig``, as a form or as JSON.
+async def read_rig_job(request: Request) -> RigJob:
+    """Read the body of ``POST /localize/rig``, a form or JSON.
 
     Raises:
         TooLarge: ``request.too_large``, before the rest of the body is read; ``rig.too_many_...``.
-        InvalidInput: ``request...``, or a code of the field that is wrong.
+        InvalidInput: ``request...``, or a code of the wrong field.
     """
-    limits = _limits(settings)
+    settings = backend_of(request).settings
+    limits = BatchLimits(settings.max_rig_images, settings.max_instants)
 
-    def job(text: str | bytes, files: Mapping[str, bytes]) -> RigJob:
-        read = LocalizeRigRequest.read_json(text, limits, MAX_INSTANT_VALUES)
-        return read.to_job(files)
+    def to_job(text: str | bytes, files: Mapping[str, bytes]) -> RigJob:
+        return LocalizeRigRequest.read_json(text, limits, MAX_INSTANT_VALUES).to_job(files)
 
-    return await _read_batch(request, settings, job, max_files=settings.max_rig_images)
+    return await _read_batch(request, to_job, max_files=settings.max_rig_images)
 
 
-async def read_sequence_jobs(
-    request: Request, settings: ServiceSettings
-) -> tuple[SequenceStart, list[Instant]]:
-    """Read the body of ``POST /localize/sequence``, as a form or as JSON.
+async def read_sequence_jobs(request: Request) -> tuple[SequenceStart, list[Instant]]:
+    """Read the body of ``POST /localize/sequence``, a form or JSON.
 
     Raises:
         TooLarge: ``request.too_large``, before the rest of the body is read;
             ``sequence.too_many_instants``, ``rig.too_many_...``.
-        InvalidInput: ``request...``, or a code of the field that is wrong.
+        InvalidInput: ``request...``, or a code of the wrong field.
     """
-    limits = _limits(settings)
+    settings = backend_of(request).settings
+    limits = BatchLimits(settings.max_rig_images, settings.max_instants)
+    max_values = max_sequence_values(settings)
 
-    def jobs(text: str | bytes, files: Mapping[str, bytes]) -> tuple[SequenceStart, list[Instant]]:
-        read = LocalizeSequenceRequest.read_json(text, limits, settings.max_sequence_values)
-        return read.to_jobs(files)
+    def to_jobs(
+        text: str | bytes, files: Mapping[str, bytes]
+    ) -> tuple[SequenceStart, list[Instant]]:
+        return LocalizeSequenceRequest.read_json(text, limits, max_values).to_jobs(files)
 
     max_files = settings.max_rig_images * settings.max_instants
-    return await _read_batch(request, settings, jobs, max_files=max_files)
+    return await _read_batch(request, to_jobs, max_files=max_files)
+
+
+def max_sequence_values(settings: ServiceSettings) -> int:
+    """Return how many values the JSON of a sequence may have."""
+    per_instant = max(_LEAST_PER_INSTANT, _VALUES_PER_IMAGE * (settings.max_rig_images + 1))
+    return max(MAX_INSTANT_VALUES, per_instant * (settings.max_instants + 1))
 
 
 async def read_use_version(request: Request) -> UseVersionRequest:
@@ -155,13 +151,13 @@ async def read_use_version(request: Request) -> UseVersionRequest:
         TooLarge: ``request.too_large``.
         InvalidInput: ``request...``.
     """
-    checked_media_type(request, ("application/json",))
-    async with arrivals_of(request).body(request, REQUEST_OVERHEAD_BYTES) as body:
+    checked_media_type(request, (_JSON,))
+    async with backend_of(request).arrivals.body(request, REQUEST_OVERHEAD_BYTES) as body:
         return UseVersionRequest.read_json(body)
 
 
 def checked_media_type(request: Request, kinds: Collection[str]) -> str:
-    """Return what kind of body it is.
+    """Return the media type of the body.
 
     Raises:
         InvalidInput: ``request.content_type`` when it is none of ``kinds``.
@@ -178,110 +174,42 @@ def checked_media_type(request: Request, kinds: Collection[str]) -> str:
     return media_type
 
 
-def _limits(settings: ServiceSettings) -> BatchLimits:
-    return BatchLimits(settings.max_rig_images, settings.max_instants)
-
-
-async def _read_batch(
-    request: Request,
-    settings: ServiceSettings,
-    to_job: Callable[[str | bytes, Mapping[str, bytes]], JobT],
-    *,
-    max_files: int,
-) -> JobT:
+async def _read_batch(request: Request, to_job: ToJob[JobT], *, max_files: int) -> JobT:
     """Read several photos: JSON, or a form with that JSON as ``request`` and a file per photo."""
+    backend = backend_of(request)
+    max_bytes = backend.settings.max_batch_bytes
+    content_type = request.headers.get("content-type", "")
 
     def from_form(body: bytes) -> tuple[str, Mapping[str, bytes]]:
-        expected = f"a form with a text request (JSON) and at most {max_files} files"
-        form = _parse_form(
-            request.headers,
+        form = parse_form(
+            content_type,
             body,
-            max_files=max_files,
-            max_texts=1,
-            max_text_bytes=settings.max_batch_bytes,
-            expected=expected,
+            FormLimits(max_files, max_texts=1, max_text_bytes=max_bytes),
+            expected=f"a form with a text request (JSON) and at most {max_files} files",
         )
         if form.texts.keys() != {"request"}:
-            name = next(iter(form.texts), None)
-            raise InvalidInput(
-                "request.missing_field" if name is None else "request.unknown_field",
-                "the form needs the request as a text",
-                field="request" if name is None else name[:100],
-                expected="a text, as of curl -F 'request=<request.json'",
-                got="a file" if name is None and "request" in form.files else name,
-            )
+            raise _no_request_text(form)
         return form.texts["request"], form.files
 
-    is_form = checked_media_type(request, _KINDS) == _FORM
-    async with arrivals_of(request).body(request, settings.max_batch_bytes) as body:
+    is_form = checked_media_type(request, (_FORM, _JSON)) == _FORM
+    async with backend.arrivals.body(request, max_bytes) as body:
         text, files = await asyncio.to_thread(from_form, body) if is_form else (body, {})
         return await _BATCHES.parse(to_job, text, files)
 
 
-async def _read(
-    request: Request,
-    *,
-    from_form: tuple[Callable[[bytes], JobT], int],
-    from_json: tuple[Callable[[bytes], JobT], int],
-) -> JobT:
-    """Read a body of either kind, each with its largest number of bytes."""
-    is_form = checked_media_type(request, _KINDS) == _FORM
-    parse, limit = from_form if is_form else from_json
-    async with arrivals_of(request).body(request, limit) as body:
-        # Photos and features take milliseconds to parse and decode: off the event loop with them.
-        return await asyncio.to_thread(parse, body)
+def _no_request_text(form: Form) -> InvalidInput:
+    name = next(iter(form.texts), None)
+    return InvalidInput(
+        "request.missing_field" if name is None else "request.unknown_field",
+        "the form needs the request as a text",
+        field="request" if name is None else name[:100],
+        expected="a text, as of curl -F 'request=<request.json'",
+        got="a file" if name is None and "request" in form.files else name,
+    )
 
 
-def _parse_form(
-    headers: Headers,
-    body: bytes,
-    *,
-    max_files: int,
-    max_texts: int,
-    max_text_bytes: int,
-    expected: str,
-) -> _Form:
-    """Take a form apart. This runs in a thread of its own: 20 MB take half a second.
-
-    Raises:
-        InvalidInput: ``request.malformed`` or ``request.duplicate_field``.
-    """
-
-    async def stream() -> AsyncGenerator[bytes, None]:
-        for start in range(0, len(body), _CHUNK_BYTES):
-            yield body[start : start + _CHUNK_BYTES]
-
-    async def parse() -> _Form:
-        parser = MultiPartParser(
-            headers,
-            stream(),
-            max_files=max_files,
-            max_fields=max_texts,
-            max_part_size=max_text_bytes,
-        )
-        parser.spool_max_size = len(body) + 1  # files stay in memory, none on disk
-        parsed = await parser.parse()
-        form = _Form()
-        try:
-            for name, value in parsed.multi_items():
-                if name in form.texts or name in form.files:
-                    raise InvalidInput("request.duplicate_field", "given twice", field=name[:100])
-                if isinstance(value, UploadFile):
-                    form.files[name] = await value.read()
-                else:
-                    form.texts[name] = value
-        finally:
-            await parsed.close()
-        return form
-
-    try:
-        return asyncio.run(parse())
-    except MultiPartException as error:
-        raise InvalidInput("request.malformed", error.message, expected=expected) from None
-
-
-def _check_kinds(form: _Form) -> None:
-    """Refuse texts that must be files, and the other way round.
+def _check_kinds(form: Form) -> None:
+    """Refuse texts that must be files, and files that must be texts.
 
     Raises:
         InvalidInput: ``request.invalid``.

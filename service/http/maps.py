@@ -1,4 +1,4 @@
-"""Maps over HTTP: what there is, and versions that come, take over and go."""
+"""Maps over HTTP: list, describe, publish, activate and delete versions."""
 
 from __future__ import annotations
 
@@ -11,12 +11,10 @@ from fastapi import FastAPI, Query, Request, Response
 from service.api import ListMapsResponse, MapInfo
 from service.api.geopose import near_from_text
 from service.api.maps import map_info
-from service.engine.engine import Engine
+from service.http.backend import backend_of
 from service.http.bodies import checked_media_type, read_use_version
 from service.http.openapi.app import problems
 from service.http.responses import json_response
-from service.http.slow_clients import arrivals_of
-from service.settings import ServiceSettings
 from visloc.errors import TooLarge
 
 _PACKED = ("application/zip", "application/octet-stream")
@@ -36,92 +34,100 @@ _USE_VERSION_BODY: dict[str, Any] = {
 }
 
 
-def add_map_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) -> None:
-    """Add the routes below /maps."""
-
-    @app.get("/maps", response_model=ListMapsResponse, responses=problems(422))
-    async def list_maps(
-        near: Annotated[
-            str | None,
-            Query(
-                description="latitude,longitude,radius (degrees, metres, WGS84): only the maps "
-                "that are anchored to the Earth and reach into this circle"
-            ),
-        ] = None,
-    ) -> Response:
-        """List the maps that can be opened, in the version that is served; sets of maps too."""
-        circle = None if near is None else near_from_text(near).to_core()
-        listed = await engine.maps(circle)
-
-        def answer() -> Response:
-            maps = tuple(map_info(served, in_list=True) for served in listed)
-            return json_response(ListMapsResponse(maps=maps))
-
-        # Of ten thousand maps, it takes a moment.
-        return await asyncio.to_thread(answer)
-
-    @app.get("/maps/{ref}", response_model=MapInfo, responses=problems(404, 422, 500))
-    async def get_map(ref: str) -> Response:
-        """Describe one map: `id`, or `id@version`."""
-        return json_response(await asyncio.to_thread(map_info, await engine.map(ref)))
-
-    @app.post(
+def add_map_routes(app: FastAPI) -> None:
+    """Add the routes of maps and their versions."""
+    version = "/maps/{map_id}/versions/{version}"
+    app.get("/maps", response_model=ListMapsResponse, responses=problems(422))(list_maps)
+    app.get("/maps/{ref}", response_model=MapInfo, responses=problems(404, 422, 500))(get_map)
+    app.post(
         "/maps/{map_id}/current",
         response_model=MapInfo,
         responses=problems(404, 409, 413, 422, 500, 503),
         openapi_extra={"requestBody": _USE_VERSION_BODY},
-    )
-    async def use_version(map_id: str, request: Request) -> Response:
-        """Put a version into use, a newer or an older one, once the server has it open and warm.
-
-        Requests that are under way are answered by the version that they began with.
-        """
-        asked = await read_use_version(request)
-        served = await engine.set_current(map_id, asked.version)
-        return json_response(map_info(served))
-
-    path = "/maps/{map_id}/versions/{version}"
-
-    @app.get(path, response_model=MapInfo, responses=problems(404, 422, 500))
-    async def get_version(map_id: str, version: str) -> Response:
-        """Describe one version, published but not necessarily in use."""
-        served = await engine.map(f"{map_id}@{version}")
-        return json_response(await asyncio.to_thread(map_info, served))
-
-    @app.put(
-        path,
+    )(use_version)
+    app.get(version, response_model=MapInfo, responses=problems(404, 422, 500))(get_version)
+    app.put(
+        version,
         status_code=201,
         response_model=MapInfo,
         responses=problems(409, 413, 422, 429, 500, 503, 504, 507),
         openapi_extra={"requestBody": _PACKED_BODY},
+    )(put_version)
+    app.delete(version, status_code=204, responses=problems(404, 409, 422, 500, 503))(
+        delete_version
     )
-    async def put_version(map_id: str, version: str, request: Request) -> Response:
-        """Publish a version from its packed file.
-
-        It is verified byte by byte before anyone can see it, and is not in use until
-        `POST /maps/{map_id}/current` names it.
-        """
-        checked_media_type(request, _PACKED)
-        _check_declared_size(request, settings)
-        async with aclosing(arrivals_of(request).chunks(request)) as chunks:
-            served = await engine.upload(map_id, version, chunks)
-        response = json_response(map_info(served), 201)
-        response.headers["Location"] = f"/maps/{map_id}/versions/{version}"
-        return response
-
-    @app.delete(path, status_code=204, responses=problems(404, 409, 422, 500, 503))
-    async def delete_version(map_id: str, version: str) -> Response:
-        """Delete a version that is not in use, or the last one there is."""
-        await engine.delete(map_id, version)
-        return Response(status_code=204)
 
 
-def _check_declared_size(request: Request, settings: ServiceSettings) -> None:
+async def list_maps(
+    request: Request,
+    near: Annotated[
+        str | None,
+        Query(
+            description="latitude,longitude,radius (degrees, metres, WGS84): only the maps that "
+            "are anchored to the Earth and reach into this circle"
+        ),
+    ] = None,
+) -> Response:
+    """List the maps and sets of maps that can be opened, each in its current version."""
+    circle = None if near is None else near_from_text(near).to_core()
+    listed = await backend_of(request).engine.maps(circle)
+
+    def answer() -> Response:
+        maps = tuple(map_info(served, in_list=True) for served in listed)
+        return json_response(ListMapsResponse(maps=maps))
+
+    return await asyncio.to_thread(answer)  # slow for ten thousand maps
+
+
+async def get_map(request: Request, ref: str) -> Response:
+    """Describe one map: `id`, or `id@version`."""
+    served = await backend_of(request).engine.map(ref)
+    return json_response(await asyncio.to_thread(map_info, served))
+
+
+async def use_version(map_id: str, request: Request) -> Response:
+    """Make a version current, newer or older, once the server has opened and warmed it.
+
+    Requests that are being served finish with the version that they started with.
+    """
+    asked = await read_use_version(request)
+    served = await backend_of(request).engine.set_current(map_id, asked.version)
+    return json_response(map_info(served))
+
+
+async def get_version(request: Request, map_id: str, version: str) -> Response:
+    """Describe one published version, current or not."""
+    return await get_map(request, f"{map_id}@{version}")
+
+
+async def put_version(map_id: str, version: str, request: Request) -> Response:
+    """Publish a version from its packed file.
+
+    Every byte is verified before the version becomes visible. It is not used until
+    `POST /maps/{map_id}/current` names it.
+    """
+    backend = backend_of(request)
+    checked_media_type(request, _PACKED)
+    _check_declared_size(request, backend.settings.max_upload_bytes)
+    async with aclosing(backend.arrivals.chunks(request)) as chunks:
+        served = await backend.engine.upload(map_id, version, chunks)
+    response = json_response(map_info(served), 201)
+    response.headers["Location"] = f"/maps/{map_id}/versions/{version}"
+    return response
+
+
+async def delete_version(request: Request, map_id: str, version: str) -> Response:
+    """Delete a version that is not current, or the last version of a map."""
+    await backend_of(request).engine.delete(map_id, version)
+    return Response(status_code=204)
+
+
+def _check_declared_size(request: Request, limit: int) -> None:
     declared = request.headers.get("content-length", "")
-    if declared.isdecimal() and int(declared[:20]) > settings.max_upload_bytes:
+    if declared.isdecimal() and int(declared[:20]) > limit:
         raise TooLarge(
             "request.too_large",
             "the packed map has too many bytes",
-            expected=f"at most {settings.max_upload_bytes} bytes",
+            expected=f"at most {limit} bytes",
             got=f"{declared[:20]} bytes",
         )

@@ -1,10 +1,10 @@
-"""How HTTP answers: JSON, problems, lines as they come, and what happens when a client leaves."""
+"""HTTP answers: JSON, problems and streamed lines; and clients that disconnect."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncGenerator, Callable, Coroutine, Mapping
+from collections.abc import AsyncGenerator, Callable, Coroutine
 from contextlib import aclosing
 from http import HTTPStatus
 from typing import Any, TypeVar
@@ -30,7 +30,7 @@ def json_response(message: BaseModel, status: int = 200) -> Response:
 
 
 def problem_of(error: VislocError, id_: str, status: HTTPStatus | None = None) -> Problem:
-    """Say an error as problem details; the status is that of its kind unless given."""
+    """Describe an error as problem details; its kind decides the status unless one is given."""
     status = status or statuses_of(error)[0]
     return Problem(
         title=status.phrase,
@@ -57,7 +57,7 @@ def problem_response(error: VislocError, id_: str, status: HTTPStatus | None = N
 
 
 async def while_connected(receive: Receive, work: Coroutine[Any, Any, T]) -> T:
-    """Do the work, or drop it when the client hangs up: nobody waits for its answer.
+    """Do the work; cancel it when the client hangs up.
 
     Raises:
         ClientDisconnect: when the client hung up.
@@ -76,21 +76,21 @@ async def while_connected(receive: Receive, work: Coroutine[Any, Any, T]) -> T:
     finally:
         working.cancel()
         leaving.cancel()
-        await asyncio.wait({working, leaving})  # what the work holds is free when this returns
+        await asyncio.wait({working, leaving})  # the work has released what it held
 
 
 class Lines(Response):
-    """One line of JSON per answer, sent as soon as it is there.
+    """One line of JSON per answer, sent as soon as the answer is there.
 
-    The next answer is asked for when the client has taken those before. An error after the first
-    line becomes a last line ``{"problem": {...}}``. The client hanging up ends the work.
+    The next answer is computed only when the client has taken the previous ones. An error after the
+    first line becomes a last line ``{"problem": {...}}``. The work ends when the client hangs up.
 
     Args:
-        first: the first answer, so that an error before it is an ordinary problem.
+        first: computed before, so that an error up to here is an ordinary problem.
         others: the answers after it; closed at the end.
-        message: an answer in the API's words.
-        id_: the id of the request.
-        patience_s: longest time for the client to take a line; then it is gone for us.
+        message: converts an answer to the words of the API.
+        id_: of the request.
+        patience_s: the longest that the client may take for a line.
     """
 
     def __init__(
@@ -110,18 +110,12 @@ class Lines(Response):
         self._patience_s = patience_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send the lines."""
         del scope
         await while_connected(receive, self._send_all(send))
 
     async def _send_all(self, send: Send) -> None:
-        await send(
-            {
-                "type": "http.response.start",
-                "status": self.status_code,
-                "headers": self.raw_headers,
-            }
-        )
+        start = {"status": self.status_code, "headers": self.raw_headers}
+        await send({"type": "http.response.start", **start})
         try:
             async with aclosing(self._answers) as answers:
                 async for answer in answers:
@@ -138,10 +132,10 @@ class Lines(Response):
         await self._send_line(send, f'{{"problem":{problem.model_dump_json()}}}')
 
     async def _send_line(self, send: Send, text: str) -> None:
-        message: Mapping[str, Any] = {"body": text.encode() + b"\n", "more_body": True}
+        body = text.encode() + b"\n"
         try:
             async with asyncio.timeout(self._patience_s):
-                await send({"type": "http.response.body", **message})
+                await send({"type": "http.response.body", "body": body, "more_body": True})
         except TimeoutError:
             raise ClientDisconnect from None
 

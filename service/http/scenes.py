@@ -1,4 +1,4 @@
-"""Points and photos of maps over HTTP, for the page and for whoever draws maps."""
+"""Landmarks and mapping images of maps over HTTP, for the page and other viewers."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Query, Request, Response
 
 from service.api import MapImages
-from service.api.deadlines import timeout_of, within
+from service.api.deadlines import within
 from service.api.maps import map_images
 from service.engine.engine import Engine
+from service.http.backend import backend_of, timeout_s_of
 from service.http.cache_headers import (
     ASK_ALWAYS_PRIVATE,
     FOR_EVER_PRIVATE,
@@ -19,11 +20,9 @@ from service.http.cache_headers import (
     not_modified,
 )
 from service.http.openapi.app import problems
-from service.settings import ServiceSettings
 from visloc.archive import MapOutline, SetOutline
 from visloc.archive.checks import is_set
 from visloc.errors import NotFound
-from visloc_api.words.wire import TIMEOUT_HEADER
 
 MAX_POINTS, MAX_IMAGES = 262_144, 10_000
 
@@ -43,70 +42,70 @@ class _Binary(Response):
     media_type = _BINARY
 
 
-def add_scene_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) -> None:
-    """Add what is below /maps to be drawn."""
-
-    def timeout(request: Request) -> float:
-        return timeout_of(request.headers.get(TIMEOUT_HEADER), settings.request_timeout_s)
-
-    @app.get(
+def add_scene_routes(app: FastAPI) -> None:
+    """Add the routes of landmarks and mapping images."""
+    refusals = problems(404, 422, 500, 503, 504)
+    app.get(
         "/maps/{ref}/points",
         response_class=_Binary,
-        responses={**_POINTS, **_CACHED, **problems(404, 422, 500, 503, 504)},
+        responses={**_POINTS, **_CACHED, **refusals},
+    )(get_points)
+    app.get("/maps/{ref}/images", response_model=MapImages, responses={**_CACHED, **refusals})(
+        get_images
     )
-    async def get_points(
-        request: Request,
-        ref: str,
-        first: First = 0,
-        count: Annotated[int, Query(ge=1, le=MAX_POINTS, description="most landmarks")] = 65_536,
-    ) -> Response:
-        """Give landmarks of a map (`id`, or `id@version`), in an order of detail.
 
-        Every beginning of the order is an even sample of the map in space: as many as are read is
-        the level of detail. With `id@version` the answer may be kept for ever.
-        """
 
-        async def answer(outline: MapOutline) -> Response:
-            headers = _caching(outline, ref, first, count)
-            if is_current(request.headers, headers["ETag"]):
-                return not_modified(headers)
-            body = await engine.scenes.points(outline, first, count)
-            return Response(body, headers=headers, media_type=_BINARY)
+async def get_points(
+    request: Request,
+    ref: str,
+    first: First = 0,
+    count: Annotated[int, Query(ge=1, le=MAX_POINTS, description="most landmarks")] = 65_536,
+) -> Response:
+    """Give landmarks of a map (`id`, or `id@version`), in an order of detail.
 
-        async with within(timeout(request)):
-            return await _of_version(engine, ref, answer)
+    Every prefix of the order samples the map evenly in space: the more is read, the finer the
+    detail. With `id@version` the answer may be cached for ever.
+    """
+    engine = backend_of(request).engine
 
-    @app.get(
-        "/maps/{ref}/images",
-        response_model=MapImages,
-        responses={**_CACHED, **problems(404, 422, 500, 503, 504)},
-    )
-    async def get_images(
-        request: Request,
-        ref: str,
-        first: First = 0,
-        count: Annotated[int, Query(ge=1, le=MAX_IMAGES, description="most photos")] = 1000,
-    ) -> Response:
-        """Say where the mapping photos of a map (`id`, or `id@version`) were taken."""
+    async def answer(outline: MapOutline) -> Response:
+        headers = _caching(outline, ref, first, count)
+        if is_current(request.headers, headers["ETag"]):
+            return not_modified(headers)
+        body = await engine.scenes.points(outline, first, count)
+        return Response(body, headers=headers, media_type=_BINARY)
 
-        async def answer(outline: MapOutline) -> Response:
-            headers = _caching(outline, ref, first, count)
-            if is_current(request.headers, headers["ETag"]):
-                return not_modified(headers)
-            photos = await engine.scenes.photos(outline)
-            text = await asyncio.to_thread(
-                lambda: map_images(outline, photos, first, count).model_dump_json()
-            )
-            return Response(text, headers=headers, media_type="application/json")
+    async with within(timeout_s_of(request)):
+        return await _of_version(engine, ref, answer)
 
-        async with within(timeout(request)):
-            return await _of_version(engine, ref, answer)
+
+async def get_images(
+    request: Request,
+    ref: str,
+    first: First = 0,
+    count: Annotated[int, Query(ge=1, le=MAX_IMAGES, description="most photos")] = 1000,
+) -> Response:
+    """Give the poses of the mapping images of a map (`id`, or `id@version`)."""
+    engine = backend_of(request).engine
+
+    async def answer(outline: MapOutline) -> Response:
+        headers = _caching(outline, ref, first, count)
+        if is_current(request.headers, headers["ETag"]):
+            return not_modified(headers)
+        photos = await engine.scenes.photos(outline)
+        text = await asyncio.to_thread(
+            lambda: map_images(outline, photos, first, count).model_dump_json()
+        )
+        return Response(text, headers=headers, media_type="application/json")
+
+    async with within(timeout_s_of(request)):
+        return await _of_version(engine, ref, answer)
 
 
 async def _of_version(
     engine: Engine, ref: str, answer: Callable[[MapOutline], Awaitable[Response]]
 ) -> Response:
-    """Answer of the version that ``ref`` stands for."""
+    """Answer for the version that ``ref`` stands for."""
     outline = _of_map((await engine.map(ref)).outline)
     try:
         return await answer(outline)
@@ -114,23 +113,23 @@ async def _of_version(
         now = _of_map((await engine.map(ref)).outline)
         if now.ref == outline.ref:
             raise
-        return await answer(now)  # it took over, and the one before was deleted
+        return await answer(now)  # a new version is current, and the old one was deleted
 
 
 def _of_map(outline: MapOutline | SetOutline) -> MapOutline:
-    """Refuse a set, whose points and photos are those of its tiles: ``map.is_set``."""
+    """Refuse a set: its landmarks and images belong to its tiles (``map.is_set``)."""
     if isinstance(outline, SetOutline):
         raise is_set(outline.ref, outline.manifest)
     return outline
 
 
 def _caching(outline: MapOutline, ref: str, first: int, count: int) -> dict[str, str]:
-    """Return the headers that say how long a part of a map may be kept."""
+    """Return the headers that say how long a part of a map may be cached."""
     manifest = outline.manifest
     return {
-        # The version too: answers name it, and it is not part of the content.
+        # The content hash does not cover the version, which answers name.
         "ETag": f'"{manifest.version}-{manifest.content_hash[:32]}-{first}-{count}"',
         "Cache-Control": FOR_EVER_PRIVATE if "@" in ref else ASK_ALWAYS_PRIVATE,
-        # With another key, or without, what was kept is no answer.
+        # A cached answer is not for callers with another key or none.
         "Vary": "Authorization, X-API-Key",
     }

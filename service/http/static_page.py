@@ -1,4 +1,4 @@
-"""The page at ``/``: the built files of ``web/``, read once and held."""
+"""The page at ``/``: the built files of ``web/``, read once and kept in memory."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from visloc_web import page_folder
 logger = logging.getLogger(__name__)
 
 INDEX = "index.html"
-# Stated, as what `mimetypes` says depends on the machine.
+# Written out because `mimetypes` depends on the machine.
 _TYPES = {
     ".css": "text/css; charset=utf-8",
     ".html": "text/html; charset=utf-8",
@@ -30,7 +30,7 @@ _TYPES = {
     ".woff2": "font/woff2",
 }
 _COMPRESSED_ALREADY = (".png", ".woff2")
-# Nothing comes from other hosts, nothing runs that is written into the page, nobody frames it.
+# No content from other hosts, no inline scripts, no framing.
 _SAFE = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
     "img-src 'self' blob:; media-src 'self' blob:; connect-src 'self'; base-uri 'none'; "
@@ -48,10 +48,8 @@ class _File:
     """A file of the page.
 
     Attributes:
-        plain: its bytes.
-        compressed: the same as gzip; None where that is no gain.
-        content_type: with the encoding of text.
-        etag: of the bytes, without quotes.
+        compressed: ``plain`` as gzip; None for formats that are compressed already.
+        etag: without quotes.
     """
 
     plain: bytes
@@ -61,7 +59,7 @@ class _File:
 
 
 def add_page_routes(app: FastAPI) -> None:
-    """Serve the page; where it was not built, say so in the log and to whoever asks."""
+    """Serve the page. If it was not built, log that and answer 404."""
     try:
         index, assets = _read(page_folder())
     except Unavailable as error:
@@ -82,11 +80,11 @@ def add_page_routes(app: FastAPI) -> None:
     async def asset(request: Request, name: str) -> Response:
         if name not in assets:
             raise NotFound("http.not_found", "the page has no such file", got=name)
-        return _answer(assets[name], request, FOR_EVER)  # names tell the content
+        return _answer(assets[name], request, FOR_EVER)  # names contain a hash of the content
 
 
 def _read(folder: Path) -> tuple[_File, Mapping[str, _File]]:
-    """Read the index, and all else by name: what is asked for never becomes a path."""
+    """Read the index, and the assets by name: a requested name never becomes a path."""
     assets = {path.name: _read_file(path) for path in sorted((folder / "assets").glob("*"))}
     return _read_file(folder / INDEX), assets
 

@@ -1,10 +1,10 @@
-"""Who may ask for what, and how often: the rules, for both doors."""
+"""Access rules of both transports: scopes, rates and web origins."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from ipaddress import ip_address
@@ -17,8 +17,8 @@ from service.telemetry.logs import note_key
 from visloc.errors import Forbidden, InvalidInput, Overloaded, Unauthenticated
 from visloc_api.v1 import localization_pb2 as pb2
 
-# What a request needs: a key with these scopes, or nothing at all. ANY_KEY is for what is not
-# there: only who has a key may find that out.
+# What a request needs: a key with these scopes, or no key at all. Unknown paths and methods need
+# ANY_KEY, so that only callers with a key learn what exists.
 Needed = frozenset[Scope] | None
 NOTHING: Needed = None
 ANY_KEY: Needed = frozenset()
@@ -44,12 +44,12 @@ _ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-f:]+\
 
 
 def needed_over_http(method: str, path: str, *, page: bool = False) -> Needed:
-    """Return what a request over HTTP needs.
+    """Return what an HTTP request needs.
 
     Args:
         method: of the request.
-        path: without %-escapes.
-        page: whether the files of our own page are served, which need nothing.
+        path: with %-escapes decoded.
+        page: whether the server has the page, whose files need no key.
     """
     if path in _PUBLIC_PATHS or (page and _is_of_page(method, path)):
         return NOTHING
@@ -70,7 +70,7 @@ def _is_of_page(method: str, path: str) -> bool:
 
 
 def needed_over_grpc(method: str) -> Needed:
-    """Return what a call needs, by the full name of its method."""
+    """Return what a gRPC call needs, by the full name of its method."""
     if method.startswith("/grpc.health.v1.Health/"):
         return NOTHING
     scope = _SCOPES_OF_CALLS.get(method)
@@ -78,18 +78,33 @@ def needed_over_grpc(method: str) -> Needed:
 
 
 def is_method(name: str) -> bool:
-    """Tell whether this is a method of the API: of gRPC's own services, health aside, none is."""
+    """Tell whether this is one of our own methods."""
     return name in _SCOPES_OF_CALLS
+
+
+def tokens_of(authorizations: Iterable[str], api_keys: Iterable[str]) -> set[str]:
+    """Return the API keys that a caller sent.
+
+    Args:
+        authorizations: ``Authorization`` headers; kinds other than Bearer are for a proxy.
+        api_keys: ``X-API-Key`` headers.
+    """
+    tokens = set(api_keys)
+    for authorization in authorizations:
+        kind, _, token = authorization.partition(" ")
+        if kind.lower() == "bearer":
+            tokens.add(token.strip())
+    return tokens
 
 
 @dataclass(slots=True)
 class _Use:
-    """What a key is used for now.
+    """The current use of a key: a token bucket.
 
     Attributes:
-        running: requests that are being served.
+        running: requests being served.
         left: requests that may come at once; grows with time.
-        at: when ``left`` was true.
+        at: the time of ``left``, seconds.
     """
 
     running: int
@@ -98,11 +113,11 @@ class _Use:
 
 
 class Access:
-    """Decides. For one event loop.
+    """Decides who may do what. For one event loop.
 
     Args:
-        ring: the keys; None lets everyone on this machine do everything.
-        origins: of the web pages that may call; ``*`` for all, with keys only.
+        ring: the keys; without keys, everyone on this machine may do everything.
+        origins: of the web pages that may call; ``*`` for all, only with keys.
         now: a clock, seconds.
     """
 
@@ -119,16 +134,16 @@ class Access:
         self._uses: dict[str, _Use] = {}
 
     def check_page(self, scheme: str, host: str, origins: Collection[str]) -> None:
-        """Refuse requests that a web page makes its visitor's browser send.
+        """Refuse requests that a foreign web page makes a browser on this machine send.
 
-        Without keys, whoever can send requests from this machine may do everything, and any page
-        can, through a browser that runs here: to this address, or to a name of its own that it
-        makes point here.
+        Without keys, every request from this machine may do everything. A web page that is open in
+        a browser here can send requests to this address, or to a name of its own that resolves
+        to it (DNS rebinding).
 
         Args:
             scheme: ``http`` or ``https``.
-            host: what the request calls this server, with the port.
-            origins: what the browser says of the page, if it does.
+            host: the ``Host`` header, with the port.
+            origins: the ``Origin`` headers.
 
         Raises:
             Forbidden: ``access.host``, ``access.origin``.
@@ -154,11 +169,11 @@ class Access:
                 )
 
     def key_of(self, tokens: Collection[str], needed: Needed) -> Key | None:
-        """Return the key of a request, which the log names; None when none is needed.
+        """Return the key of a request and note it for the log; None when no key is needed.
 
         Args:
-            tokens: what was sent as keys.
-            needed: what the request needs.
+            tokens: the keys that were sent.
+            needed: by the request.
 
         Raises:
             Unauthenticated: ``access.key_missing``, ``access.key_unknown``.
@@ -223,13 +238,13 @@ class Access:
             use.running -= 1
 
     def wait_s(self, key: Key | None) -> int:
-        """Return after how many whole seconds, at least one, a key may be used again."""
+        """Return the whole seconds, at least one, after which a key may be used again."""
         if key is None or key.rate is None:
             return 1
         return max(1, math.ceil((1 - self._use_of(key).left) / key.rate))
 
     def _use_of(self, key: Key) -> _Use:
-        """Return the use of a key, with what time has given back to it."""
+        """Return the use of a key, with ``left`` as it is now."""
         now = self._now()
         if key.rate is None or key.burst is None:
             burst, rate = math.inf, 0.0
@@ -242,7 +257,7 @@ class Access:
 
 
 def open_access(settings: ServiceSettings) -> Access:
-    """Make the rules of a service, or refuse settings that would leave it open.
+    """Make the rules of a service; refuse settings that would leave it open.
 
     Raises:
         SettingsError: naming the setting.
@@ -270,7 +285,7 @@ def open_access(settings: ServiceSettings) -> Access:
 
 
 def is_loopback(host: str) -> bool:
-    """Tell whether a name or an address is one of this machine only."""
+    """Tell whether a host name or an address means this machine only."""
     if host.lower() == "localhost":
         return True
     try:

@@ -1,4 +1,4 @@
-"""The API keys of a running service, as the file has them now."""
+"""The API keys of a running service, kept up to date with their file."""
 
 from __future__ import annotations
 
@@ -10,18 +10,17 @@ from visloc.errors import InvalidInput
 
 logger = logging.getLogger(__name__)
 
-# Compared with where there is no such key, so that the answer takes as long.
-_NOBODY = Key("0" * 12, "nobody", frozenset(), bytes(16), bytes(32), "")
+# Compared with unknown keys, so that their refusal takes as long.
+_NOBODY = Key("0" * 12, "nobody", frozenset(), "", bytes(16), bytes(32), None, None, None)
 
 
 class KeyRing:
     """Finds keys; reads the file again when it has changed.
 
-    A file that became unreadable or wrong is reported in the log and changes nothing: the keys of
-    before stay good.
+    If the changed file cannot be used, that is logged and the old keys stay valid.
 
     Raises:
-        InvalidInput: ``keys.*`` when the file cannot be used at first.
+        InvalidInput: ``keys.*`` when the file cannot be used at the start.
     """
 
     def __init__(self, path: Path) -> None:
@@ -30,7 +29,7 @@ class KeyRing:
         self._keys = _by_id(read_keys(path))
 
     def find(self, token: str) -> Key | None:
-        """Return the key that a caller has shown, None when it is none of ours."""
+        """Return the key of a token, None for an unknown or revoked one."""
         self._take_over_changes()
         id_, secret = split_token(token) or ("", "")
         key = self._keys.get(id_, _NOBODY)
@@ -44,9 +43,9 @@ class KeyRing:
         try:
             self._keys = _by_id(read_keys(self._path))
         except InvalidInput as error:
-            logger.error("the API keys stay as they were: %s", error)  # noqa: TRY400
+            logger.error("the API keys were not reloaded: %s", error)  # noqa: TRY400
         else:
-            logger.info("%d API keys are good now", len(self._keys))
+            logger.info("reloaded the API keys: %d are valid", len(self._keys))
 
     def _version_now(self) -> tuple[int, ...] | None:
         try:

@@ -1,4 +1,4 @@
-"""The certificate of both doors."""
+"""The TLS certificate of both transports."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from service.settings import ServiceSettings, SettingsError
 
 
 class TlsConfig(TypedDict, total=False):
-    """What uvicorn wants to know."""
+    """Settings of uvicorn."""
 
     ssl_certfile: str
     ssl_keyfile: str
 
 
 def check_tls(settings: ServiceSettings) -> None:
-    """Refuse a certificate that cannot be used, before anything listens.
+    """Refuse a certificate that cannot be used, before any port is open.
 
     Raises:
         SettingsError: naming the setting.
@@ -45,14 +45,14 @@ def check_tls(settings: ServiceSettings) -> None:
 
 
 def tls_config(settings: ServiceSettings) -> TlsConfig:
-    """Return what makes uvicorn speak HTTPS, nothing without a certificate."""
+    """Return the settings for HTTPS; none without a certificate."""
     if settings.tls_cert is None or settings.tls_key is None:
         return {}
     return {"ssl_certfile": str(settings.tls_cert), "ssl_keyfile": str(settings.tls_key)}
 
 
 def grpc_credentials(settings: ServiceSettings) -> grpc.ServerCredentials | None:
-    """Return what makes gRPC speak TLS, None without a certificate."""
+    """Return the credentials for gRPC over TLS; None without a certificate."""
     if settings.tls_cert is None or settings.tls_key is None:
         return None
     pair = (settings.tls_key.read_bytes(), settings.tls_cert.read_bytes())

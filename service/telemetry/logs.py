@@ -1,7 +1,7 @@
-"""Log lines for people or for machines, and what is known of the request that they belong to.
+"""Log lines for people or machines, and the record of the request that they belong to.
 
-No image bytes and no keys are logged. No caller can forge a line: control characters are escaped,
-and the further lines of a traceback are marked.
+Images and keys are not logged. Callers cannot forge lines: control characters are escaped, and the
+lines of a traceback are marked.
 """
 
 from __future__ import annotations
@@ -17,28 +17,30 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from service.telemetry.tracing import Stage, TraceContext
+    from opentelemetry.trace import SpanContext
 
-# Answered, but by no route: such a path is the caller's words.
+    from service.telemetry.tracing import Stage
+
+# The route of requests that match none: their paths are the caller's words.
 UNMATCHED = "unmatched"
 
 
 @dataclass(slots=True)
 class RequestRecord:
-    """What becomes known of a request on its way; written to the log when it ends.
+    """What is known of a request so far; logged when it ends.
 
     Attributes:
         door: ``http`` or ``grpc``.
-        request_id: the caller's or ours; checked by ``wire.request_id``.
-        trace: where it stands in the caller's trace; None without a trace.
+        request_id: the caller's if it was acceptable, else ours.
+        trace: its span in the caller's trace, if there is one.
         key: the name of the API key.
-        peer: the address that asks; logged only of those who are refused access.
-        route: the template of the path with its method, or the name of the gRPC method.
-        status: of the answer: ``200``, ``OK``; empty until there is one.
+        peer: the caller's address; logged only when access is refused.
+        route: the method and the template of the path, or the name of the gRPC method.
+        status: of the answer, such as ``200`` or ``OK``; empty until there is one.
         map: the id of the map that answered.
-        outcome: ``localized``, or why not; of several instants, that of the last.
-        instants: that were answered.
-        localized: how many of those were.
+        outcome: ``localized``, or the reason why not; of several instants, that of the last.
+        instants: the number answered.
+        localized: how many of these were localized.
         code: of the error that was answered.
         failed: whether that error was the server's fault.
         stages: of the work for a photo.
@@ -46,7 +48,7 @@ class RequestRecord:
 
     door: str
     request_id: str
-    trace: TraceContext | None = None
+    trace: SpanContext | None = None
     key: str | None = None
     peer: str | None = None
     route: str = UNMATCHED
@@ -65,12 +67,12 @@ _key: ContextVar[str | None] = ContextVar("key", default=None)
 
 
 def current_request() -> RequestRecord | None:
-    """Return the request that is being served here, None outside of any."""
+    """Return the request that the current task serves, if any."""
     return _request.get()
 
 
 def note_key(name: str) -> None:
-    """Say which API key the request came with, by its name."""
+    """Record the name of the API key of the current request."""
     record = _request.get()
     if record is None:
         _key.set(name)  # gRPC's interceptors run first, in the task that then serves the call
@@ -79,33 +81,33 @@ def note_key(name: str) -> None:
 
 
 def begin_request(record: RequestRecord) -> None:
-    """Make the record that of the task that runs, and of those that it starts."""
+    """Make this the record of the current task and of the tasks that it starts."""
     record.key = record.key or _key.get()
     _key.set(None)
     _request.set(record)
 
 
 def end_request() -> None:
-    """Belong to no request again."""
+    """Detach the current task from its request."""
     _request.set(None)
 
 
 class LogSettings(Protocol):
-    """What is logged and how; of the service and of its worker processes."""
+    """How the service and its worker processes log."""
 
     @property
     def log_level(self) -> str:
-        """Debug, info, warning or error."""
+        """``debug``, ``info``, ``warning`` or ``error``."""
 
     @property
     def log_format(self) -> str:
-        """Text or json."""
+        """``text`` or ``json``."""
 
 
 def configure_logging(settings: LogSettings) -> None:
-    """Log to stderr as the settings say: in ``main``, and first thing in every worker process.
+    """Log to stderr. Called once in ``main`` and first in every worker process.
 
-    Libraries are heard from WARNING on: what some of them say below it contains credentials.
+    Libraries log from WARNING up, because below it some of them log credentials.
     """
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter() if settings.log_format == "json" else TextFormatter())
@@ -118,16 +120,15 @@ def configure_logging(settings: LogSettings) -> None:
     for name in ("service", "visloc"):
         logging.getLogger(name).setLevel(level)
     logging.getLogger("python_multipart").setLevel(logging.ERROR)  # malformed forms are answered
-    # It warns of every span that is dropped while its collector is away.
+    # It warns of every span that it drops, and of callers' malformed headers.
     logging.getLogger("opentelemetry").setLevel(logging.ERROR)
     logging.captureWarnings(True)
 
 
 class TextFormatter(logging.Formatter):
-    """One line per record: time, level, logger, message, then ``name=value`` of the request."""
+    """One line per record: time, level, logger, message, then ``name=value`` pairs."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line, and the marked lines of a traceback."""
         facts = " ".join(f"{name}={_word(value)}" for name, value in _facts_of(record).items())
         line = " ".join(
             (_time_of(record), record.levelname, record.name + ":", one_line(record.getMessage()))
@@ -140,7 +141,6 @@ class JsonFormatter(logging.Formatter):
     """One JSON object per line."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the object."""
         entry: dict[str, object] = {
             "time": _time_of(record),
             "level": record.levelname.lower(),
@@ -154,16 +154,16 @@ class JsonFormatter(logging.Formatter):
 
 
 def one_line(text: str) -> str:
-    """Escape what ends a line, moves a terminal's cursor or turns the direction of writing."""
+    """Escape characters that end a line, control a terminal or change the text direction."""
     return _UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
-# Controls of ASCII and Latin-1, line and paragraph separators, marks of direction, surrogates.
+# ASCII and Latin-1 controls, line and paragraph separators, direction marks, surrogates.
 _UNPRINTABLE = re.compile(
     r"[\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufeff]"
 )
-# An API key as `python -m service.keys` prints it. No line of ours has one; this is for the day
-# that a library puts a request's headers into an exception.
+# An API key as `python -m service.keys` prints it. The service logs none; a library may put a
+# request's headers into an exception.
 _API_KEY = re.compile(r"(visloc_[A-Za-z0-9-]+_)[A-Za-z0-9_-]{32,}")
 
 
@@ -191,13 +191,13 @@ def _traceback_of(formatter: logging.Formatter, record: logging.LogRecord) -> li
 
 
 def _facts_of(record: logging.LogRecord) -> Mapping[str, object]:
-    """What the record was given as ``extra={"facts": ...}``, and the ids of its request."""
+    """Return the ``facts`` given to the log call, and the ids of the current request."""
     facts = dict(getattr(record, "facts", {}))
     request = _request.get()
     if request is not None:
         facts["request_id"] = request.request_id
         if request.trace is not None:
-            facts["trace_id"] = request.trace.trace_id
+            facts["trace_id"] = f"{request.trace.trace_id:032x}"
         if request.key is not None:
             facts["key"] = request.key
     return facts

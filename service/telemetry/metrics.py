@@ -1,15 +1,17 @@
-"""What Prometheus scrapes: counters that the doors and the engine raise, gauges of one moment.
+"""Prometheus metrics: counters of events and gauges of the current state.
 
-Nothing here is global, and no label takes a caller's words: routes are templates, codes and stages
-are the service's own, maps are those that answered.
+Nothing here is global. No label holds a caller's words: routes are templates, codes and stages are
+the service's own, maps are those that answered.
 """
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from functools import partial
 from pathlib import Path
+from typing import Any, TypeVar
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
 from prometheus_client.core import GaugeMetricFamily, Metric
@@ -21,28 +23,21 @@ from visloc.errors import VislocError
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 LOCALIZED = "localized"
-# The label of the maps after the first MAX_MAPS: uploading maps must not fill Prometheus.
+# Maps after the first MAX_MAPS share one label, so that uploads cannot fill Prometheus.
 MAX_MAPS = 200
 OTHER_MAPS = "(others)"
 
+_HELP = "help"
+LabelsT = TypeVar("LabelsT", bound=tuple[str, ...])
+
 _REQUEST_BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0)
-_STAGE_BUCKETS = (
-    0.001,
-    0.0025,
-    0.005,
-    0.01,
-    0.025,
-    0.05,
-    0.1,
-    0.25,
-    0.5,
-    1.0,
-    2.5,
-    5.0,
-    10.0,
-    30.0,
-)
+_STAGE_BUCKETS = (0.001, 0.0025, 0.005, *_REQUEST_BUCKETS[:-1])
 _INLIER_BUCKETS = (0, 10, 20, 30, 50, 75, 100, 150, 250, 500, 1000, 2500)
+
+
+def _gauge_field(help_text: str) -> Any:
+    """Declare a number of ``ServiceState`` that is a gauge of the same name."""
+    return field(default=0, metadata={_HELP: help_text})
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,121 +45,97 @@ class ServiceState:
     """The service at one moment.
 
     Attributes:
-        ready: what ``/readyz`` says.
-        draining: whether it ends what runs and accepts nothing new.
-        photos_waiting: for a worker.
-        max_queue: places for those.
-        photos_running: being worked on.
-        batches_running: rigs and sequences.
-        max_batches: places for those.
-        workers: that there should be.
-        worker_pids: of those that live.
-        loaded_maps: bytes of each map that is open in a worker, by id and version.
-        max_loaded_bytes: room for open maps of one worker.
-        unusable_maps: the code of why a map that is there is not served, by id.
-        store_reachable: whether the maps' store answers; a folder always does.
-        buffered_bytes: of requests that are arriving.
-        max_buffered_bytes: room for those.
-        connections: that are open, of HTTP.
-        max_connections: places for those.
-        folders: whose disks may fill, by what they are for: ``maps``, ``cache``.
+        worker_pids: of the worker processes alive.
+        loaded_maps: bytes of each map that is open in a worker, by (id, version).
+        unusable_maps: the error code of each map that exists and cannot be served, by id.
+        folders: on disks that may fill up, by purpose: ``maps``, ``cache``.
     """
 
-    ready: bool
-    draining: bool = False
-    photos_waiting: int = 0
-    max_queue: int = 0
-    photos_running: int = 0
-    batches_running: int = 0
-    max_batches: int = 0
-    workers: int = 0
+    ready: bool = _gauge_field("1 when maps and networks are warm.")
+    draining: bool = _gauge_field("1 while running requests end and no new ones are accepted.")
+    photos_waiting: int = _gauge_field("Photos waiting for a worker.")
+    max_queue: int = _gauge_field("Limit of photos waiting.")
+    photos_running: int = _gauge_field("Photos being processed.")
+    batches_running: int = _gauge_field("Rigs and sequences being served.")
+    max_batches: int = _gauge_field("Limit of rigs and sequences served at once.")
+    workers: int = _gauge_field("Worker processes wanted.")
+    max_loaded_bytes: int = _gauge_field("Limit of bytes of open maps per worker.")
+    store_reachable: bool = _gauge_field("1 when the store of the maps answers.")
+    buffered_bytes: int = _gauge_field("Bytes of requests that are arriving.")
+    max_buffered_bytes: int = _gauge_field("Limit of bytes of arriving requests.")
+    connections: int = _gauge_field("Open HTTP connections.")
+    max_connections: int = _gauge_field("Limit of open connections.")
     worker_pids: tuple[int, ...] = ()
     loaded_maps: Mapping[tuple[str, str], int] = field(default_factory=dict)
-    max_loaded_bytes: int = 0
     unusable_maps: Mapping[str, str] = field(default_factory=dict)
-    store_reachable: bool = True
-    buffered_bytes: int = 0
-    max_buffered_bytes: int = 0
-    connections: int = 0
-    max_connections: int = 0
     folders: Mapping[str, Path] = field(default_factory=dict)
 
 
 class Metrics:
-    """Counts what happens. Its methods are cheap and may be called from any thread."""
+    """Counts events. Its methods are cheap and may be called from any thread."""
 
     def __init__(self) -> None:
-        self._registry = CollectorRegistry()
+        self._registry = registry = CollectorRegistry()
         self._maps: set[str] = set()
-        ProcessCollector(registry=self._registry)
-        self._requests = Counter(
+        counter = partial(Counter, registry=registry)
+        histogram = partial(Histogram, registry=registry)
+        ProcessCollector(registry=registry)
+        self._requests = counter(
             "visloc_requests",
-            "Requests that ended, by status; CANCELLED: the caller left.",
+            "Finished requests by status; CANCELLED: the caller left.",
             ("door", "route", "status"),
-            registry=self._registry,
         )
-        self._request_seconds = Histogram(
+        self._request_seconds = histogram(
             "visloc_request_seconds",
-            "Time from a request's head to the end of its answer.",
+            "Time from the head of a request to the end of its answer.",
             ("door", "route"),
             buckets=_REQUEST_BUCKETS,
-            registry=self._registry,
         )
         self._in_progress = Gauge(
-            "visloc_requests_in_progress",
-            "Requests that have not ended.",
-            ("door",),
-            registry=self._registry,
+            "visloc_requests_in_progress", "Unfinished requests.", ("door",), registry=registry
         )
-        self._errors = Counter(
+        self._errors = counter(
             "visloc_errors",
-            "Requests that were answered with an error, by its code and kind.",
+            "Requests answered with an error, by its code and kind.",
             ("door", "code", "kind"),
-            registry=self._registry,
         )
-        self._localizations = Counter(
+        self._localizations = counter(
             "visloc_localizations",
-            "Photos and instants that were answered: localized, or why not.",
+            "Answered photos and instants: localized, or the reason why not.",
             ("map", "outcome"),
-            registry=self._registry,
         )
-        self._inliers = Histogram(
+        self._inliers = histogram(
             "visloc_localization_inliers",
             "Inliers of the best pose, accepted (localized=true) or not.",
             ("map", "localized"),
             buckets=_INLIER_BUCKETS,
-            registry=self._registry,
         )
-        self._stage_seconds = Histogram(
+        self._stage_seconds = histogram(
             "visloc_stage_seconds",
             "Time that a photo or an instant spent in a stage.",
             ("stage",),
             buckets=_STAGE_BUCKETS,
-            registry=self._registry,
         )
-        self._tiles_searched = Histogram(
+        self._tiles_searched = histogram(
             "visloc_tiles_searched",
             "Maps of a set that were searched for a photo or an instant.",
             buckets=(1, 2, 3, 4, 5),
-            registry=self._registry,
         )
-        self._map_changes = Counter(
+        self._map_changes = counter(
             "visloc_map_changes",
-            "Uploads, activations and deletions of map versions, by how they ended.",
+            "Uploads, activations and deletions of map versions, by result.",
             ("change", "result"),
-            registry=self._registry,
         )
-        self._uploaded_bytes = Counter(
-            "visloc_uploaded_bytes",
-            "Bytes of packed maps that arrived, kept or not.",
-            registry=self._registry,
+        self._uploaded_bytes = counter(
+            "visloc_uploaded_bytes", "Bytes of packed maps received, kept or not."
         )
-        self._worker_deaths = Counter(
-            "visloc_worker_deaths",
-            "Worker processes that ended unasked and were replaced.",
-            registry=self._registry,
+        self._worker_deaths = counter(
+            "visloc_worker_deaths", "Worker processes that died and were replaced."
         )
-        # A rate sees the first of something only when it was 0 before.
+        self._start_at_zero()
+
+    def _start_at_zero(self) -> None:
+        """Create series whose first event must count: a rate misses a series that starts at 1."""
         for door in ("http", "grpc"):
             self._in_progress.labels(door)
             self._errors.labels(door, "server.internal", VislocError.__name__)
@@ -183,31 +154,24 @@ class Metrics:
             door: ``http`` or ``grpc``.
             route: the template of its path or the name of its method, never the path itself.
             status: the HTTP status, the name of the gRPC status, or ``CANCELLED``.
-            seconds: how long it took.
+            seconds: its duration.
         """
         self._in_progress.labels(door).dec()
         self._requests.labels(door, route, status).inc()
         self._request_seconds.labels(door, route).observe(seconds)
 
     def observe_error(self, door: str, error: VislocError) -> None:
-        """Count an error that a caller was told."""
         self._errors.labels(door, error.code, type(error).__name__).inc()
 
     def observe_localization(
-        self,
-        map_id: str,
-        localized: bool,
-        reason: str | None,
-        inliers: int,
-        seconds: Mapping[str, float],
+        self, map_id: str, reason: str | None, inliers: int, seconds: Mapping[str, float]
     ) -> None:
         """Count the answer to a photo or an instant.
 
         Args:
-            map_id: the map that gave it: one that exists.
-            localized: whether it is a pose.
-            reason: a ``visloc.types.Reason`` when it is none.
-            inliers: of the best pose, refused or not.
+            map_id: the map that gave it; it exists.
+            reason: why there is no pose, a ``visloc.types.Reason``; None when there is one.
+            inliers: of the best pose, accepted or not.
             seconds: by stage.
         """
         if map_id not in self._maps:
@@ -216,8 +180,8 @@ class Metrics:
                 self._localizations.labels(map_id, LOCALIZED)
             else:
                 map_id = OTHER_MAPS
-        self._localizations.labels(map_id, LOCALIZED if localized else reason or "unknown").inc()
-        self._inliers.labels(map_id, str(localized).lower()).observe(inliers)
+        self._localizations.labels(map_id, reason or LOCALIZED).inc()
+        self._inliers.labels(map_id, str(reason is None).lower()).observe(inliers)
         for stage, duration in seconds.items():
             self._stage_seconds.labels(stage).observe(duration)
 
@@ -226,15 +190,13 @@ class Metrics:
         self._tiles_searched.observe(searched)
 
     def observe_map_change(self, change: str, done: bool) -> None:
-        """Count an ``upload``, ``activate`` or ``delete`` of a map's version."""
+        """Count an ``upload``, ``activate`` or ``delete`` of a map version."""
         self._map_changes.labels(change, "done" if done else "failed").inc()
 
     def observe_uploaded(self, num_bytes: int) -> None:
-        """Count bytes of a packed map that arrived."""
         self._uploaded_bytes.inc(num_bytes)
 
     def observe_worker_death(self) -> None:
-        """Count a worker process that ended unasked."""
         self._worker_deaths.inc()
 
     def render(self, state: ServiceState) -> tuple[bytes, str]:
@@ -244,14 +206,14 @@ class Metrics:
 
 @dataclass(frozen=True, slots=True)
 class _Scrape:
-    """All that is known, in the shape that ``generate_latest`` asks a registry for."""
+    """Events and state together, in the shape that ``generate_latest`` expects of a registry."""
 
     registry: CollectorRegistry
     state: ServiceState
 
     def collect(self) -> Iterator[Metric]:
         for metric in self.registry.collect():
-            # When a series began helps nobody here, and would double their number.
+            # The times at which series began would double their number.
             metric.samples = [s for s in metric.samples if not s.name.endswith("_created")]
             if metric.samples:
                 yield metric
@@ -260,74 +222,50 @@ class _Scrape:
 
 def _gauges_of(state: ServiceState) -> Iterator[Metric]:
     yield _gauge(
-        "visloc_build_info",
-        "Always 1; the version is a label.",
-        ("version",),
-        [((visloc.__version__,), 1)],
+        "build_info", "Always 1; the version is a label.", {(visloc.__version__,): 1}, "version"
     )
-    for name, help_text, value in (
-        ("ready", "1 when maps and networks are warm.", state.ready),
-        ("draining", "1 when it ends what runs and accepts nothing new.", state.draining),
-        ("photos_waiting", "Photos that wait for a worker.", state.photos_waiting),
-        ("max_queue", "Photos that may wait.", state.max_queue),
-        ("photos_running", "Photos that are being worked on.", state.photos_running),
-        ("batches_running", "Rigs and sequences that are being served.", state.batches_running),
-        ("max_batches", "Rigs and sequences that may be served at once.", state.max_batches),
-        ("workers", "Worker processes that there should be.", state.workers),
-        ("workers_alive", "Worker processes that live.", len(state.worker_pids)),
-        ("max_loaded_bytes", "Room for open maps.", state.max_loaded_bytes),
-        ("store_reachable", "1 when the store of the maps answers.", state.store_reachable),
-        ("buffered_bytes", "Bytes of requests that are arriving.", state.buffered_bytes),
-        ("max_buffered_bytes", "Room for requests that are arriving.", state.max_buffered_bytes),
-        ("connections", "Open connections of HTTP.", state.connections),
-        ("max_connections", "Connections that may be open at once.", state.max_connections),
-    ):
-        yield GaugeMetricFamily(f"visloc_{name}", help_text, value=float(value))
+    for number in fields(state):
+        if help_text := number.metadata.get(_HELP):
+            yield _gauge(number.name, help_text, {(): getattr(state, number.name)})
+    yield _gauge("workers_alive", "Worker processes alive.", {(): len(state.worker_pids)})
     yield _gauge(
-        "visloc_loaded_map_bytes",
+        "loaded_map_bytes",
         "Bytes of a map that is open in a worker, most of them mapped and shared.",
-        ("map", "version"),
-        state.loaded_maps.items(),
+        state.loaded_maps,
+        *("map", "version"),
     )
     yield _gauge(
-        "visloc_map_unusable",
-        "1 for a map that is there and cannot be served, with the code of why.",
-        ("map", "code"),
-        (((map_id, code), 1) for map_id, code in state.unusable_maps.items()),
+        "map_unusable",
+        "1 for a map that exists and cannot be served; the error code is a label.",
+        dict.fromkeys(state.unusable_maps.items(), 1),
+        *("map", "code"),
     )
     yield _gauge(
-        "visloc_resident_memory_bytes",
+        "resident_memory_bytes",
         "Memory of a process: its own (anonymous), and files that it has mapped (file).",
-        ("process", "kind"),
-        resident_memory(state.worker_pids).items(),
+        resident_memory(state.worker_pids),
+        *("process", "kind"),
     )
     limit = memory_limit()
     if limit is not None:
-        yield GaugeMetricFamily(
-            "visloc_memory_limit_bytes", "Memory that there is for all of it.", value=limit
-        )
+        yield _gauge("memory_limit_bytes", "Memory of the container or machine.", {(): limit})
     yield _gauge(
-        "visloc_disk_free_bytes",
-        "Room on the disk of a folder.",
-        ("folder",),
-        (((name,), shutil.disk_usage(path).free) for name, path in _existing(state.folders)),
+        "disk_free_bytes",
+        "Free bytes on the disk of a folder.",
+        {(name,): shutil.disk_usage(path).free for name, path in _existing(state.folders)},
+        "folder",
     )
 
 
-def _gauge(
-    name: str,
-    help_text: str,
-    labels: tuple[str, ...],
-    values: Iterable[tuple[tuple[str, ...], float]],
-) -> Metric:
-    family = GaugeMetricFamily(name, help_text, labels=labels)
-    for label_values, value in values:
+def _gauge(name: str, help_text: str, values: Mapping[LabelsT, float], *labels: str) -> Metric:
+    family = GaugeMetricFamily(f"visloc_{name}", help_text, labels=labels)
+    for label_values, value in values.items():
         family.add_metric(label_values, value)
     return family
 
 
 def _existing(folders: Mapping[str, Path]) -> Iterator[tuple[str, Path]]:
-    """The folders; one that is not there yet will be made on the disk of the nearest above it."""
+    """Give the folders; for a missing one, the nearest parent, on whose disk it will be made."""
     for name, path in folders.items():
         absolute = path.absolute()
         yield name, next(p for p in (absolute, *absolute.parents) if p.exists())

@@ -1,4 +1,4 @@
-"""What becomes of every request, told at one place to the metrics, the log and the traces."""
+"""Reports every request of both transports to the metrics, the log and the traces."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from time import perf_counter, time_ns
-
-from starlette.types import Scope
 
 from service.errors import statuses_of
 from service.telemetry.logs import (
@@ -21,29 +19,28 @@ from service.telemetry.metrics import LOCALIZED, Metrics
 from service.telemetry.tracing import (
     RequestSpan,
     Spans,
-    continued,
+    child_of,
+    new_trace,
     parse_traceparent,
     stages_until,
-    started_trace,
 )
 from service.values import Localization
 from visloc.errors import VislocError
 
-access_log = logging.getLogger("service.security.access")
+access_log = logging.getLogger("service.access")
 
-_METHODS = ("GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH")
-# The status of what was not answered: the caller left.
+# The status of a request whose caller left before the answer.
 CANCELLED = "CANCELLED"
-# What asks every few seconds whether the service lives: at level debug.
+# Probes come every few seconds: they are logged at level debug and have no spans.
 _PROBES = ("GET /healthz", "GET /readyz", "GET /metrics")
 
 
 class Observer:
-    """Watches the requests of both doors.
+    """Watches the requests of both transports.
 
     Args:
-        metrics: that count them.
-        spans: where they are sent as spans; None for nowhere.
+        metrics: counts them.
+        spans: where their spans are sent; None for nowhere.
     """
 
     def __init__(self, metrics: Metrics, spans: Spans | None = None) -> None:
@@ -56,21 +53,21 @@ class Observer:
     ) -> Iterator[RequestRecord]:
         """Watch a request from its head to the end of its answer.
 
-        The block sets ``status`` of the record when it answers, and ``route`` when that is known.
+        The block sets the record's ``status`` when it answers, and ``route`` once it is known.
 
         Args:
             door: ``http`` or ``grpc``.
-            request_id: checked by ``wire.request_id``.
-            route: as of ``route_of``, or the name of the gRPC method.
-            traceparent: the caller's header, as it came.
+            request_id: as ``service.api.request_ids`` returned it.
+            route: the method and the template of the path, or the name of the gRPC method.
+            traceparent: the caller's header, unchecked.
         """
         caller = parse_traceparent(traceparent)
-        place = None
+        trace = None
         if caller is not None:
-            place = continued(caller)
+            trace = child_of(caller)
         elif self._spans is not None:
-            place = started_trace()
-        record = RequestRecord(door, request_id, place, route=route)
+            trace = new_trace()
+        record = RequestRecord(door, request_id, trace, route=route)
         begin_request(record)
         self.metrics.request_started(door)
         started, started_ns = perf_counter(), time_ns()
@@ -80,16 +77,15 @@ class Observer:
             seconds = perf_counter() - started
             record.status = record.status or CANCELLED
             self.metrics.observe_request(door, record.route, record.status, seconds)
-            _write(record, seconds)
-            if self._spans is not None and place is not None and record.route not in _PROBES:
-                end_ns = started_ns + round(seconds * 1e9)
+            _log(record, seconds)
+            if self._spans is not None and trace is not None and record.route not in _PROBES:
                 self._spans.send(
                     RequestSpan(
                         f"{door} {record.route}",
-                        place,
+                        trace,
                         caller,
                         started_ns,
-                        end_ns,
+                        started_ns + round(seconds * 1e9),
                         _attributes_of(record),
                         record.failed,
                         record.stages,
@@ -98,7 +94,7 @@ class Observer:
             end_request()
 
     def error(self, error: VislocError) -> None:
-        """Note the error that the request in which this runs is answered with."""
+        """Note the error that answers the current request."""
         record = current_request()
         if record is not None:
             record.code = error.code
@@ -113,7 +109,7 @@ class Observer:
             record.stages = stages_until(time_ns(), found.answer.seconds)
 
     def instant(self, found: Localization) -> None:
-        """Note the answer to an instant; a pose that others lent it does not count as its own."""
+        """Note the answer to an instant; a pose filled in from its neighbours does not count."""
         self._answer(found)
         record = current_request()
         if record is not None:
@@ -123,30 +119,18 @@ class Observer:
     def _answer(self, found: Localization) -> None:
         answer = found.answer
         reason = None if answer.refusal is None else answer.refusal.reason.value
-        self.metrics.observe_localization(
-            found.map_id, reason is None, reason, answer.num_inliers, answer.seconds
-        )
+        self.metrics.observe_localization(found.map_id, reason, answer.num_inliers, answer.seconds)
         record = current_request()
         if record is not None:
             record.map, record.outcome = found.map_id, reason or LOCALIZED
 
 
-def route_of(scope: Scope) -> str:
-    """Return the method and the template of a request that was served: ``GET /maps/{ref}``."""
-    path = getattr(scope.get("route"), "path", None)
-    method = scope["method"]
-    if path is None or method not in _METHODS:
-        return UNMATCHED
-    return f"{method} {path}"
-
-
-def _write(record: RequestRecord, seconds: float) -> None:
-    milliseconds = round(seconds * 1000, 1)
+def _log(record: RequestRecord, seconds: float) -> None:
     facts: dict[str, object] = {
         "door": record.door,
         "route": record.route,
         "status": record.status,
-        "ms": milliseconds,
+        "ms": round(seconds * 1000, 1),
     }
     if record.instants > 1:
         facts |= {"map": record.map, "instants": record.instants, "localized": record.localized}
@@ -161,12 +145,10 @@ def _write(record: RequestRecord, seconds: float) -> None:
 
 
 def _attributes_of(record: RequestRecord) -> dict[str, str | int | float]:
-    attributes: dict[str, str | int | float] = {"visloc.request_id": record.request_id}
+    attributes: dict[str, str | int | float | None] = {"visloc.request_id": record.request_id}
     if record.door == "http":
         method, _, path = record.route.rpartition(" ")
-        attributes |= {"http.route": path}
-        if method:
-            attributes["http.request.method"] = method
+        attributes |= {"http.route": path, "http.request.method": method or None}
         if record.status.isdigit():
             attributes["http.response.status_code"] = int(record.status)
     else:
@@ -175,13 +157,11 @@ def _attributes_of(record: RequestRecord) -> dict[str, str | int | float]:
             "rpc.method": record.route,
             "visloc.grpc.status": record.status,
         }
-    for name, value in (
-        ("error.type", record.code),
-        ("visloc.map", record.map),
-        ("visloc.outcome", record.outcome),
-    ):
-        if value is not None:
-            attributes[name] = value
+    attributes |= {
+        "error.type": record.code,
+        "visloc.map": record.map,
+        "visloc.outcome": record.outcome,
+    }
     if record.instants:
         attributes |= {"visloc.instants": record.instants, "visloc.localized": record.localized}
-    return attributes
+    return {name: value for name, value in attributes.items() if value is not None}

@@ -1,6 +1,6 @@
-"""How much memory processes take and how much there is, as Linux tells it; elsewhere, nothing.
+"""Memory of processes and of the machine, read from Linux; other systems report nothing.
 
-And how this process gives back what it no longer needs.
+Also returns freed memory of this process to the system.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ def resident_memory(
 ) -> Mapping[tuple[str, str], int]:
     """Return the bytes of this process (``server``) and its workers (``worker-0``...), by kind.
 
-    Mapped files count once for every process that has them, and can be given back at any time: what
-    leaks is ``anonymous``. A process that ended meanwhile is left out.
+    Mapped files count once per process and the system may drop them at any time, so that only
+    ``anonymous`` memory can leak. Processes that have ended are left out.
     """
     names = {"server": "self", **{f"worker-{i}": str(pid) for i, pid in enumerate(worker_pids)}}
     found = {}
@@ -35,7 +35,7 @@ def resident_memory(
 
 
 def memory_limit(cgroup: Path = Path("/sys/fs/cgroup"), proc: Path = Path("/proc")) -> int | None:
-    """Return the bytes that there are for all processes: of the container, else of the machine."""
+    """Return the memory for all processes in bytes: the container's, else the machine's."""
     limits = [
         int(line)
         for name in ("memory.max", "memory/memory.limit_in_bytes")  # cgroup v2, v1
@@ -51,12 +51,11 @@ def memory_limit(cgroup: Path = Path("/sys/fs/cgroup"), proc: Path = Path("/proc
 
 
 async def give_back_memory() -> None:
-    """Return freed memory to the system, for ever. Where the C library is not glibc, do nothing.
+    """Return freed memory to the system until cancelled. Does nothing without glibc.
 
-    glibc keeps what large requests leave behind, in an arena for each thread that parsed one.
-    Memory at the end of an arena goes back when it is freed, if the threshold for that is fixed;
-    by itself the threshold grows with the largest request. Gaps within an arena go back when glibc
-    is asked, every few seconds.
+    glibc keeps the memory of large requests in one arena for each thread that parsed one. Free
+    memory at the end of an arena is returned only above a threshold, which grows with the largest
+    request unless it is fixed. Gaps within an arena are returned only by ``malloc_trim``.
     """
     libc = ctypes.CDLL(None)
     if not hasattr(libc, "malloc_trim"):

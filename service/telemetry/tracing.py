@@ -1,76 +1,78 @@
-"""Traces: whose request this is (W3C Trace Context), and spans for an OpenTelemetry collector.
+"""Trace ids (W3C Trace Context) and spans for an OpenTelemetry collector.
 
-Trace ids are followed into logs and answers with or without a collector; the packages that speak
-to one are only imported when there is one.
+Logs and answers carry trace ids with or without a collector. The packages that talk to a collector
+are imported only when the settings name one.
 """
 
 from __future__ import annotations
 
-import re
 import secrets
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
+from opentelemetry.context import Context
+from opentelemetry.trace import (
+    NonRecordingSpan,
+    SpanContext,
+    TraceFlags,
+    get_current_span,
+    set_span_in_context,
+)
+from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
+
 import visloc
 from service.settings import ServiceSettings, SettingsError
 
 SERVICE_NAME = "visloc"
-# Where OTLP over HTTP takes spans, when the endpoint names a host only.
+# The path of OTLP over HTTP, added to an endpoint without one.
 _TRACES_PATH = "/v1/traces"
-# Spans that wait for a collector that is slow or away; beyond it they are dropped.
+# Spans that wait for a slow or absent collector; more are dropped.
 _MAX_WAITING_SPANS = 2048
 _MAX_EXPORTED_SPANS = 512
 _EXPORT_EVERY_MS = 2000
 _EXPORT_TIMEOUT_S = 5.0
 _CLOSE_TIMEOUT_S = 3.0
 
-# https://www.w3.org/TR/trace-context/#traceparent-header: a later version may append fields.
-_TRACEPARENT = re.compile(r"([0-9a-f]{2})-([0-9a-f]{32})-([0-9a-f]{16})-([0-9a-f]{2})(-.*)?")
+_PROPAGATOR = TraceContextTextMapPropagator()
+_HEADER = "traceparent"
 
 
-@dataclass(frozen=True, slots=True)
-class TraceContext:
-    """A place in a trace.
-
-    Attributes:
-        trace_id: 32 hexadecimal digits.
-        span_id: 16 hexadecimal digits.
-        sampled: whether the caller records the trace.
-    """
-
-    trace_id: str
-    span_id: str
-    sampled: bool
-
-    @property
-    def traceparent(self) -> str:
-        """The header that says it: ``traceparent`` of requests, ``traceresponse`` of answers."""
-        return f"00-{self.trace_id}-{self.span_id}-{int(self.sampled):02x}"
-
-
-def parse_traceparent(header: str | None) -> TraceContext | None:
-    """Return what a caller's header says; None for none and, as is the standard, a wrong one."""
-    found = _TRACEPARENT.fullmatch(header or "")
-    if found is None:
+def parse_traceparent(header: str | None) -> SpanContext | None:
+    """Return the caller's span; None when the header is missing or, as W3C asks, malformed."""
+    if header is None:
         return None
-    version, trace_id, span_id, flags, more = found.groups()
-    if version == "ff" or (version == "00" and more is not None):
-        return None
-    if not trace_id.strip("0") or not span_id.strip("0"):
-        return None
-    return TraceContext(trace_id, span_id, bool(int(flags, 16) & 1))
+    # The context is given, or the propagator would look for the current one.
+    context = _PROPAGATOR.extract({_HEADER: header}, Context())
+    caller = get_current_span(context).get_span_context()
+    return caller if caller.is_valid else None
 
 
-def continued(caller: TraceContext) -> TraceContext:
-    """Return a place of our own in the caller's trace."""
-    return TraceContext(caller.trace_id, secrets.token_hex(8), caller.sampled)
+def traceparent_of(span: SpanContext) -> str:
+    """Return the header of a span: ``traceparent`` of requests, ``traceresponse`` of answers."""
+    carrier: dict[str, str] = {}
+    _PROPAGATOR.inject(carrier, set_span_in_context(NonRecordingSpan(span), Context()))
+    return carrier[_HEADER]
 
 
-def started_trace() -> TraceContext:
-    """Return a place in a trace of our own."""
-    return TraceContext(secrets.token_hex(16), secrets.token_hex(8), True)
+def child_of(parent: SpanContext) -> SpanContext:
+    """Return a new span in the same trace; it is sampled if the parent is."""
+    return _new_span(parent.trace_id, sampled=parent.trace_flags.sampled)
+
+
+def new_trace() -> SpanContext:
+    """Return the first span of a new trace, sampled."""
+    return _new_span(_random_id(128), sampled=True)
+
+
+def _new_span(trace_id: int, *, sampled: bool) -> SpanContext:
+    flags = TraceFlags(TraceFlags.SAMPLED if sampled else TraceFlags.DEFAULT)
+    return SpanContext(trace_id, _random_id(64), is_remote=False, trace_flags=flags)
+
+
+def _random_id(bits: int) -> int:
+    return secrets.randbits(bits) or 1  # 0 stands for none
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,22 +86,18 @@ class Stage:
 
 @dataclass(frozen=True, slots=True)
 class RequestSpan:
-    """What is told of a request that ended.
+    """A request that ended; times in ns since 1970.
 
     Attributes:
-        name: its route.
-        place: where it stands in its trace.
-        caller: the span that it is part of; None for none.
-        start_ns: since 1970.
-        end_ns: since 1970.
-        attributes: by the names of OpenTelemetry's semantic conventions where there is one.
-        failed: whether that was the server's fault.
-        stages: of its work.
+        context: the ids of its own span.
+        caller: the caller's span, which is the parent.
+        attributes: named by OpenTelemetry's semantic conventions where they have a name.
+        failed: whether the error was the server's fault.
     """
 
     name: str
-    place: TraceContext
-    caller: TraceContext | None
+    context: SpanContext
+    caller: SpanContext | None
     start_ns: int
     end_ns: int
     attributes: Mapping[str, str | int | float]
@@ -108,7 +106,7 @@ class RequestSpan:
 
 
 def stages_until(end_ns: int, seconds: Mapping[str, float]) -> tuple[Stage, ...]:
-    """Lay stages that ran one after the other on the clock (ns since 1970), the last until now."""
+    """Place consecutive stages on the clock (ns since 1970) so that the last ends at ``end_ns``."""
     start = end_ns - sum(round(duration * 1e9) for duration in seconds.values())
     stages = []
     for name, duration in seconds.items():
@@ -118,13 +116,13 @@ def stages_until(end_ns: int, seconds: Mapping[str, float]) -> tuple[Stage, ...]
 
 
 class Spans:
-    """Sends spans to a collector from a thread of its own; one that is away costs nothing else.
+    """Sends spans to a collector from its own thread, so that an absent one delays no request.
 
     Args:
         endpoint: URL of the collector; ``/v1/traces`` is added to one without a path.
 
     Raises:
-        SettingsError: when the URL cannot be used, or the packages are not installed.
+        SettingsError: for a URL that cannot be used, or when packages are not installed.
     """
 
     def __init__(self, endpoint: str) -> None:
@@ -157,20 +155,16 @@ class Spans:
         )
 
     def send(self, request: RequestSpan) -> None:
-        """Take a request and its stages; unless its caller does not record the trace."""
+        """Queue a request and its stages, unless the caller does not sample the trace."""
         from opentelemetry.sdk.trace import ReadableSpan
-        from opentelemetry.trace import SpanContext, SpanKind, Status, StatusCode, TraceFlags
+        from opentelemetry.trace import SpanKind, Status, StatusCode
 
-        def context_of(place: TraceContext, *, remote: bool) -> SpanContext:
-            flags = TraceFlags(TraceFlags.SAMPLED if place.sampled else TraceFlags.DEFAULT)
-            return SpanContext(int(place.trace_id, 16), int(place.span_id, 16), remote, flags)
-
-        own = context_of(request.place, remote=False)
+        own = request.context
         self._processor.on_end(
             ReadableSpan(
                 request.name,
                 own,
-                None if request.caller is None else context_of(request.caller, remote=True),
+                request.caller,
                 self._resource,
                 request.attributes,
                 kind=SpanKind.SERVER,
@@ -183,7 +177,7 @@ class Spans:
             self._processor.on_end(
                 ReadableSpan(
                     stage.name,
-                    context_of(continued(request.place), remote=False),
+                    child_of(own),
                     own,
                     self._resource,
                     start_time=stage.start_ns,
@@ -192,7 +186,7 @@ class Spans:
             )
 
     def close(self) -> None:
-        """Send what waits, as far as the collector takes it within seconds. Blocks."""
+        """Send the waiting spans; give up after a few seconds. Blocks."""
         # Only the exporter's end stops its attempts; the processor would wait for half a minute.
         giving_up = threading.Timer(_CLOSE_TIMEOUT_S, self._exporter.shutdown)
         giving_up.daemon = True
@@ -202,9 +196,9 @@ class Spans:
 
 
 def open_spans(settings: ServiceSettings) -> Spans | None:
-    """Return where spans go; None when the settings name no collector.
+    """Connect to the collector that the settings name, if any.
 
     Raises:
-        SettingsError: as of ``Spans``.
+        SettingsError: see ``Spans``.
     """
     return None if settings.otlp_endpoint is None else Spans(settings.otlp_endpoint)

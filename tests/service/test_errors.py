@@ -4,7 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from service.errors import STATUSES, request_id, statuses_of
+from service.api.request_ids import request_id
+from service.errors import STATUSES, statuses_of
 from visloc.errors import Overloaded, TooLarge, VislocError
 
 

@@ -23,6 +23,16 @@ from visloc_api.v1.localization_pb2_grpc import LocalizationStub
 READY = re.compile(r"ready: http://127\.0\.0\.1:(\d+) grpc://127\.0\.0\.1:(\d+), maps: (.*)")
 
 
+def test_main_sets_thread_counts_before_the_libraries_that_read_them_are_loaded() -> None:
+    program = "import service.__main__, sys; print({'numpy', 'cv2', 'torch'} & sys.modules.keys())"
+
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+
+    assert done.stdout == "set()\n"
+
+
 @contextmanager
 def started(*arguments: str) -> Iterator[subprocess.Popen[str]]:
     environment = {name: value for name, value in os.environ.items() if "VISLOC" not in name}

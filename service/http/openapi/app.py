@@ -1,4 +1,4 @@
-"""What FastAPI cannot derive for /openapi.json: schemas of bodies, examples, problems."""
+"""The parts of /openapi.json that FastAPI cannot derive: request bodies, examples, problems."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ _ANSWERS: dict[tuple[str, str, str], dict[str, Any]] = {
 }
 
 _PROBLEMS = {
-    404: "no such map, version or rig",
-    409: "the features or weights that the map was built with are not here; of maps: the version "
-    "exists already, or is in use",
+    404: "unknown map, version or rig",
+    409: "the server lacks the features or weights that the map was built with; for versions of "
+    "maps: the version already exists, or is current",
     413: "over a limit on bytes, pixels, photos or instants",
-    422: "the request cannot be used as it is",
-    429: "too many photos are waiting, or rigs and sequences being served; try again",
-    500: "a map on disk is damaged, or the server made a mistake",
+    422: "the request is invalid",
+    429: "too many photos are waiting, or too many rigs and sequences are being served; try again",
+    500: "a map on disk is damaged, or the server failed",
     503: "the maps are being loaded; try again",
-    504: "the time for the request is over",
-    507: "there is no room on the server's disk",
+    504: "the request took too long",
+    507: "the server's disk is full",
 }
 
 
@@ -66,7 +66,7 @@ def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 
 class App(FastAPI):
-    """FastAPI with the schemas of what it does not parse itself."""
+    """FastAPI with the schemas of bodies that it does not parse itself."""
 
     def openapi(self) -> dict[str, Any]:
         """Return /openapi.json."""
@@ -86,7 +86,7 @@ class App(FastAPI):
             )
             schema["components"]["schemas"].update(ours["$defs"])
             schema["components"]["schemas"]["Problem"]["example"] = example("problem")
-            # Not given to the routes: FastAPI would drop their nulls.
+            # Added here, because FastAPI drops nulls from the examples of routes.
             for (path, method, status), shown in _ANSWERS.items():
                 response = schema["paths"][path][method]["responses"][status]
                 response["content"]["application/json"]["examples"] = {
@@ -95,9 +95,9 @@ class App(FastAPI):
             lines = schema["paths"]["/localize/sequence"]["post"]["responses"]["200"]["content"]
             lines[NDJSON] = {
                 "schema": {
-                    "description": "with Accept: application/x-ndjson, lines of this JSON: one per "
-                    "instant, in order, each sent as soon as it is final; after an error, a last "
-                    "one with the problem",
+                    "description": "with Accept: application/x-ndjson, one line of this JSON per "
+                    "instant, in order, each sent as soon as it is final; after an error, the last "
+                    "line holds the problem",
                     "oneOf": [
                         {"$ref": _REF.format(model="InstantAnswer")},
                         {

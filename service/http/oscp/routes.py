@@ -11,89 +11,80 @@ from fastapi import FastAPI, Request
 from numpy.typing import NDArray
 from starlette.responses import Response
 
-from service.api.deadlines import timeout_of, within
+from service.api.deadlines import within
 from service.api.geopose import geoposes_to_words
-from service.api.oscp import (
-    GeoPoseAccuracy,
-    GeoPoseRequest,
-    GeoPoseResponse,
-    GeoPoseStatus,
-)
-from service.engine.engine import Engine
+from service.api.oscp import GeoPoseAccuracy, GeoPoseRequest, GeoPoseResponse, GeoPoseStatus
+from service.http.backend import Backend, backend_of, timeout_s_of
 from service.http.bodies import checked_media_type
 from service.http.openapi.app import problems
 from service.http.oscp.examples import GEOPOSE_BODY, GEOPOSE_RESPONSES
 from service.http.responses import json_response, problem_response, while_connected
-from service.http.slow_clients import arrivals_of
 from service.settings import ServiceSettings
-from service.telemetry.observer import Observer
 from service.values import Localization, RigJob
 from visloc.errors import InvalidInput, NotFound
 from visloc.geometry import Pose
 from visloc.geopose import accuracy_of
-from visloc_api.words.wire import TIMEOUT_HEADER
 
 OSCP = "application/vnd.oscp+json"
 OGC = "application/geopose+json"
 JSON = "application/json"
 _VERSIONS = {OSCP: ("1.0", "2.0"), OGC: ("1.0",), JSON: ()}
 _READ = (JSON, OSCP)
-# The protocol's accuracy where it is not known.
+# The protocol's word for an unknown accuracy.
 UNKNOWN = -1.0
 _MAX_ID = 200
 
 
-def add_geopose_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) -> None:
-    """Serve the protocol. The state of the app has its observer and its arrivals."""
-
-    @app.get("/geopose", response_model=GeoPoseStatus)
-    async def geopose_status() -> Response:
-        """Tell that the protocol is spoken here."""
-        return json_response(GeoPoseStatus())
-
-    @app.post(
+def add_geopose_routes(app: FastAPI) -> None:
+    """Add ``/geopose``."""
+    app.get("/geopose", response_model=GeoPoseStatus)(geopose_status)
+    app.post(
         "/geopose",
         response_model=GeoPoseResponse,
-        responses={
-            **problems(409, 413, 422, 429, 500, 503, 504),
-            **GEOPOSE_RESPONSES,
-        },
+        responses={**problems(409, 413, 422, 429, 500, 503, 504), **GEOPOSE_RESPONSES},
         openapi_extra={"requestBody": GEOPOSE_BODY},
-    )
-    async def geopose(request: Request) -> Response:
-        """Find where on Earth a photo was taken: the OSCP GeoPose protocol, versions 1 and 2.
+    )(geopose)
 
-        It searches the maps that are anchored around the request's latest geolocation reading (else
-        its prior poses, else all). The answer is the pose of the camera of the first camera
-        reading, as an OGC GeoPose of a body with x forward, y left, z up; with
-        `Accept: application/geopose+json` it is the bare GeoPose. Photos of one rig and instant are
-        localized together. A photo that cannot be localized is an error here, 404 with the code
-        `geopose.not_localized`, as the protocol has no other word for it.
-        """
-        observer: Observer = request.app.state.observer
-        try:
-            kind = answer_kind(request.headers.getlist("accept"))
-        except InvalidInput as error:
-            observer.error(error)
-            return problem_response(error, request.state.request_id, HTTPStatus.NOT_ACCEPTABLE)
-        checked_media_type(request, _READ)
-        timeout_s = timeout_of(request.headers.get(TIMEOUT_HEADER), settings.request_timeout_s)
-        engine.check_room()
-        async with arrivals_of(request).body(request, settings.max_batch_bytes) as body:
-            asked, job = await asyncio.to_thread(_read, body, settings)
-        async with within(timeout_s):
-            work = _answer(engine, observer, asked, job, request.state.request_id)
-            answer = await while_connected(request.receive, work)
-        if kind.partition(";")[0] == OGC:
-            return Response(answer.geopose.model_dump_json(), media_type=kind)
-        return Response(answer.model_dump_json(), media_type=kind)
+
+async def geopose_status() -> Response:
+    """Tell that this server speaks the protocol."""
+    return json_response(GeoPoseStatus())
+
+
+async def geopose(request: Request) -> Response:
+    """Find where on Earth a photo was taken: the OSCP GeoPose protocol, versions 1 and 2.
+
+    The search covers the maps anchored around the latest geolocation reading; without one, those
+    around the prior poses; without these, all maps. The answer is the pose of the camera of the
+    first camera reading, as an OGC GeoPose of a body with x forward, y left, z up. With
+    `Accept: application/geopose+json` it is the bare GeoPose. Photos of one rig and instant are
+    localized together. A photo that cannot be localized is an error here, 404 with the code
+    `geopose.not_localized`, because the protocol has no other word for it.
+    """
+    backend = backend_of(request)
+    try:
+        kind = answer_kind(request.headers.getlist("accept"))
+    except InvalidInput as error:
+        backend.observer.error(error)
+        return problem_response(error, request.state.request_id, HTTPStatus.NOT_ACCEPTABLE)
+    checked_media_type(request, _READ)
+    timeout_s = timeout_s_of(request)
+    backend.engine.check_room()
+    async with backend.arrivals.body(request, backend.settings.max_batch_bytes) as body:
+        asked, job = await asyncio.to_thread(_read, body, backend.settings)
+    async with within(timeout_s):
+        work = _answer(backend, asked, job, request.state.request_id)
+        answer = await while_connected(request.receive, work)
+    if kind.partition(";")[0] == OGC:
+        return Response(answer.geopose.model_dump_json(), media_type=kind)
+    return Response(answer.model_dump_json(), media_type=kind)
 
 
 def answer_kind(accept: list[str]) -> str:
-    """Return the media type of the answer that the Accept headers like best.
+    """Return the media type that the Accept headers prefer.
 
     Raises:
-        InvalidInput: ``geopose.accept`` when they allow none that is given here.
+        InvalidInput: ``geopose.accept`` when they allow no supported type.
     """
     ranges = [one for header in accept for one in header.split(",") if one.strip()]
     best, best_quality = JSON if not ranges else None, 0.0
@@ -133,12 +124,9 @@ def _read(body: bytes, settings: ServiceSettings) -> tuple[GeoPoseRequest, RigJo
 
 
 async def _answer(
-    engine: Engine,
-    observer: Observer,
-    asked: GeoPoseRequest,
-    job: RigJob,
-    request_id: str,
+    backend: Backend, asked: GeoPoseRequest, job: RigJob, request_id: str
 ) -> GeoPoseResponse:
+    engine, observer = backend.engine, backend.observer
     if job.rig is None:
         found = await engine.localize(job)
         observer.localization(found)
@@ -150,24 +138,20 @@ async def _answer(
     map_ref = f"{found.map_id}@{found.map_version}"
     geopose, _ = geoposes_to_words(cam_from_world, found.geodetic, ypr=False)
     if geopose is None or found.geodetic is None:
-        # Found by its anchor, and replaced by a version without one in that moment.
+        # The map was chosen by its anchor, and then replaced by a version without one.
         raise NotFound(
             "geopose.not_anchored",
             f"map {map_ref} localizes the photo and is not anchored to the Earth",
         )
-    # Of a place that was simply given, nobody knows how exact it is.
+    # An anchor that was given, not estimated, has no known accuracy.
     anchor = (await engine.map(map_ref)).outline.manifest.world.anchor
-    accuracy = accuracy_of(
-        cam_from_world,
-        covariance,
-        found.geodetic,
-        None if anchor is None else anchor.rms,
-    )
+    rms = None if anchor is None else anchor.rms
+    accuracy = accuracy_of(cam_from_world, covariance, found.geodetic, rms)
     return GeoPoseResponse(
         id=(asked.id or request_id)[:_MAX_ID],
         timestamp=round(time() * 1000) if asked.timestamp is None else asked.timestamp,
         accuracy=GeoPoseAccuracy(
-            position=UNKNOWN if anchor is None or anchor.rms is None else accuracy.position,
+            position=UNKNOWN if rms is None else accuracy.position,
             orientation=accuracy.orientation,
         ),
         geopose=geopose,
@@ -178,7 +162,7 @@ def _first_camera(found: Localization) -> tuple[Pose, NDArray[np.float64]]:
     """Return the pose and covariance (6, 6) of the camera of the first reading."""
     pose, refusal = found.answer.pose, found.answer.refusal
     if pose is None:
-        assert refusal is not None  # an instant has one of both
+        assert refusal is not None  # an instant has a pose or a refusal
         raise NotFound(
             "geopose.not_localized", refusal.message, got=f"{refusal.stage}: {refusal.reason}"
         )

@@ -17,6 +17,7 @@ from service.api import (
 )
 from service.api.answers import instant_answer
 from service.grpc.messages import instant_of, rig_job_of, sequence_start_of
+from service.http.bodies import max_sequence_values
 from service.settings import ServiceSettings
 from service.values import ONLY_SENSOR, Localization, RigJob
 from visloc.errors import InvalidInput, TooLarge
@@ -124,7 +125,7 @@ def test_a_sequence_of_as_many_instants_as_there_may_be_has_room(
         "priors": {"pose": {"device_from_world": IDENTITY, "covariance": MATRIX}},
     }
 
-    assert num_values(instant) * settings.max_instants < settings.max_sequence_values
+    assert num_values(instant) * settings.max_instants < max_sequence_values(settings)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from grpc_status import rpc_status
 
 import visloc
 from clients.transport.messages import plain
-from service.grpc.localization import SERVICE_NAME
+from service.grpc.server import SERVICE_NAMES
 from service.telemetry.metrics import Metrics, ServiceState
 from service.values import RigJob
 from visloc_api.v1 import localization_pb2 as pb2
@@ -241,7 +241,7 @@ A_START = pb2.LocalizeSequenceRequest(start=pb2.SequenceStart(map="room")).Seria
 
 @pytest.mark.parametrize(
     ("service", "method", "before"),
-    [*((*each, []) for each in METHODS), (SERVICE_NAME, "LocalizeSequence", [A_START])],
+    [*((*each, []) for each in METHODS), (SERVICE_NAMES[0], "LocalizeSequence", [A_START])],
 )
 def test_a_message_that_is_no_protobuf_is_refused_counted_and_logged_in_a_line(
     service: str,
@@ -364,7 +364,7 @@ def test_health_says_serving_only_when_the_maps_are_warm(
         stub = health_pb2_grpc.HealthStub(doors.channel)
         return [
             stub.Check(health_pb2.HealthCheckRequest(service=name)).status
-            for name in ("", SERVICE_NAME)
+            for name in ("", SERVICE_NAMES[0])
         ]
 
     serving = health_pb2.HealthCheckResponse.SERVING

@@ -11,6 +11,8 @@ import threading
 import time
 import zlib
 from collections.abc import Iterator
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any, NoReturn
 
 import httpx
@@ -23,11 +25,9 @@ from starlette.responses import PlainTextResponse
 import visloc
 from service import api as schemas
 from service.http.acceptor import OpenConnections
-from service.http.app import RequestEnvelope, create_app
+from service.http.app import create_app
+from service.http.envelope import RequestEnvelope
 from service.http.openapi import example
-from service.http.slow_clients import Arrivals
-from service.security.access import open_access
-from service.settings import ServiceSettings
 from service.values import RigJob
 from tests.turning import png, turned_camera, turned_pixels, turned_pose
 from visloc.geometry import Pose, rotation_angle
@@ -326,9 +326,9 @@ def test_a_full_queue_is_429_with_retry_after(
 
 def test_a_server_that_stops_closes_each_connection_with_its_answer(doors: Any) -> None:
     async def ask(is_stopping: bool) -> httpx.Response:
-        app = RequestEnvelope(
-            PlainTextResponse("ok"), doors.server.observer, OpenConnections(1), lambda: is_stopping
-        )
+        engine: Any = SimpleNamespace(draining=is_stopping)
+        backend = replace(doors.server.backend, engine=engine, connections=OpenConnections(1))
+        app = RequestEnvelope(PlainTextResponse("ok"), backend)
         transport = httpx.ASGITransport(app)
         async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as http:
             return await http.get("/")
@@ -545,16 +545,7 @@ def test_nothing_of_the_service_loads_from_other_hosts(doors: Any) -> None:
 
 
 def test_what_fastapi_refuses_is_a_problem_too(doors: Any) -> None:
-    settings = ServiceSettings()
-    app = create_app(
-        doors.server.engine,
-        settings,
-        observer=doors.server.observer,
-        access=open_access(settings),
-        arrivals=Arrivals(1.0, 1),
-        connections=OpenConnections(1000),
-        state=doors.server.state,
-    )
+    app = create_app(doors.server.backend)
     app.get("/cube")(_cube)
     transport = httpx.ASGITransport(app)
 

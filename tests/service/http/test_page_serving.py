@@ -18,6 +18,7 @@ from starlette.datastructures import Headers
 import service.http.static_page
 from service.http.acceptor import OpenConnections
 from service.http.app import create_app
+from service.http.backend import Backend
 from service.http.cache_headers import is_current, takes_gzip
 from service.http.slow_clients import Arrivals
 from service.security.access import open_access
@@ -57,13 +58,15 @@ def app_with(**settings: Any) -> FastAPI:
     read = ServiceSettings(**settings)
     engine: Any = Idle()
     return create_app(
-        engine,
-        read,
-        observer=Observer(Metrics()),
-        access=open_access(read),
-        arrivals=Arrivals(1.0, 1),
-        connections=OpenConnections(1000),
-        state=lambda: ServiceState(ready=True),
+        Backend(
+            engine,
+            read,
+            Observer(Metrics()),
+            open_access(read),
+            Arrivals(1.0, 1),
+            OpenConnections(1000),
+            lambda: ServiceState(ready=True),
+        )
     )
 
 
@@ -258,7 +261,7 @@ def test_requests_for_files_are_counted_under_few_names() -> None:
         ask(app, f"/assets/{number}.js")
     ask(app, "/")
 
-    text = app.state.observer.metrics.render(ServiceState(ready=True))[0].decode()
+    text = app.state.backend.observer.metrics.render(ServiceState(ready=True))[0].decode()
     assert 'route="GET /assets/{name}"' in text
     assert 'route="GET /"' in text
     assert "7.js" not in text

@@ -20,7 +20,8 @@ from uvicorn.server import ServerState
 
 from service.http.acceptor import Acceptor, OpenConnections
 from service.http.responses import problem_response
-from service.http.slow_clients import SLOWEST_BYTES_PER_S, Arrivals, arrivals_of, http_protocol
+from service.http.slow_clients import Arrivals, http_protocol
+from service.settings import SLOWEST_BYTES_PER_S
 from visloc.errors import VislocError
 
 GRACE_S = 0.6
@@ -29,9 +30,10 @@ BUDGET = 300_000
 
 
 async def read(request: Request) -> Response:
+    arrivals: Arrivals = request.app.state.arrivals
     try:
-        async with arrivals_of(request).body(request, LIMIT) as body:
-            return PlainTextResponse(f"{len(body)} {arrivals_of(request).bytes_held}")
+        async with arrivals.body(request, LIMIT) as body:
+            return PlainTextResponse(f"{len(body)} {arrivals.bytes_held}")
     except VislocError as error:
         return problem_response(error, "the-id")
 

@@ -25,8 +25,8 @@ from starlette.types import Scope as AsgiScope
 from service.grpc.access import AccessInterceptor
 from service.grpc.connections import GrpcConnections
 from service.grpc.envelope import Envelope
+from service.grpc.slow_clients import TimelyCalls
 from service.http.access import add_access
-from service.http.slow_clients import TimelyCalls
 from service.security.access import (
     ANY_KEY,
     NOTHING,

@@ -52,11 +52,47 @@ def test_neither_secret_nor_token_is_in_the_file_and_nobody_else_may_read_it(pat
     assert [file.name for file in path.parent.iterdir()] == ["keys.json"]
 
 
+FILE = """\
+{
+  "format": 1,
+  "keys": [
+    {
+      "id": "7502a7f782ac",
+      "name": "robot",
+      "scopes": [
+        "localize",
+        "read"
+      ],
+      "created": "2026-11-22T23:03:00+00:00",
+      "salt": "33ae4d00283e84ab155af03d593fcce1",
+      "sha256": "52b1db749002e3246ea4ad795e83e7e985cedcf9b602d9b6287fb08bb193006f",
+      "rate": 2.5,
+      "burst": 4,
+      "concurrency": null
+    }
+  ]
+}
+"""
+
+
+def test_the_format_of_the_file_stays(path: Path) -> None:
+    path.write_text(FILE)
+    path.chmod(0o600)
+    (robot,) = read_keys(path)
+    copy = path.with_name("copy.json")
+    stored(copy, robot)
+
+    assert (robot.id, robot.scopes) == ("7502a7f782ac", {Scope.LOCALIZE, Scope.READ})
+    assert (robot.rate, robot.burst, robot.concurrency) == (2.5, 4, None)
+    assert (len(robot.salt), robot.sha256[:2]) == (16, b"\x52\xb1")
+    assert copy.read_text() == FILE
+
+
 def test_equal_secrets_would_have_different_hashes() -> None:
     (first, _), (second, _) = (new_key("robot", frozenset(Scope)) for _ in range(2))
 
     assert first.salt != second.salt
-    assert first.digest != second.digest
+    assert first.sha256 != second.sha256
     assert first.id != second.id
 
 

@@ -190,7 +190,7 @@ def test_the_server_says_over_both_doors_why_it_refuses(guarded: Guarded, door: 
 
 @pytest.mark.parametrize("door", ["http", "grpc"])
 def test_the_log_names_the_key_that_was_refused(guarded: Guarded, door: str) -> None:
-    log, written = logging.getLogger("service.security.access"), io.StringIO()
+    log, written = logging.getLogger("service.access"), io.StringIO()
     handler = logging.StreamHandler(written)
     handler.setFormatter(TextFormatter())
     log.addHandler(handler)

@@ -25,7 +25,7 @@ from service.telemetry.logs import (
     note_key,
     one_line,
 )
-from service.telemetry.tracing import TraceContext
+from service.telemetry.tracing import parse_traceparent
 
 SECRET = "visloc_7f3a_" + "Zk3-_9" * 8
 
@@ -57,7 +57,7 @@ def logging_as(format_: Literal["text", "json"], level: str = "info") -> Iterato
 
 @pytest.fixture
 def in_request() -> Iterator[None]:
-    trace = TraceContext("1" * 32, "2" * 16, sampled=True)
+    trace = parse_traceparent(f"00-{'1' * 32}-{'2' * 16}-01")
     begin_request(RequestRecord("http", "abc", trace, key="robot 7"))
     yield
     end_request()

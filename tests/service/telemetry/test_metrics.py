@@ -47,8 +47,8 @@ def test_a_request_is_counted_with_its_door_route_and_status() -> None:
 def test_answers_are_counted_by_map_and_reason_with_inliers_and_stages() -> None:
     metrics = Metrics()
 
-    metrics.observe_localization("hall", True, None, 120, {"queued": 0.01, "pose": 0.02})
-    metrics.observe_localization("hall", False, "too_few_inliers", 7, {"queued": 0.03})
+    metrics.observe_localization("hall", None, 120, {"queued": 0.01, "pose": 0.02})
+    metrics.observe_localization("hall", "too_few_inliers", 7, {"queued": 0.03})
 
     samples = scrape(metrics)
     assert value(samples, "visloc_localizations_total", map="hall", outcome="localized") == 1
@@ -64,7 +64,7 @@ def test_answers_are_counted_by_map_and_reason_with_inliers_and_stages() -> None
 def test_a_map_that_localizes_nothing_has_a_share_of_zero_not_none() -> None:
     metrics = Metrics()
 
-    metrics.observe_localization("hall", False, "no_pose", 0, {})
+    metrics.observe_localization("hall", "no_pose", 0, {})
 
     name = "visloc_localizations_total"
     assert value(scrape(metrics), name, map="hall", outcome="localized") == 0
@@ -102,14 +102,14 @@ def test_changes_of_maps_uploads_and_worker_deaths_are_counted() -> None:
 def test_the_number_of_series_is_bounded_however_many_maps_come_and_go() -> None:
     metrics = Metrics()
     for number in range(MAX_MAPS + 50):
-        metrics.observe_localization(f"map{number}", True, None, 50, {})
+        metrics.observe_localization(f"map{number}", None, 50, {})
 
     samples = scrape(metrics)
 
     maps = {dict(labels)["map"] for name, labels in samples if name.startswith("visloc_localiza")}
     assert len(maps) == MAX_MAPS + 1
     assert value(samples, "visloc_localizations_total", map=OTHER_MAPS, outcome="localized") == 50
-    metrics.observe_localization("map0", True, None, 50, {})  # those that have a series keep it
+    metrics.observe_localization("map0", None, 50, {})  # those that have a series keep it
     assert (
         value(scrape(metrics), "visloc_localizations_total", map="map0", outcome="localized") == 2
     )
@@ -176,7 +176,7 @@ def test_counting_from_many_threads_loses_nothing() -> None:
 
     def count() -> None:
         for _ in range(500):
-            metrics.observe_localization("hall", True, None, 50, {"pose": 0.1})
+            metrics.observe_localization("hall", None, 50, {"pose": 0.1})
 
     threads = [threading.Thread(target=count) for _ in range(4)]
     for thread in threads:

@@ -40,7 +40,7 @@ def known_series() -> dict[str, set[str]]:
     metrics.request_started("http")
     metrics.observe_request("http", "POST /localize", "200", 0.1)
     metrics.observe_error("http", VislocError("server.internal", "a mistake"))
-    metrics.observe_localization("hall", True, None, 50, {"pose": 0.1})
+    metrics.observe_localization("hall", None, 50, {"pose": 0.1})
     metrics.observe_map_change("upload", done=True)
     state = ServiceState(
         ready=True,

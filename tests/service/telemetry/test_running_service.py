@@ -70,7 +70,7 @@ class _Kept(logging.Handler):
 def watched(
     serve: Callable[..., AbstractContextManager[Any]], built_maps: Path, query: Any
 ) -> Iterator[Watched]:
-    kept, log = _Kept(), logging.getLogger("service.security.access")
+    kept, log = _Kept(), logging.getLogger("service.access")
     log.addHandler(kept)
     log.setLevel(logging.INFO)
     collector = HTTPServer(("127.0.0.1", 0), _Handler)

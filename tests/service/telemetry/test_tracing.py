@@ -12,20 +12,27 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
+from opentelemetry.trace import SpanContext
 
 from service.settings import ServiceSettings, SettingsError
 from service.telemetry.tracing import (
     RequestSpan,
     Spans,
-    TraceContext,
-    continued,
+    child_of,
+    new_trace,
     open_spans,
     parse_traceparent,
     stages_until,
-    started_trace,
+    traceparent_of,
 )
 
 TRACE, SPAN = "0af7651916cd43dd8448eb211c80319c", "b7ad6b7169203331"
+
+
+def caller_of(flags: str = "01") -> SpanContext:
+    caller = parse_traceparent(f"00-{TRACE}-{SPAN}-{flags}")
+    assert caller is not None
+    return caller
 
 
 class Collector(HTTPServer):
@@ -75,16 +82,26 @@ def collector() -> Iterator[Collector]:
         thread.join()
 
 
-def test_a_traceparent_is_read_and_written() -> None:
-    header = f"00-{TRACE}-{SPAN}-01"
+@pytest.mark.parametrize(
+    ("header", "sampled"),
+    [
+        (f"00-{TRACE}-{SPAN}-01", True),
+        (f"00-{TRACE}-{SPAN}-00", False),
+        (f"00-{TRACE}-{SPAN}-02", False),
+        (f"cc-{TRACE}-{SPAN}-03-more", True),  # later versions may say more, at the end
+        (f" 00-{TRACE}-{SPAN}-01\t", True),  # white space around it is not part of a header
+    ],
+)
+def test_a_traceparent_is_read_and_answered(header: str, sampled: bool) -> None:
+    caller = parse_traceparent(header)
 
-    found = parse_traceparent(header)
-
-    assert found == TraceContext(TRACE, SPAN, True)
-    assert found.traceparent == header
-    assert parse_traceparent(f"00-{TRACE}-{SPAN}-00") == TraceContext(TRACE, SPAN, False)
-    # Later versions may say more, at the end.
-    assert parse_traceparent(f"cc-{TRACE}-{SPAN}-03-more") == TraceContext(TRACE, SPAN, True)
+    assert caller is not None
+    assert (caller.trace_id, caller.span_id) == (int(TRACE, 16), int(SPAN, 16))
+    assert caller.trace_flags.sampled == sampled
+    child = child_of(caller)
+    answered = traceparent_of(child)
+    assert answered == f"00-{TRACE}-{child.span_id:016x}-0{int(sampled)}"
+    assert child.span_id != caller.span_id
 
 
 @pytest.mark.parametrize(
@@ -95,14 +112,13 @@ def test_a_traceparent_is_read_and_written() -> None:
         "00",
         f"00-{TRACE}-{SPAN}",
         f"00-{TRACE}-{SPAN}-01-more",
-        f"00-{TRACE}-{SPAN}-01\n",
         f"ff-{TRACE}-{SPAN}-01",
         f"00-{'0' * 32}-{SPAN}-01",
         f"00-{TRACE}-{'0' * 16}-01",
         f"00-{TRACE.upper()}-{SPAN}-01",
         f"00-{TRACE[:-1]}-{SPAN}-01",
         f"00-{TRACE[:-1]}\u0663-{SPAN}-01",  # a digit, in Arabic
-        f" 00-{TRACE}-{SPAN}-01",
+        f"cc-{TRACE}-{SPAN}-01-" + 10_000 * "x",
     ],
 )
 def test_a_wrong_traceparent_is_none(header: str | None) -> None:
@@ -114,21 +130,18 @@ def test_whatever_a_caller_sends_a_trace_id_is_32_hexadecimal_digits(header: str
     found = parse_traceparent(header)
 
     if found is not None:
-        assert parse_traceparent(found.traceparent) == found
-        assert len(found.trace_id) == 32
-        assert int(found.trace_id, 16) > 0
+        own = traceparent_of(child_of(found))
+        assert own.startswith(f"00-{found.trace_id:032x}-")
+        assert len(own) == len(f"00-{TRACE}-{SPAN}-01")
+        assert parse_traceparent(own) is not None
 
 
-def test_a_trace_goes_on_in_a_span_of_its_own() -> None:
-    caller = TraceContext(TRACE, SPAN, False)
+def test_a_new_trace_is_sampled_and_has_ids_of_its_own() -> None:
+    one, other = new_trace(), new_trace()
 
-    own, fresh = continued(caller), started_trace()
-
-    assert (own.trace_id, own.sampled) == (TRACE, False)
-    assert own.span_id != SPAN
-    assert fresh.sampled
-    for place in (own, fresh):
-        assert parse_traceparent(place.traceparent) == place
+    assert one.trace_flags.sampled
+    assert one.trace_id != other.trace_id
+    assert one.span_id != other.span_id
 
 
 def test_stages_end_now_and_follow_one_another() -> None:
@@ -143,11 +156,11 @@ def test_stages_end_now_and_follow_one_another() -> None:
     assert stages_until(10, {}) == ()
 
 
-def span_of(place: TraceContext, caller: TraceContext | None = None) -> RequestSpan:
+def span_of(context: SpanContext, caller: SpanContext | None = None) -> RequestSpan:
     now = time.time_ns()
     return RequestSpan(
         "http POST /localize",
-        place,
+        context,
         caller,
         now - 2_000_000_000,
         now,
@@ -160,8 +173,8 @@ def span_of(place: TraceContext, caller: TraceContext | None = None) -> RequestS
 def test_a_collector_gets_the_request_under_its_caller_and_the_stages_under_it(
     collector: Collector,
 ) -> None:
-    caller = TraceContext(TRACE, SPAN, True)
-    sent = span_of(continued(caller), caller)
+    caller = caller_of()
+    sent = span_of(child_of(caller), caller)
     spans = Spans(collector.url)
 
     spans.send(sent)
@@ -174,7 +187,7 @@ def test_a_collector_gets_the_request_under_its_caller_and_the_stages_under_it(
     request, queued, pose = collector.spans
     assert request.trace_id.hex() == TRACE
     assert request.parent_span_id.hex() == SPAN
-    assert request.span_id.hex() == sent.place.span_id
+    assert int.from_bytes(request.span_id) == sent.context.span_id
     assert request.name == "http POST /localize"
     assert request.kind == request.SPAN_KIND_SERVER
     attributes = {a.key: a.value for a in request.attributes}
@@ -192,11 +205,11 @@ def test_a_collector_gets_the_request_under_its_caller_and_the_stages_under_it(
 
 def test_a_request_that_failed_by_the_servers_fault_is_marked(collector: Collector) -> None:
     spans = Spans(collector.url + "/other/path")
-    good = span_of(started_trace())
+    good = span_of(new_trace())
 
     spans.send(
         RequestSpan(
-            good.name, good.place, None, good.start_ns, good.end_ns, {}, failed=True, stages=()
+            good.name, good.context, None, good.start_ns, good.end_ns, {}, failed=True, stages=()
         )
     )
     spans.close()
@@ -208,10 +221,10 @@ def test_a_request_that_failed_by_the_servers_fault_is_marked(collector: Collect
 
 
 def test_a_trace_that_its_caller_does_not_record_is_not_sent(collector: Collector) -> None:
-    caller = TraceContext(TRACE, SPAN, False)
+    caller = caller_of("00")
     spans = Spans(collector.url)
 
-    spans.send(span_of(continued(caller), caller))
+    spans.send(span_of(child_of(caller), caller))
     spans.close()
 
     assert collector.exports == []
@@ -228,7 +241,7 @@ def test_a_collector_that_is_away_delays_neither_requests_nor_the_end_for_long(
 
     start = time.perf_counter()
     for _ in range(3000):  # more than wait
-        spans.send(span_of(started_trace()))
+        spans.send(span_of(new_trace()))
     sent = time.perf_counter()
     spans.close()
 

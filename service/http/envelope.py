@@ -1,0 +1,119 @@
+"""The outermost layer of the HTTP API: request ids, the log, and an answer to every request."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from http import HTTPStatus
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import ClientDisconnect
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.api.request_ids import request_id
+from service.errors import internal_error, stopping_error
+from service.http.backend import Backend
+from service.http.responses import problem_response
+from service.telemetry.logs import UNMATCHED, RequestRecord
+from service.telemetry.tracing import traceparent_of
+from visloc.errors import InvalidInput, Overloaded, VislocError
+
+logger = logging.getLogger(__name__)
+
+# Answered even when all connections are in use.
+_PROBED_PATHS = ("/healthz", "/readyz", "/metrics")
+_METHODS = ("GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH")
+
+
+class RequestEnvelope:
+    """Gives every request an id, a log line, and an answer even when the code behind it fails."""
+
+    def __init__(self, app: ASGIApp, backend: Backend) -> None:
+        self._app = app
+        self._engine = backend.engine
+        self._observer = backend.observer
+        self._connections = backend.connections
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        id_ = request_id(headers.get("x-request-id"))
+        scope.setdefault("state", {})["request_id"] = id_
+        with self._observer.request("http", id_, traceparent=headers.get("traceparent")) as record:
+            record.peer = scope["client"][0] if scope.get("client") else None
+
+            async def send_with_id(message: Message) -> None:
+                if message["type"] == "http.response.start":
+                    self._complete(message, record)
+                await send(message)
+
+            try:
+                await self._serve(record, scope, receive, send_with_id)
+            finally:
+                record.route = route_of(scope)
+
+    def _complete(self, start: Message, record: RequestRecord) -> None:
+        """Note the status of an answer that starts, and add our headers to it."""
+        record.status = str(start["status"])
+        headers = MutableHeaders(scope=start)
+        headers["X-Request-Id"] = record.request_id
+        if self._engine.draining:  # else the next request would be cut off
+            headers["Connection"] = "close"
+        if record.trace is not None:
+            headers["traceresponse"] = traceparent_of(record.trace)
+
+    async def _serve(
+        self, record: RequestRecord, scope: Scope, receive: Receive, send: Send
+    ) -> None:
+        async def refuse(error: VislocError, status: HTTPStatus | None = None) -> None:
+            self._observer.error(error)
+            response = problem_response(error, record.request_id, status)
+            response.headers["Connection"] = "close"
+            await response(scope, receive, send)
+
+        headers = Headers(scope=scope)
+        try:
+            if "content-length" in headers and "transfer-encoding" in headers:
+                # RFC 9112, 6.3: a proxy may have understood it otherwise.
+                await refuse(_ambiguous(), HTTPStatus.BAD_REQUEST)
+            elif self._connections.is_busy and scope["path"] not in _PROBED_PATHS:
+                await refuse(_busy())
+            else:
+                await self._app(scope, receive, send)
+        except asyncio.CancelledError:
+            if record.status or not self._engine.draining:
+                raise
+            await refuse(stopping_error())
+        except ClientDisconnect:
+            logger.info("the client of request %s left before it was answered", record.request_id)
+        except Exception:  # the last line of defence: every caller gets an answer
+            logger.exception("request %s broke", record.request_id)
+            if record.status:
+                raise  # too late to answer: the server closes the connection
+            await refuse(internal_error())
+
+
+def route_of(scope: Scope) -> str:
+    """Return the method and the path template of a served request, as ``GET /maps/{ref}``."""
+    path = getattr(scope.get("route"), "path", None)
+    method = scope["method"]
+    if path is None or method not in _METHODS:
+        return UNMATCHED
+    return f"{method} {path}"
+
+
+def _busy() -> Overloaded:
+    return Overloaded(
+        "server.busy", "requests are being served on all connections; try again shortly"
+    )
+
+
+def _ambiguous() -> InvalidInput:
+    return InvalidInput(
+        "request.framing",
+        "the request says in two ways where its body ends",
+        field="Transfer-Encoding",
+        expected="Content-Length or Transfer-Encoding, not both",
+    )
