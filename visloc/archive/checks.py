@@ -23,7 +23,7 @@ from visloc.errors import InvalidInput, MapCorrupt
 RecordType = TypeVar("RecordType", bound=BaseModel)
 
 _MAX_JSON_BYTES = 2**27  # about a million photos; read, it takes some 20 times the memory
-_MAX_MANIFEST_BYTES = 16 * 2**20
+MAX_MANIFEST_BYTES = 16 * 2**20
 
 # Rows of an array that are read at a time: some hundred kilobytes.
 _BLOCK_ROWS = 16_384
@@ -83,7 +83,22 @@ def read_any_manifest(folder: Path) -> Manifest | SetManifest:
         MapCorrupt: as ``read_manifest``.
     """
     path = folder / "manifest.json"
-    text = _read_text(path, _MAX_MANIFEST_BYTES, "map.manifest")
+    return parse_any_manifest(_read_bytes(path, MAX_MANIFEST_BYTES, "map.manifest"), str(path))
+
+
+def parse_any_manifest(content: bytes, address: str) -> Manifest | SetManifest:
+    """Parse ``manifest.json`` of a map or a set.
+
+    Args:
+        content: the file.
+        address: where it was found, for error messages.
+
+    Raises:
+        MapCorrupt: as ``read_manifest``.
+    """
+    if len(content) > MAX_MANIFEST_BYTES:
+        raise _too_large(address, MAX_MANIFEST_BYTES, "map.manifest")
+    text = _decoded(content, address, "map.manifest")
     try:
         fields = json.loads(text)
         of_set, version = fields.get("format") == SET_FORMAT, str(fields.get("format_version", ""))
@@ -95,13 +110,13 @@ def read_any_manifest(folder: Path) -> Manifest | SetManifest:
         raise MapCorrupt(
             "map.format_version",
             "the map was written by a newer visloc; upgrade visloc or rebuild the map",
-            field=str(path),
+            field=address,
             expected=f"format {newest[0]}.x or older (this program writes {newest[0]}.{newest[1]})",
             got=version,
         )
     if of_set:
-        return _parse(SetManifest, text, path, "map.manifest")
-    return _parse(Manifest, text, path, "map.manifest")
+        return _parse(SetManifest, text, address, "map.manifest")
+    return _parse(Manifest, text, address, "map.manifest")
 
 
 def is_set(ref: str, manifest: SetManifest) -> InvalidInput:
@@ -183,7 +198,8 @@ def check_checksums(folder: Path, manifest: Manifest | SetManifest) -> None:
 def read_record(folder: Path, name: str, record: type[RecordType]) -> RecordType:
     """Read one of a map's JSON files."""
     path = folder / name
-    return _parse(record, _read_text(path, _MAX_JSON_BYTES, "map.json"), path, "map.json")
+    text = _decoded(_read_bytes(path, _MAX_JSON_BYTES, "map.json"), str(path), "map.json")
+    return _parse(record, text, str(path), "map.json")
 
 
 def map_array(
@@ -338,34 +354,43 @@ def _cut_short(path: Path) -> MapCorrupt:
     )
 
 
-def _read_text(path: Path, limit: int, code: str) -> str:
+def _read_bytes(path: Path, limit: int, code: str) -> bytes:
     try:
         status = path.lstat()
         if not stat.S_ISREG(status.st_mode):  # to open a pipe is to wait for its other end
             raise MapCorrupt(code, "not a file", field=str(path), expected="a plain file")
         if status.st_size > limit:
-            raise MapCorrupt(
-                code, "the file is too large", field=str(path), expected=f"at most {limit} bytes"
-            )
-        return path.read_text(encoding="utf-8")
+            raise _too_large(str(path), limit, code)
+        return path.read_bytes()
     except FileNotFoundError:
         raise MapCorrupt(code, "the file is missing", field=str(path)) from None
     except OSError as error:
         raise MapCorrupt(
             code, "the file cannot be read", field=str(path), got=error.strerror
         ) from error
+
+
+def _too_large(address: str, limit: int, code: str) -> MapCorrupt:
+    return MapCorrupt(
+        code, "the file is too large", field=address, expected=f"at most {limit} bytes"
+    )
+
+
+def _decoded(content: bytes, address: str, code: str) -> str:
+    try:
+        return content.decode()
     except UnicodeDecodeError as error:
-        raise MapCorrupt(code, "the file is not UTF-8 text", field=str(path)) from error
+        raise MapCorrupt(code, "the file is not UTF-8 text", field=address) from error
 
 
-def _parse(record: type[RecordType], text: str, path: Path, code: str) -> RecordType:
+def _parse(record: type[RecordType], text: str, address: str, code: str) -> RecordType:
     try:
         return record.model_validate_json(text)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
         raise MapCorrupt(
-            code, f"{where or 'the file'}: {first['msg']}", field=str(path), got=first["input"]
+            code, f"{where or 'the file'}: {first['msg']}", field=address, got=first["input"]
         ) from error
 
 

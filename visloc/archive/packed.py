@@ -20,13 +20,12 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
+from visloc.archive.backends.base import MANIFEST
+from visloc.archive.backends.folder import storage_errors
 from visloc.archive.checks import check_files, read_any_manifest
 from visloc.archive.set_rules import AnyManifest
 from visloc.archive.sets import SET_CODES
-from visloc.archive.store import storage_errors
 from visloc.errors import InvalidInput, TooLarge
-
-MANIFEST = "manifest.json"
 
 MAX_ENTRIES = 100_000
 _MAX_DIRECTORY_BYTES = 16 * 2**20
