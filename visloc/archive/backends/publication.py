@@ -63,10 +63,7 @@ class Publisher:
                 self._overwrite({**files, MANIFEST: manifest}, place)
                 return
             if not self._add(files, place):
-                if not self._is_leftover(place):
-                    raise _upload_runs(map_id, version)
-                logger.info("deleting what a publication of %s@%s left behind", map_id, version)
-                self._fs.rm(place, recursive=True)
+                self._delete_leftover(place, map_id, version)
                 if not self._add(files, place):
                     raise _upload_runs(map_id, version)
             token = secrets.token_hex(8)
@@ -150,11 +147,20 @@ class Publisher:
         with self._fs.open(target, "rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest() == sha256_of(path)
 
-    def _is_leftover(self, place: str) -> bool:
-        """Tell whether nothing was written to an unfinished version for a long time."""
+    def _delete_leftover(self, place: str, map_id: str, version: str) -> None:
+        """Delete an unfinished version to which nobody has added for a long time.
+
+        Raises:
+            Conflict: ``map.version_exists`` if it is finished; ``map.upload_runs`` if it is new.
+        """
         found = self._fs.find(place, detail=True)
-        newest = max((info["LastModified"] for info in found.values()), default=None)
-        return newest is not None and datetime.now(UTC) - newest > timedelta(seconds=LEFTOVER_S)
+        if f"{place}/{MANIFEST}" in found:
+            raise version_exists(map_id, version)
+        newest = max((info["LastModified"] for info in found.values()), default=datetime.now(UTC))
+        if datetime.now(UTC) - newest <= timedelta(seconds=LEFTOVER_S):
+            raise _upload_runs(map_id, version)
+        logger.info("deleting what a publication of %s@%s left behind", map_id, version)
+        self._fs.rm(place, recursive=True)
 
     def _token_of(self, target: str) -> str | None:
         found = self._fs.metadata(target).get(_TOKEN)
