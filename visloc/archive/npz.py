@@ -7,6 +7,8 @@ import io
 import math
 import tokenize
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -32,17 +34,23 @@ def read_npz(archive: Path | bytes, kinds: str = "biuf") -> dict[str, NDArray[An
         ValueError: not such an archive; the message says what is wrong.
         OSError: the file cannot be read.
     """
+    source = io.BytesIO(archive) if isinstance(archive, bytes) else archive
+    size = len(archive) if isinstance(archive, bytes) else archive.stat().st_size
+    with zip_errors(), zipfile.ZipFile(source) as opened:
+        entries = opened.infolist()
+        _check_entries(entries, size)
+        arrays = {}
+        for entry in entries:
+            with opened.open(entry) as file:
+                arrays[entry.filename.removesuffix(_SUFFIX)] = _read_array(file, entry, kinds)
+        return arrays
+
+
+@contextmanager
+def zip_errors() -> Iterator[None]:
+    """Turn the errors of ``zipfile`` for an archive that is damaged into ValueErrors."""
     try:
-        source = io.BytesIO(archive) if isinstance(archive, bytes) else archive
-        size = len(archive) if isinstance(archive, bytes) else archive.stat().st_size
-        with zipfile.ZipFile(source) as opened:
-            entries = opened.infolist()
-            _check_entries(entries, size)
-            arrays = {}
-            for entry in entries:
-                with opened.open(entry) as file:
-                    arrays[entry.filename.removesuffix(_SUFFIX)] = _read_array(file, entry, kinds)
-            return arrays
+        yield
     except (zipfile.BadZipFile, NotImplementedError, EOFError, OverflowError) as error:
         raise ValueError(str(error) or "the archive is cut short") from error
     except OSError as error:
