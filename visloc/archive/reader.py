@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -188,36 +189,16 @@ def open_map(folder: Path) -> Map:
     """
     manifest = read_manifest(folder)
     check_files(folder, manifest)
+    _check_listed(folder, manifest)
+    _check_photos(folder, manifest)
+    outline = outline_of(folder, manifest)
+    images = read_images(folder, outline)
     counts, local = manifest.counts, manifest.local_features
     n, num_landmarks, m = counts.images, counts.landmarks, counts.observations
-    files = {
-        record.fingerprint.name: f"global/{record.fingerprint.file_stem}"
-        for record in manifest.global_features
-    }
-    if len(set(files.values())) != len(manifest.global_features):
-        raise MapCorrupt(
-            "map.manifest",
-            "two global descriptors of one name",
-            field=str(folder / "manifest.json"),
-            got=", ".join(record.fingerprint.name for record in manifest.global_features),
-        )
-    described = [f + end for f in files.values() for end in (".npy", ".model.npz")]
-    for record in manifest.global_features:
-        described += [name for name, _, _ in _beside_rows(record, n)]
-    for name in (*_ARRAYS, *described):
-        if name not in manifest.files:
-            raise MapCorrupt(
-                "map.file_missing", "a file that every such map has is not listed", field=name
-            )
-    _check_photos(folder, manifest)
-    images = read_record(folder, "images.json", ImagesFile).images
-    outline = outline_of(folder, manifest)
-    if len(images) != n or any(image.camera not in outline.cameras for image in images):
-        raise MapCorrupt(
-            "map.images",
-            "the photos do not fit the manifest or the cameras",
-            field=str(folder / "images.json"),
-        )
+
+    def array(stem: str, dtype: str, *shape: int, before: str | None = None) -> NDArray[Any]:
+        return map_array(folder, f"{stem}.npy", dtype, shape, before=before)
+
     return Map(
         path=folder,
         manifest=manifest,
@@ -225,36 +206,49 @@ def open_map(folder: Path) -> Map:
         rigs=outline.rigs,
         images=images,
         image_poses=map_array(folder, "image_poses.npy", "<f8", (n, 7), load=True),
-        landmarks=map_array(folder, "landmarks.npy", "<f4", (num_landmarks, 3)),
-        track_lengths=map_array(folder, "landmark_track_length.npy", "<u2", (num_landmarks,)),
-        errors_px=map_array(folder, "landmark_error_px.npy", "<f2", (num_landmarks,), before="<f4"),
-        angles_deg=map_array(
-            folder, "landmark_angle_deg.npy", "<f2", (num_landmarks,), before="<f4"
-        )
+        landmarks=array("landmarks", "<f4", num_landmarks, 3),
+        track_lengths=array("landmark_track_length", "<u2", num_landmarks),
+        errors_px=array("landmark_error_px", "<f2", num_landmarks, before="<f4"),
+        angles_deg=array("landmark_angle_deg", "<f2", num_landmarks, before="<f4")
         if "landmark_angle_deg.npy" in manifest.files
         else np.broadcast_to(np.float16(np.nan), num_landmarks),
-        colors=map_array(folder, "landmark_rgb.npy", "|u1", (num_landmarks, 3))
+        colors=array("landmark_rgb", "|u1", num_landmarks, 3)
         if "landmark_rgb.npy" in manifest.files
         else None,
         observation_offsets=map_array(
             folder, "observation_offsets.npy", "<i8", (n + 1,), load=True
         ),
-        observation_landmarks=map_array(folder, "observation_landmarks.npy", "<u4", (m,)),
-        observation_descriptors=map_array(
-            folder, "observation_descriptors.npy", "|i1", (m, local.descriptor_dim)
-        ),
-        observation_keypoints=map_array(
-            folder,
-            "observation_keypoints.npy",
-            "<f4" if local.keypoint_step_px is None else "<i2",
-            (m, 2),
+        observation_landmarks=array("observation_landmarks", "<u4", m),
+        observation_descriptors=array("observation_descriptors", "|i1", m, local.descriptor_dim),
+        observation_keypoints=array(
+            "observation_keypoints", "<f4" if local.keypoint_step_px is None else "<i2", m, 2
         ),
         global_descriptors={
             record.fingerprint.name: _map_rows(folder, record, n)
             for record in manifest.global_features
         },
-        global_models={name: read_model(folder, f"{f}.model.npz") for name, f in files.items()},
+        global_models={
+            record.fingerprint.name: read_model(folder, _model_file(record))
+            for record in manifest.global_features
+        },
     )
+
+
+def read_images(folder: Path, outline: MapOutline) -> tuple[ImageRecord, ...]:
+    """Read names and cameras of the mapping photos of a map.
+
+    Raises:
+        MapCorrupt: ``map.json``, ``map.images``.
+    """
+    images = read_record(folder, "images.json", ImagesFile).images
+    num = outline.manifest.counts.images
+    if len(images) != num or any(image.camera not in outline.cameras for image in images):
+        raise MapCorrupt(
+            "map.images",
+            "the photos do not fit the manifest or the cameras",
+            field=str(folder / "images.json"),
+        )
+    return images
 
 
 def verify_map(folder: Path) -> Map:
@@ -293,8 +287,7 @@ def verify_map(folder: Path) -> Map:
 
 def _map_rows(folder: Path, record: GlobalFeaturesRecord, num_images: int) -> GlobalRows:
     dtype = "|i1" if record.bits == 8 else "<f4"
-    name = f"global/{record.fingerprint.file_stem}.npy"
-    values = map_array(folder, name, dtype, (num_images, record.dim))
+    values = map_array(folder, _rows_file(record), dtype, (num_images, record.dim))
     beside = [map_array(folder, *one) for one in _beside_rows(record, num_images)]
     scales = beside.pop(0) if record.bits == 8 else None
     return GlobalRows(values, scales, Clusters(*beside) if beside else None)
@@ -333,6 +326,34 @@ def _are_good(clusters: Clusters, num_images: int) -> bool:
         and int(members.max()) < num_images
         and bool((np.bincount(members, minlength=num_images) == 1).all())
     )
+
+
+def _check_listed(folder: Path, manifest: Manifest) -> None:
+    """Refuse a manifest that does not list the files that every such map has."""
+    records = manifest.global_features
+    if len(set(map(_rows_file, records))) != len(records):
+        raise MapCorrupt(
+            "map.manifest",
+            "two global descriptors of one name",
+            field=str(folder / "manifest.json"),
+            got=", ".join(record.fingerprint.name for record in records),
+        )
+    files = [*_ARRAYS, *map(_rows_file, records), *map(_model_file, records)]
+    for record in records:
+        files += [name for name, _, _ in _beside_rows(record, manifest.counts.images)]
+    for name in files:
+        if name not in manifest.files:
+            raise MapCorrupt(
+                "map.file_missing", "a file that every such map has is not listed", field=name
+            )
+
+
+def _rows_file(record: GlobalFeaturesRecord) -> str:
+    return f"global/{record.fingerprint.file_stem}.npy"
+
+
+def _model_file(record: GlobalFeaturesRecord) -> str:
+    return f"global/{record.fingerprint.file_stem}.model.npz"
 
 
 def _check_photos(folder: Path, manifest: Manifest) -> None:

@@ -146,32 +146,9 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
     Returns:
         The version.
     """
-    landmarks = content.landmarks
-    files = Files(folder)
-    files.write_json(
-        "cameras.json",
-        {
-            "cameras": {
-                key: {"model": c.model, "width": c.width, "height": c.height, "params": c.params}
-                for key, c in content.cameras.items()
-            },
-            "rigs": {
-                rig: {key: list(row) for key, row in members.items()}
-                for rig, members in content.rigs.items()
-            },
-        },
-    )
-    files.write_json("images.json", {"images": [asdict(image) for image in content.images]})
-    files.write_array("image_poses.npy", "<f8", content.image_poses)
-    files.write_array("landmarks.npy", "<f4", landmarks.points)
-    files.write_array("landmark_track_length.npy", "<u2", landmarks.track_lengths)
-    files.write_array("landmark_error_px.npy", "<f2", landmarks.errors_px, _within_float16)
-    if any(not np.isnan(block).all() for block in _blocks(landmarks.angles_deg)):
-        files.write_array("landmark_angle_deg.npy", "<f2", landmarks.angles_deg, _within_float16)
-    if landmarks.colors is not None:
-        files.write_array("landmark_rgb.npy", "|u1", landmarks.colors)
-    files.write_array("observation_offsets.npy", "<i8", landmarks.offsets)
-    files.write_array("observation_landmarks.npy", "<u4", landmarks.observed)
+    files, landmarks = Files(folder), content.landmarks
+    _write_images(files, content)
+    _write_landmarks(files, landmarks)
     keypoint_step = _write_keypoints(files, landmarks.keypoints, content.cameras)
     scale = _write_descriptors(
         files,
@@ -180,22 +157,12 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
         content.descriptor_scale,
     )
     clusters = [_write_global(files, features) for features in content.global_features]
-    extent = landmarks.points.min(axis=0), landmarks.points.max(axis=0)
     manifest: dict[str, Any] = {
         "format": FORMAT,
         "format_version": f"{FORMAT_MAJOR}.{FORMAT_MINOR}",
         "id": map_id,
         "created": created,
-        "world": {
-            "metric": content.metric,
-            "origin": landmarks.origin.tolist(),
-            "extent": {
-                "min": (landmarks.origin + extent[0]).tolist(),
-                "max": (landmarks.origin + extent[1]).tolist(),
-            },
-            **({} if content.anchor is None else {"anchor": content.anchor.model_dump()}),
-            **({} if content.gravity is None else {"gravity": list(content.gravity)}),
-        },
+        "world": _world(content),
         "method": {"name": content.method, "settings": dict(content.settings)},
         "local_features": {
             "fingerprint": content.local_fingerprint.model_dump(),
@@ -207,12 +174,12 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
         },
         "global_features": [
             {
-                "fingerprint": f.fingerprint.model_dump(),
-                "dim": f.descriptors.shape[1],
+                "fingerprint": features.fingerprint.model_dump(),
+                "dim": features.descriptors.shape[1],
                 "bits": 8,
                 "clusters": count,
             }
-            for f, count in zip(content.global_features, clusters, strict=True)
+            for features, count in zip(content.global_features, clusters, strict=True)
         ],
         "retrieval": RetrievalRecord.of(content.fusion).model_dump(mode="json"),
         "counts": {
@@ -324,6 +291,50 @@ def _within_float16(values: NDArray[Any]) -> NDArray[Any]:
     """Clip to what float16 can hold; NaN stays."""
     limit = float(np.finfo(np.float16).max)
     return np.asarray(np.clip(values, -limit, limit))
+
+
+def _world(content: MapContent) -> dict[str, Any]:
+    landmarks = content.landmarks
+    low, high = landmarks.points.min(axis=0), landmarks.points.max(axis=0)
+    world: dict[str, Any] = {
+        "metric": content.metric,
+        "origin": landmarks.origin.tolist(),
+        "extent": {
+            "min": (landmarks.origin + low).tolist(),
+            "max": (landmarks.origin + high).tolist(),
+        },
+    }
+    if content.anchor is not None:
+        world["anchor"] = content.anchor.model_dump()
+    if content.gravity is not None:
+        world["gravity"] = list(content.gravity)
+    return world
+
+
+def _write_images(files: Files, content: MapContent) -> None:
+    cameras = {
+        key: {"model": c.model, "width": c.width, "height": c.height, "params": c.params}
+        for key, c in content.cameras.items()
+    }
+    rigs = {
+        rig: {key: list(row) for key, row in members.items()}
+        for rig, members in content.rigs.items()
+    }
+    files.write_json("cameras.json", {"cameras": cameras, "rigs": rigs})
+    files.write_json("images.json", {"images": [asdict(image) for image in content.images]})
+    files.write_array("image_poses.npy", "<f8", content.image_poses)
+
+
+def _write_landmarks(files: Files, landmarks: Landmarks) -> None:
+    files.write_array("landmarks.npy", "<f4", landmarks.points)
+    files.write_array("landmark_track_length.npy", "<u2", landmarks.track_lengths)
+    files.write_array("landmark_error_px.npy", "<f2", landmarks.errors_px, _within_float16)
+    if any(not np.isnan(block).all() for block in _blocks(landmarks.angles_deg)):
+        files.write_array("landmark_angle_deg.npy", "<f2", landmarks.angles_deg, _within_float16)
+    if landmarks.colors is not None:
+        files.write_array("landmark_rgb.npy", "|u1", landmarks.colors)
+    files.write_array("observation_offsets.npy", "<i8", landmarks.offsets)
+    files.write_array("observation_landmarks.npy", "<u4", landmarks.observed)
 
 
 def _write_keypoints(
