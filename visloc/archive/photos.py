@@ -1,4 +1,4 @@
-"""Where a map's photos were taken, without opening the map."""
+"""Poses of a map's photos, without opening the map."""
 
 from __future__ import annotations
 
@@ -18,9 +18,8 @@ class MappingPhotos:
     """The mapping photos.
 
     Attributes:
-        images: n names and cameras.
-        positions: (n, 3) float64, the camera centres in the world.
-        orientations: (n, 4) float64, the rotations of world_from_cam as w, x, y, z with w >= 0.
+        positions: (n, 3) float64, camera centres in the world.
+        orientations: (n, 4) float64, rotations of world_from_cam as w, x, y, z with w >= 0.
     """
 
     images: tuple[ImageRecord, ...]
@@ -29,7 +28,7 @@ class MappingPhotos:
 
 
 def read_photos(folder: Path, outline: MapOutline) -> MappingPhotos:
-    """Read the mapping photos of a map whose outline was read before.
+    """Read the mapping photos of a map whose outline was read.
 
     Raises:
         MapCorrupt: ``map.json``, ``map.images``, ``map.array``.

@@ -1,4 +1,4 @@
-"""A map in memory: small things read, large arrays mapped from disk."""
+"""A map in memory: small files are read, large arrays are mapped from disk."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ Model = Mapping[str, NDArray[np.float32]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapOutline:
-    """What a version of a map says about itself: its small files, read.
+    """The small files of a map's version.
 
     Attributes:
         manifest: ``manifest.json``.
         cameras: intrinsics by camera id.
-        rigs: of each rig, cam_from_rig by camera id.
+        rigs: cam_from_rig by rig id and camera id.
     """
 
     manifest: Manifest
@@ -60,10 +60,7 @@ class MapOutline:
 
     @property
     def gravity(self) -> NDArray[np.float64] | None:
-        """(3,) unit vector that points down in the world; None where that is not known.
-
-        A geodetic anchor tells it too.
-        """
+        """(3,) unit vector that points down in the world; None when unknown."""
         world = self.manifest.world
         if world.gravity is not None:
             return np.array(world.gravity)
@@ -71,23 +68,23 @@ class MapOutline:
 
     @property
     def fusion(self) -> LateFusion:
-        """How queries rank its photos unless they say otherwise."""
+        """How queries rank its photos by default."""
         return self.manifest.retrieval.late_fusion
 
     @property
     def geodetic(self) -> Geodetic | None:
-        """Where the world lies on Earth; None where that is not known."""
+        """Where the world lies on Earth; None when unknown."""
         anchor = self.manifest.world.anchor
         return None if anchor is None else anchor.geodetic
 
     @property
     def place(self) -> GeoCircle | None:
-        """A circle on Earth that holds the map; None where that is not known."""
+        """A circle on Earth that holds the map; None when unknown."""
         return circle_of(self.manifest.world)
 
     @property
     def size_bytes(self) -> int:
-        """Size of all files but the manifest."""
+        """Size of all files except the manifest."""
         return sum(entry.size for entry in self.manifest.files.values())
 
 
@@ -96,22 +93,20 @@ class Map(MapOutline):
     """One version of a map, open for reading. Files stay mapped while it lives.
 
     Attributes:
-        path: its folder.
-        images: the mapping photos.
         image_poses: (n, 7) float64, cam_from_world as qw qx qy qz tx ty tz.
         landmarks: (P, 3) float32, relative to the manifest's origin.
         track_lengths: (P,) uint16, mapping photos that see each landmark.
         errors_px: (P,) float16 (float32 before format 2.0), mean reprojection error; NaN where it
             does not apply.
-        angles_deg: (P,) as ``errors_px``, largest angle between viewing rays; NaN where not
+        angles_deg: (P,) of the same type, largest angle between viewing rays; NaN where it was not
             computed.
         colors: (P, 3) uint8 RGB; None when the map has none.
         observation_offsets: (n + 1,) int64; rows offsets[i]:offsets[i + 1] belong to photo i.
         observation_landmarks: (M,) uint32 rows of ``landmarks``.
-        observation_descriptors: (M, D) int8; times the manifest's ``descriptor_scale``.
-        observation_keypoints: (M, 2) int16, or float32; ``keypoints`` reads them as pixels.
+        observation_descriptors: (M, D) int8, in steps of the manifest's ``descriptor_scale``.
+        observation_keypoints: (M, 2) int16 or float32; ``keypoints`` reads them as pixels.
         global_descriptors: unit rows (n, D) by name.
-        global_models: the arrays of each global descriptor's model.
+        global_models: arrays of the models by descriptor.
     """
 
     path: Path
@@ -132,13 +127,13 @@ class Map(MapOutline):
     def observations(self, image: int) -> tuple[NDArray[np.uint32], NDArray[np.int8]]:
         """Landmarks (m,) that one photo observes and their descriptors (m, D), not copied.
 
-        Descriptors times the manifest's ``descriptor_scale`` are unit rows but for the rounding.
+        Descriptors times the manifest's ``descriptor_scale`` are unit rows, except for rounding.
         """
         start, stop = self.observation_offsets[image], self.observation_offsets[image + 1]
         return self.observation_landmarks[start:stop], self.observation_descriptors[start:stop]
 
     def keypoints(self, image: int) -> NDArray[np.float32]:
-        """Where one photo sees its landmarks, (m, 2) pixels in the order of ``observations``."""
+        """Keypoints (m, 2) of one photo in pixels, in the order of ``observations``."""
         start, stop = self.observation_offsets[image], self.observation_offsets[image + 1]
         keypoints = self.observation_keypoints[start:stop].astype(np.float32)
         step = self.manifest.local_features.keypoint_step_px
@@ -151,7 +146,7 @@ class Map(MapOutline):
 
 
 def read_outline(folder: Path) -> MapOutline:
-    """Read the small files of a map that say what it is; its arrays need not be there.
+    """Read the small files of a map; its arrays need not be there.
 
     Raises:
         MapCorrupt: with the file that is wrong.
@@ -160,7 +155,7 @@ def read_outline(folder: Path) -> MapOutline:
 
 
 def outline_of(folder: Path, manifest: Manifest) -> MapOutline:
-    """Read what a map whose manifest is read says of itself besides; raises ``map.cameras``."""
+    """Read the cameras of a map whose manifest was read; raises ``map.cameras``."""
     cameras = read_record(folder, "cameras.json", CamerasFile)
     try:
         return MapOutline(
@@ -181,8 +176,8 @@ def outline_of(folder: Path, manifest: Manifest) -> MapOutline:
 def open_map(folder: Path) -> Map:
     """Open a map after checking its manifest and the presence and size of its files.
 
-    Contents are checked when a map is published and by ``verify_map``, not here: opening a map
-    of many gigabytes takes milliseconds.
+    Contents are not checked, so that a map of many gigabytes opens in milliseconds: they are
+    checked when a map is published and by ``verify_map``.
 
     Raises:
         MapCorrupt: with the file that is wrong.
@@ -296,7 +291,7 @@ def _map_rows(folder: Path, record: GlobalFeaturesRecord, num_images: int) -> Gl
 def _beside_rows(
     record: GlobalFeaturesRecord, num_images: int
 ) -> list[tuple[str, str, tuple[int, ...]]]:
-    """Name, type and shape of the arrays that a global descriptor has beside its rows."""
+    """Name, type and shape of a global descriptor's arrays besides its rows."""
     stem, clusters = record.fingerprint.file_stem, record.clusters
     beside: list[tuple[str, str, tuple[int, ...]]] = []
     if record.bits == 8:
@@ -311,14 +306,14 @@ def _beside_rows(
 
 
 def _lead_through(offsets: NDArray[np.int64], num_rows: int) -> bool:
-    """Whether offsets lead from the first row to the last and never back."""
-    # Compared, not subtracted: differences of large numbers wrap around.
+    """Tell whether offsets lead from the first row to the last and never back."""
+    # Compared, not subtracted: differences of large numbers overflow.
     ascend = bool((offsets[1:] >= offsets[:-1]).all())
     return ascend and int(offsets[0]) == 0 and int(offsets[-1]) == num_rows
 
 
 def _are_good(clusters: Clusters, num_images: int) -> bool:
-    """Whether clusters hold every photo once."""
+    """Tell whether clusters hold every photo once."""
     offsets, members = clusters.offsets, clusters.members
     return (
         is_finite(clusters.centers)
@@ -357,7 +352,7 @@ def _model_file(record: GlobalFeaturesRecord) -> str:
 
 
 def _check_photos(folder: Path, manifest: Manifest) -> None:
-    """Refuse a map that keeps some of its photos only, or large ones."""
+    """Refuse a map that keeps only some of its photos, or large ones."""
     if not any(name.startswith("photos/") for name in manifest.files):
         return
     files = [manifest.files.get(photo_file(row)) for row in range(manifest.counts.images)]
@@ -373,7 +368,7 @@ def _check_photos(folder: Path, manifest: Manifest) -> None:
 
 
 def _are_unit(rows: NDArray[np.float64]) -> bool:
-    with np.errstate(over="ignore"):  # the square of a number out of range is one as well
+    with np.errstate(over="ignore"):  # an infinite norm is not 1 either
         return bool((np.abs(np.linalg.norm(rows, axis=1) - 1) < 1e-6).all())
 
 
