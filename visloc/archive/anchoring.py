@@ -8,10 +8,10 @@ import os
 import shutil
 from pathlib import Path
 
-from visloc.archive.checks import content_hash, json_text, manifest_hash
 from visloc.archive.places import down_of
 from visloc.archive.reader import Map
 from visloc.archive.schema import Anchor
+from visloc.archive.writer import Files
 
 # Errors of file systems that have no hard links, or none between two folders.
 _NO_LINKS = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP)
@@ -47,16 +47,8 @@ def write_anchored(opened: Map, folder: Path, anchor: Anchor, *, version: str, c
     for name in opened.manifest.files:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         link_or_copy(opened.path / name, folder / name)
-    digest = content_hash(manifest)
-    manifest["content_hash"] = digest
-    manifest["version"] = version + digest[:8] if version.endswith("-") else version
     manifest["created"] = created
-    manifest["manifest_hash"] = manifest_hash(manifest)
-    with (folder / "manifest.json").open("w", encoding="utf-8") as file:
-        file.write(json_text(manifest))
-        file.flush()
-        os.fsync(file.fileno())
-    return str(manifest["version"])
+    return Files(folder).finish(manifest, version)
 
 
 def link_or_copy(source: Path, target: Path) -> None:

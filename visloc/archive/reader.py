@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from visloc.archive.schema import (
     Manifest,
     photo_file,
 )
+from visloc.archive.set_schema import SetManifest
 from visloc.errors import InvalidInput, MapCorrupt
 from visloc.geometry import Camera, Pose
 from visloc.retrieval.fusion import LateFusion
@@ -37,10 +38,39 @@ from visloc.retrieval.rows import GlobalRows
 from visloc.retrieval.shortlist import Clusters
 
 Model = Mapping[str, NDArray[np.float32]]
+ManifestType = TypeVar("ManifestType", Manifest, SetManifest)
+
+
+class Outline(Generic[ManifestType]):
+    """What the manifest of a map or a set says."""
+
+    __slots__ = ()
+    manifest: ManifestType
+
+    @property
+    def ref(self) -> str:
+        """``id@version``."""
+        return f"{self.manifest.id}@{self.manifest.version}"
+
+    @property
+    def geodetic(self) -> Geodetic | None:
+        """Where the frame lies on Earth; None when unknown."""
+        anchor = self.manifest.world.anchor
+        return None if anchor is None else anchor.geodetic
+
+    @property
+    def place(self) -> GeoCircle | None:
+        """A circle on Earth that holds the map or all tiles; None when unknown."""
+        return circle_of(self.manifest.world)
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the version's own files except the manifest."""
+        return sum(entry.size for entry in self.manifest.files.values())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MapOutline:
+class MapOutline(Outline[Manifest]):
     """The small files of a map's version.
 
     Attributes:
@@ -54,11 +84,6 @@ class MapOutline:
     rigs: Mapping[str, Mapping[str, Pose]]
 
     @property
-    def ref(self) -> str:
-        """``id@version``."""
-        return f"{self.manifest.id}@{self.manifest.version}"
-
-    @property
     def gravity(self) -> NDArray[np.float64] | None:
         """(3,) unit vector that points down in the world; None when unknown."""
         world = self.manifest.world
@@ -70,22 +95,6 @@ class MapOutline:
     def fusion(self) -> LateFusion:
         """How queries rank its photos by default."""
         return self.manifest.retrieval.late_fusion
-
-    @property
-    def geodetic(self) -> Geodetic | None:
-        """Where the world lies on Earth; None when unknown."""
-        anchor = self.manifest.world.anchor
-        return None if anchor is None else anchor.geodetic
-
-    @property
-    def place(self) -> GeoCircle | None:
-        """A circle on Earth that holds the map; None when unknown."""
-        return circle_of(self.manifest.world)
-
-    @property
-    def size_bytes(self) -> int:
-        """Size of all files except the manifest."""
-        return sum(entry.size for entry in self.manifest.files.values())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

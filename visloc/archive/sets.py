@@ -18,9 +18,8 @@ from visloc.archive.checks import (
     read_any_manifest,
     read_model,
 )
-from visloc.archive.places import GeoCircle, circle_of
-from visloc.archive.reader import MapOutline, outline_of, verify_map
-from visloc.archive.schema import Extent, FingerprintRecord, Geodetic
+from visloc.archive.reader import MapOutline, Outline, outline_of, verify_map
+from visloc.archive.schema import Extent, FingerprintRecord
 from visloc.archive.set_schema import (
     SET_FORMAT,
     SET_MAJOR,
@@ -42,7 +41,7 @@ _MODEL_ARRAYS = ("vocabulary", "mean", "axes", "planes")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SetOutline:
+class SetOutline(Outline[SetManifest]):
     """The manifest of a set, and arrays over its T tiles.
 
     Attributes:
@@ -56,11 +55,6 @@ class SetOutline:
     reaches: NDArray[np.float64]
 
     @property
-    def ref(self) -> str:
-        """``id@version``."""
-        return f"{self.manifest.id}@{self.manifest.version}"
-
-    @property
     def tiles(self) -> tuple[TileRecord, ...]:
         return self.manifest.tiles
 
@@ -70,22 +64,6 @@ class SetOutline:
         # Not from the anchor: that one of its maps lies on Earth says nothing about the others.
         gravity = self.manifest.world.gravity
         return None if gravity is None else np.array(gravity)
-
-    @property
-    def geodetic(self) -> Geodetic | None:
-        """Where the set's frame lies on Earth; None when unknown."""
-        anchor = self.manifest.world.anchor
-        return None if anchor is None else anchor.geodetic
-
-    @property
-    def place(self) -> GeoCircle | None:
-        """A circle on Earth that holds all tiles; None when unknown."""
-        return circle_of(self.manifest.world)
-
-    @property
-    def size_bytes(self) -> int:
-        """Size of the set's own files except the manifest, without its tiles."""
-        return sum(entry.size for entry in self.manifest.files.values())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
