@@ -1,7 +1,7 @@
 """Reading ready-made features: keypoints, descriptors and global features of any type.
 
-The files come from anywhere. Types are looked up in a table, sizes are checked before anything
-is read, and paths stay inside the folder.
+The files are not trusted: types are looked up in a table, sizes are checked before reading, and
+paths stay inside the folder.
 """
 
 from __future__ import annotations
@@ -34,16 +34,14 @@ class FeatureSet:
     """The files of one kind and type of features, open for reading. It can be pickled.
 
     Attributes:
-        kind: ``keypoints``, ``descriptors`` or ``global_features``.
         type_name: folder TYPE.
-        name: of the method, as the config file has it.
-        dtype: of one number.
+        name: name of the method in the config file.
         dsize: numbers per row.
         keypoints_type: TYPE of the keypoints that descriptors belong to; None for other kinds.
-        metric_type: how rows are compared, as the config file has it; None for keypoints.
+        metric_type: how rows are compared, as in the config file; None for keypoints.
         folder: holds the config file, and the files of the images or ``<kind>.tar``.
-        members: offset and size by file name in ``<kind>.tar``; None without it. Where there is
-            one, files beside it are not looked at.
+        members: offset and size by file name in ``<kind>.tar``, which hides other files; None
+            without it.
     """
 
     kind: FeatureKind
@@ -66,7 +64,7 @@ class FeatureSet:
         return (self.folder / name).is_file() if self.members is None else name in self.members
 
     def count(self, image_path: str) -> int:
-        """Return how many rows an image has, without reading them.
+        """Return the number of rows of an image without reading them.
 
         Raises:
             DatasetError: as ``read``.
@@ -99,7 +97,7 @@ class FeatureSet:
         return np.frombuffer(content, self.dtype).reshape(num_rows, self.dsize).copy()
 
     def label(self, image_path: str) -> str:
-        """Name the file of an image for a person."""
+        """Name the file of an image, for error messages."""
         holder = self.folder if self.members is None else self.folder / f"{self.kind}.tar"
         return str(holder / self._file_name(image_path))
 
@@ -185,10 +183,10 @@ def open_features(
             ``<kind>/TYPE``, in this order.
 
     Raises:
-        InvalidInput: ``kapture.feature_type`` for a name that no folder of features has.
-        DatasetError: ``kapture.no_features`` (it tells where it looked and which types exist),
-            ``kapture.version`` for the layout of kapture 1.0, ``kapture.tar``, and what is wrong
-            in the config file with its line.
+        InvalidInput: ``kapture.feature_type`` for an impossible name.
+        DatasetError: ``kapture.no_features`` with the places and existing types;
+            ``kapture.version`` for the layout of kapture 1.0; ``kapture.tar``; errors of the config
+            file with its line.
     """
     if not _TYPE_NAME.fullmatch(type_name):
         raise InvalidInput(
@@ -208,10 +206,10 @@ def open_features(
 def open_local_features(
     root: Path, type_name: str, features_dir: Path | None = None
 ) -> tuple[FeatureSet, FeatureSet]:
-    """Find the descriptors of one type and the keypoints that they say they belong to.
+    """Find the descriptors of one type and the keypoints that they belong to.
 
     Returns:
-        The keypoints and the descriptors. Types can differ: a published dataset describes
+        The keypoints and the descriptors. Their types can differ: a published dataset describes
         keypoints of type HessianAffine by descriptors of type HOG.
 
     Raises:
@@ -225,7 +223,7 @@ def open_local_features(
 def feature_types(
     root: Path, kind: FeatureKind, features_dir: Path | None = None
 ) -> tuple[str, ...]:
-    """Return the types of which ``open_features`` finds features of this kind, sorted."""
+    """Return the types that ``open_features`` finds, sorted."""
     found = set()
     for pattern in _patterns(kind, features_dir):
         before, after = (part.strip("/") for part in pattern.split("{}"))

@@ -1,4 +1,4 @@
-"""Writing features in kapture's layout, one image at a time, so that other tools can run on them.
+"""Writing features in kapture's layout, one image at a time, for other tools.
 
 ``reconstruction/keypoints/TYPE/IMAGE.kpt`` and its siblings hold rows of numbers, little-endian
 and without a header; one line in ``keypoints.txt`` says of which type and how many per row.
@@ -30,12 +30,12 @@ def write_local_features(
 
     Args:
         root: the dataset; its ``sensors`` need not exist.
-        feature_type: folder TYPE, for keypoints and descriptors alike.
-        image_path: the image's identity, as in ``records_camera.txt``.
-        keypoints: (N, K >= 2): x, y in pixels (top-left centre at 0.5), then what the type adds,
-            such as the scale. N may be 0.
+        feature_type: folder TYPE of both.
+        image_path: as in ``records_camera.txt``.
+        keypoints: (N, K >= 2): x, y in pixels (top-left centre at 0.5), then values such as the
+            scale. N may be 0.
         descriptors: (N, D), compared by their L2 distance.
-        name: of the method, for the reader of ``keypoints.txt``.
+        name: name of the method, for ``keypoints.txt``.
 
     Raises:
         Conflict: ``kapture.feature_type`` if TYPE exists with other names, numbers or sizes.
@@ -57,7 +57,7 @@ def write_local_features(
 def write_keypoints(
     root: Path, feature_type: str, image_path: str, keypoints: NDArray[np.generic], *, name: str
 ) -> None:
-    """Write the keypoints (N, K >= 2) of one image that has no descriptors.
+    """Write the keypoints (N, K >= 2) of one image without descriptors.
 
     Raises:
         Conflict, InvalidInput, DatasetError: as ``write_local_features``.

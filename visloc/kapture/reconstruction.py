@@ -1,4 +1,4 @@
-"""3D points of a dataset and which keypoints see them: points3d.txt and observations.txt."""
+"""3D points of a dataset and their observations: points3d.txt and observations.txt."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class Reconstruction:
         points: (P, 3) float64 in the world.
         colors: (P, 3) uint8 RGB; None without.
         keypoints_type: folder TYPE of the keypoints; None when there are no observations.
-        images: paths of the images that observe, each once.
-        observations: (M, 3) int64 rows: row of ``points``, row of ``images``, row of that image's
+        images: paths of the observing images, each once.
+        observations: (M, 3) int64: row of ``points``, row of ``images``, row of that image's
             keypoints. An image can see a point several times.
     """
 
@@ -52,7 +52,7 @@ def read_reconstruction(
         root: the dataset.
         keypoints_type: folder TYPE of the keypoints; None takes the only one there is.
         features_dir: where keypoints lie outside the dataset, as for ``open_features``.
-            Where they are found, rows are checked against their number.
+            If keypoints are found, rows are checked against their number.
 
     Returns:
         None if the dataset has no points.
@@ -84,8 +84,8 @@ def read_reconstruction(
 def write_reconstruction(root: Path, reconstruction: Reconstruction) -> None:
     """Write ``points3d.txt`` and, if anything is observed, ``observations.txt``.
 
-    Numbers come back as they were; observations come back sorted by point. Each file is complete
-    or not there, and the points come last: observations alone are not read.
+    Reading returns the same numbers, with observations sorted by point. Each file is written
+    atomically, the points last: observations without points are ignored.
 
     Raises:
         Conflict: ``kapture.exists`` if one of the files exists.
@@ -138,7 +138,7 @@ def _read_points(table: Table) -> tuple[NDArray[np.float64], NDArray[np.uint8] |
 
 
 class _Tracks:
-    """Observations by one type of keypoints, taken from the table line by line."""
+    """Observations by one type of keypoints, collected line by line."""
 
     def __init__(self, table: Table, num_points: int, keypoints: FeatureSet | None) -> None:
         self.rows: dict[str, int] = {}  # of images, by path
@@ -179,7 +179,7 @@ class _Tracks:
     def _row(self, name: str) -> int:
         row = self._row_of_name.get(name)
         if row is None:
-            path = _path(self._table, name)
+            path = self._table.path(name, "the dataset")
             if path not in self.rows:
                 self.rows[path] = len(self.rows)
                 keypoints = self._keypoints
@@ -230,7 +230,7 @@ def _read_observations(
 
 def _indices(table: Table, texts: list[str], limit: int, what: str) -> list[int]:
     joined = "".join(texts)
-    # int() would also take signs, underscores, digits of other scripts, and texts of any length.
+    # int() also accepts signs, underscores, digits of other scripts, and texts of any length.
     if all(texts) and joined.isascii() and (joined.isdigit() or not texts):
         indices = [int(text) for text in texts if len(text) <= _MAX_DIGITS]
         if len(indices) == len(texts) and max(indices, default=-1) < limit:
@@ -241,18 +241,6 @@ def _indices(table: Table, texts: list[str], limit: int, what: str) -> list[int]
         expected=f"integers from 0 to {limit - 1}" if limit else "no rows: there are none",
         got=", ".join(texts),
     )
-
-
-def _path(table: Table, text: str) -> str:
-    try:
-        return relative_path(text)
-    except ValueError:
-        raise table.error(
-            "kapture.path",
-            "not the path of an image",
-            expected="a relative path that stays inside the dataset",
-            got=text,
-        ) from None
 
 
 def _check(reconstruction: Reconstruction) -> None:
