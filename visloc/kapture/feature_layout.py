@@ -7,6 +7,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from visloc.errors import DatasetError
+from visloc.kapture.text import relative_path
+
 FeatureKind = Literal["keypoints", "descriptors", "global_features"]
 
 # Maps name the features of a dataset by this prefix and TYPE.
@@ -28,6 +31,24 @@ SUFFIXES: Mapping[FeatureKind, str] = {
     "descriptors": ".desc",
     "global_features": ".gfeat",
 }
+
+
+def feature_file(kind: FeatureKind, image_path: str) -> str:
+    """Return the path of an image's features in their folder.
+
+    Raises:
+        DatasetError: ``kapture.path``.
+    """
+    try:
+        return relative_path(image_path) + SUFFIXES[kind]
+    except ValueError:
+        raise DatasetError(
+            "kapture.path",
+            f"no {kind.replace('_', ' ')} can belong to this image",
+            field="image_path",
+            expected="a relative path that stays inside the dataset",
+            got=image_path,
+        ) from None
 
 
 def parse_dtype(text: str) -> np.dtype[Any] | None:

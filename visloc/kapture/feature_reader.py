@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.errors import DatasetError, InvalidInput
-from visloc.kapture.feature_layout import COLUMNS, DTYPES, SUFFIXES, FeatureKind, parse_dtype
+from visloc.kapture.feature_layout import COLUMNS, DTYPES, FeatureKind, feature_file, parse_dtype
 from visloc.kapture.feature_tar import index_tar
 from visloc.kapture.table import Table
-from visloc.kapture.text import relative_path
 
 _TYPE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _MAX_DSIZE = 2**20
@@ -60,7 +59,7 @@ class FeatureSet:
         Raises:
             DatasetError: ``kapture.path``.
         """
-        name = self._file_name(image_path)
+        name = feature_file(self.kind, image_path)
         return (self.folder / name).is_file() if self.members is None else name in self.members
 
     def count(self, image_path: str) -> int:
@@ -99,23 +98,11 @@ class FeatureSet:
     def label(self, image_path: str) -> str:
         """Name the file of an image, for error messages."""
         holder = self.folder if self.members is None else self.folder / f"{self.kind}.tar"
-        return str(holder / self._file_name(image_path))
-
-    def _file_name(self, image_path: str) -> str:
-        try:
-            return relative_path(image_path) + SUFFIXES[self.kind]
-        except ValueError:
-            raise DatasetError(
-                "kapture.path",
-                f"no {self.kind.replace('_', ' ')} can belong to this image",
-                field="image_path",
-                expected="a relative path that stays inside the dataset",
-                got=image_path,
-            ) from None
+        return str(holder / feature_file(self.kind, image_path))
 
     def _place(self, image_path: str) -> tuple[Path, int, int]:
         """File, offset and size in bytes of an image's rows."""
-        name = self._file_name(image_path)
+        name = feature_file(self.kind, image_path)
         if self.members is not None:
             if name in self.members:
                 return (self.folder / f"{self.kind}.tar", *self.members[name])

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.errors import Conflict, DatasetError, InvalidInput
-from visloc.kapture.feature_layout import COLUMNS, DTYPES, SUFFIXES, FeatureKind
-from visloc.kapture.text import is_field, is_folder_name, relative_path
+from visloc.kapture.feature_layout import COLUMNS, DTYPES, FeatureKind, feature_file
+from visloc.kapture.text import is_field, is_folder_name
 from visloc.kapture.writer import VERSION_LINE, write_atomically
 
 
@@ -94,16 +94,7 @@ def _write(
             expected="a folder name without commas",
             got=f"type {feature_type!r}, name {name!r}",
         )
-    try:
-        relative = relative_path(image_path)
-    except ValueError:
-        raise DatasetError(
-            "kapture.path",
-            "features cannot be written for this image",
-            field="image_path",
-            expected="a relative path that stays inside the dataset",
-            got=image_path,
-        ) from None
+    file = feature_file(kind, image_path)
     dtype_name = rows.dtype.newbyteorder("=").name
     if rows.ndim != 2 or rows.shape[1] == 0 or dtype_name not in DTYPES:
         raise InvalidInput(
@@ -116,7 +107,7 @@ def _write(
     folder = root / "reconstruction" / kind / feature_type
     fields = (name, dtype_name, str(rows.shape[1]), *last_fields)
     _declare(folder / f"{kind}.txt", COLUMNS[kind], fields)
-    path = folder / f"{relative}{SUFFIXES[kind]}"
+    path = folder / file
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, np.ascontiguousarray(rows, dtype=DTYPES[dtype_name]).tobytes())
 

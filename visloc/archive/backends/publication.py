@@ -4,13 +4,13 @@ There are no renames and no locks. ``manifest.json`` is written last: its presen
 version. On S3 every object of a version is written on the condition that it does not exist yet, so
 that no publisher changes what another one has written:
 
-- Publishers of the same version write the same names in the same order. Whoever finds an object
-  with other bytes gives up, so that only one of them gets to the manifest.
-- Objects with the same bytes are left as they are: an interrupted publication goes on.
-- Objects with other bytes that nobody has added to for ``LEFTOVER_S`` are deleted.
+- Publishers of the same version write in the same order. A publisher that finds an object with
+  other bytes gives up, so that only one of them reaches the manifest.
+- Objects with the same bytes stay: the next attempt continues an interrupted publication.
+- Objects with other bytes are deleted when nothing was added to them for ``LEFTOVER_S``.
 
-``current`` is one small object: the last writer wins. An update that is based on a version replaces
-``current`` on the condition that it still names that version.
+``current`` is one small object: the last writer wins. A publication that is based on a version
+replaces ``current`` on the condition that it still names that version.
 
 Other storages, and S3 servers that ignore conditions, have no such protection: there, only one
 server at a time may publish. A warning in the log says so.
@@ -33,6 +33,8 @@ from visloc.errors import Conflict
 logger = logging.getLogger(__name__)
 
 LEFTOVER_S = 3600.0
+# The last one is for two such writes at the same moment.
+_CONDITION_CODES = ("PreconditionFailed", "412", "ConditionalRequestConflict")
 _TOKEN = "publication"  # the metadata that tells the manifest of one publication from others
 
 
@@ -169,7 +171,8 @@ class Publisher:
     def _checks_conditions(self, files: dict[str, Path], place: str) -> bool:
         """Tell whether the storage refuses to overwrite: found out by creating a file twice."""
         if self._has_conditions is None:
-            name, path = min(files.items(), key=lambda item: item[1].stat().st_size)
+            # The first one, so that all publishers still write in the same order.
+            name, path = next(iter(files.items()))
             self._has_conditions = self._storage.is_s3 and not all(
                 self._create(path, f"{place}/{name}") for _ in range(2)
             )
@@ -186,7 +189,7 @@ def _is_condition(error: OSError) -> bool:
     # s3fs makes it a FileExistsError only if the server names the condition.
     response = getattr(error.__cause__, "response", {})
     code = response.get("Error", {}).get("Code")
-    return isinstance(error, FileExistsError) or code in ("PreconditionFailed", "412")
+    return isinstance(error, FileExistsError) or code in _CONDITION_CODES
 
 
 def _upload_runs(map_id: str, version: str) -> Conflict:
