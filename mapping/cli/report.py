@@ -26,7 +26,8 @@ from mapping.report import make_report_data
 from mapping.report.data import UP_IS_A_GUESS, decimals_of
 from mapping.report.html import report_page
 from visloc.archive import Map, open_map
-from visloc.drawing.detail_levels import detail_order, packed_points
+from visloc.drawing.detail_levels import detail_order
+from visloc.drawing.point_bytes import packed_points
 from visloc.errors import Conflict
 from visloc_web import report_parts
 

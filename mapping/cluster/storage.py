@@ -80,7 +80,7 @@ def open_store(maps_dir: Path, cache_dir: Path) -> MapStore:
         return MapStore(maps_dir)
     from visloc.archive.remote_store import RemoteMapStore  # its libraries are optional
 
-    return cast("MapStore", RemoteMapStore(str(maps_dir), cache_dir, sys.maxsize))
+    return RemoteMapStore(str(maps_dir), cache_dir, sys.maxsize)
 
 
 def lies_in(place: Path, other: Path) -> bool:

@@ -26,7 +26,7 @@ from mapping.frames.anchor import (
     coordinate_system,
 )
 from visloc.archive import Anchor, Geodetic, Map, MapStore, down_of, write_anchored
-from visloc.archive.store import outdated
+from visloc.archive.version_rules import outdated
 from visloc.errors import Conflict, DatasetError, InvalidInput
 from visloc.geodesy import enu_from_geodetic
 from visloc.geometry import Pose, Similarity

@@ -33,7 +33,8 @@ from visloc.archive.places import enu_of, origin_of
 from visloc.archive.schema import Extent, Geodetic
 from visloc.archive.set_rules import refuse_other_features
 from visloc.archive.sets import joined_extent
-from visloc.archive.store import checked_name, open_published
+from visloc.archive.store import open_published
+from visloc.archive.version_rules import checked_name
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound
 from visloc.geodesy import ecef_from_geodetic, geodetic_from_enu
 from visloc.geometry import Similarity

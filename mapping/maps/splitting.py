@@ -17,7 +17,8 @@ from visloc.archive import Map, MapContent, MapStore, write_map
 from visloc.archive.anchoring import link_or_copy
 from visloc.archive.checks import read_any_manifest
 from visloc.archive.schema import ID_PATTERN, photo_file
-from visloc.archive.store import checked_name, open_published
+from visloc.archive.store import open_published
+from visloc.archive.version_rules import checked_name
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound
 from visloc.geometry import Similarity
 from visloc.localization.constraints import MapGeometry

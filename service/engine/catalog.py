@@ -19,7 +19,7 @@ from service.workers.pool import Workers
 from service.workers.tasks import Vision
 from visloc.archive import SetOutline, read_any_outline
 from visloc.archive.set_rules import refuse_if_tile
-from visloc.archive.store import version_in_use
+from visloc.archive.version_rules import version_in_use
 from visloc.errors import MapCorrupt, NotFound, Unavailable, VislocError
 from visloc.types import Near
 

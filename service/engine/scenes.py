@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from service.engine.catalog import Catalog
 from visloc.archive import MapOutline
 from visloc.archive.photos import MappingPhotos, read_photos
-from visloc.drawing.detail_levels import detail_order, read_landmarks, read_points
+from visloc.drawing.detail_levels import detail_order, read_landmarks
+from visloc.drawing.point_bytes import read_points
 from visloc.errors import VislocError
 
 # Requests that read at once.

@@ -12,7 +12,7 @@ from typing import ParamSpec, TypeVar
 
 from service.engine.stores import Store
 from visloc.archive.packed import unpack_map
-from visloc.archive.store import checked_name
+from visloc.archive.version_rules import checked_name
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, TooLarge
 
 # Uploads that are written or verified at once.

@@ -1,4 +1,4 @@
-"""The same map tied to the Earth in another way: a new manifest over the same files."""
+"""A map with another anchor: a new manifest over the same files."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ import os
 import shutil
 from pathlib import Path
 
-from visloc.archive.checks import content_hash, json_text, manifest_hash
 from visloc.archive.places import down_of
 from visloc.archive.reader import Map
 from visloc.archive.schema import Anchor
+from visloc.archive.writer import Files
 
-# What says that a file system has no hard links, or not between these two folders.
+# Errors of file systems that have no hard links, or none between two folders.
 _NO_LINKS = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP)
 
 
 def write_anchored(opened: Map, folder: Path, anchor: Anchor, *, version: str, created: str) -> str:
     """Write a map with another anchor into an empty folder.
 
-    Landmarks and photos stay where they are in the world, in files that both versions share: they
-    are hard links where the file system has them, else copies. Down in the world is what the new
-    anchor says where the old one said it too; a direction that was given otherwise is kept.
+    Landmarks and photos keep their coordinates. Both versions share their files through hard links
+    where the file system has them; otherwise they are copied. Gravity follows the new anchor if it
+    was unknown or came from the old anchor; a direction from elsewhere is kept.
 
     Args:
-        opened: the map; nothing of it is changed.
+        opened: the map, which stays as it is.
         folder: exists and is empty.
-        anchor: what its world rests on now; with its place on Earth.
+        anchor: the new anchor.
         version: the version, or a prefix ending in ``-``, to which a part of the content hash is
             appended.
         created: ISO 8601 in UTC.
@@ -37,7 +37,8 @@ def write_anchored(opened: Map, folder: Path, anchor: Anchor, *, version: str, c
     """
     manifest = json.loads((opened.path / "manifest.json").read_text(encoding="utf-8"))
     major, minor = map(int, opened.manifest.format_version.split("."))
-    # The files stay as they are, and so does who can read them; such an anchor came with 1.3.
+    # The files stay as they are, and so do the formats that can read them. Format 1.3 introduced
+    # such anchors.
     manifest["format_version"] = "{}.{}".format(*max((major, minor), (1, 3)))
     world = manifest["world"]
     if anchor.geodetic is not None and (world.get("gravity") is None or opened.geodetic):
@@ -46,20 +47,12 @@ def write_anchored(opened: Map, folder: Path, anchor: Anchor, *, version: str, c
     for name in opened.manifest.files:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         link_or_copy(opened.path / name, folder / name)
-    digest = content_hash(manifest)
-    manifest["content_hash"] = digest
-    manifest["version"] = version + digest[:8] if version.endswith("-") else version
     manifest["created"] = created
-    manifest["manifest_hash"] = manifest_hash(manifest)
-    with (folder / "manifest.json").open("w", encoding="utf-8") as file:
-        file.write(json_text(manifest))
-        file.flush()
-        os.fsync(file.fileno())
-    return str(manifest["version"])
+    return Files(folder).finish(manifest, version)
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Make a file of a map that of another one too: as a hard link where there are such."""
+    """Share a file between two maps: as a hard link if possible, otherwise as a copy."""
     try:
         target.hardlink_to(source)
     except OSError as error:

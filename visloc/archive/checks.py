@@ -22,13 +22,13 @@ from visloc.errors import InvalidInput, MapCorrupt
 
 RecordType = TypeVar("RecordType", bound=BaseModel)
 
-_MAX_JSON_BYTES = 2**27  # about a million photos; read, it takes some 20 times the memory
-_MAX_MANIFEST_BYTES = 16 * 2**20
+_MAX_JSON_BYTES = 2**27  # about a million photos; parsed, it takes 20 times the memory
+MAX_MANIFEST_BYTES = 16 * 2**20
 
-# Rows of an array that are read at a time: some hundred kilobytes.
+# Rows of an array that are read at once: some hundred kilobytes.
 _BLOCK_ROWS = 16_384
 
-# What follows the name of a model's int8 matrix in the name of the scales of its columns.
+# Suffix of the array with the scales of the columns of a model's int8 matrix.
 SCALES = ".scales"
 
 
@@ -39,7 +39,7 @@ def sha256_of(path: Path) -> str:
 
 
 def content_hash(manifest: Mapping[str, Any]) -> str:
-    """Hash of everything in a map but its id, version and creation time.
+    """Hash of everything in a map except its id, version and creation time.
 
     Args:
         manifest: the manifest as JSON values; its ``files`` carry the other files' checksums.
@@ -48,12 +48,12 @@ def content_hash(manifest: Mapping[str, Any]) -> str:
 
 
 def manifest_hash(manifest: Mapping[str, Any]) -> str:
-    """Hash of the whole manifest but itself."""
+    """Hash of the whole manifest except the hash itself."""
     return _hash_without(manifest, "manifest_hash")
 
 
 def json_text(value: object) -> str:
-    """The one spelling of a map's JSON files."""
+    """The canonical form of a map's JSON files."""
     return json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n"
 
 
@@ -66,9 +66,9 @@ def read_manifest(folder: Path) -> Manifest:
     """Read ``manifest.json`` of a map folder.
 
     Raises:
-        MapCorrupt: ``map.manifest`` when it is missing or not a manifest, ``map.format_version``
-            when it is of a newer major format.
-        InvalidInput: ``map.is_set`` when it is that of a set.
+        MapCorrupt: ``map.manifest`` when it is missing or not a manifest; ``map.format_version``
+            for a newer major format.
+        InvalidInput: ``map.is_set`` for the manifest of a set.
     """
     manifest = read_any_manifest(folder)
     if isinstance(manifest, SetManifest):
@@ -83,7 +83,22 @@ def read_any_manifest(folder: Path) -> Manifest | SetManifest:
         MapCorrupt: as ``read_manifest``.
     """
     path = folder / "manifest.json"
-    text = _read_text(path, _MAX_MANIFEST_BYTES, "map.manifest")
+    return parse_any_manifest(_read_bytes(path, MAX_MANIFEST_BYTES, "map.manifest"), str(path))
+
+
+def parse_any_manifest(content: bytes, address: str) -> Manifest | SetManifest:
+    """Parse ``manifest.json`` of a map or a set.
+
+    Args:
+        content: the file.
+        address: where it was found, for error messages.
+
+    Raises:
+        MapCorrupt: as ``read_manifest``.
+    """
+    if len(content) > MAX_MANIFEST_BYTES:
+        raise _too_large(address, MAX_MANIFEST_BYTES, "map.manifest")
+    text = _decoded(content, address, "map.manifest")
     try:
         fields = json.loads(text)
         of_set, version = fields.get("format") == SET_FORMAT, str(fields.get("format_version", ""))
@@ -95,13 +110,13 @@ def read_any_manifest(folder: Path) -> Manifest | SetManifest:
         raise MapCorrupt(
             "map.format_version",
             "the map was written by a newer visloc; upgrade visloc or rebuild the map",
-            field=str(path),
+            field=address,
             expected=f"format {newest[0]}.x or older (this program writes {newest[0]}.{newest[1]})",
             got=version,
         )
     if of_set:
-        return _parse(SetManifest, text, path, "map.manifest")
-    return _parse(Manifest, text, path, "map.manifest")
+        return _parse(SetManifest, text, address, "map.manifest")
+    return _parse(Manifest, text, address, "map.manifest")
 
 
 def is_set(ref: str, manifest: SetManifest) -> InvalidInput:
@@ -117,7 +132,7 @@ def is_set(ref: str, manifest: SetManifest) -> InvalidInput:
 
 
 def check_files(folder: Path, manifest: Manifest | SetManifest) -> None:
-    """Check that every file of the manifest is there with its size.
+    """Check that every file of the manifest exists and has its size.
 
     Raises:
         MapCorrupt: ``map.file_missing``, ``map.file_size`` or ``map.file_name``.
@@ -183,7 +198,8 @@ def check_checksums(folder: Path, manifest: Manifest | SetManifest) -> None:
 def read_record(folder: Path, name: str, record: type[RecordType]) -> RecordType:
     """Read one of a map's JSON files."""
     path = folder / name
-    return _parse(record, _read_text(path, _MAX_JSON_BYTES, "map.json"), path, "map.json")
+    text = _decoded(_read_bytes(path, _MAX_JSON_BYTES, "map.json"), str(path), "map.json")
+    return _parse(record, text, str(path), "map.json")
 
 
 def map_array(
@@ -200,10 +216,10 @@ def map_array(
     Args:
         folder: the map.
         name: the file.
-        dtype: what it holds.
-        shape: its shape.
-        before: what it held in older formats, where that was another type.
-        load: read it now.
+        dtype: the type that it must have.
+        shape: the shape that it must have.
+        before: the type that older formats had, if another.
+        load: whether to read it into memory now.
 
     Raises:
         MapCorrupt: ``map.array`` when it is not exactly such an array.
@@ -226,14 +242,14 @@ def array_rows(
 ) -> NDArray[Any]:
     """Read some rows of one ``.npy`` of a map, without mapping it into memory.
 
-    A file that is cut short while it is mapped ends the process that looks at it (SIGBUS); one
-    that is read is refused. Blocks of the file are read in turn, but for those that hold no row.
+    If a mapped file is truncated, reading it ends the process (SIGBUS); reading a file that was
+    truncated raises an error. Only blocks of the file that hold wanted rows are read.
 
     Args:
         folder: the map.
         name: the file.
-        dtype: what it holds.
-        shape: its shape.
+        dtype: the type that it must have.
+        shape: the shape that it must have.
         rows: (k,) in any order.
 
     Raises:
@@ -297,18 +313,18 @@ def read_model(folder: Path, name: str) -> dict[str, NDArray[np.float32]]:
 
 
 def _widened(values: NDArray[Any], scales: NDArray[Any]) -> NDArray[Any]:
-    """Multiply the columns of an int8 matrix with their scales; what is none stays as it is."""
+    """Multiply the columns of an int8 matrix by their scales; return any other array as it is."""
     fits = values.ndim == 2 and scales.shape == values.shape[1:]
     if not fits or values.dtype != np.int8 or scales.dtype != np.float32:
         return values
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused next
+    with np.errstate(over="ignore", invalid="ignore"):  # the caller refuses infinities
         return np.asarray(values * scales)
 
 
 def _array_header(
     path: Path, dtype: str, shape: tuple[int, ...], before: str | None
 ) -> tuple[np.dtype[Any], int, Literal["C", "F"]]:
-    """Check an ``.npy``; return its type, where its numbers begin, and their order."""
+    """Check an ``.npy``; return its type, the offset of its numbers, and their order."""
     try:
         with path.open("rb") as file:
             found_shape, fortran, found = read_npy_header(file)
@@ -318,7 +334,7 @@ def _array_header(
         raise MapCorrupt("map.array", "not a NumPy array file", field=str(path)) from error
     expected = np.dtype(dtype if before is None or found != np.dtype(before) else before)
     whole = size == offset + math.prod(shape) * expected.itemsize
-    # Before any memory is taken: a header can say anything.
+    # Before memory is allocated, as a header can claim any shape.
     if found != expected or found_shape != shape or not whole:
         raise MapCorrupt(
             "map.array",
@@ -338,39 +354,48 @@ def _cut_short(path: Path) -> MapCorrupt:
     )
 
 
-def _read_text(path: Path, limit: int, code: str) -> str:
+def _read_bytes(path: Path, limit: int, code: str) -> bytes:
     try:
         status = path.lstat()
-        if not stat.S_ISREG(status.st_mode):  # to open a pipe is to wait for its other end
+        if not stat.S_ISREG(status.st_mode):  # opening a pipe waits for its other end
             raise MapCorrupt(code, "not a file", field=str(path), expected="a plain file")
         if status.st_size > limit:
-            raise MapCorrupt(
-                code, "the file is too large", field=str(path), expected=f"at most {limit} bytes"
-            )
-        return path.read_text(encoding="utf-8")
+            raise _too_large(str(path), limit, code)
+        return path.read_bytes()
     except FileNotFoundError:
         raise MapCorrupt(code, "the file is missing", field=str(path)) from None
     except OSError as error:
         raise MapCorrupt(
             code, "the file cannot be read", field=str(path), got=error.strerror
         ) from error
+
+
+def _too_large(address: str, limit: int, code: str) -> MapCorrupt:
+    return MapCorrupt(
+        code, "the file is too large", field=address, expected=f"at most {limit} bytes"
+    )
+
+
+def _decoded(content: bytes, address: str, code: str) -> str:
+    try:
+        return content.decode()
     except UnicodeDecodeError as error:
-        raise MapCorrupt(code, "the file is not UTF-8 text", field=str(path)) from error
+        raise MapCorrupt(code, "the file is not UTF-8 text", field=address) from error
 
 
-def _parse(record: type[RecordType], text: str, path: Path, code: str) -> RecordType:
+def _parse(record: type[RecordType], text: str, address: str, code: str) -> RecordType:
     try:
         return record.model_validate_json(text)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
         raise MapCorrupt(
-            code, f"{where or 'the file'}: {first['msg']}", field=str(path), got=first["input"]
+            code, f"{where or 'the file'}: {first['msg']}", field=address, got=first["input"]
         ) from error
 
 
 def is_finite(array: NDArray[Any], block: int = 1_000_000) -> bool:
-    """Tell whether all numbers are finite, reading block by block."""
+    """Tell whether all numbers are finite, block by block."""
     return all(
         bool(np.isfinite(array[start : start + block]).all())
         for start in range(0, max(len(array), 1), block)

@@ -1,4 +1,4 @@
-"""NumPy's ``.npz`` archives, read without trusting what they say of themselves."""
+"""Reading NumPy's ``.npz`` archives without trusting them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import io
 import math
 import tokenize
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -19,30 +21,36 @@ _EMPTY_BYTES = 22  # a zip archive of nothing
 
 
 def read_npz(archive: Path | bytes, kinds: str = "biuf") -> dict[str, NDArray[Any]]:
-    """Read the arrays of an archive without compression; they are read-only.
+    """Read the arrays of an uncompressed archive; they are read-only.
 
-    No more memory is taken than the file is long, whatever its headers announce: entries that are
-    compressed, and arrays whose shape is not that of their entry, are refused before they are read.
+    Compressed entries, and arrays whose shape does not fit their entry, are refused before they
+    are read. So memory never exceeds the size of the file, whatever its headers claim.
 
     Args:
-        archive: its file, or what is in it.
-        kinds: NumPy's letters of the types that are allowed: numbers and truth values.
+        archive: the file, or its content.
+        kinds: NumPy's letters of the allowed types; by default numbers and booleans.
 
     Raises:
-        ValueError: not such an archive; the message says what is wrong.
+        ValueError: it is no such archive; the message says why.
         OSError: the file cannot be read.
     """
+    source = io.BytesIO(archive) if isinstance(archive, bytes) else archive
+    size = len(archive) if isinstance(archive, bytes) else archive.stat().st_size
+    with zip_errors(), zipfile.ZipFile(source) as opened:
+        entries = opened.infolist()
+        _check_entries(entries, size)
+        arrays = {}
+        for entry in entries:
+            with opened.open(entry) as file:
+                arrays[entry.filename.removesuffix(_SUFFIX)] = _read_array(file, entry, kinds)
+        return arrays
+
+
+@contextmanager
+def zip_errors() -> Iterator[None]:
+    """Turn the errors of ``zipfile`` for an archive that is damaged into ValueErrors."""
     try:
-        source = io.BytesIO(archive) if isinstance(archive, bytes) else archive
-        size = len(archive) if isinstance(archive, bytes) else archive.stat().st_size
-        with zipfile.ZipFile(source) as opened:
-            entries = opened.infolist()
-            _check_entries(entries, size)
-            arrays = {}
-            for entry in entries:
-                with opened.open(entry) as file:
-                    arrays[entry.filename.removesuffix(_SUFFIX)] = _read_array(file, entry, kinds)
-            return arrays
+        yield
     except (zipfile.BadZipFile, NotImplementedError, EOFError, OverflowError) as error:
         raise ValueError(str(error) or "the archive is cut short") from error
     except OSError as error:
@@ -67,15 +75,15 @@ def _check_entries(entries: list[zipfile.ZipInfo], size: int) -> None:
         raise ValueError("the archive lists nothing of what it holds")
     if len({entry.filename for entry in entries}) != len(entries):
         raise ValueError("an array occurs twice")
-    if sum(entry.file_size for entry in entries) > size:  # several could share the same bytes
+    if sum(entry.file_size for entry in entries) > size:  # entries could share bytes
         raise ValueError("the arrays are larger than the archive")
 
 
 def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Read what an ``.npy`` says of itself; its numbers follow in the file.
+    """Read the header of an ``.npy``; its numbers follow in the file.
 
     Returns:
-        Its shape, whether it is in Fortran's order, and its type. They may be anything.
+        Shape, whether the order is Fortran's, and type. They are not checked.
 
     Raises:
         ValueError: it is no such file.
@@ -87,7 +95,7 @@ def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[An
             (2, 0): np.lib.format.read_array_header_2_0,
         }[version]
         return read_header(file)
-    # What evaluating a literal raises, which the header is.
+    # The header is a Python literal; evaluating it can raise all of these.
     except (
         ValueError,
         KeyError,

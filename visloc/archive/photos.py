@@ -1,4 +1,4 @@
-"""Where a map's photos were taken, without opening the map."""
+"""Poses of a map's photos, without opening the map."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.archive.checks import map_array, read_record
-from visloc.archive.reader import MapOutline
-from visloc.archive.schema import ImageRecord, ImagesFile
-from visloc.errors import MapCorrupt
+from visloc.archive.checks import map_array
+from visloc.archive.reader import MapOutline, read_images
+from visloc.archive.schema import ImageRecord
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -19,9 +18,8 @@ class MappingPhotos:
     """The mapping photos.
 
     Attributes:
-        images: n names and cameras.
-        positions: (n, 3) float64, the camera centres in the world.
-        orientations: (n, 4) float64, the rotations of world_from_cam as w, x, y, z with w >= 0.
+        positions: (n, 3) float64, camera centres in the world.
+        orientations: (n, 4) float64, rotations of world_from_cam as w, x, y, z with w >= 0.
     """
 
     images: tuple[ImageRecord, ...]
@@ -30,20 +28,13 @@ class MappingPhotos:
 
 
 def read_photos(folder: Path, outline: MapOutline) -> MappingPhotos:
-    """Read the mapping photos of a map whose outline was read before.
+    """Read the mapping photos of a map whose outline was read.
 
     Raises:
         MapCorrupt: ``map.json``, ``map.images``, ``map.array``.
     """
-    images = read_record(folder, "images.json", ImagesFile).images
-    num = outline.manifest.counts.images
-    if len(images) != num or any(image.camera not in outline.cameras for image in images):
-        raise MapCorrupt(
-            "map.images",
-            "the photos do not fit the manifest or the cameras",
-            field=str(folder / "images.json"),
-        )
-    poses = map_array(folder, "image_poses.npy", "<f8", (num, 7), load=True)
+    images = read_images(folder, outline)
+    poses = map_array(folder, "image_poses.npy", "<f8", (len(images), 7), load=True)
     conjugate = np.where(poses[:, :1] < 0, -1.0, 1.0) * poses[:, :4] * (1.0, -1.0, -1.0, -1.0)
     return MappingPhotos(images, -_rotated(conjugate, poses[:, 4:]), conjugate)
 

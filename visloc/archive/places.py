@@ -1,4 +1,4 @@
-"""Where a map lies on Earth, from its manifest alone."""
+"""Where a map lies on Earth, according to its manifest."""
 
 from __future__ import annotations
 
@@ -21,37 +21,31 @@ from visloc.geometry import Pose, Similarity
 
 @dataclass(frozen=True, slots=True)
 class GeoCircle:
-    """A circle on Earth, WGS84.
-
-    Attributes:
-        latitude: degrees.
-        longitude: degrees.
-        radius: metres.
-    """
+    """A circle on Earth, WGS84: degrees, and a radius in metres."""
 
     latitude: float
     longitude: float
     radius: float
 
     def distance_to(self, latitude: float, longitude: float) -> float:
-        """Metres from the circle to a position (deg); 0 within it."""
+        """Distance from the circle to a position (deg) in metres; 0 within it."""
         middle = np.array([self.latitude, self.longitude, 0.0])
         return max(0.0, ground_distance(middle, np.array([latitude, longitude, 0.0])) - self.radius)
 
 
 def enu_of(points: NDArray[np.float64], geodetic: Geodetic) -> NDArray[np.float64]:
-    """Convert points (n, 3) of a world to metres (n, 3) east, north and up of its anchor."""
+    """Convert points (n, 3) of a world to metres (n, 3) east, north and up from its anchor."""
     enu_from_world = Pose.from_quaternion(geodetic.rotation_wxyz, geodetic.translation)
     return enu_from_world.apply(geodetic.scale * points)
 
 
 def origin_of(geodetic: Geodetic) -> NDArray[np.float64]:
-    """Return the anchor's geodetic position (3,), as ``visloc.geodesy`` has them."""
+    """Return the anchor's position (3,): latitude, longitude (deg), altitude (m)."""
     return np.array([geodetic.latitude_deg, geodetic.longitude_deg, geodetic.altitude_m])
 
 
 def anchor_rms(world: World | SetWorld) -> float:
-    """Return how far the world may be off its place on Earth, in its unit; 0 when unknown."""
+    """Return the error of the world's place on Earth, in its unit; 0 when unknown."""
     return (world.anchor and world.anchor.rms) or 0.0
 
 
@@ -75,10 +69,9 @@ def down_of(geodetic: Geodetic) -> NDArray[np.float64]:
 
 
 def circle_of(world: World | SetWorld) -> GeoCircle | None:
-    """Return a circle about the middle of the map's extent that holds all of its landmarks.
+    """Return a circle about the middle of the map's extent that holds the corners of the extent.
 
-    It is that of the extent's corners, so that no landmark has to be read; None where it is not
-    known where the world lies.
+    No landmark needs to be read. None when the world's place on Earth is unknown.
     """
     geodetic = None if world.anchor is None else world.anchor.geodetic
     if geodetic is None:
@@ -92,7 +85,7 @@ def circles_of(boxes: NDArray[np.float64], geodetic: Geodetic) -> NDArray[np.flo
 
     Args:
         boxes: (n, 2, 3) smallest and largest coordinates.
-        geodetic: where the world lies.
+        geodetic: where the world lies on Earth.
 
     Returns:
         (n, 3) latitude, longitude (deg) and radius (m).
@@ -105,7 +98,7 @@ def circles_of(boxes: NDArray[np.float64], geodetic: Geodetic) -> NDArray[np.flo
     middles = positions.reshape(points.shape)[:, 0]
     away = ecef_from_geodetic(positions).reshape(points.shape)
     away = away[:, 1:] - away[:, :1]
-    # Across, in the plane at each middle: what is not up or down.
+    # Horizontal distance: without the component along up at each middle.
     up = ecef_from_geodetic(middles + np.array([0.0, 0.0, 1.0])) - ecef_from_geodetic(middles)
     across = away - (away @ up[:, :, None]) * up[:, None]
     radii = np.linalg.norm(across, axis=2).max(axis=1)

@@ -1,10 +1,11 @@
-"""A map in memory: small things read, large arrays mapped from disk."""
+"""A map in memory: small files are read, large arrays are mapped from disk."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ from visloc.archive.schema import (
     Manifest,
     photo_file,
 )
+from visloc.archive.set_schema import SetManifest
 from visloc.errors import InvalidInput, MapCorrupt
 from visloc.geometry import Camera, Pose
 from visloc.retrieval.fusion import LateFusion
@@ -36,21 +38,14 @@ from visloc.retrieval.rows import GlobalRows
 from visloc.retrieval.shortlist import Clusters
 
 Model = Mapping[str, NDArray[np.float32]]
+ManifestType = TypeVar("ManifestType", Manifest, SetManifest)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MapOutline:
-    """What a version of a map says about itself: its small files, read.
+class Outline(Generic[ManifestType]):
+    """What the manifest of a map or a set says."""
 
-    Attributes:
-        manifest: ``manifest.json``.
-        cameras: intrinsics by camera id.
-        rigs: of each rig, cam_from_rig by camera id.
-    """
-
-    manifest: Manifest
-    cameras: Mapping[str, Camera]
-    rigs: Mapping[str, Mapping[str, Pose]]
+    __slots__ = ()
+    manifest: ManifestType
 
     @property
     def ref(self) -> str:
@@ -58,11 +53,39 @@ class MapOutline:
         return f"{self.manifest.id}@{self.manifest.version}"
 
     @property
-    def gravity(self) -> NDArray[np.float64] | None:
-        """(3,) unit vector that points down in the world; None where that is not known.
+    def geodetic(self) -> Geodetic | None:
+        """Where the frame lies on Earth; None when unknown."""
+        anchor = self.manifest.world.anchor
+        return None if anchor is None else anchor.geodetic
 
-        A geodetic anchor tells it too.
-        """
+    @property
+    def place(self) -> GeoCircle | None:
+        """A circle on Earth that holds the map or all tiles; None when unknown."""
+        return circle_of(self.manifest.world)
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the version's own files except the manifest."""
+        return sum(entry.size for entry in self.manifest.files.values())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapOutline(Outline[Manifest]):
+    """The small files of a map's version.
+
+    Attributes:
+        manifest: ``manifest.json``.
+        cameras: intrinsics by camera id.
+        rigs: cam_from_rig by rig id and camera id.
+    """
+
+    manifest: Manifest
+    cameras: Mapping[str, Camera]
+    rigs: Mapping[str, Mapping[str, Pose]]
+
+    @property
+    def gravity(self) -> NDArray[np.float64] | None:
+        """(3,) unit vector that points down in the world; None when unknown."""
         world = self.manifest.world
         if world.gravity is not None:
             return np.array(world.gravity)
@@ -70,24 +93,8 @@ class MapOutline:
 
     @property
     def fusion(self) -> LateFusion:
-        """How queries rank its photos unless they say otherwise."""
+        """How queries rank its photos by default."""
         return self.manifest.retrieval.late_fusion
-
-    @property
-    def geodetic(self) -> Geodetic | None:
-        """Where the world lies on Earth; None where that is not known."""
-        anchor = self.manifest.world.anchor
-        return None if anchor is None else anchor.geodetic
-
-    @property
-    def place(self) -> GeoCircle | None:
-        """A circle on Earth that holds the map; None where that is not known."""
-        return circle_of(self.manifest.world)
-
-    @property
-    def size_bytes(self) -> int:
-        """Size of all files but the manifest."""
-        return sum(entry.size for entry in self.manifest.files.values())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,22 +102,20 @@ class Map(MapOutline):
     """One version of a map, open for reading. Files stay mapped while it lives.
 
     Attributes:
-        path: its folder.
-        images: the mapping photos.
         image_poses: (n, 7) float64, cam_from_world as qw qx qy qz tx ty tz.
         landmarks: (P, 3) float32, relative to the manifest's origin.
         track_lengths: (P,) uint16, mapping photos that see each landmark.
         errors_px: (P,) float16 (float32 before format 2.0), mean reprojection error; NaN where it
             does not apply.
-        angles_deg: (P,) as ``errors_px``, largest angle between viewing rays; NaN where not
+        angles_deg: (P,) of the same type, largest angle between viewing rays; NaN where it was not
             computed.
         colors: (P, 3) uint8 RGB; None when the map has none.
         observation_offsets: (n + 1,) int64; rows offsets[i]:offsets[i + 1] belong to photo i.
         observation_landmarks: (M,) uint32 rows of ``landmarks``.
-        observation_descriptors: (M, D) int8; times the manifest's ``descriptor_scale``.
-        observation_keypoints: (M, 2) int16, or float32; ``keypoints`` reads them as pixels.
+        observation_descriptors: (M, D) int8, in steps of the manifest's ``descriptor_scale``.
+        observation_keypoints: (M, 2) int16 or float32; ``keypoints`` reads them as pixels.
         global_descriptors: unit rows (n, D) by name.
-        global_models: the arrays of each global descriptor's model.
+        global_models: arrays of the models by descriptor.
     """
 
     path: Path
@@ -131,13 +136,13 @@ class Map(MapOutline):
     def observations(self, image: int) -> tuple[NDArray[np.uint32], NDArray[np.int8]]:
         """Landmarks (m,) that one photo observes and their descriptors (m, D), not copied.
 
-        Descriptors times the manifest's ``descriptor_scale`` are unit rows but for the rounding.
+        Descriptors times the manifest's ``descriptor_scale`` are unit rows, except for rounding.
         """
         start, stop = self.observation_offsets[image], self.observation_offsets[image + 1]
         return self.observation_landmarks[start:stop], self.observation_descriptors[start:stop]
 
     def keypoints(self, image: int) -> NDArray[np.float32]:
-        """Where one photo sees its landmarks, (m, 2) pixels in the order of ``observations``."""
+        """Keypoints (m, 2) of one photo in pixels, in the order of ``observations``."""
         start, stop = self.observation_offsets[image], self.observation_offsets[image + 1]
         keypoints = self.observation_keypoints[start:stop].astype(np.float32)
         step = self.manifest.local_features.keypoint_step_px
@@ -150,7 +155,7 @@ class Map(MapOutline):
 
 
 def read_outline(folder: Path) -> MapOutline:
-    """Read the small files of a map that say what it is; its arrays need not be there.
+    """Read the small files of a map; its arrays need not be there.
 
     Raises:
         MapCorrupt: with the file that is wrong.
@@ -159,7 +164,7 @@ def read_outline(folder: Path) -> MapOutline:
 
 
 def outline_of(folder: Path, manifest: Manifest) -> MapOutline:
-    """Read what a map whose manifest is read says of itself besides; raises ``map.cameras``."""
+    """Read the cameras of a map whose manifest was read; raises ``map.cameras``."""
     cameras = read_record(folder, "cameras.json", CamerasFile)
     try:
         return MapOutline(
@@ -180,44 +185,24 @@ def outline_of(folder: Path, manifest: Manifest) -> MapOutline:
 def open_map(folder: Path) -> Map:
     """Open a map after checking its manifest and the presence and size of its files.
 
-    Contents are checked when a map is published and by ``verify_map``, not here: opening a map
-    of many gigabytes takes milliseconds.
+    Contents are not checked, so that a map of many gigabytes opens in milliseconds: they are
+    checked when a map is published and by ``verify_map``.
 
     Raises:
         MapCorrupt: with the file that is wrong.
     """
     manifest = read_manifest(folder)
     check_files(folder, manifest)
+    _check_listed(folder, manifest)
+    _check_photos(folder, manifest)
+    outline = outline_of(folder, manifest)
+    images = read_images(folder, outline)
     counts, local = manifest.counts, manifest.local_features
     n, num_landmarks, m = counts.images, counts.landmarks, counts.observations
-    files = {
-        record.fingerprint.name: f"global/{record.fingerprint.file_stem}"
-        for record in manifest.global_features
-    }
-    if len(set(files.values())) != len(manifest.global_features):
-        raise MapCorrupt(
-            "map.manifest",
-            "two global descriptors of one name",
-            field=str(folder / "manifest.json"),
-            got=", ".join(record.fingerprint.name for record in manifest.global_features),
-        )
-    described = [f + end for f in files.values() for end in (".npy", ".model.npz")]
-    for record in manifest.global_features:
-        described += [name for name, _, _ in _beside_rows(record, n)]
-    for name in (*_ARRAYS, *described):
-        if name not in manifest.files:
-            raise MapCorrupt(
-                "map.file_missing", "a file that every such map has is not listed", field=name
-            )
-    _check_photos(folder, manifest)
-    images = read_record(folder, "images.json", ImagesFile).images
-    outline = outline_of(folder, manifest)
-    if len(images) != n or any(image.camera not in outline.cameras for image in images):
-        raise MapCorrupt(
-            "map.images",
-            "the photos do not fit the manifest or the cameras",
-            field=str(folder / "images.json"),
-        )
+
+    def array(stem: str, dtype: str, *shape: int, before: str | None = None) -> NDArray[Any]:
+        return map_array(folder, f"{stem}.npy", dtype, shape, before=before)
+
     return Map(
         path=folder,
         manifest=manifest,
@@ -225,36 +210,49 @@ def open_map(folder: Path) -> Map:
         rigs=outline.rigs,
         images=images,
         image_poses=map_array(folder, "image_poses.npy", "<f8", (n, 7), load=True),
-        landmarks=map_array(folder, "landmarks.npy", "<f4", (num_landmarks, 3)),
-        track_lengths=map_array(folder, "landmark_track_length.npy", "<u2", (num_landmarks,)),
-        errors_px=map_array(folder, "landmark_error_px.npy", "<f2", (num_landmarks,), before="<f4"),
-        angles_deg=map_array(
-            folder, "landmark_angle_deg.npy", "<f2", (num_landmarks,), before="<f4"
-        )
+        landmarks=array("landmarks", "<f4", num_landmarks, 3),
+        track_lengths=array("landmark_track_length", "<u2", num_landmarks),
+        errors_px=array("landmark_error_px", "<f2", num_landmarks, before="<f4"),
+        angles_deg=array("landmark_angle_deg", "<f2", num_landmarks, before="<f4")
         if "landmark_angle_deg.npy" in manifest.files
         else np.broadcast_to(np.float16(np.nan), num_landmarks),
-        colors=map_array(folder, "landmark_rgb.npy", "|u1", (num_landmarks, 3))
+        colors=array("landmark_rgb", "|u1", num_landmarks, 3)
         if "landmark_rgb.npy" in manifest.files
         else None,
         observation_offsets=map_array(
             folder, "observation_offsets.npy", "<i8", (n + 1,), load=True
         ),
-        observation_landmarks=map_array(folder, "observation_landmarks.npy", "<u4", (m,)),
-        observation_descriptors=map_array(
-            folder, "observation_descriptors.npy", "|i1", (m, local.descriptor_dim)
-        ),
-        observation_keypoints=map_array(
-            folder,
-            "observation_keypoints.npy",
-            "<f4" if local.keypoint_step_px is None else "<i2",
-            (m, 2),
+        observation_landmarks=array("observation_landmarks", "<u4", m),
+        observation_descriptors=array("observation_descriptors", "|i1", m, local.descriptor_dim),
+        observation_keypoints=array(
+            "observation_keypoints", "<f4" if local.keypoint_step_px is None else "<i2", m, 2
         ),
         global_descriptors={
             record.fingerprint.name: _map_rows(folder, record, n)
             for record in manifest.global_features
         },
-        global_models={name: read_model(folder, f"{f}.model.npz") for name, f in files.items()},
+        global_models={
+            record.fingerprint.name: read_model(folder, _model_file(record))
+            for record in manifest.global_features
+        },
     )
+
+
+def read_images(folder: Path, outline: MapOutline) -> tuple[ImageRecord, ...]:
+    """Read names and cameras of the mapping photos of a map.
+
+    Raises:
+        MapCorrupt: ``map.json``, ``map.images``.
+    """
+    images = read_record(folder, "images.json", ImagesFile).images
+    num = outline.manifest.counts.images
+    if len(images) != num or any(image.camera not in outline.cameras for image in images):
+        raise MapCorrupt(
+            "map.images",
+            "the photos do not fit the manifest or the cameras",
+            field=str(folder / "images.json"),
+        )
+    return images
 
 
 def verify_map(folder: Path) -> Map:
@@ -293,8 +291,7 @@ def verify_map(folder: Path) -> Map:
 
 def _map_rows(folder: Path, record: GlobalFeaturesRecord, num_images: int) -> GlobalRows:
     dtype = "|i1" if record.bits == 8 else "<f4"
-    name = f"global/{record.fingerprint.file_stem}.npy"
-    values = map_array(folder, name, dtype, (num_images, record.dim))
+    values = map_array(folder, _rows_file(record), dtype, (num_images, record.dim))
     beside = [map_array(folder, *one) for one in _beside_rows(record, num_images)]
     scales = beside.pop(0) if record.bits == 8 else None
     return GlobalRows(values, scales, Clusters(*beside) if beside else None)
@@ -303,7 +300,7 @@ def _map_rows(folder: Path, record: GlobalFeaturesRecord, num_images: int) -> Gl
 def _beside_rows(
     record: GlobalFeaturesRecord, num_images: int
 ) -> list[tuple[str, str, tuple[int, ...]]]:
-    """Name, type and shape of the arrays that a global descriptor has beside its rows."""
+    """Name, type and shape of a global descriptor's arrays besides its rows."""
     stem, clusters = record.fingerprint.file_stem, record.clusters
     beside: list[tuple[str, str, tuple[int, ...]]] = []
     if record.bits == 8:
@@ -318,14 +315,14 @@ def _beside_rows(
 
 
 def _lead_through(offsets: NDArray[np.int64], num_rows: int) -> bool:
-    """Whether offsets lead from the first row to the last and never back."""
-    # Compared, not subtracted: differences of large numbers wrap around.
+    """Tell whether offsets lead from the first row to the last and never back."""
+    # Compared, not subtracted: differences of large numbers overflow.
     ascend = bool((offsets[1:] >= offsets[:-1]).all())
     return ascend and int(offsets[0]) == 0 and int(offsets[-1]) == num_rows
 
 
 def _are_good(clusters: Clusters, num_images: int) -> bool:
-    """Whether clusters hold every photo once."""
+    """Tell whether clusters hold every photo once."""
     offsets, members = clusters.offsets, clusters.members
     return (
         is_finite(clusters.centers)
@@ -335,8 +332,36 @@ def _are_good(clusters: Clusters, num_images: int) -> bool:
     )
 
 
+def _check_listed(folder: Path, manifest: Manifest) -> None:
+    """Refuse a manifest that does not list the files that every such map has."""
+    records = manifest.global_features
+    if len(set(map(_rows_file, records))) != len(records):
+        raise MapCorrupt(
+            "map.manifest",
+            "two global descriptors of one name",
+            field=str(folder / "manifest.json"),
+            got=", ".join(record.fingerprint.name for record in records),
+        )
+    files = [*_ARRAYS, *map(_rows_file, records), *map(_model_file, records)]
+    for record in records:
+        files += [name for name, _, _ in _beside_rows(record, manifest.counts.images)]
+    for name in files:
+        if name not in manifest.files:
+            raise MapCorrupt(
+                "map.file_missing", "a file that every such map has is not listed", field=name
+            )
+
+
+def _rows_file(record: GlobalFeaturesRecord) -> str:
+    return f"global/{record.fingerprint.file_stem}.npy"
+
+
+def _model_file(record: GlobalFeaturesRecord) -> str:
+    return f"global/{record.fingerprint.file_stem}.model.npz"
+
+
 def _check_photos(folder: Path, manifest: Manifest) -> None:
-    """Refuse a map that keeps some of its photos only, or large ones."""
+    """Refuse a map that keeps only some of its photos, or large ones."""
     if not any(name.startswith("photos/") for name in manifest.files):
         return
     files = [manifest.files.get(photo_file(row)) for row in range(manifest.counts.images)]
@@ -352,7 +377,7 @@ def _check_photos(folder: Path, manifest: Manifest) -> None:
 
 
 def _are_unit(rows: NDArray[np.float64]) -> bool:
-    with np.errstate(over="ignore"):  # the square of a number out of range is one as well
+    with np.errstate(over="ignore"):  # an infinite norm is not 1 either
         return bool((np.abs(np.linalg.norm(rows, axis=1) - 1) < 1e-6).all())
 
 

@@ -1,4 +1,4 @@
-"""The words of a map's manifest and its JSON files (docs/map-format.md)."""
+"""Schema of a map's manifest and JSON files (docs/map-format.md)."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ UnitQuaternion = Annotated[tuple[float, float, float, float], AfterValidator(_of
 
 
 def photo_file(image: int) -> str:
-    """The file of a map that keeps photos: that of the photo in this row of ``images.json``."""
+    """Name of the file of the photo in a row of ``images.json``, in maps that keep photos."""
     return f"photos/{image:06d}.jpg"
 
 
 class Record(BaseModel):
-    """JSON of ours: frozen, without infinities; of a newer minor format, with more fields."""
+    """A frozen JSON object without infinities."""
 
-    # Unknown fields pass: a reader must open maps of a newer minor format.
+    # Unknown fields are allowed: a reader must open maps of a newer minor format.
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
 
@@ -77,7 +77,6 @@ class FingerprintRecord(Record):
 
     @staticmethod
     def of(fingerprint: Fingerprint) -> FingerprintRecord:
-        """Return the same as a record."""
         return FingerprintRecord(
             name=fingerprint.name,
             revision=fingerprint.revision,
@@ -87,15 +86,12 @@ class FingerprintRecord(Record):
 
     @property
     def file_stem(self) -> str:
-        """Its name in file names, which cannot have a colon everywhere."""
+        """The name as part of a file name; not every file system allows colons."""
         return self.name.replace(":", "-")
 
 
 class LocalFeaturesRecord(Record):
-    """The local feature that a map was built with, and how its observations are stored.
-
-    ``computed_with`` tells what computed the features, for people.
-    """
+    """The local feature of a map, and how its observations are stored."""
 
     fingerprint: FingerprintRecord
     max_keypoints: Annotated[int, Field(ge=1)]
@@ -104,15 +100,15 @@ class LocalFeaturesRecord(Record):
     descriptor_scale: Annotated[float, Field(gt=0)]
     # pixel = stored int16 x step; None: pixels are stored as float32, as in all maps before 2.0.
     keypoint_step_px: Annotated[float, Field(gt=0, le=1)] | None = None
-    computed_with: str | None = None
+    computed_with: str | None = None  # for people
 
 
 class GlobalFeaturesRecord(Record):
     """One global descriptor of a map.
 
     Attributes:
-        bits: 8: int8 with a scale for each row; 32: float32, as in all maps before 2.0.
-        clusters: of the rows, in maps of so many photos that not all are compared with a query.
+        bits: 8 for int8 with a scale for each row; 32 for float32, as in all maps before 2.0.
+        clusters: number of clusters in maps with too many photos to compare all with a query.
     """
 
     fingerprint: FingerprintRecord
@@ -129,18 +125,16 @@ class RetrievalRecord(Record):
 
     @staticmethod
     def of(fusion: LateFusion) -> RetrievalRecord:
-        """Return the same as a record."""
         weights = None if fusion.weights is None else dict(fusion.weights)
         return RetrievalRecord(fusion=fusion.operator, weights=weights)
 
     @property
     def late_fusion(self) -> LateFusion:
-        """The same as retrieval takes it."""
         return LateFusion(self.fusion, self.weights)
 
 
 class Extent(Record):
-    """Smallest box along the world's axes that holds all landmarks."""
+    """Axis-aligned bounding box of all landmarks."""
 
     min: Vector
     max: Vector
@@ -165,14 +159,13 @@ class Anchor(Record):
     """What the world's position, orientation and scale rest on.
 
     Attributes:
-        kind: ``dataset``: poses that the dataset gave; ``model``: those of an imported
+        kind: ``dataset``: poses from the dataset; ``model``: poses from an imported
             reconstruction; ``gnss`` or ``positions``: aligned to fixes or known positions;
-            ``correspondences``: tied to the Earth by given points; ``none``: nothing, the frame
-            is arbitrary.
-        images: photos, or given points, that it rests on.
-        rms: distance between those photos and where they were said to be, in units of the world,
-            root mean square; None where nothing was fitted.
-        geodetic: where the world lies on Earth; None when that is unknown.
+            ``correspondences``: tied to the Earth by given points; ``none``: arbitrary frame.
+        images: number of photos or given points that it rests on.
+        rms: root mean square distance between these and their given positions, in units of the
+            world; None where nothing was fitted.
+        geodetic: where the world lies on Earth; None when unknown.
     """
 
     kind: Literal["dataset", "model", "gnss", "positions", "correspondences", "none"]
@@ -182,10 +175,9 @@ class Anchor(Record):
 
 
 class World(Record):
-    """The frame of the map; maps of format 1.0 do not tell their anchor, those of 1.1 no gravity.
+    """The frame of the map. Format 1.0 had no anchor, format 1.1 no gravity.
 
-    ``gravity`` points down. ``visloc.archive.Map.gravity`` knows more: a geodetic anchor tells
-    it too.
+    ``gravity`` points down. ``visloc.archive.Map.gravity`` also derives it from a geodetic anchor.
     """
 
     metric: bool
@@ -196,7 +188,7 @@ class World(Record):
 
 
 class Counts(Record):
-    """How much of everything."""
+    """Numbers of photos, landmarks and observations."""
 
     images: Annotated[int, Field(ge=1)]
     landmarks: Annotated[int, Field(ge=1)]
@@ -222,7 +214,7 @@ class Manifest(Record):
     method: Method
     local_features: LocalFeaturesRecord
     global_features: Annotated[tuple[GlobalFeaturesRecord, ...], Field(min_length=1)]
-    # Maps of formats before 2.1 have none, and are asked by what it says then.
+    # Maps of formats before 2.1 have none and use the default.
     retrieval: RetrievalRecord = RetrievalRecord()
     counts: Counts
     notes: tuple[str, ...] = ()
@@ -263,13 +255,13 @@ class CamerasFile(Record):
     rigs: dict[str, dict[str, tuple[float, float, float, float, float, float, float]]] = {}
 
 
-# A dataclass takes a fifth of the memory that a model takes: there may be 100 000.
+# A dataclass takes a fifth of the memory of a pydantic model, and there may be 100 000.
 @dataclass(frozen=True, slots=True)
 class ImageRecord:
     """One mapping photo; its pose is the same row of ``image_poses.npy``.
 
-    ``turn`` is the EXIF orientation by which the photo was turned before features were found in
-    it. Its camera, pose and keypoints refer to the pixels as stored.
+    ``turn`` is the EXIF orientation by which the photo was turned for feature extraction. Its
+    camera, pose and keypoints refer to the pixels as stored.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What a store refuses so that a set and its tiles stay together, whatever the store."""
+"""What a store refuses so that a set and its tiles stay consistent."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from visloc.archive.set_schema import SetManifest
 from visloc.errors import Conflict, MapCorrupt, NotFound
 
 AnyManifest = Manifest | SetManifest
-# Of map ids and versions, in their order; raises NotFound for what is not in the store.
+# Yields the manifests of (id, version) in order; raises NotFound for a missing one.
 ReadManifests = Callable[[Sequence[tuple[str, str]]], Iterator[AnyManifest]]
 
 
@@ -17,8 +17,8 @@ def refuse_other_kind(incoming: AnyManifest, published: AnyManifest | None) -> N
     """Refuse a set under the id of a map, and a map under that of a set.
 
     Args:
-        incoming: what is to be published.
-        published: a version that the store has under the same id; None for none.
+        incoming: the version to be published.
+        published: any version of the same id in the store; None if there is none.
 
     Raises:
         Conflict: ``set.id_is_map``, ``map.id_is_set``.
@@ -39,12 +39,12 @@ def refuse_other_kind(incoming: AnyManifest, published: AnyManifest | None) -> N
 
 
 def refuse_missing_tiles(incoming: AnyManifest, read_manifests: ReadManifests) -> None:
-    """Refuse a set unless each of its tiles is in the store, with the content that it names.
+    """Refuse a set unless the store has each of its tiles with the content that the set names.
 
     Raises:
-        NotFound: ``set.tile``: a tile is not there.
-        Conflict: ``set.tile``: it is a set, or another map; ``set.features``: it has other local
-            features than the set says, so that one extraction does not serve all tiles.
+        NotFound: ``set.tile``: a tile is missing.
+        Conflict: ``set.tile``: a tile is a set, or another map; ``set.features``: it has other
+            local features than the set, so that one extraction does not serve all tiles.
     """
     if not isinstance(incoming, SetManifest):
         return
@@ -72,7 +72,7 @@ def refuse_missing_tiles(incoming: AnyManifest, read_manifests: ReadManifests) -
 
 
 def refuse_other_features(ref: str, found: FingerprintRecord, expected: FingerprintRecord) -> None:
-    """Refuse a tile whose local features are not those of the others.
+    """Refuse a tile whose local features differ from those of the set.
 
     Raises:
         Conflict: ``set.features``.
@@ -92,8 +92,8 @@ def refuse_if_tile(map_id: str, version: str, current: Iterable[tuple[str, AnyMa
 
     Args:
         map_id: the map.
-        version: of it.
-        current: reference and manifest of what is in use.
+        version: the version that is to be removed.
+        current: references and manifests of the versions in use.
 
     Raises:
         Conflict: ``map.in_set``.
@@ -112,7 +112,7 @@ def refuse_if_tile(map_id: str, version: str, current: Iterable[tuple[str, AnyMa
 
 
 def unreadable_set(ref: str, error: MapCorrupt) -> Conflict:
-    """``map.in_set``: nobody can tell whether a set in use names a version."""
+    """``map.in_set``, because a set in use cannot be read."""
     return Conflict(
         "map.in_set",
         f"{ref} is a set in use that cannot be read, so that nobody knows its tiles; publish it "

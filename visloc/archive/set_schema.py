@@ -1,4 +1,4 @@
-"""The words of a set's manifest (docs/map-format.md): which maps, and where each lies."""
+"""Schema of a set's manifest (docs/map-format.md): its tiles and where each of them lies."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from visloc.priors import MAX_TILES
 
 SET_FORMAT = "visloc-set"
 SET_MAJOR, SET_MINOR = 1, 0
-# Of where a tile lies. Beyond that, squares and inverses of it are no numbers any more.
+# Scale of a tile. Beyond these, squares and inverses overflow.
 MIN_SCALE, MAX_SCALE = 1e-9, 1e9
-# What a query takes is proportional to it.
+# The time of a query is proportional to it.
 MAX_BITS = 1024
 
 
@@ -39,7 +39,6 @@ class SimilarityRecord(Record):
 
     @staticmethod
     def of(similarity: Similarity) -> SimilarityRecord:
-        """Return the same as a record."""
         pose = Pose(similarity.rotation, similarity.translation)
         w, x, y, z = pose.rotation_wxyz.tolist()
         tx, ty, tz = similarity.translation.tolist()
@@ -49,7 +48,6 @@ class SimilarityRecord(Record):
 
     @property
     def similarity(self) -> Similarity:
-        """The same as the geometry takes it."""
         pose = Pose.from_quaternion(self.rotation_wxyz, self.translation)
         return Similarity(self.scale, pose.rotation, pose.translation)
 
@@ -59,15 +57,10 @@ class TileRecord(Record):
 
     Attributes:
         map: id of the map.
-        version: of the map.
-        content_hash: of that version.
-        set_from_tile: where the map's world lies in the set's.
-        extent: smallest box along the set's axes that holds its landmarks and photos.
-        photo_extent: ... its photos' centres only.
+        set_from_tile: from the map's world to the set's frame.
+        extent: bounding box of landmarks and photos, along the set's axes.
+        photo_extent: bounding box of the photos' centres, along the set's axes.
         reach: median distance from its photos to the landmarks that they see.
-        images: mapping photos.
-        landmarks: of the map.
-        size_bytes: of the map's files.
     """
 
     map: Annotated[str, Field(pattern=rf"^{ID_PATTERN.pattern}$")]
@@ -90,11 +83,7 @@ class TileRecord(Record):
 class CoarseRecord(Record):
     """The coarse index over all photos of all tiles.
 
-    Attributes:
-        fingerprint: of the global descriptor that it is made with.
-        dim: numbers of a descriptor.
-        bits: of the code of a photo.
-        centroids: rows that stand for the photos of one tile.
+    ``bits`` is the length of a photo's code; ``centroids`` is the number of rows for each tile.
     """
 
     fingerprint: FingerprintRecord
@@ -104,10 +93,7 @@ class CoarseRecord(Record):
 
 
 class SetWorld(Record):
-    """The frame of the set, as ``World`` is that of a map.
-
-    ``extent`` holds the extents of all tiles. ``gravity`` points down.
-    """
+    """The frame of the set. ``extent`` holds those of all tiles; ``gravity`` points down."""
 
     metric: bool
     extent: Extent
@@ -116,7 +102,7 @@ class SetWorld(Record):
 
 
 class SetCounts(Record):
-    """How much of everything, over all tiles."""
+    """Totals over all tiles."""
 
     tiles: Annotated[int, Field(ge=1, le=MAX_TILES)]
     images: Annotated[int, Field(ge=1)]

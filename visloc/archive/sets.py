@@ -1,4 +1,4 @@
-"""A set of maps on disk: its manifest, and the coarse index over all of its tiles' photos."""
+"""A set of maps on disk: its manifest, and the coarse index over the photos of all tiles."""
 
 from __future__ import annotations
 
@@ -18,9 +18,8 @@ from visloc.archive.checks import (
     read_any_manifest,
     read_model,
 )
-from visloc.archive.places import GeoCircle, circle_of
-from visloc.archive.reader import MapOutline, outline_of, verify_map
-from visloc.archive.schema import Extent, FingerprintRecord, Geodetic
+from visloc.archive.reader import MapOutline, Outline, outline_of, verify_map
+from visloc.archive.schema import Extent, FingerprintRecord
 from visloc.archive.set_schema import (
     SET_FORMAT,
     SET_MAJOR,
@@ -37,18 +36,17 @@ SET_CODES = "coarse/codes.npy"
 _OFFSETS, _MODEL = "coarse/offsets.npy", "coarse/model.npz"
 _CENTROIDS, _SCALES = "coarse/centroids.npy", "coarse/centroids.scales.npy"
 _FILES = (SET_CODES, _OFFSETS, _MODEL, _CENTROIDS, _SCALES)
-# The arrays of the model: what localvlad learns, and the planes whose sides are the bits.
+# The arrays that localvlad learns, and the planes of the codes.
 _MODEL_ARRAYS = ("vocabulary", "mean", "axes", "planes")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SetOutline:
-    """What a version of a set says about itself.
+class SetOutline(Outline[SetManifest]):
+    """The manifest of a set, and arrays over its T tiles.
 
     Attributes:
         manifest: ``manifest.json``.
-        photo_boxes: (T, 2, 3) of each tile, smallest and largest coordinates of its photos'
-            centres in the set's frame.
+        photo_boxes: (T, 2, 3) bounding boxes of the photos' centres in the set's frame.
         reaches: (T,) how far the photos of each tile see, in the set's unit.
     """
 
@@ -57,42 +55,20 @@ class SetOutline:
     reaches: NDArray[np.float64]
 
     @property
-    def ref(self) -> str:
-        """``id@version``."""
-        return f"{self.manifest.id}@{self.manifest.version}"
-
-    @property
     def tiles(self) -> tuple[TileRecord, ...]:
-        """The maps of the set."""
         return self.manifest.tiles
 
     @property
     def gravity(self) -> NDArray[np.float64] | None:
-        """(3,) unit vector that points down in the set's frame; None where that is not known."""
-        # That one of its maps lies on Earth tells nothing of what the others know.
+        """(3,) unit vector that points down in the set's frame; None when unknown."""
+        # Not from the anchor: that one of its maps lies on Earth says nothing about the others.
         gravity = self.manifest.world.gravity
         return None if gravity is None else np.array(gravity)
-
-    @property
-    def geodetic(self) -> Geodetic | None:
-        """Where the set's frame lies on Earth; None where that is not known."""
-        anchor = self.manifest.world.anchor
-        return None if anchor is None else anchor.geodetic
-
-    @property
-    def place(self) -> GeoCircle | None:
-        """A circle on Earth that holds all tiles; None where that is not known."""
-        return circle_of(self.manifest.world)
-
-    @property
-    def size_bytes(self) -> int:
-        """Size of the set's own files but the manifest; those of its tiles are not counted."""
-        return sum(entry.size for entry in self.manifest.files.values())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoarseIndex:
-    """Every photo of every tile in a few bytes, and every tile in a few rows.
+    """A code of a few bytes for every photo, and a few rows for every tile.
 
     Attributes:
         fingerprint: of the global descriptor.
@@ -100,7 +76,7 @@ class CoarseIndex:
             plane b its descriptor lies.
         codes: (N, bits / 64) uint64, the codes of all photos, tile by tile.
         offsets: (T + 1,) int64; rows offsets[t]:offsets[t + 1] of ``codes`` belong to tile t.
-        centroids: (T * C, D) rows; the C rows of tile t stand for its photos.
+        centroids: (T * C, D), C rows that summarize the photos of each tile.
     """
 
     fingerprint: FingerprintRecord
@@ -117,12 +93,7 @@ class CoarseIndex:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapSet(SetOutline):
-    """One version of a set, open for reading. Its tiles are not.
-
-    Attributes:
-        path: its folder.
-        coarse: the index; its codes are mapped from disk while it lives.
-    """
+    """One version of a set, open for reading; its tiles are not. Codes are mapped from disk."""
 
     path: Path
     coarse: CoarseIndex
@@ -130,7 +101,7 @@ class MapSet(SetOutline):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetContent:
-    """Everything a set holds, but its id, version and creation time."""
+    """Everything in a set except its id, version and creation time."""
 
     world: SetWorld
     local_features: FingerprintRecord
@@ -142,16 +113,7 @@ class SetContent:
 def write_set(folder: Path, content: SetContent, *, set_id: str, version: str, created: str) -> str:
     """Write a set into an empty folder. All files are on disk when this returns.
 
-    Args:
-        folder: exists and is empty.
-        content: the set.
-        set_id: the set's id.
-        version: its version, or a prefix ending in ``-``, to which a part of the content hash
-            is appended.
-        created: ISO 8601 in UTC.
-
-    Returns:
-        The version.
+    Arguments and result are as for ``write_map``.
     """
     files, coarse, tiles = Files(folder), content.coarse, content.tiles
     scales = coarse.centroids.scales
@@ -207,7 +169,7 @@ def read_set_outline(folder: Path) -> SetOutline:
 
 
 def read_any_outline(folder: Path) -> MapOutline | SetOutline:
-    """Read the small files of a map or a set that say what it is.
+    """Read the small files of a map or a set.
 
     Raises:
         MapCorrupt: with the file that is wrong.
@@ -256,7 +218,7 @@ def open_set(folder: Path) -> MapSet:
 def verify_set(folder: Path) -> MapSet:
     """Open a set and read every byte of it: checksums, then ranges.
 
-    Whether its tiles are there is for ``MapStore.publish``.
+    ``MapStore.publish`` checks its tiles.
 
     Raises:
         MapCorrupt: with the file and what is wrong.
@@ -281,7 +243,7 @@ def verify_any(folder: Path) -> MapOutline | SetOutline:
 
 
 def joined_extent(extents: list[Extent]) -> Extent:
-    """Return the smallest box that holds some boxes."""
+    """Return the bounding box of boxes."""
     low = np.min([extent.min for extent in extents], axis=0)
     high = np.max([extent.max for extent in extents], axis=0)
     return Extent(min=low.tolist(), max=high.tolist())

@@ -1,26 +1,18 @@
-"""A folder of maps: ``<maps-dir>/<id>/<version>/`` and ``<maps-dir>/<id>/current``.
+"""A store of maps: its rules, over a folder or another backend.
 
-A set of maps lies beside its tiles, in a folder of the same kind.
-
-Several threads and processes may read and change one store. Readers take no lock: every change
-becomes visible by one rename. Whoever changes something holds the lock ``<maps-dir>/.lock``, so
-that what it found is still true when it renames.
+A set of maps lies beside its tiles, as a version of the same kind.
 """
 
 from __future__ import annotations
 
-import errno
-import fcntl
-import os
-import secrets
-import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 
-from visloc.archive.checks import check_files, read_any_manifest
+from visloc.archive.backends.base import CURRENT, MANIFEST, Backend
+from visloc.archive.backends.folder import FolderBackend
 from visloc.archive.reader import Map, MapOutline, open_map
-from visloc.archive.schema import ID_PATTERN
+from visloc.archive.schema import ID_PATTERN, Manifest
 from visloc.archive.set_rules import (
     AnyManifest,
     refuse_if_tile,
@@ -28,50 +20,45 @@ from visloc.archive.set_rules import (
     refuse_other_kind,
     unreadable_set,
 )
-from visloc.archive.set_schema import SetManifest
-from visloc.archive.sets import (
-    SET_CODES,
-    MapSet,
-    SetOutline,
-    open_set,
-    read_any_outline,
-    verify_any,
+from visloc.archive.sets import SET_CODES, MapSet, SetOutline, open_set, verify_any
+from visloc.archive.version_rules import (
+    checked_name,
+    none_in_use,
+    outdated,
+    refuse_renamed,
+    unknown_version,
+    version_exists,
+    version_in_use,
 )
-from visloc.errors import (
-    Conflict,
-    Forbidden,
-    InvalidInput,
-    MapCorrupt,
-    NotFound,
-    StorageFull,
-)
+from visloc.errors import MapCorrupt, NotFound
 
-CURRENT = "current"
-INCOMING, REMOVED = ".incoming", ".removed-"
 # Every map has it, and no set.
-IMAGE_POSES = "image_poses.npy"
-FULL = (errno.ENOSPC, errno.EDQUOT)
+_IMAGE_POSES = "image_poses.npy"
 
 
 class MapStore:
-    """Finds, opens, publishes and removes maps below one folder."""
+    """Finds, opens, publishes and removes the maps of one place. Several threads may use it.
+
+    A place on another machine raises Unavailable ``maps.storage_away`` where it does not answer
+    and nothing is known of it.
+    """
 
     def __init__(self, root: Path) -> None:
         self.root = root
+        self.backend: Backend = FolderBackend(root)
 
     @property
     def reachable(self) -> bool:
-        """Always: the folder is on this machine."""
-        return True
+        """Whether the place answered when it was last asked."""
+        return self.backend.reachable
 
     def ids(self) -> list[str]:
         """Ids of the maps that have a current version, sorted."""
-        return [name for name in _names_in(self.root) if (self.root / name / CURRENT).is_file()]
+        return self.backend.ids()
 
     def versions(self, map_id: str) -> list[str]:
         """Published versions of a map, oldest first."""
-        folder = self.root / checked_name(map_id, "map")
-        return [name for name in _names_in(folder) if (folder / name / "manifest.json").is_file()]
+        return self.backend.versions(checked_name(map_id, "map"))
 
     def current_version(self, map_id: str) -> str:
         """The version in use.
@@ -80,49 +67,29 @@ class MapStore:
             NotFound: ``map.unknown``, ``map.none_in_use``.
             MapCorrupt: ``map.current`` when the file that names it is damaged.
         """
-        path = self.root / checked_name(map_id, "map") / CURRENT
-        try:
-            version = path.read_text(encoding="ascii").strip()
-        except FileNotFoundError:
+        version = self.backend.current(checked_name(map_id, "map"))
+        if version is None:
             versions = self.versions(map_id)
-            if versions:
-                raise none_in_use(map_id, versions) from None
-            known = ", ".join(self.ids()) or "none"
-            raise NotFound(
-                "map.unknown", "no such map", field="map", expected=f"one of: {known}", got=map_id
-            ) from None
-        except (OSError, UnicodeDecodeError) as error:
-            raise MapCorrupt("map.current", "cannot be read", field=str(path)) from error
+            raise none_in_use(map_id, versions) if versions else self._unknown_map(map_id)
         if not ID_PATTERN.fullmatch(version):
-            raise MapCorrupt("map.current", "does not name a version", field=str(path), got=version)
+            field = self.backend.address(map_id, CURRENT)
+            raise MapCorrupt("map.current", "does not name a version", field=field, got=version)
         return version
 
     def folder(self, ref: str) -> Path:
-        """The folder of ``id`` (its current version) or ``id@version``.
+        """The local folder of ``id`` (its current version) or ``id@version``, fetched if necessary.
 
         Raises:
             InvalidInput: ``map.id`` for a reference that is neither.
             NotFound: ``map.unknown`` or ``map.version``.
+            MapCorrupt: when what was fetched is not what its manifest says.
+            StorageFull: ``maps.storage_full`` when there is no room for a copy.
         """
-        map_id, at, version = ref.partition("@")
-        if not at:
-            version = self.current_version(map_id)
-        folder = self.root / checked_name(map_id, "map") / checked_name(version, "map version")
-        if not folder.is_dir():
-            if not self.versions(map_id):
-                self.current_version(map_id)  # raises: no such map
-            raise NotFound(
-                "map.version",
-                f"map {map_id!r} has no such version",
-                field="map",
-                expected=f"one of: {', '.join(self.versions(map_id)) or 'none'}",
-                got=version,
-            )
-        return folder
+        return self.backend.folder(*self._found(ref))
 
     def at_hand(self, ref: str) -> Path | None:
-        """The same as ``folder``: nothing needs to be fetched."""
-        return self.folder(ref)
+        """The same as ``folder`` where that is quick; None when it must be fetched first."""
+        return self.backend.local_folder(*self._found(ref))
 
     def open(self, ref: str) -> Map:
         """Open ``id`` or ``id@version``; raises what ``folder`` and ``open_published`` raise."""
@@ -134,7 +101,7 @@ class MapStore:
 
     def outline(self, ref: str) -> MapOutline | SetOutline:
         """Say what ``id`` or ``id@version`` is, without opening its arrays; raises as ``open``."""
-        return read_published_outline(self.folder(ref))
+        return self.backend.outline(*self._found(ref))
 
     def publish(
         self,
@@ -147,78 +114,44 @@ class MapStore:
     ) -> Path:
         """Verify a finished map folder, give it its place, and make it current.
 
-        Every byte is read first. The rename and the switch of ``current`` are atomic: a reader
-        sees the old map or the new one, never a half. Killed between the two, the version is there
-        and the one before it stays in use.
+        Every byte is read first. A reader sees the old map or the new one, never a half. Killed
+        before ``current`` is switched, the version is there and the one before it stays in use.
 
         Args:
-            incoming: the map, in a folder on the same file system as the store.
+            incoming: the map, within a folder that ``incoming()`` gave.
             map_id: the map's id.
             version: the version's name.
             make_current: whether it takes over from the version in use. A map without a current
                 version is not among ``ids``.
-            based_on: the version that it was made from, if it was made from one, which must still
-                be the one in use: what another one brought would be lost.
+            based_on: the version that it was made from, if any. It must still be the one in use;
+                otherwise the changes that came into use meanwhile would be lost.
 
         Returns:
-            The folder of the published version.
+            The local folder of the published version.
 
         Raises:
             Conflict: ``map.version_exists``, ``map.outdated``; ``set.id_is_map``,
-                ``map.id_is_set``; ``set.tile``, ``set.features``.
+                ``map.id_is_set``; ``set.tile``, ``set.features``; in object storage also
+                ``map.upload_runs``.
             NotFound: ``set.tile`` when a tile of a set is not in the store.
             MapCorrupt: what ``verify_any`` finds, or ``map.renamed`` when the manifest names
                 another id or version.
         """
-        return self._place(
-            incoming,
-            map_id,
-            version,
-            make_current=make_current,
-            keeps_rules=True,
-            based_on=based_on,
-        )
-
-    def keep_copy(self, incoming: Path, map_id: str, version: str) -> Path:
-        """Take in a version that another store has published: as ``publish``, not made current.
-
-        What else that store has is not here, so that it is not asked for the tiles of a set.
-        """
-        return self._place(incoming, map_id, version, make_current=False, keeps_rules=False)
-
-    def _place(
-        self,
-        incoming: Path,
-        map_id: str,
-        version: str,
-        *,
-        make_current: bool,
-        keeps_rules: bool,
-        based_on: str | None = None,
-    ) -> Path:
-        target = self.root / checked_name(map_id, "map") / checked_name(version, "map version")
+        checked_name(map_id, "map")
+        checked_name(version, "map version")
         manifest = verify_any(incoming).manifest
-        refuse_renamed(manifest, incoming, map_id, version)
-        with self._changing():
-            if keeps_rules:
-                refuse_other_kind(manifest, self._any_version(map_id))
-                refuse_missing_tiles(manifest, self._manifests)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            if target.exists():
+        refuse_renamed(manifest, str(incoming), map_id, version)
+        with self.backend.changing():
+            refuse_other_kind(manifest, self._any_version(map_id))
+            refuse_missing_tiles(manifest, self._manifests)
+            if self.backend.has_version(map_id, version):
                 raise version_exists(map_id, version)
-            if based_on is not None and _current_or_none(self, map_id) != based_on:
-                raise outdated(map_id, based_on, _current_or_none(self, map_id))
-            for folder in (*(path for path in incoming.rglob("*") if path.is_dir()), incoming):
-                _sync_folder(folder)
-            if make_current:  # first what a full disk could refuse
-                switch = _prepare_current(target.parent, version)
-            incoming.rename(target)
-            _sync_folder(target.parent)
-            _sync_folder(self.root)
-            if make_current:
-                switch.replace(target.parent / CURRENT)
-                _sync_folder(target.parent)
-        return target
+            current = self.backend.current(map_id)
+            if based_on is not None and current != based_on:
+                raise outdated(map_id, based_on, current)
+            return self.backend.publish(
+                incoming, map_id, version, make_current=make_current, based_on=based_on
+            )
 
     def set_current(self, map_id: str, version: str) -> None:
         """Make a published version the one in use, atomically.
@@ -227,306 +160,139 @@ class MapStore:
             NotFound: ``map.unknown`` or ``map.version``; ``set.tile``, and
             Conflict: ``set.tile``, for a set whose tiles are not in the store any more.
         """
-        with self._changing():
-            parent = self.folder(f"{map_id}@{version}").parent
-            refuse_missing_tiles(read_any_manifest(parent / version), self._manifests)
-            _prepare_current(parent, version).replace(parent / CURRENT)
-            _sync_folder(parent)
+        with self.backend.changing():
+            self._found(f"{map_id}@{version}")
+            (manifest,) = self._manifests([(map_id, version)])
+            refuse_missing_tiles(manifest, self._manifests)
+            self.backend.set_current(map_id, version)
 
     def remove(self, map_id: str, version: str) -> None:
         """Remove a version; with the last one, the map.
 
-        It disappears by one rename before its files are deleted. Whoever has it open can go on.
+        It disappears at once, before its files are deleted. Maps that are open stay readable.
 
         Raises:
             NotFound: ``map.unknown`` or ``map.version``.
             Conflict: ``map.version_in_use`` for the current version of a map that has others;
                 ``map.in_set`` for a version that a set in use names.
         """
-        with self._changing():
-            folder = self.folder(f"{map_id}@{version}")
+        with self.backend.changing():
+            self._found(f"{map_id}@{version}")
             others = [name for name in self.versions(map_id) if name != version]
-            if others and _current_or_none(self, map_id) == version:
+            if others and self.backend.current(map_id) == version:
                 raise version_in_use(map_id, version, others)
-            if may_be_tile(lambda: read_any_manifest(folder), has_file(folder)):
-                refuse_if_tile(map_id, version, self._sets_in_use(folder))
-            leaving = folder if others else folder.parent
-            # Beside where it was, as a full disk may have no room for another folder.
-            removed = leaving.with_name(f"{REMOVED}{secrets.token_hex(8)}")
-            leaving.rename(removed)
-            _sync_folder(removed.parent)
-        shutil.rmtree(removed, ignore_errors=True)
+            if self._may_be_tile(map_id, version):
+                refuse_if_tile(map_id, version, self._sets_in_use((map_id, version)))
+            delete = self.backend.remove(map_id, version, is_last=not others)
+        delete()
 
-    @contextmanager
-    def incoming(self) -> Iterator[Path]:
-        """Give an empty folder on the store's file system, for a map that is to be published.
+    def incoming(self) -> AbstractContextManager[Path]:
+        """Give an empty folder for a map that is to be published.
 
-        What is left in it is deleted in the end; what a process leaves that is killed meanwhile is
-        deleted by the next ``sweep``, which comes with every ``incoming``.
+        It is deleted in the end with all that is left in it. If the process is killed meanwhile,
+        the next ``sweep`` deletes it; every ``incoming`` begins with one.
 
         Raises:
             StorageFull: ``maps.storage_full``, also for a full disk within the block.
             Forbidden: ``maps.read_only``, likewise.
         """
-        self.sweep()
-        folder = self.root / INCOMING / secrets.token_hex(8)
-        lock = folder.with_suffix(".lock")
-        with storage_errors(self.root), ExitStack() as holding:
-            with self._changing():
-                folder.parent.mkdir(exist_ok=True)
-                # Held while the folder is in use: a process id means nothing in another container.
-                fcntl.flock(holding.enter_context(lock.open("w")), fcntl.LOCK_EX)
-            try:
-                folder.mkdir()
-                yield folder
-            finally:
-                shutil.rmtree(folder, ignore_errors=True)
-                lock.unlink(missing_ok=True)
+        return self.backend.incoming()
 
     def sweep(self) -> None:
-        """Delete what uploads and removals left behind whose process was killed."""
-        for removed in (*self.root.glob(f"{REMOVED}*"), *self.root.glob(f"*/{REMOVED}*")):
-            shutil.rmtree(removed, ignore_errors=True)
-        parent = self.root / INCOMING
-        if not parent.is_dir() or not os.access(parent, os.W_OK):
-            return
-        with ExitStack() as holding, self._changing():
-            for path in parent.glob("*.lock"):
-                lock = holding.enter_context(path.open("w"))
-                with suppress(BlockingIOError):
-                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    holding.callback(path.unlink, missing_ok=True)
-                    holding.callback(shutil.rmtree, path.with_suffix(""), ignore_errors=True)
+        """Delete what killed processes left behind of uploads and removals."""
+        self.backend.sweep()
 
-    def _manifest(self, map_id: str, version: str) -> AnyManifest:
-        return read_any_manifest(self.folder(f"{map_id}@{version}"))
+    def _found(self, ref: str) -> tuple[str, str]:
+        """The id and version of ``id`` (its current version) or ``id@version``; raise NotFound."""
+        map_id, at, version = ref.partition("@")
+        if not at:
+            version = self.current_version(map_id)
+        checked_name(map_id, "map")
+        checked_name(version, "map version")
+        if not self.backend.has_version(map_id, version):
+            versions = self.versions(map_id)
+            raise (
+                unknown_version(map_id, version, versions)
+                if versions or self.backend.current(map_id) is not None
+                else self._unknown_map(map_id)
+            )
+        return map_id, version
+
+    def _unknown_map(self, map_id: str) -> NotFound:
+        known = ", ".join(self.ids()) or "none"
+        return NotFound(
+            "map.unknown", "no such map", field="map", expected=f"one of: {known}", got=map_id
+        )
 
     def _manifests(self, refs: Sequence[tuple[str, str]]) -> Iterator[AnyManifest]:
-        for ref in refs:
-            yield self._manifest(*ref)
+        """The manifests of versions; raises NotFound and MapCorrupt in their turn."""
+        for (map_id, version), found in zip(refs, self.backend.manifests(refs), strict=True):
+            if found is None:
+                self._found(f"{map_id}@{version}")
+                field = self.backend.address(map_id, version, MANIFEST)
+                raise MapCorrupt("map.manifest", "the file is missing", field=field)
+            if isinstance(found, MapCorrupt):
+                raise found
+            yield found
 
     def _any_version(self, map_id: str) -> AnyManifest | None:
         """The manifest of any version of a map or set; None when none can be read."""
-        for version in self.versions(map_id):
-            with suppress(MapCorrupt):
-                return self._manifest(map_id, version)
-        return None
+        found = self.backend.manifests([(map_id, version) for version in self.versions(map_id)])
+        return next((one for one in found if one and not isinstance(one, MapCorrupt)), None)
 
-    def _sets_in_use(self, leaving: Path) -> Iterator[tuple[str, AnyManifest]]:
-        """The sets in use but for ``leaving``; of an id whose ``current`` is damaged, all versions.
+    def _may_be_tile(self, map_id: str, version: str) -> bool:
+        """Tell whether sets may name a version; a damaged one is judged by its files."""
+        (manifest,) = self.backend.manifests([(map_id, version)])
+        if manifest is None or isinstance(manifest, MapCorrupt):
+            has_poses = self.backend.has_file(map_id, version, _IMAGE_POSES)
+            return has_poses or not self.backend.has_file(map_id, version, SET_CODES)
+        return isinstance(manifest, Manifest)
 
-        A map may be among them.
+    def _looks_like_map(self, map_id: str, version: str) -> bool:
+        """Tell by its files that a version is no set; one that lost files does not look like it."""
+        has_poses = self.backend.has_file(map_id, version, _IMAGE_POSES)
+        return has_poses and not self.backend.has_file(map_id, version, SET_CODES)
+
+    def _sets_in_use(self, leaving: tuple[str, str]) -> Iterator[tuple[str, AnyManifest]]:
+        """The sets in use except ``leaving``; every version of an id whose ``current`` is damaged.
+
+        Maps may be among them.
 
         Raises:
-            Conflict: ``map.in_set`` for one that cannot be read.
+            Conflict: ``map.in_set`` for a set that cannot be read.
         """
+        refs = []
         for map_id in self.ids():
-            try:
-                versions = [self.current_version(map_id)]
-            except NotFound:
-                continue
-            except MapCorrupt:
-                versions = self.versions(map_id)
-            for version in versions:
-                folder, ref = self.root / map_id / version, f"{map_id}@{version}"
-                if folder == leaving or not folder.is_dir():
-                    continue
-                if looks_like_map(has_file(folder)):  # of thousands, no manifest is read
-                    continue
-                try:
-                    yield ref, read_any_manifest(folder)
-                except MapCorrupt as error:
-                    raise unreadable_set(ref, error) from error
-
-    @contextmanager
-    def _changing(self) -> Iterator[None]:
-        with storage_errors(self.root):
-            self.root.mkdir(parents=True, exist_ok=True)
-            with (self.root / ".lock").open("w") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)
-                yield
-
-
-def looks_like_map(has: Callable[[str], bool]) -> bool:
-    """Tell by its files that a version is a map and no set; a file that is lost makes no map."""
-    return has(IMAGE_POSES) and not has(SET_CODES)
-
-
-def may_be_tile(read: Callable[[], AnyManifest], has: Callable[[str], bool]) -> bool:
-    """Tell whether sets may name a version: whether it is no set.
-
-    Args:
-        read: its manifest; raises MapCorrupt when that is damaged, and its files tell.
-        has: whether it has a file.
-    """
-    try:
-        return not isinstance(read(), SetManifest)
-    except MapCorrupt:
-        return has(IMAGE_POSES) or not has(SET_CODES)
-
-
-def has_file(folder: Path) -> Callable[[str], bool]:
-    """Return what tells whether a folder has a file."""
-    return lambda name: (folder / name).is_file()
+            current = self.backend.current(map_id)
+            if current is not None:
+                is_name = ID_PATTERN.fullmatch(current)
+                versions = [current] if is_name else self.versions(map_id)
+                refs += [(map_id, version) for version in versions]
+        refs = [ref for ref in refs if ref != leaving]
+        if self.backend.is_local:  # with thousands of maps, reading their manifests takes longer
+            refs = [ref for ref in refs if not self._looks_like_map(*ref)]
+        for (map_id, version), found in zip(refs, self.backend.manifests(refs), strict=True):
+            ref = f"{map_id}@{version}"
+            if isinstance(found, MapCorrupt):
+                if not self._looks_like_map(map_id, version):
+                    raise unreadable_set(ref, found) from found
+            elif found is not None:  # it is None if another server has just removed it
+                yield ref, found
 
 
 def open_published(folder: Path) -> Map:
     """Open the map in a folder ``<id>/<version>``.
 
     Raises:
-        MapCorrupt: what ``open_map`` finds, or ``map.renamed`` when the folder was copied or
-            renamed: answers would carry the old name.
+        MapCorrupt: what ``open_map`` finds, or ``map.renamed`` for another folder than that.
     """
     opened = open_map(folder)
-    refuse_renamed(opened.manifest, folder, folder.parent.name, folder.name)
+    refuse_renamed(opened.manifest, str(folder), folder.parent.name, folder.name)
     return opened
 
 
 def open_published_set(folder: Path) -> MapSet:
-    """Open the set in a folder ``<id>/<version>``.
-
-    Raises:
-        MapCorrupt: as ``open_published``.
-    """
+    """Open the set in a folder ``<id>/<version>``; raises as ``open_published``."""
     opened = open_set(folder)
-    refuse_renamed(opened.manifest, folder, folder.parent.name, folder.name)
+    refuse_renamed(opened.manifest, str(folder), folder.parent.name, folder.name)
     return opened
-
-
-def read_published_outline(folder: Path) -> MapOutline | SetOutline:
-    """Read what the map or set in a folder ``<id>/<version>`` says, whose files must be there.
-
-    Raises:
-        MapCorrupt: as ``open_published``, but the arrays are not opened.
-    """
-    outline = read_any_outline(folder)
-    check_files(folder, outline.manifest)
-    refuse_renamed(outline.manifest, folder, folder.parent.name, folder.name)
-    return outline
-
-
-def refuse_renamed(manifest: AnyManifest, folder: Path, map_id: str, version: str) -> None:
-    """Raise MapCorrupt ``map.renamed`` unless a manifest is of this name."""
-    if (manifest.id, manifest.version) != (map_id, version):
-        raise MapCorrupt(
-            "map.renamed",
-            "the map's folder was copied or renamed; build the map under its new id",
-            field=str(folder),
-            expected=f"{manifest.id}/{manifest.version}",
-            got=f"{map_id}/{version}",
-        )
-
-
-def checked_name(name: str, what: str) -> str:
-    """Return an id of a map or version; InvalidInput ``map.id`` for what cannot be one."""
-    if not ID_PATTERN.fullmatch(name):
-        raise InvalidInput(
-            "map.id",
-            f"not a {what} name",
-            field="map",
-            expected="up to 64 letters, digits, '.', '_', '-', beginning with a letter or digit",
-            got=name,
-        )
-    return name
-
-
-def version_exists(map_id: str, version: str) -> Conflict:
-    """``map.version_exists``."""
-    return Conflict(
-        "map.version_exists",
-        "the version exists already; versions never change, publish under another name",
-        field="map",
-        got=f"{map_id}@{version}",
-    )
-
-
-def none_in_use(map_id: str, versions: Sequence[str]) -> NotFound:
-    """``map.none_in_use``."""
-    return NotFound(
-        "map.none_in_use",
-        "no version of the map is in use; put one into use, or name one",
-        field="map",
-        expected=f"one of: {', '.join(f'{map_id}@{version}' for version in versions)}",
-        got=map_id,
-    )
-
-
-def version_in_use(map_id: str, version: str, others: Sequence[str]) -> Conflict:
-    """``map.version_in_use``."""
-    return Conflict(
-        "map.version_in_use",
-        "the version is in use; make another one current first",
-        field="map",
-        expected=f"one of: {', '.join(others)}",
-        got=f"{map_id}@{version}",
-    )
-
-
-def outdated(map_id: str, based_on: str, current: str | None) -> Conflict:
-    """``map.outdated``."""
-    return Conflict(
-        "map.outdated",
-        "another version of the map came into use meanwhile; run the same command again on it",
-        field="map",
-        expected=f"{map_id}@{based_on}",
-        got="no version" if current is None else f"{map_id}@{current}",
-    )
-
-
-@contextmanager
-def storage_errors(place: Path) -> Iterator[None]:
-    """Turn a full or read-only disk into an error for users.
-
-    Raises:
-        StorageFull: ``maps.storage_full``.
-        Forbidden: ``maps.read_only``.
-    """
-    try:
-        yield
-    except OSError as error:
-        if error.errno in FULL:
-            raise StorageFull(
-                "maps.storage_full",
-                "no room on the disk; remove maps or versions that are not needed",
-                field=str(place),
-            ) from error
-        if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
-            raise Forbidden(
-                "maps.read_only",
-                "the folder of maps may not be written to by this program",
-                field=str(place),
-                got=error.strerror,
-            ) from error
-        raise
-
-
-def _names_in(folder: Path) -> list[str]:
-    try:
-        return sorted(path.name for path in folder.iterdir() if ID_PATTERN.fullmatch(path.name))
-    except (FileNotFoundError, NotADirectoryError):  # another process may have removed it
-        return []
-
-
-def _current_or_none(store: MapStore, map_id: str) -> str | None:
-    try:
-        return store.current_version(map_id)
-    except NotFound:
-        return None
-
-
-def _prepare_current(folder: Path, version: str) -> Path:
-    """Write what is to replace ``current``; only under the lock, as the name is always the same."""
-    switch = folder / f".{CURRENT}.new"
-    with switch.open("w", encoding="ascii") as file:
-        file.write(version + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-    return switch
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -33,13 +33,13 @@ from visloc.retrieval.index import MAX_EXACT
 from visloc.retrieval.rows import in_8_bits
 from visloc.retrieval.shortlist import make_clusters
 
-# Rows of an array that are converted and written at a time.
+# Rows of an array that are converted and written at once.
 _BLOCK_ROWS = 8192
-# Pixels are stored in steps of a power of two, such that an image is at most so many steps wide;
-# some room is left beyond its edges. In 16 bits where that is fine enough and all lie in that room.
+# Keypoints are stored as 16-bit multiples of a power of two, with an image at most so many steps
+# wide, which leaves room beyond its edges. Where that is too coarse or too narrow: as float32.
 _MAX_STEPS = 30_000
 _MAX_KEYPOINT_STEP_PX = 0.25
-# Matrices of a model with more numbers than this are stored in 8 bits.
+# Larger matrices of a model are stored in 8 bits.
 _MAX_FLOAT_MODEL = 2**16
 
 # qw qx qy qz tx ty tz
@@ -48,18 +48,18 @@ PoseRow = tuple[float, ...]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Landmarks:
-    """Landmarks and who observes them, as one of the mapping methods made them.
+    """Landmarks and their observations.
 
     Attributes:
-        origin: (3,) float64, the point of the world that ``points`` are relative to.
+        origin: (3,) float64, origin of ``points`` in the world.
         points: (P, 3) float32.
         track_lengths: (P,) uint16.
         errors_px: (P,) float32, NaN where it does not apply.
         angles_deg: (P,) float32, NaN where it does not apply.
-        offsets: (n + 1,) int64, rows of the next two by photo.
+        offsets: (n + 1,) int64, rows of ``observed`` and ``keypoints`` by photo.
         observed: (M,) uint32 rows of ``points``.
         keypoints: (M, 2) float32 pixels.
-        colors: (P, 3) uint8 RGB; None if they are not known.
+        colors: (P, 3) uint8 RGB; None when unknown.
     """
 
     origin: NDArray[np.float64]
@@ -78,10 +78,9 @@ class GlobalFeatures:
     """One global descriptor of all mapping photos.
 
     Attributes:
-        fingerprint: which.
         descriptors: (n, D) unit rows; zero rows for blank photos.
-        model: its float32 arrays, or as a map stores them: large ones in int8 beside their scales.
-            Empty if the descriptor is ready-made.
+        model: its float32 arrays, or as a map stores them, with large ones in int8 and their
+            scales. Empty if the descriptor is ready-made.
     """
 
     fingerprint: FingerprintRecord
@@ -91,16 +90,20 @@ class GlobalFeatures:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapContent:
-    """Everything a map holds, but its id, version and creation time.
+    """Everything in a map except its id, version and creation time.
 
-    ``descriptors()`` yields, photo by photo, the unit descriptors (m_i, D) float32 of that photo's
-    observations in the order of ``landmarks``; it is read twice. ``descriptor_scale`` is the value
-    of one of the steps they are stored in: that of the map they were read from, so that they are
-    stored as they were; None for one that fits the largest. ``image_poses`` are cam_from_world
-    (n, 7), and those of rigs cam_from_rig (7,), as ``pose_row`` has them. ``gravity`` is the unit
-    vector that points down in the world, None where that is not known. ``computed_with`` tells what
-    computed the local features, for people. ``fusion`` is how queries rank the photos unless they
-    say otherwise. Arrays may be mapped from files: none is copied whole.
+    Arrays may be mapped from files: none is copied whole.
+
+    Attributes:
+        rigs: cam_from_rig (7,) by rig and camera.
+        image_poses: cam_from_world (n, 7).
+        descriptors: yields the unit descriptors (m_i, D) float32 of each photo's observations, in
+            the order of ``landmarks``. It is called twice.
+        gravity: unit vector that points down in the world; None when unknown.
+        computed_with: what computed the local features, for people.
+        fusion: how queries rank the photos by default.
+        descriptor_scale: the step in which descriptors are stored. The step of the map that they
+            were read from stores them unchanged; None chooses one that fits the largest value.
     """
 
     metric: bool
@@ -127,7 +130,7 @@ class MapContent:
 def pose_row(pose: Pose) -> PoseRow:
     """Return a pose as it is stored: qw qx qy qz tx ty tz.
 
-    Of a row that was read as a pose, the last digit can differ; rows that stay are passed on.
+    A row that was read as a pose can come back with another last digit: pass on rows that stay.
     """
     return (*pose.rotation_wxyz.tolist(), *pose.translation.tolist())
 
@@ -141,37 +144,14 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
         map_id: the map's id.
         version: its version, or a prefix ending in ``-``, to which a part of the content hash
             is appended.
-        created: ISO 8601 in UTC; given, because nothing below ``mapping`` reads a clock.
+        created: ISO 8601 in UTC; a parameter because nothing below ``mapping`` reads a clock.
 
     Returns:
         The version.
     """
-    landmarks = content.landmarks
-    files = Files(folder)
-    files.write_json(
-        "cameras.json",
-        {
-            "cameras": {
-                key: {"model": c.model, "width": c.width, "height": c.height, "params": c.params}
-                for key, c in content.cameras.items()
-            },
-            "rigs": {
-                rig: {key: list(row) for key, row in members.items()}
-                for rig, members in content.rigs.items()
-            },
-        },
-    )
-    files.write_json("images.json", {"images": [asdict(image) for image in content.images]})
-    files.write_array("image_poses.npy", "<f8", content.image_poses)
-    files.write_array("landmarks.npy", "<f4", landmarks.points)
-    files.write_array("landmark_track_length.npy", "<u2", landmarks.track_lengths)
-    files.write_array("landmark_error_px.npy", "<f2", landmarks.errors_px, _within_float16)
-    if any(not np.isnan(block).all() for block in _blocks(landmarks.angles_deg)):
-        files.write_array("landmark_angle_deg.npy", "<f2", landmarks.angles_deg, _within_float16)
-    if landmarks.colors is not None:
-        files.write_array("landmark_rgb.npy", "|u1", landmarks.colors)
-    files.write_array("observation_offsets.npy", "<i8", landmarks.offsets)
-    files.write_array("observation_landmarks.npy", "<u4", landmarks.observed)
+    files, landmarks = Files(folder), content.landmarks
+    _write_images(files, content)
+    _write_landmarks(files, landmarks)
     keypoint_step = _write_keypoints(files, landmarks.keypoints, content.cameras)
     scale = _write_descriptors(
         files,
@@ -180,22 +160,12 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
         content.descriptor_scale,
     )
     clusters = [_write_global(files, features) for features in content.global_features]
-    extent = landmarks.points.min(axis=0), landmarks.points.max(axis=0)
     manifest: dict[str, Any] = {
         "format": FORMAT,
         "format_version": f"{FORMAT_MAJOR}.{FORMAT_MINOR}",
         "id": map_id,
         "created": created,
-        "world": {
-            "metric": content.metric,
-            "origin": landmarks.origin.tolist(),
-            "extent": {
-                "min": (landmarks.origin + extent[0]).tolist(),
-                "max": (landmarks.origin + extent[1]).tolist(),
-            },
-            **({} if content.anchor is None else {"anchor": content.anchor.model_dump()}),
-            **({} if content.gravity is None else {"gravity": list(content.gravity)}),
-        },
+        "world": _world(content),
         "method": {"name": content.method, "settings": dict(content.settings)},
         "local_features": {
             "fingerprint": content.local_fingerprint.model_dump(),
@@ -207,12 +177,12 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
         },
         "global_features": [
             {
-                "fingerprint": f.fingerprint.model_dump(),
-                "dim": f.descriptors.shape[1],
+                "fingerprint": features.fingerprint.model_dump(),
+                "dim": features.descriptors.shape[1],
                 "bits": 8,
                 "clusters": count,
             }
-            for f, count in zip(content.global_features, clusters, strict=True)
+            for features, count in zip(content.global_features, clusters, strict=True)
         ],
         "retrieval": RetrievalRecord.of(content.fusion).model_dump(mode="json"),
         "counts": {
@@ -227,14 +197,13 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
 
 
 class Files:
-    """The files of a map as they are written, each with its checksum."""
+    """Writes the files of a map and collects their checksums."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._written: dict[str, str] = {}
 
     def write_json(self, name: str, value: object) -> None:
-        """Write a JSON file in its one spelling."""
         self._write(name, [json_text(value).encode()])
 
     def write_array(
@@ -244,7 +213,7 @@ class Files:
         array: NDArray[Any],
         converted: Callable[[NDArray[Any]], NDArray[Any]] = np.asarray,
     ) -> None:
-        """Write an array of which a block at a time is in memory, converted to ``dtype``."""
+        """Write an array converted to ``dtype``, block by block."""
         self.write_blocks(name, dtype, array.shape, map(converted, _blocks(array)))
 
     def write_blocks(
@@ -252,7 +221,7 @@ class Files:
     ) -> None:
         """Write an ``.npy`` block by block.
 
-        On a full disk ``np.save`` does not say what is wrong, and a memory map ends the process.
+        On a full disk ``np.save`` hides the reason, and a memory map ends the process.
         """
         header = io.BytesIO()
         np.lib.format.write_array_header_1_0(
@@ -262,7 +231,7 @@ class Files:
         self._write(name, itertools.chain([header.getvalue()], rows))
 
     def write_model(self, name: str, model: Mapping[str, NDArray[Any]]) -> None:
-        """Write the arrays of a model, of which large matrices are stored in 8 bits."""
+        """Write the arrays of a model, with large matrices in 8 bits."""
         path = self._path(name)
         with path.open("xb") as file:
             # The savez stub takes no mapping of arrays as keywords beside allow_pickle.
@@ -270,7 +239,7 @@ class Files:
         self._written[name] = sha256_of(path)
 
     def entries(self) -> dict[str, dict[str, int | str]]:
-        """Size and checksum of all files in the folder, those written by others read again."""
+        """Size and checksum of all files in the folder, also of those that others wrote."""
         entries: dict[str, dict[str, int | str]] = {}
         for path in sorted(self.folder.rglob("*")):
             if path.is_file():
@@ -280,12 +249,11 @@ class Files:
         return entries
 
     def finish(self, manifest: dict[str, Any], version: str) -> str:
-        """Complete a manifest with version and hashes, write it, and see all files on disk.
+        """Add version and hashes to a manifest, write it, and sync all files to disk.
 
         Args:
-            manifest: all else; its ``files`` are ``entries()``.
-            version: the version, or a prefix ending in ``-``, to which a part of the content
-                hash is appended.
+            manifest: everything else; its ``files`` are ``entries()``.
+            version: as for ``write_map``.
 
         Returns:
             The version.
@@ -321,20 +289,64 @@ def _blocks(array: NDArray[Any]) -> Iterator[NDArray[Any]]:
 
 
 def _within_float16(values: NDArray[Any]) -> NDArray[Any]:
-    """Clip to what float16 can hold; NaN stays."""
+    """Clip to the range of float16; NaN stays."""
     limit = float(np.finfo(np.float16).max)
     return np.asarray(np.clip(values, -limit, limit))
+
+
+def _world(content: MapContent) -> dict[str, Any]:
+    landmarks = content.landmarks
+    low, high = landmarks.points.min(axis=0), landmarks.points.max(axis=0)
+    world: dict[str, Any] = {
+        "metric": content.metric,
+        "origin": landmarks.origin.tolist(),
+        "extent": {
+            "min": (landmarks.origin + low).tolist(),
+            "max": (landmarks.origin + high).tolist(),
+        },
+    }
+    if content.anchor is not None:
+        world["anchor"] = content.anchor.model_dump()
+    if content.gravity is not None:
+        world["gravity"] = list(content.gravity)
+    return world
+
+
+def _write_images(files: Files, content: MapContent) -> None:
+    cameras = {
+        key: {"model": c.model, "width": c.width, "height": c.height, "params": c.params}
+        for key, c in content.cameras.items()
+    }
+    rigs = {
+        rig: {key: list(row) for key, row in members.items()}
+        for rig, members in content.rigs.items()
+    }
+    files.write_json("cameras.json", {"cameras": cameras, "rigs": rigs})
+    files.write_json("images.json", {"images": [asdict(image) for image in content.images]})
+    files.write_array("image_poses.npy", "<f8", content.image_poses)
+
+
+def _write_landmarks(files: Files, landmarks: Landmarks) -> None:
+    files.write_array("landmarks.npy", "<f4", landmarks.points)
+    files.write_array("landmark_track_length.npy", "<u2", landmarks.track_lengths)
+    files.write_array("landmark_error_px.npy", "<f2", landmarks.errors_px, _within_float16)
+    if any(not np.isnan(block).all() for block in _blocks(landmarks.angles_deg)):
+        files.write_array("landmark_angle_deg.npy", "<f2", landmarks.angles_deg, _within_float16)
+    if landmarks.colors is not None:
+        files.write_array("landmark_rgb.npy", "|u1", landmarks.colors)
+    files.write_array("observation_offsets.npy", "<i8", landmarks.offsets)
+    files.write_array("observation_landmarks.npy", "<u4", landmarks.observed)
 
 
 def _write_keypoints(
     files: Files, keypoints: NDArray[np.float32], cameras: Mapping[str, Camera]
 ) -> float | None:
-    """Store pixels in 16 bits where they fit, and return the step; None for float32."""
+    """Store keypoints in 16 bits if they fit and return the step; None for float32."""
     name = "observation_keypoints.npy"
     side = max(max(camera.width, camera.height) for camera in cameras.values())
     step = 2.0 ** math.ceil(math.log2(side / _MAX_STEPS))
     most = step * np.iinfo(np.int16).max
-    # NaN fits no comparison.
+    # NaN fails every comparison.
     fits = all(bool((np.abs(block) <= most).all()) for block in _blocks(keypoints))
     if step > _MAX_KEYPOINT_STEP_PX or not fits:
         files.write_array(name, "<f4", keypoints)
@@ -349,10 +361,10 @@ def _write_descriptors(
     shape: tuple[int, int],
     scale: float | None,
 ) -> float:
-    """Store unit descriptors in 8 bits and return the value of one step.
+    """Store unit descriptors in 8 bits and return the step.
 
-    One step for the whole map: it keeps products of stored integers comparable. Values beyond
-    what a given step can hold become the largest.
+    The step is one for the whole map, so that products of stored integers are comparable. Values
+    out of range are clipped.
     """
     if scale is None:
         blocks = descriptors()
@@ -374,7 +386,7 @@ def _write_descriptors(
 
 
 def _write_global(files: Files, features: GlobalFeatures) -> int | None:
-    """Store a global descriptor's rows and model in 8 bits; return how many clusters it has."""
+    """Store a global descriptor's rows and model in 8 bits; return its number of clusters."""
     stem, rows = features.fingerprint.file_stem, features.descriptors
     scales = np.empty(len(rows), np.float32)
 
@@ -397,7 +409,7 @@ def _write_global(files: Files, features: GlobalFeatures) -> int | None:
 
 
 def _stored_model(model: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """A model with its large matrices in 8 bits, which have a scale for each column."""
+    """A model with its large matrices in 8 bits and a scale for each of their columns."""
     stored: dict[str, NDArray[Any]] = {}
     for name, array in model.items():
         if array.ndim != 2 or array.size <= _MAX_FLOAT_MODEL or array.dtype == np.int8:

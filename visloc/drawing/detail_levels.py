@@ -1,100 +1,46 @@
-"""Landmarks to be drawn: in an order of which every beginning shows the whole map, as bytes."""
+"""Level-of-detail order of landmarks: every prefix samples the whole map evenly."""
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.archive.checks import array_rows, is_finite, map_array
+from visloc.archive.checks import is_finite, map_array
 from visloc.archive.schema import Manifest
 from visloc.errors import MapCorrupt
 
-MAGIC = b"VLPT"
-FORMAT = 1
-HAS_COLORS = 1
-# magic, format, landmarks of the map, first row, rows, flags; origin of the map
-_HEADER = struct.Struct("<4s5I3d")
-_ROW = np.dtype([("position", "<f4", 3), ("rgb", "u1", 3), ("photos", "u1")])
-HEADER_BYTES, ROW_BYTES = _HEADER.size, _ROW.itemsize
-_LANDMARKS, _COLORS = "landmarks.npy", "landmark_rgb.npy"
-
-# How often cells are halved; the numbers of the finest along three axes fit into 64 bits.
+# How often cells are halved; three axes of the finest cell numbers fit into 64 bits.
 _LEVELS = 21
-# Of each axis, landmarks that say how large the scene is. What lies outside may be an outlier.
+# Percentiles of the landmarks along each axis that bound the scene; beyond may be outliers.
 _INNER_PERCENT = (1, 99)
 _MAX_MEASURED = 1_000_000
 _BLOCK = 250_000
-
-
-class DrawnMap(Protocol):
-    """What is drawn of a map: of a ``Map``, the landmarks without what localizes."""
-
-    @property
-    def manifest(self) -> Manifest:
-        """``manifest.json``."""
-
-    @property
-    def landmarks(self) -> NDArray[np.float32]:
-        """(P, 3), relative to the manifest's origin."""
-
-    @property
-    def track_lengths(self) -> NDArray[np.uint16]:
-        """(P,) mapping photos that see each landmark."""
-
-    @property
-    def colors(self) -> NDArray[np.uint8] | None:
-        """(P, 3) RGB; None when the map has none."""
+LANDMARKS_FILE = "landmarks.npy"
 
 
 def read_landmarks(folder: Path, manifest: Manifest) -> NDArray[np.float32]:
-    """Read where the landmarks (P, 3) of a map are, whose manifest was read before.
+    """Read the landmarks (P, 3) of a map into memory.
 
     Raises:
-        MapCorrupt: ``map.array``; ``map.range`` where they are not finite, which no map is that
-            was verified.
+        MapCorrupt: ``map.array``; ``map.range`` for numbers that are not finite.
     """
-    landmarks = map_array(folder, _LANDMARKS, "<f4", (manifest.counts.landmarks, 3), load=True)
+    landmarks = map_array(folder, LANDMARKS_FILE, "<f4", (manifest.counts.landmarks, 3), load=True)
     if not is_finite(landmarks):
         raise MapCorrupt(
-            "map.range", "numbers are out of their range", field=str(folder / _LANDMARKS)
+            "map.range", "numbers are out of their range", field=str(folder / LANDMARKS_FILE)
         )
     return landmarks
 
 
-def read_points(folder: Path, manifest: Manifest, rows: NDArray[np.uint32], first: int) -> bytes:
-    """Read landmarks of a map as ``GET /maps/{id}/points`` sends them (docs/api.md).
-
-    Nothing of the map is mapped into memory, or kept open.
-
-    Args:
-        folder: the map.
-        manifest: of it, read before.
-        rows: (k,) of the landmarks, in the order in which they are sent.
-        first: place of the first of them in the map's ``detail_order``.
-
-    Raises:
-        MapCorrupt: ``map.array``.
-    """
-    num = manifest.counts.landmarks
-    colored = _COLORS in manifest.files
-    return _header(manifest, first, len(rows), colored=colored) + _packed(
-        array_rows(folder, _LANDMARKS, "<f4", (num, 3), rows),
-        array_rows(folder, "landmark_track_length.npy", "<u2", (num,), rows),
-        array_rows(folder, _COLORS, "|u1", (num, 3), rows) if colored else None,
-    )
-
-
 def detail_order(landmarks: NDArray[np.float32]) -> NDArray[np.uint32]:
-    """Order landmarks so that every beginning of the order samples the map evenly in space.
+    """Order landmarks so that every prefix of the order samples the map evenly in space.
 
-    Cells of an octree over the scene come level by level: one landmark of each cell, then one of
-    each cell of half the size that has none yet, and so on, by chance within a level and within a
-    cell. Outside of the inner 98 % of the landmarks along each axis, cells grow with the distance,
-    so that a few that are far away are seen and yet take little from the rest.
+    The cells of an octree over the scene come level by level: one landmark of each cell, then one
+    of each cell of half the size that has none yet, and so on, in random order within a level and
+    within a cell. Beyond the inner 98 % of the landmarks along each axis, cells grow with the
+    distance, so that a few distant landmarks appear without crowding out the rest.
 
     Args:
         landmarks: (P, 3), finite.
@@ -105,7 +51,7 @@ def detail_order(landmarks: NDArray[np.float32]) -> NDArray[np.uint32]:
     num = len(landmarks)
     if num == 0:
         return np.zeros(0, np.uint32)
-    # Maps may be large: what is no longer needed goes at once, and what can be changed in place is.
+    # Maps may be large: arrays are changed in place and deleted as soon as possible.
     shuffled = np.arange(num, dtype=np.uint32)
     np.random.default_rng(0).shuffle(shuffled)
     cells = _cells(landmarks)[shuffled]
@@ -125,45 +71,6 @@ def detail_order(landmarks: NDArray[np.float32]) -> NDArray[np.uint32]:
         del begins, starts
     del cells, chosen
     return shuffled[np.argsort(levels, kind="stable")]
-
-
-def packed_points(opened: DrawnMap, order: NDArray[np.uint32], first: int, count: int) -> bytes:
-    """Return landmarks as ``GET /maps/{id}/points`` sends them (docs/api.md).
-
-    Args:
-        opened: the map.
-        order: its ``detail_order``.
-        first: place in the order to begin at; from its end on, nothing follows the header.
-        count: most landmarks to return.
-    """
-    rows = order[first : first + count]
-    colors = opened.colors
-    return _header(opened.manifest, first, len(rows), colored=colors is not None) + _packed(
-        opened.landmarks[rows],
-        opened.track_lengths[rows],
-        None if colors is None else colors[rows],
-    )
-
-
-def _header(manifest: Manifest, first: int, count: int, *, colored: bool) -> bytes:
-    """The 48 bytes before ``count`` rows."""
-    flags = HAS_COLORS if colored else 0
-    total = manifest.counts.landmarks
-    return _HEADER.pack(MAGIC, FORMAT, total, first, count, flags, *manifest.world.origin)
-
-
-def _packed(
-    positions: NDArray[np.float32],
-    track_lengths: NDArray[np.uint16],
-    colors: NDArray[np.uint8] | None,
-) -> bytes:
-    """16 bytes of each landmark: x, y, z, colour, number of photos."""
-    packed = np.zeros(len(positions), _ROW)
-    packed["position"] = positions
-    if colors is not None:
-        packed["rgb"] = colors
-    packed["photos"] = np.minimum(track_lengths, 255)
-    return packed.tobytes()
 
 
 def _cells(landmarks: NDArray[np.float32]) -> NDArray[np.uint64]:
@@ -187,7 +94,7 @@ def _cells(landmarks: NDArray[np.float32]) -> NDArray[np.uint64]:
 
 
 def _drawn_nearer(along: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Leave what is within 1 of 0 where it is, and bring the rest nearer: x to 1 + log x."""
+    """Keep coordinates within [-1, 1]; compress those beyond, x to 1 + log x."""
     away = np.abs(along)
     return np.where(away <= 1, along, np.copysign(1 + np.log(np.maximum(away, 1)), along))
 

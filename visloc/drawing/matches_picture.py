@@ -1,7 +1,7 @@
-"""A picture of what was matched and what became of it, for a person's eyes.
+"""Draws the matches between a query and a map.
 
-The photo with its matches is on the left, the most similar photos of the map on the right; lines
-join the two places where a match is seen.
+The query with its matches is on the left, the most similar photos of the map on the right; lines
+join the two keypoints of a match.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ _CELL_WIDTH = (_WIDTH - 3 * _MARGIN - _QUERY_BOX[0] - (_COLUMNS - 1) * _GAP) // 
 _CELL_HEIGHT = round(_CELL_WIDTH * 3 / 4)
 _MAX_ROWS = 4
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-_MAX_TEXT = 250  # characters: more fit into no line
-_SHIFT = 4  # fractional bits of places, as OpenCV draws them
-_MAX_LINES = 30  # per photo of the map: more cannot be told apart
+_MAX_TEXT = 250  # characters of a line
+_SHIFT = 4  # fractional bits of coordinates for OpenCV
+_MAX_LINES = 30  # per photo of the map; more cannot be told apart
 _JPEG_QUALITY = 88
-# Photos of the map are small (docs/map-format.md); a map that was tampered with may say otherwise.
+# Photos of a map are small (docs/map-format.md) unless it was tampered with.
 _PREVIEW_LIMITS = ImageLimits(max_bytes=MAX_PHOTO_BYTES, max_pixels=MAX_PHOTO_SIDE**2)
 
 _GROUND: Color = (22, 24, 28)
@@ -49,7 +49,7 @@ _DIM: Color = (160, 164, 170)
 _INLIER: Color = (40, 220, 90)
 _OUTLIER: Color = (255, 70, 60)
 _SEEN: Color = (120, 170, 255)
-# One for the lines of each photo of the map, told apart by those who see no red or green too.
+# Line colours of the map's photos, distinct also for red-green colour blindness.
 _LINES: tuple[Color, ...] = (
     *((255, 200, 0), (0, 200, 255), (255, 110, 220), (240, 240, 240)),
     *((255, 140, 40), (170, 150, 255), (0, 230, 180), (200, 160, 110)),
@@ -58,7 +58,7 @@ _LINES: tuple[Color, ...] = (
 
 @dataclass(frozen=True, slots=True)
 class _Panel:
-    """Where a photo lies on the canvas: a pixel of the photo is ``scale`` pixels of the canvas."""
+    """The place of a photo on the canvas. ``scale`` is canvas pixels per photo pixel."""
 
     left: int
     top: int
@@ -68,12 +68,10 @@ class _Panel:
 
     @property
     def rows(self) -> slice:
-        """Of the canvas."""
         return slice(self.top, self.top + self.height)
 
     @property
     def columns(self) -> slice:
-        """Of the canvas."""
         return slice(self.left, self.left + self.width)
 
     def place(self, keypoints: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -90,18 +88,17 @@ class _Panel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Shown:
-    """A photo of the map on the canvas, with what it sees.
+    """A photo of the map on the canvas, with its keypoints.
 
     Attributes:
-        name: of the photo.
         color: of its lines.
-        left: where its words begin.
-        panel: where it lies; its pixels are those of its camera.
-        preview: (H, W, 3) RGB; None where the map keeps no photos.
-        keypoints: (m, 2) of all landmarks that it sees.
-        rgb: (m, 3) their colours, where the map knows them.
-        matches: (k,) rows of the look's matches whose landmarks it sees.
-        at: (k, 2) where it sees those.
+        left: where its caption begins.
+        panel: in pixels of its camera.
+        preview: (H, W, 3) RGB; None if the map keeps no photos.
+        keypoints: (m, 2) of all its landmarks.
+        rgb: (m, 3) colours of the landmarks; None if the map has none.
+        matches: (k,) rows of the query's matches whose landmarks it sees.
+        at: (k, 2) its keypoints of these.
     """
 
     name: str
@@ -118,14 +115,14 @@ class _Shown:
 def draw_overlay(
     photo: Photo, opened: Map, look: Look, answer: Outcome, inliers: NDArray[np.bool_]
 ) -> bytes:
-    """Draw a photo's matches beside the photos of the map that they were found in.
+    """Draw a query's matches beside the photos of the map that they were found in.
 
     Args:
-        photo: the query. It is drawn as it was looked at, turned upright or not.
-        opened: the map. Where it keeps no photos, what they see is drawn on dark ground.
-        look: what the query shows of this map.
-        answer: what became of it.
-        inliers: (n,) of the look's matches, whether the best pose explains them.
+        photo: the query. It is drawn in the orientation in which features were extracted.
+        opened: the map. Without kept photos, keypoints are drawn on a dark background.
+        look: the query's matches with the map.
+        answer: the result.
+        inliers: (n,) whether the best pose explains each match.
 
     Returns:
         A JPEG, 1600 pixels wide.
@@ -154,7 +151,7 @@ def draw_overlay(
 
 
 def _as_looked_at(photo: Photo, look: Look) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """The pixels that features were found in, and the matches' keypoints there."""
+    """The pixels that features were extracted from, and the keypoints of the matches in them."""
     pixels = look.matches.pixels
     turn = turn_of(photo.exif_orientation) if look.evidence.read_as is ReadAs.UPRIGHT else 1
     turned = upright_from_stored(pixels, turn, photo.width, photo.height)
@@ -170,7 +167,7 @@ def _fit(width: int, height: int, corner: tuple[int, int], box: tuple[int, int])
 
 
 def _shown(opened: Map, look: Look, query: _Panel) -> Iterator[_Shown]:
-    """The best retrieved photos, as many as there is room for beside the query."""
+    """The best retrieved photos that fit beside the query."""
     row_of = {record.name: row for row, record in enumerate(opened.images)}
     retrieved = look.evidence.retrieved
     pitch = _CELL_HEIGHT + _CAPTION_PX
@@ -243,7 +240,7 @@ def _with_lines(
     shown: Sequence[_Shown],
     inliers: NDArray[np.bool_],
 ) -> Canvas:
-    """Join where the query and the photos of the map see an inlier, each photo's some."""
+    """Join the keypoints of inliers with lines, some for each photo."""
     lines = canvas.copy()
     for one in shown:
         right = np.flatnonzero(inliers[one.matches])
@@ -269,7 +266,7 @@ def _draw_marks(
 
 
 def _fixed(places: NDArray[np.float64]) -> list[tuple[int, int]]:
-    """Places (n, 2) as OpenCV's fixed-point numbers; what no canvas can hold comes to its edge."""
+    """Places (n, 2) as OpenCV's fixed-point numbers, clipped to the range of a canvas."""
     near = np.clip(places, -10_000, 10_000)
     return [(x, y) for x, y in np.rint(near * (1 << _SHIFT)).astype(int).tolist()]
 

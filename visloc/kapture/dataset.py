@@ -1,4 +1,4 @@
-"""A kapture dataset in memory: its sensors, poses and records, not the pixels."""
+"""A kapture dataset in memory: sensors, poses and records, without pixels."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class Sensor:
     """One line of ``sensors.txt``.
 
     Attributes:
-        id: names the sensor in every other file; any text, never a file name.
+        id: any text; do not use it as a file name.
         name: for people; may be empty.
         kind: "camera", "depth", "gnss" or any other word.
-        params: the parameters as in the file; of a camera: model, width, height, ...
+        params: the parameters as in the file; for a camera: model, width, height, ...
         camera: intrinsics of a camera or depth sensor; None for UNKNOWN_CAMERA and other kinds.
     """
 
@@ -33,14 +33,13 @@ class Sensor:
 
     @staticmethod
     def with_camera(sensor_id: str, camera: Camera, kind: str = "camera", name: str = "") -> Sensor:
-        """Make a camera or depth sensor, with the parameters written out."""
         values = (_shortest(value) for value in camera.params)
         params = (camera.model, str(camera.width), str(camera.height), *values)
         return Sensor(sensor_id, name, kind, params, camera)
 
     @property
     def image_size(self) -> tuple[int, int] | None:
-        """(width, height) in pixels, also of an UNKNOWN_CAMERA; None for other kinds."""
+        """(width, height) in pixels, also for UNKNOWN_CAMERA; None for other kinds."""
         if self.camera is not None:
             return self.camera.width, self.camera.height
         if self.kind in ("camera", "depth") and self.params[:1] == (UNKNOWN_CAMERA,):
@@ -53,9 +52,8 @@ class FileRecord:
     """A photo or depth map.
 
     Attributes:
-        timestamp: integer in the dataset's own unit.
-        sensor_id: the sensor that took it.
-        path: relative to ``sensors/records_data``, with forward slashes: its identity.
+        timestamp: in the dataset's own unit.
+        path: relative to ``sensors/records_data``, with forward slashes; its identity.
     """
 
     timestamp: int
@@ -68,10 +66,10 @@ class GnssRecord:
     """A GNSS fix.
 
     Attributes:
-        timestamp: integer in the dataset's own unit.
+        timestamp: in the dataset's own unit.
         sensor_id: the receiver; its parameter names the coordinate system, EPSG:4326 by default.
-        x: longitude in degrees for EPSG:4326, else easting.
-        y: latitude in degrees for EPSG:4326, else northing.
+        x: longitude in degrees for EPSG:4326, otherwise easting.
+        y: latitude in degrees for EPSG:4326, otherwise northing.
         z: altitude in metres.
         utc: Unix time in seconds, 0 when unknown.
         dop: dilution of precision, 0 when unknown.
@@ -87,40 +85,33 @@ class GnssRecord:
 
 
 class RecordFiles(Protocol):
-    """Where files of records lie that are not below their dataset, by their names."""
+    """Finds files of records outside their dataset by name."""
 
-    def path_of(self, name: str) -> Path:
-        """Where a file should lie."""
-        ...
+    def path_of(self, name: str) -> Path: ...
 
-    def has(self, name: str) -> bool:
-        """Whether it is there."""
-        ...
+    def has(self, name: str) -> bool: ...
 
     def identity(self, name: str) -> str:
-        """What changes when its content does."""
-        ...
+        """Return a text that changes when the content does."""
 
     def without_listing(self) -> RecordFiles:
-        """The same places, without knowing what is there."""
-        ...
+        """Return the same places without the list of files."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dataset:
-    """What the ``sensors`` folder of a kapture dataset says.
+    """The ``sensors`` folder of a kapture dataset.
 
     Attributes:
         root: the folder that holds ``sensors``.
         sensors: by id.
-        rigs: rig id -> sensor id -> ``sensor_from_rig``; nested rigs are unrolled; None where
-            the transform is unknown.
+        rigs: rig id -> sensor id -> ``sensor_from_rig``, None if unknown; nested rigs are unrolled.
         trajectories: (timestamp, sensor or rig id) -> ``device_from_world``.
         images: sorted by (timestamp, sensor_id, path).
         depth_maps: sorted the same way.
         gnss: sorted by (timestamp, sensor_id).
-        notes: what was tolerated in reading, one sentence each, with file and count.
-        files: where photos and depth maps lie, when not in ``sensors/records_data``.
+        notes: bad rows that were tolerated, one sentence each, with file and count.
+        files: where photos and depth maps lie, if not in ``sensors/records_data``.
     """
 
     root: Path
@@ -142,9 +133,9 @@ class Dataset:
         object.__setattr__(self, "_rigs_of_sensor", rigs_of_sensor)
 
     def pose(self, record: FileRecord) -> Pose | None:
-        """Return ``sensor_from_world`` of a record, None when it is unknown.
+        """Return ``sensor_from_world`` of a record; None when unknown.
 
-        The sensor's own trajectory is preferred to that of a rig that carries it.
+        The sensor's own trajectory has priority over those of its rigs.
         """
         own = self.trajectories.get((record.timestamp, record.sensor_id))
         if own is not None:
@@ -167,14 +158,14 @@ class Dataset:
         return self.root / "sensors" / "records_data" / record.path
 
     def without_records(self) -> Dataset:
-        """Return what it takes to find files: this dataset, light enough to be sent to others."""
+        """Return a dataset that only finds files, small enough to send to other processes."""
         files = None if self.files is None else self.files.without_listing()
         return replace(
             self, trajectories={}, images=(), depth_maps=(), gnss=(), notes=(), files=files
         )
 
     def with_pixels_from(self, origin: PixelOrigin) -> Dataset:
-        """Return this dataset in our convention, when its calibrations count from ``origin``."""
+        """Return this dataset in our pixel convention, given that of its calibrations."""
         sensors = {
             key: sensor
             if sensor.camera is None
@@ -186,7 +177,6 @@ class Dataset:
         return replace(self, sensors=sensors)
 
     def has_file(self, record: FileRecord) -> bool:
-        """Tell whether the record's file is there."""
         if self.files is not None:
             return self.files.has(record.path)
         # Path.is_file raises for names that are longer than a file's name can be.
@@ -194,5 +184,5 @@ class Dataset:
 
 
 def _shortest(value: float) -> str:
-    # kapture's own tools write whole numbers without a point; repr keeps every digit of others.
+    # kapture's own tools write whole numbers without a point; repr keeps all other digits.
     return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(float(value))

@@ -1,4 +1,4 @@
-"""What reading and writing features share: kinds of files, their names, types of numbers."""
+"""Layout of feature files: kinds, names, and types of numbers."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from visloc.errors import DatasetError
+from visloc.kapture.text import relative_path
+
 FeatureKind = Literal["keypoints", "descriptors", "global_features"]
 
-# What maps put before TYPE to name the features that a dataset brought along.
+# Maps name the features of a dataset by this prefix and TYPE.
 READY_MADE_PREFIX = "kapture:"
 
 DTYPES: Mapping[str, np.dtype[Any]] = {
@@ -30,10 +33,28 @@ SUFFIXES: Mapping[FeatureKind, str] = {
 }
 
 
-def parse_dtype(text: str) -> np.dtype[Any] | None:
-    """Look up the type that a config file names; None if it is none that kapture has.
+def feature_file(kind: FeatureKind, image_path: str) -> str:
+    """Return the path of an image's features in their folder.
 
-    Files of kapture 1.0 hold Python's spellings too, such as ``np.float32`` and ``float``.
+    Raises:
+        DatasetError: ``kapture.path``.
+    """
+    try:
+        return relative_path(image_path) + SUFFIXES[kind]
+    except ValueError:
+        raise DatasetError(
+            "kapture.path",
+            f"no {kind.replace('_', ' ')} can belong to this image",
+            field="image_path",
+            expected="a relative path that stays inside the dataset",
+            got=image_path,
+        ) from None
+
+
+def parse_dtype(text: str) -> np.dtype[Any] | None:
+    """Look up the type that a config file names; None if kapture has no such type.
+
+    Files of kapture 1.0 also hold Python's spellings, such as ``np.float32`` and ``float``.
     """
     name = text.removeprefix("numpy.").removeprefix("np.")
     return DTYPES.get("float64" if name == "float" else name)

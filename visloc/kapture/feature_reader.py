@@ -1,7 +1,7 @@
 """Reading ready-made features: keypoints, descriptors and global features of any type.
 
-The files come from anywhere. Types are looked up in a table, sizes are checked before anything
-is read, and paths stay inside the folder.
+The files are not trusted: types are looked up in a table, sizes are checked before reading, and
+paths stay inside the folder.
 """
 
 from __future__ import annotations
@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.errors import DatasetError, InvalidInput
-from visloc.kapture.feature_layout import COLUMNS, DTYPES, SUFFIXES, FeatureKind, parse_dtype
+from visloc.kapture.feature_layout import COLUMNS, DTYPES, FeatureKind, feature_file, parse_dtype
 from visloc.kapture.feature_tar import index_tar
 from visloc.kapture.table import Table
-from visloc.kapture.text import relative_path
 
 _TYPE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _MAX_DSIZE = 2**20
@@ -34,16 +33,14 @@ class FeatureSet:
     """The files of one kind and type of features, open for reading. It can be pickled.
 
     Attributes:
-        kind: ``keypoints``, ``descriptors`` or ``global_features``.
         type_name: folder TYPE.
-        name: of the method, as the config file has it.
-        dtype: of one number.
+        name: name of the method in the config file.
         dsize: numbers per row.
         keypoints_type: TYPE of the keypoints that descriptors belong to; None for other kinds.
-        metric_type: how rows are compared, as the config file has it; None for keypoints.
+        metric_type: how rows are compared, as in the config file; None for keypoints.
         folder: holds the config file, and the files of the images or ``<kind>.tar``.
-        members: offset and size by file name in ``<kind>.tar``; None without it. Where there is
-            one, files beside it are not looked at.
+        members: offset and size by file name in ``<kind>.tar``, which hides other files; None
+            without it.
     """
 
     kind: FeatureKind
@@ -62,11 +59,11 @@ class FeatureSet:
         Raises:
             DatasetError: ``kapture.path``.
         """
-        name = self._file_name(image_path)
+        name = feature_file(self.kind, image_path)
         return (self.folder / name).is_file() if self.members is None else name in self.members
 
     def count(self, image_path: str) -> int:
-        """Return how many rows an image has, without reading them.
+        """Return the number of rows of an image without reading them.
 
         Raises:
             DatasetError: as ``read``.
@@ -99,25 +96,13 @@ class FeatureSet:
         return np.frombuffer(content, self.dtype).reshape(num_rows, self.dsize).copy()
 
     def label(self, image_path: str) -> str:
-        """Name the file of an image for a person."""
+        """Name the file of an image, for error messages."""
         holder = self.folder if self.members is None else self.folder / f"{self.kind}.tar"
-        return str(holder / self._file_name(image_path))
-
-    def _file_name(self, image_path: str) -> str:
-        try:
-            return relative_path(image_path) + SUFFIXES[self.kind]
-        except ValueError:
-            raise DatasetError(
-                "kapture.path",
-                f"no {self.kind.replace('_', ' ')} can belong to this image",
-                field="image_path",
-                expected="a relative path that stays inside the dataset",
-                got=image_path,
-            ) from None
+        return str(holder / feature_file(self.kind, image_path))
 
     def _place(self, image_path: str) -> tuple[Path, int, int]:
         """File, offset and size in bytes of an image's rows."""
-        name = self._file_name(image_path)
+        name = feature_file(self.kind, image_path)
         if self.members is not None:
             if name in self.members:
                 return (self.folder / f"{self.kind}.tar", *self.members[name])
@@ -185,10 +170,10 @@ def open_features(
             ``<kind>/TYPE``, in this order.
 
     Raises:
-        InvalidInput: ``kapture.feature_type`` for a name that no folder of features has.
-        DatasetError: ``kapture.no_features`` (it tells where it looked and which types exist),
-            ``kapture.version`` for the layout of kapture 1.0, ``kapture.tar``, and what is wrong
-            in the config file with its line.
+        InvalidInput: ``kapture.feature_type`` for an impossible name.
+        DatasetError: ``kapture.no_features`` with the places and existing types;
+            ``kapture.version`` for the layout of kapture 1.0; ``kapture.tar``; errors of the config
+            file with its line.
     """
     if not _TYPE_NAME.fullmatch(type_name):
         raise InvalidInput(
@@ -208,10 +193,10 @@ def open_features(
 def open_local_features(
     root: Path, type_name: str, features_dir: Path | None = None
 ) -> tuple[FeatureSet, FeatureSet]:
-    """Find the descriptors of one type and the keypoints that they say they belong to.
+    """Find the descriptors of one type and the keypoints that they belong to.
 
     Returns:
-        The keypoints and the descriptors. Types can differ: a published dataset describes
+        The keypoints and the descriptors. Their types can differ: a published dataset describes
         keypoints of type HessianAffine by descriptors of type HOG.
 
     Raises:
@@ -225,7 +210,7 @@ def open_local_features(
 def feature_types(
     root: Path, kind: FeatureKind, features_dir: Path | None = None
 ) -> tuple[str, ...]:
-    """Return the types of which ``open_features`` finds features of this kind, sorted."""
+    """Return the types that ``open_features`` finds, sorted."""
     found = set()
     for pattern in _patterns(kind, features_dir):
         before, after = (part.strip("/") for part in pattern.split("{}"))

@@ -14,23 +14,23 @@ from visloc.kapture.text import relative_path
 def index_tar(path: Path) -> Mapping[str, tuple[int, int]]:
     """Return offset and size of each plain file in an uncompressed tar, by normalized name.
 
-    Of two members of one name the last wins: appending is how kapture replaces a file. Folders,
-    links, and members whose names lead out are left out; nothing is ever unpacked.
+    Of two members of one name the last wins, as kapture replaces files by appending. Folders,
+    links, and members whose names lead out are ignored; nothing is ever unpacked.
 
     Raises:
-        DatasetError: ``kapture.tar`` when it is not such an archive, or is cut short.
+        DatasetError: ``kapture.tar`` for any other file, or a truncated archive.
     """
     members: dict[str, tuple[int, int]] = {}
     end = 0
     try:
         status = path.stat()
-        if not stat.S_ISREG(status.st_mode):  # a pipe would be waited for
+        if not stat.S_ISREG(status.st_mode):  # a pipe blocks
             raise _damaged(path, "not a plain file")
         total = status.st_size
         with path.open("rb") as file, tarfile.open(fileobj=file, mode="r:") as archive:
             while (member := archive.next()) is not None:
-                archive.members.clear()  # type: ignore[attr-defined]  # or it keeps every header
-                # A header may claim a negative size and send the reader round in circles.
+                archive.members.clear()  # type: ignore[attr-defined]  # otherwise it keeps every header
+                # A header with a negative size would make the reader loop.
                 if member.offset_data < end or member.size < 0:
                     raise _damaged(path, f"{member.name!r} lies within what precedes it")
                 end = member.offset_data + member.size

@@ -1,4 +1,4 @@
-"""Writing features in kapture's layout, one image at a time, so that other tools can run on them.
+"""Writing features in kapture's layout, one image at a time, for other tools.
 
 ``reconstruction/keypoints/TYPE/IMAGE.kpt`` and its siblings hold rows of numbers, little-endian
 and without a header; one line in ``keypoints.txt`` says of which type and how many per row.
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.errors import Conflict, DatasetError, InvalidInput
-from visloc.kapture.feature_layout import COLUMNS, DTYPES, SUFFIXES, FeatureKind
-from visloc.kapture.text import is_field, is_folder_name, relative_path
+from visloc.kapture.feature_layout import COLUMNS, DTYPES, FeatureKind, feature_file
+from visloc.kapture.text import is_field, is_folder_name
 from visloc.kapture.writer import VERSION_LINE, write_atomically
 
 
@@ -30,12 +30,12 @@ def write_local_features(
 
     Args:
         root: the dataset; its ``sensors`` need not exist.
-        feature_type: folder TYPE, for keypoints and descriptors alike.
-        image_path: the image's identity, as in ``records_camera.txt``.
-        keypoints: (N, K >= 2): x, y in pixels (top-left centre at 0.5), then what the type adds,
-            such as the scale. N may be 0.
+        feature_type: folder TYPE of both.
+        image_path: as in ``records_camera.txt``.
+        keypoints: (N, K >= 2): x, y in pixels (top-left centre at 0.5), then values such as the
+            scale. N may be 0.
         descriptors: (N, D), compared by their L2 distance.
-        name: of the method, for the reader of ``keypoints.txt``.
+        name: name of the method, for ``keypoints.txt``.
 
     Raises:
         Conflict: ``kapture.feature_type`` if TYPE exists with other names, numbers or sizes.
@@ -57,7 +57,7 @@ def write_local_features(
 def write_keypoints(
     root: Path, feature_type: str, image_path: str, keypoints: NDArray[np.generic], *, name: str
 ) -> None:
-    """Write the keypoints (N, K >= 2) of one image that has no descriptors.
+    """Write the keypoints (N, K >= 2) of one image without descriptors.
 
     Raises:
         Conflict, InvalidInput, DatasetError: as ``write_local_features``.
@@ -94,16 +94,7 @@ def _write(
             expected="a folder name without commas",
             got=f"type {feature_type!r}, name {name!r}",
         )
-    try:
-        relative = relative_path(image_path)
-    except ValueError:
-        raise DatasetError(
-            "kapture.path",
-            "features cannot be written for this image",
-            field="image_path",
-            expected="a relative path that stays inside the dataset",
-            got=image_path,
-        ) from None
+    file = feature_file(kind, image_path)
     dtype_name = rows.dtype.newbyteorder("=").name
     if rows.ndim != 2 or rows.shape[1] == 0 or dtype_name not in DTYPES:
         raise InvalidInput(
@@ -116,7 +107,7 @@ def _write(
     folder = root / "reconstruction" / kind / feature_type
     fields = (name, dtype_name, str(rows.shape[1]), *last_fields)
     _declare(folder / f"{kind}.txt", COLUMNS[kind], fields)
-    path = folder / f"{relative}{SUFFIXES[kind]}"
+    path = folder / file
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, np.ascontiguousarray(rows, dtype=DTYPES[dtype_name]).tobytes())
 

@@ -1,4 +1,4 @@
-"""Ready-made keypoints with their descriptors, checked against each other and the image."""
+"""Ready-made keypoints and descriptors, checked against each other and the image."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ def read_local(
 ) -> tuple[NDArray[np.float32], NDArray[Any]]:
     """Read the keypoints and descriptors of one image.
 
-    Files do not say themselves what they hold, and published ones contradict their config file.
-    Numbers that cannot be pixels of the image are therefore refused.
+    Files have no header, and published ones contradict their config file. Numbers that cannot be
+    pixels of the image are therefore refused.
 
     Args:
-        keypoints: where keypoints are.
-        descriptors: where their descriptors are.
-        image_path: the image's identity, as in ``records_camera.txt``.
-        image_size: width and height; None checks only against the largest image there can be.
-        origin: what the keypoints count from.
+        keypoints: the files of the keypoints.
+        descriptors: the files of their descriptors.
+        image_path: as in ``records_camera.txt``.
+        image_size: width and height; None checks only against the largest possible image.
+        origin: the pixel origin of the keypoints.
 
     Returns:
         (N, 2) float32 x, y in pixels, top-left centre at (0.5, 0.5), and the descriptors (N, D)
@@ -76,8 +76,8 @@ def _check_pixels(
     size = np.array(image_size or (MAX_IMAGE_SIDE, MAX_IMAGE_SIDE))
     inside = ((pixels >= -1) & (pixels <= size)).all(axis=1)
     magnitude = np.abs(pixels)
-    # Half of a float64, or an integer, read as float32 is often far smaller than any detector
-    # places a keypoint, while single values such as 1e-8 do come from rounding.
+    # Half of a float64, or an integer, read as float32 is often far smaller than any coordinate of
+    # a detector. Single values such as 1e-8 do come from rounding.
     tiny = ((magnitude > 0) & (magnitude < 1e-6)).any(axis=1)
     example = int(np.argmin(inside))
     if not inside.all():

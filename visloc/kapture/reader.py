@@ -1,7 +1,7 @@
 """Reading the ``sensors`` folder of a dataset, kapture 1.0 or 1.1.
 
-Bad data is either tolerated with a note or refused with file and line. Nothing in it is executed
-or guessed, and no path leads out of ``records_data`` except through links that lie there.
+Bad data is either tolerated with a note or refused with file and line. Nothing is executed or
+guessed, and no path leads out of ``records_data`` except through links in it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from visloc.kapture.dataset import (
 )
 from visloc.kapture.rigs import unroll_rigs
 from visloc.kapture.table import Table
-from visloc.kapture.text import relative_path
 
 _NEWEST_VERSION = (1, 1)
 
@@ -29,11 +28,11 @@ _NEWEST_VERSION = (1, 1)
 def read_dataset(root: Path, files: RecordFiles | None = None) -> Dataset:
     """Read sensors, rigs, trajectories and the camera, depth and GNSS records of a dataset.
 
-    Only ``sensors/sensors.txt`` must exist. What is tolerated is told in ``notes``.
+    Only ``sensors/sensors.txt`` must exist.
 
     Args:
         root: the dataset.
-        files: where photos and depth maps lie, when not in its ``sensors/records_data``.
+        files: where photos and depth maps lie, if not in its ``sensors/records_data``.
 
     Raises:
         DatasetError: codes ``kapture.*``, ``camera.*`` and ``pose.*``; the field is the file,
@@ -203,15 +202,7 @@ def _read_files(
     for timestamp, sensor_id, path_text in table:
         key = (table.timestamp(timestamp), sensor_id)
         _refuse_duplicate(table, key, records)
-        try:
-            path = relative_path(path_text)
-        except ValueError:
-            raise table.error(
-                "kapture.path",
-                "the path cannot be used",
-                expected="a relative path that stays inside sensors/records_data",
-                got=path_text,
-            ) from None
+        path = table.path(path_text, "sensors/records_data")
         if not _is_known(table, sensors, sensor_id, kind):
             records[key] = None
             continue
@@ -224,7 +215,7 @@ def _read_files(
             )
         paths.add(path)
         records[key] = FileRecord(*key, path)
-        # Path.is_file would raise for a name that is too long.
+        # Path.is_file raises for a name that is too long.
         is_there = os.path.isfile(data / path) if files is None else files.has(path)  # noqa: PTH113
         if not is_there:
             table.tolerate("files do not exist", path)

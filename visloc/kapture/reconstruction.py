@@ -1,4 +1,4 @@
-"""3D points of a dataset and which keypoints see them: points3d.txt and observations.txt."""
+"""3D points of a dataset and their observations: points3d.txt and observations.txt."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class Reconstruction:
         points: (P, 3) float64 in the world.
         colors: (P, 3) uint8 RGB; None without.
         keypoints_type: folder TYPE of the keypoints; None when there are no observations.
-        images: paths of the images that observe, each once.
-        observations: (M, 3) int64 rows: row of ``points``, row of ``images``, row of that image's
+        images: paths of the observing images, each once.
+        observations: (M, 3) int64: row of ``points``, row of ``images``, row of that image's
             keypoints. An image can see a point several times.
     """
 
@@ -52,7 +52,7 @@ def read_reconstruction(
         root: the dataset.
         keypoints_type: folder TYPE of the keypoints; None takes the only one there is.
         features_dir: where keypoints lie outside the dataset, as for ``open_features``.
-            Where they are found, rows are checked against their number.
+            If keypoints are found, rows are checked against their number.
 
     Returns:
         None if the dataset has no points.
@@ -84,8 +84,8 @@ def read_reconstruction(
 def write_reconstruction(root: Path, reconstruction: Reconstruction) -> None:
     """Write ``points3d.txt`` and, if anything is observed, ``observations.txt``.
 
-    Numbers come back as they were; observations come back sorted by point. Each file is complete
-    or not there, and the points come last: observations alone are not read.
+    Reading returns the same numbers, with observations sorted by point. Each file is written
+    atomically, the points last: observations without points are ignored.
 
     Raises:
         Conflict: ``kapture.exists`` if one of the files exists.
@@ -137,25 +137,54 @@ def _read_points(table: Table) -> tuple[NDArray[np.float64], NDArray[np.uint8] |
     return rows[:, :3].copy(), colors
 
 
-class _Observers:
-    """The images of observations and, where it is known, how many keypoints each has."""
+class _Tracks:
+    """Observations by one type of keypoints, collected line by line."""
 
-    def __init__(self, keypoints: FeatureSet | None) -> None:
-        self.rows: dict[str, int] = {}  # by path
-        self.num_keypoints: list[int] = []
-        self._keypoints = keypoints
+    def __init__(self, table: Table, num_points: int, keypoints: FeatureSet | None) -> None:
+        self.rows: dict[str, int] = {}  # of images, by path
+        self._table, self._num_points, self._keypoints = table, num_points, keypoints
+        self._num_keypoints: list[int] = []  # of each image; _MAX_INDEX where it is not known
         self._row_of_name: dict[str, int] = {}  # as written
+        self._seen: set[int] = set()
+        self._points, self._images, self._indices = array("q"), array("q"), array("q")
 
-    def row(self, table: Table, name: str) -> int:
-        """Row of an image, a new one if need be."""
+    def add(self, fields: list[str]) -> None:
+        """Take one line: point, type, then image and keypoint in turn."""
+        table = self._table
+        (point,) = _indices(table, fields[:1], self._num_points, "point in points3d.txt")
+        if point in self._seen:
+            raise table.error(
+                "kapture.duplicate", "a second line for the same point and type", got=fields[0]
+            )
+        self._seen.add(point)
+        track = _indices(table, fields[3::2], _MAX_INDEX, "keypoint")
+        for name, keypoint in zip(fields[2::2], track, strict=True):
+            row = self._row(name)
+            if keypoint >= self._num_keypoints[row]:
+                raise table.error(
+                    "kapture.index",
+                    f"{name} has no such keypoint",
+                    expected=f"less than {self._num_keypoints[row]}",
+                    got=str(keypoint),
+                )
+            self._images.append(row)
+        self._indices.extend(track)
+        self._points.extend([point] * len(track))
+
+    def observations(self) -> NDArray[np.int64]:
+        """(M, 3) rows of points, of images and of keypoints."""
+        columns = (self._points, self._images, self._indices)
+        return np.stack([np.frombuffer(column, np.int64) for column in columns], axis=1)
+
+    def _row(self, name: str) -> int:
         row = self._row_of_name.get(name)
         if row is None:
-            path = _path(table, name)
+            path = self._table.path(name, "the dataset")
             if path not in self.rows:
                 self.rows[path] = len(self.rows)
                 keypoints = self._keypoints
                 known = keypoints.count(path) if keypoints and keypoints.has(path) else _MAX_INDEX
-                self.num_keypoints.append(known)
+                self._num_keypoints.append(known)
             row = self._row_of_name[name] = self.rows[path]
         return row
 
@@ -167,9 +196,7 @@ def _read_observations(
     open_keypoints: Callable[[str], FeatureSet | None],
 ) -> tuple[str | None, tuple[str, ...], NDArray[np.int64]]:
     wanted, types = keypoints_type, dict[str, None]()
-    observers = _Observers(None if wanted is None else open_keypoints(wanted))
-    seen_points: set[int] = set()
-    points, lengths, images, keypoints = (array("q") for _ in range(4))
+    tracks = _Tracks(table, num_points, None if wanted is None else open_keypoints(wanted))
     for fields in table:
         if len(fields) < 2 or len(fields) % 2:
             raise table.error(
@@ -181,35 +208,15 @@ def _read_observations(
         types[fields[1]] = None
         if wanted is None:
             wanted = fields[1]
-            observers = _Observers(open_keypoints(wanted))
-        if fields[1] != wanted:
-            if keypoints_type is None:
-                raise table.error(
-                    "kapture.keypoints_type",
-                    "keypoints of several types observe the points; name the one to use",
-                    expected=" or ".join(types),
-                )
-            continue
-        (point,) = _indices(table, fields[:1], num_points, "point in points3d.txt")
-        if point in seen_points:
+            tracks = _Tracks(table, num_points, open_keypoints(wanted))
+        if fields[1] == wanted:
+            tracks.add(fields)
+        elif keypoints_type is None:
             raise table.error(
-                "kapture.duplicate", "a second line for the same point and type", got=fields[0]
+                "kapture.keypoints_type",
+                "keypoints of several types observe the points; name the one to use",
+                expected=" or ".join(types),
             )
-        seen_points.add(point)
-        track = _indices(table, fields[3::2], _MAX_INDEX, "keypoint")
-        for name, keypoint in zip(fields[2::2], track, strict=True):
-            row = observers.row(table, name)
-            if keypoint >= observers.num_keypoints[row]:
-                raise table.error(
-                    "kapture.index",
-                    f"{name} has no such keypoint",
-                    expected=f"less than {observers.num_keypoints[row]}",
-                    got=str(keypoint),
-                )
-            images.append(row)
-        keypoints.extend(track)
-        points.append(point)
-        lengths.append(len(track))
     if keypoints_type is not None and types and keypoints_type not in types:
         raise DatasetError(
             "kapture.keypoints_type",
@@ -218,14 +225,12 @@ def _read_observations(
             expected=" or ".join(types),
             got=keypoints_type,
         )
-    point_of_row = np.repeat(np.frombuffer(points, np.int64), np.frombuffer(lengths, np.int64))
-    rest = (np.frombuffer(column, np.int64) for column in (images, keypoints))
-    return wanted, tuple(observers.rows), np.stack([point_of_row, *rest], axis=1)
+    return wanted, tuple(tracks.rows), tracks.observations()
 
 
 def _indices(table: Table, texts: list[str], limit: int, what: str) -> list[int]:
     joined = "".join(texts)
-    # int() would also take signs, underscores, digits of other scripts, and texts of any length.
+    # int() also accepts signs, underscores, digits of other scripts, and texts of any length.
     if all(texts) and joined.isascii() and (joined.isdigit() or not texts):
         indices = [int(text) for text in texts if len(text) <= _MAX_DIGITS]
         if len(indices) == len(texts) and max(indices, default=-1) < limit:
@@ -236,18 +241,6 @@ def _indices(table: Table, texts: list[str], limit: int, what: str) -> list[int]
         expected=f"integers from 0 to {limit - 1}" if limit else "no rows: there are none",
         got=", ".join(texts),
     )
-
-
-def _path(table: Table, text: str) -> str:
-    try:
-        return relative_path(text)
-    except ValueError:
-        raise table.error(
-            "kapture.path",
-            "not the path of an image",
-            expected="a relative path that stays inside the dataset",
-            got=text,
-        ) from None
 
 
 def _check(reconstruction: Reconstruction) -> None:

@@ -1,4 +1,4 @@
-"""Nested rigs, turned into plain ones."""
+"""Unrolling nested rigs."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ def unroll_rigs(
     """Replace rigs among the members of rigs by their sensors.
 
     Args:
-        members: rig id -> id of a sensor or of another rig -> ``member_from_rig``, None where
-            unknown; the ids that are keys are the rigs.
+        members: rig id -> id of a sensor or of another rig -> ``member_from_rig``, None if
+            unknown. The keys are the rigs.
         table: ``rigs.txt``, for errors.
 
     Returns:
-        rig id -> sensor id -> ``sensor_from_rig``, None where unknown, in the order given.
+        rig id -> sensor id -> ``sensor_from_rig``, None if unknown, in the order given.
 
     Raises:
         DatasetError: ``kapture.rig_cycle``, ``kapture.rig_depth`` for more than
-            ``MAX_RIG_DEPTH`` levels, ``kapture.duplicate`` if a sensor comes twice into a rig.
+            ``MAX_RIG_DEPTH`` levels, ``kapture.duplicate`` if a sensor is twice in a rig.
     """
     subrigs = {rig_id: [m for m in rig if m in members] for rig_id, rig in members.items()}
     try:

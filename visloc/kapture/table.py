@@ -1,4 +1,4 @@
-"""Rows of one kapture text file, with errors that name file and line."""
+"""Rows of one kapture text file, and errors that name file and line."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from visloc.errors import DatasetError, InvalidInput
+from visloc.kapture.text import relative_path
 
 _VERSION = re.compile(r"#\s*kapture format:\s*(\d{1,4})\.(\d{1,4})", re.ASCII)
 _INTEGER = re.compile(r"[+-]?\d{1,19}", re.ASCII)
@@ -18,24 +19,23 @@ _INT64_LIMIT = 2**63
 
 
 class Table:
-    """One text file of a dataset: iterates over its rows and collects what was tolerated.
+    """One text file of a dataset. Iterates over its rows and collects notes about bad ones.
 
     Args:
         root: folder of the dataset.
         relative: path of the file in it, with forward slashes.
-        num_columns: fields of every row; None where they differ.
+        num_columns: fields of every row; None if rows differ.
     """
 
     def __init__(self, root: Path, relative: str, num_columns: int | None) -> None:
         self.relative = relative
-        self.line = 0  # of the row at hand, from 1
+        self.line = 0  # of the current row, from 1
         self._path = root / relative
         self._num_columns = num_columns
         self._tolerated: Counter[str] = Counter()
         self._examples: dict[str, str] = {}
 
     def exists(self) -> bool:
-        """Tell whether the file is there."""
         try:
             self._path.stat()
         except (FileNotFoundError, NotADirectoryError):
@@ -45,7 +45,7 @@ class Table:
         return True
 
     def version(self) -> tuple[int, int] | None:
-        """Return the version that the first line declares, None when it declares none."""
+        """Return the version that the first line declares; None if it declares none."""
         for line in self._lines():
             match = _VERSION.match(line.strip())
             return None if match is None else (int(match[1]), int(match[2]))
@@ -69,13 +69,13 @@ class Table:
     def error(
         self, code: str, message: str, *, expected: str | None = None, got: object = None
     ) -> DatasetError:
-        """Make an error about the row at hand."""
+        """Make an error about the current row."""
         where = f"{self.relative}:{self.line}" if self.line else self.relative
         return DatasetError(code, message, field=where, expected=expected, got=got)
 
     @contextmanager
     def errors_at_row(self) -> Iterator[None]:
-        """Turn what a value says of itself into an error about the row at hand."""
+        """Turn InvalidInput of a value into an error about the current row."""
         try:
             yield
         except InvalidInput as error:
@@ -84,12 +84,12 @@ class Table:
             ) from None
 
     def tolerate(self, what: str, example: str) -> None:
-        """Count one row, or one thing said in it, that is left out."""
+        """Count one row that is ignored, in whole or in part."""
         self._tolerated[what] += 1
         self._examples.setdefault(what, f"line {self.line}: {example}")
 
     def notes(self) -> list[str]:
-        """Return one sentence for each kind of thing tolerated, with its count."""
+        """Return one sentence with a count for each kind of tolerated row."""
         return [
             f"{self.relative}: {count} {what} (first in {self._examples[what]})"
             for what, count in self._tolerated.items()
@@ -104,6 +104,18 @@ class Table:
         raise self.error(
             "kapture.timestamp", "not a timestamp", expected="a 64-bit integer", got=text
         )
+
+    def path(self, text: str, folder: str) -> str:
+        """Parse a relative path."""
+        try:
+            return relative_path(text)
+        except ValueError:
+            raise self.error(
+                "kapture.path",
+                "the path cannot be used",
+                expected=f"a relative path that stays inside {folder}",
+                got=text,
+            ) from None
 
     def numbers(self, texts: list[str]) -> list[float]:
         """Parse finite numbers."""
@@ -123,7 +135,7 @@ class Table:
     def _lines(self) -> Iterator[str]:
         self.line = 0
         try:
-            # A pipe would be waited for, and a device may have no end.
+            # A pipe blocks, and a device may have no end.
             if not stat.S_ISREG(self._path.stat().st_mode):
                 raise self.error("kapture.unreadable", "not a file", expected="a plain file")
             with self._path.open(encoding="utf-8-sig") as file:

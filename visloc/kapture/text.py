@@ -1,4 +1,4 @@
-"""The text rules that kapture's files share: comma-separated fields without quoting."""
+"""Text rules of kapture's files: comma-separated fields without quoting."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def relative_path(text: str) -> str:
     """Normalize the path of a record or image to forward slashes, without ``.`` or doubled ones.
 
     Raises:
-        ValueError: if it is empty, absolute, climbs with ``..`` or has control characters.
+        ValueError: if it is empty, absolute, contains ``..`` or has control characters.
     """
     path = PurePosixPath(text.replace("\\", "/"))
     if (
@@ -28,15 +28,15 @@ def relative_path(text: str) -> str:
 
 
 def has_control_characters(text: str) -> bool:
-    """Tell whether a text has line breaks, tabs, NUL or lone surrogates, which no name needs."""
+    """Tell whether a text has line breaks, tabs, NUL or lone surrogates."""
     return not text.isprintable() and any(unicodedata.category(c) in ("Cc", "Cs") for c in text)
 
 
 def is_field(text: str) -> bool:
-    """Tell whether a text can be one field: it must come back as written."""
+    """Tell whether a text can be one field, which reading returns unchanged."""
     return text == text.strip() and "," not in text and not has_control_characters(text)
 
 
 def is_folder_name(text: str) -> bool:
-    """Tell whether a text can be one folder, such as a feature type."""
+    """Tell whether a text can be the name of a folder, such as a feature type."""
     return is_field(text) and text not in ("", ".", "..") and not set(text) & set("/\\:")

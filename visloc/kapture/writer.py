@@ -16,7 +16,7 @@ VERSION_LINE = "# kapture format: 1.1"
 
 _POSE = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 _RIG_COLUMNS = ("rig_id", "sensor_id", *_POSE)
-# How far kapture's own tools pad the fields of a column.
+# Widths to which kapture's own tools pad columns.
 _WIDTHS = {"timestamp": 8, "device_id": 3, **dict.fromkeys(_POSE, 4)}
 _PATHS = ("image_path", "depth_map_path")
 
@@ -25,10 +25,10 @@ def write_dataset(dataset: Dataset) -> None:
     """Write ``sensors/*.txt`` under ``dataset.root``; ``sensors.txt`` comes last.
 
     Optional files without content are not written; files in ``records_data`` are the caller's.
-    Numbers are written so that they come back as they were.
+    Reading returns the same numbers.
 
     Raises:
-        Conflict: ``kapture.exists`` if one of the files exists: no dataset is overwritten.
+        Conflict: ``kapture.exists`` if one of the files exists.
         DatasetError: ``kapture.field`` for a text that kapture cannot hold, such as a comma.
     """
     folder = dataset.root / "sensors"
@@ -68,7 +68,7 @@ def write_rigs(path: Path, rigs: Mapping[str, Mapping[str, Pose | None]]) -> Non
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file that is either complete or not there."""
+    """Write a file so that it is complete or does not exist."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         partial.write_bytes(content)
@@ -79,11 +79,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def _tables(dataset: Dataset) -> Iterator[tuple[str, Sequence[str], list[list[str]]]]:
-    yield (
-        "rigs.txt",
-        _RIG_COLUMNS,
-        _rig_rows(dataset.rigs),
-    )
+    yield "rigs.txt", _RIG_COLUMNS, _rig_rows(dataset.rigs)
     yield (
         "trajectories.txt",
         ("timestamp", "device_id", *_POSE),
@@ -158,6 +154,6 @@ def _comes_back(field: str, *, is_first: bool, is_path: bool) -> bool:
                 return False
         except ValueError:
             return False
-    if is_first and field[:1] in ("", "#"):  # would be read as nothing, or as a comment
+    if is_first and field[:1] in ("", "#"):  # reads as nothing, or as a comment
         return False
     return is_field(field)

@@ -2,13 +2,12 @@
 
 Section 4.3 and appendix B of Humenberger et al. 2020. An operator takes similarities (m, n), one
 row per global descriptor, and positive weights (m,) whose sum is 1, and gives fused scores (n,).
-Scores order the photos of one query; they are no cosines, but for a single descriptor, whose
-cosines they are.
+Scores order the photos of one query. They are not cosines, except with a single descriptor.
 
 Every operator is defined and finite for all cosines from -1 to 1, and no score falls when a
-similarity rises. Formulas that divide by similarities or take powers of them end where one is 0
-(generalized harmonic mean: below it). From there on the smallest counts alone: the same value at
-the border, and the more dissimilar the lower.
+similarity rises. Formulas that divide by similarities or take powers of them are undefined from 0
+on (generalized harmonic mean: from a negative value on). There the smallest similarity is the
+score, which is continuous.
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ GHARM_GAMMA = 0.5
 
 
 def equal_weights(count: int) -> NDArray[np.float64]:
-    """Return the weights (count,) of descriptors of which none counts more."""
+    """Return equal weights (count,) with sum 1."""
     return np.full(count, 1.0 / count)
 
 
 def _of_several(operator: FusionOperator) -> FusionOperator:
-    """Give a single descriptor's cosines as they are, where formulas would round or rank."""
+    """Return a single descriptor's cosines unchanged, which formulas would round or rank."""
 
     @wraps(operator)
     def fused(
@@ -114,13 +113,13 @@ def harmonic(
 def round_robin(
     similarities: NDArray[np.float64], weights: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Take the first of every descriptor's ranking, then the second of every one, and so on.
+    """Take the first photo of every descriptor's ranking, then the second of each, and so on.
 
-    A photo that was taken is skipped. Those of one round come in the order of their weighted mean:
-    otherwise the order of the descriptors would decide. Weights have no other effect.
+    A photo that was taken is skipped. Photos of one round are ordered by their weighted mean, so
+    that the order of the descriptors does not matter. Weights have no other effect.
 
     Returns:
-        (n,) 1 / position. Photos that nothing tells apart share the first of their positions.
+        (n,) 1 / position. Photos with equal similarities share the first of their positions.
     """
     rising = np.sort(similarities, axis=1)
     num = similarities.shape[1]
@@ -168,15 +167,15 @@ class LateFusion:
 
     Attributes:
         operator: a key of ``FUSION_OPERATORS``.
-        weights: positive weight by global descriptor, of any sum; those without one are left out.
-            None: all count the same.
+        weights: positive weight by global descriptor, of any sum; descriptors without a weight are
+            ignored. None weighs all equally.
     """
 
     operator: Fusion = Fusion.GHARM
     weights: Mapping[str, float] | None = None
 
     def counted(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Those of some global descriptors that are not left out."""
+        """The global descriptors that are not ignored."""
         return tuple(name for name in names if self.weights is None or name in self.weights)
 
     def scores(self, similarities: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64]:
@@ -196,15 +195,10 @@ EQUAL_GHARM = LateFusion()
 def chosen_fusion(
     options: LocalizeOptions, default: LateFusion, names: Iterable[str]
 ) -> LateFusion:
-    """Return what a query asks for, else the map's default.
-
-    Args:
-        options: of the query.
-        default: of the map.
-        names: the map's global descriptors.
+    """Return the fusion that a query's options ask for, or the map's default.
 
     Raises:
-        InvalidInput: ``options.fusion_weights`` for one that the map does not have.
+        InvalidInput: ``options.fusion_weights`` for a name that is not in the map's ``names``.
     """
     known = tuple(names)
     for name in options.fusion_weights or ():

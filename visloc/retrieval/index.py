@@ -1,4 +1,4 @@
-"""Which mapping photos look most like the query."""
+"""Ranks the mapping photos by similarity to the query."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from visloc.retrieval.fusion import EQUAL_GHARM, LateFusion
 from visloc.retrieval.rows import GlobalRows
 from visloc.retrieval.shortlist import united
 
-# Maps of more photos are written with clusters.
+# Maps with more photos have clusters.
 MAX_EXACT = 50_000
-# Of those, what each descriptor proposes; measured in docs/decisions/0016.
+# Photos that each descriptor proposes in such maps; measured in docs/decisions/0016.
 _NUM_PROPOSED = 4000
 _PROPOSED_PER_RESULT = 20
 
@@ -43,17 +43,16 @@ def retrieve(
 ) -> Retrieved:
     """Rank the photos of a map by fused similarity to a query.
 
-    Of up to ``MAX_EXACT`` photos all are compared. Of more, each descriptor proposes those of the
-    clusters most like the query, and all that any of them proposes are compared under all.
+    Up to ``MAX_EXACT`` photos are all compared. In larger maps each descriptor proposes the photos
+    of the clusters nearest to the query, and all proposals are compared under all descriptors.
 
     Args:
-        query: unit vector (D,) by global descriptor, of all that count; a zero vector is similar
-            to nothing.
-        index: unit rows of the map's photos by the same global descriptors.
-        top_k: how many to return; fewer when the map has fewer photos.
-        photo_weights: (n,) from 0, never to be returned, to 1; they scale how much better a photo
-            is than the worst that was compared. The scores that are returned stay as they are.
-        fusion: how similarities become scores; of which global descriptors. It leaves one or more.
+        query: unit vector (D,) by global descriptor; a zero vector is similar to nothing.
+        index: unit rows of the map's photos by global descriptor.
+        top_k: number of photos; fewer if the map has fewer.
+        photo_weights: (n,) from 0, which excludes a photo, to 1. They scale the distance of a
+            score from the lowest one, for ranking only: returned scores are not changed.
+        fusion: fuses similarities into scores; it must use at least one of the descriptors.
     """
     index = {name: index[name] for name in fusion.counted(index)}
     compared = _compared(query, index, top_k, photo_weights)
@@ -66,7 +65,7 @@ def retrieve(
         candidates = np.flatnonzero(photo_weights[photos])
         ranked = scores[candidates]
         ranked = (ranked - ranked.min(initial=np.inf)) * photo_weights[photos[candidates]]
-    # A stable sort: of equal scores the earlier photo comes first, on every machine.
+    # A stable sort, so that equal scores keep the map's order on every machine.
     best = candidates[np.argsort(-ranked, kind="stable")[:top_k]]
     return Retrieved(
         images=photos[best],

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-# Numbers that are turned into float32 at a time: 1 MiB of them stay in the cache of a core. It is
-# also small enough for BLAS not to wake other threads, which costs more than the product.
+# Numbers converted to float32 at once: 1 MiB stays in the cache of a core, and is too small for
+# BLAS to wake other threads, which costs more than the product.
 _BLOCK_NUMBERS = 2**18
 
 
@@ -15,18 +15,10 @@ def dot_products(
     vector: NDArray[np.float32],
     rows: NDArray[np.int64] | None = None,
 ) -> NDArray[np.float32]:
-    """Multiply rows of a matrix (n, D) with a vector (D,).
+    """Return the products (m,) of some rows (m,) of a matrix (n, D), or all, with a vector (D,).
 
-    8-bit rows are widened block by block: that takes less time than reading rows of 32 bits from
-    memory would, and no memory.
-
-    Args:
-        matrix: may be mapped from a file.
-        vector: of D numbers.
-        rows: (m,) which rows; None for all.
-
-    Returns:
-        (m,) products.
+    8-bit rows are converted block by block, which is faster than reading 32-bit rows from memory.
+    The matrix may be mapped from a file.
     """
     num = len(matrix) if rows is None else len(rows)
     found = np.empty(num, np.float32)

@@ -1,4 +1,4 @@
-"""One global descriptor of all photos of a map, as it is stored."""
+"""One global descriptor of all photos of a map, as stored."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class GlobalRows:
     """Unit rows (n, D), one per photo; ``rows[i]`` reads some as float32.
 
     Attributes:
-        values: (n, D) int8, or float32.
-        scales: (n,) float32, of what each row of ``values`` is to be multiplied with; None for 1.
-        clusters: of the rows; None in maps in which all rows are compared with every query.
+        values: (n, D) int8 or float32.
+        scales: (n,) float32 factors of the rows of ``values``; None for 1.
+        clusters: None in maps whose rows are all compared with every query.
     """
 
     values: NDArray[np.int8] | NDArray[np.float32]
@@ -37,15 +37,7 @@ class GlobalRows:
     def cosines(
         self, query: NDArray[np.float32], photos: NDArray[np.int64] | None = None
     ) -> NDArray[np.float64]:
-        """Compare with a unit vector (D,).
-
-        Args:
-            query: unit vector (D,); a zero vector is similar to nothing.
-            photos: (m,) the rows to compare; None for all.
-
-        Returns:
-            (m,) cosines.
-        """
+        """Return the cosines (m,) of a unit vector (D,) with some rows (m,), or all."""
         found = dot_products(self.values, query, photos)
         if self.scales is not None:
             found *= self.scales if photos is None else self.scales[photos]
@@ -54,9 +46,9 @@ class GlobalRows:
 
 
 def in_8_bits(rows: NDArray[np.float32]) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
-    """Round unit rows (n, D) to int8; their scales (n,) make them of unit length again.
+    """Round unit rows (n, D) to int8; return them with scales (n,) that restore unit length.
 
-    Zero rows, of blank photos, stay zero.
+    The zero rows of blank photos stay zero.
     """
     largest = np.abs(rows).max(axis=1, initial=0.0)
     steps = np.where(largest > 0, largest, 1) / np.float32(127)

@@ -1,7 +1,7 @@
-"""Which photos of a very large map to look at: those in the clusters nearest to the query.
+"""Selects the photos of a very large map that are compared with a query.
 
 An inverted file (Sivic and Zisserman 2003) in plain arrays: the rows of one global descriptor are
-clustered by spherical k-means, and a query looks into the clusters whose centres are most like it.
+clustered by spherical k-means, and the clusters nearest to the query are compared.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from visloc.retrieval.products import dot_products
 
-# Clusters are 2 sqrt(n): comparing a query with their centres then takes as long as a few of them.
+# With 2 sqrt(n) clusters, comparing the centres takes as long as comparing a few clusters.
 _CLUSTERS_PER_ROOT = 2.0
 _SAMPLES_PER_CLUSTER = 50
 _ITERATIONS = 10
@@ -24,7 +24,7 @@ _BLOCK_ROWS = 4096
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Clusters:
-    """The photos of a map by what one global descriptor has in common.
+    """The photos of a map, clustered by one global descriptor.
 
     Attributes:
         centers: (C, D) float32 unit rows.
@@ -39,16 +39,16 @@ class Clusters:
     def nearest(
         self, query: NDArray[np.float32], count: int, allowed: NDArray[np.bool_] | None
     ) -> NDArray[np.int64]:
-        """Photos of the clusters most like a query, until there are ``count`` or no more clusters.
+        """Photos of the clusters nearest to a query, at least ``count`` if there are so many.
 
         Args:
             query: unit vector (D,).
-            count: how many photos are wanted at least.
-            allowed: (n,) which photos count; None for all.
+            count: minimum number of photos.
+            allowed: (n,) the photos that may be returned; None for all.
         """
         found: list[NDArray[np.int64]] = []
         wanted = count
-        # A stable sort, as everywhere: of equal clusters the first comes first.
+        # A stable sort, so that equal clusters keep their order on every machine.
         for cluster in np.argsort(-dot_products(self.centers, query), kind="stable"):
             if wanted <= 0:
                 break
@@ -60,7 +60,7 @@ class Clusters:
 
 
 def make_clusters(rows: NDArray[np.float32], seed: int = 0) -> Clusters:
-    """Cluster unit rows (n, D), of which only blocks and a sample are in memory."""
+    """Cluster unit rows (n, D), reading only blocks and a sample into memory."""
     num = len(rows)
     count = min(num, round(_CLUSTERS_PER_ROOT * math.sqrt(num)))
     random = np.random.default_rng(seed)
@@ -83,7 +83,7 @@ def make_clusters(rows: NDArray[np.float32], seed: int = 0) -> Clusters:
 
 
 def united(photos: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Photos that are in any of several selections, in the order of the map."""
+    """The union of several selections of photos, in the order of the map."""
     return np.unique(np.concatenate(photos))
 
 

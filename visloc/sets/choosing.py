@@ -1,4 +1,4 @@
-"""Which tiles of a set are searched, and in which order."""
+"""Chooses the tiles of a set that are searched, and their order."""
 
 from __future__ import annotations
 
@@ -18,22 +18,20 @@ from visloc.priors import HEIGHT_REACH, POSE_PRIOR_STDS, REACH, Priors
 from visloc.sets.frame import down_in_set
 from visloc.types import InstantAnswer
 
-# Tiles that a query is searched in, at most.
+# Maximum number of tiles searched for one query.
 MAX_SEARCHED = 5
-# Tiles of at least this share of the best score are searched at once with the best.
+# Tiles with at least this share of the best score are searched together with the best.
 _CLOSE_SCORE = 0.8
-# An answer of so many inliers needs no other tile.
+# With so many inliers no other tile is searched.
 CLEAR_INLIERS = 100
 _NAMED = 5
 
 
 @dataclass(frozen=True, slots=True)
 class TileScore:
-    """How much a tile looks like a query.
+    """A tile's row in the set and its similarity to a query.
 
-    Attributes:
-        tile: its row in the set.
-        score: estimated cosine similarity of its best photos, comparable within one query.
+    The score is the estimated cosine similarity of its best photos, comparable within one query.
     """
 
     tile: int
@@ -43,16 +41,10 @@ class TileScore:
 def tiles_near(
     outline: SetOutline, latitude: float, longitude: float, radius: float
 ) -> NDArray[np.bool_]:
-    """Tell which tiles reach into a circle on Earth.
-
-    Args:
-        outline: the set.
-        latitude: of the circle's middle, degrees.
-        longitude: likewise.
-        radius: metres.
+    """Tell which tiles overlap a circle on Earth (degrees, and a radius in metres).
 
     Returns:
-        (T,) all False for a set that is not tied to the Earth.
+        (T,) all False for a set without a place on Earth.
     """
     if outline.geodetic is None:
         return np.zeros(len(outline.tiles), np.bool_)
@@ -67,23 +59,22 @@ def allowed_tiles(
 ) -> NDArray[np.bool_]:
     """Tell which tiles the priors allow.
 
-    A tile is allowed when a photo of it may show what the device sees. As in one map, photos
-    count that were taken within twice the distance that they see of a sphere, or within a quarter
-    of its height of a band (``visloc.localization.constraints``). Of a tile, the box of its photos'
-    centres is
-    looked at.
+    A tile is allowed if one of its photos may show what the device sees. The distances are those
+    of a single map (``visloc.localization.constraints``), measured from the bounding box of the
+    photos' centres: twice the viewing distance around a sphere, a quarter of the height around a
+    band.
 
     Args:
         outline: the set.
-        priors: in its frame.
-        within: (T,) the tiles that are asked for; None for all.
+        priors: in the set's frame.
+        within: (T,) the requested tiles; None for all.
 
     Returns:
-        (T,) one at least is True.
+        (T,) at least one is True.
 
     Raises:
         InvalidInput: ``priors.maps`` for a name that is no tile; ``priors.height`` when neither the
-            set nor the priors know which way is down.
+            set nor the priors define which way is down.
         NotFound: ``set.no_tile``.
     """
     low, high = outline.photo_boxes[:, 0], outline.photo_boxes[:, 1]
@@ -119,21 +110,18 @@ def allowed_tiles(
 def nearest_tile(
     outline: SetOutline, priors: Priors, within: NDArray[np.bool_] | None = None
 ) -> int:
-    """Return the tile that says best that it has no photo where the priors allow the device.
+    """Return the row of the tile that reports that no photo fits the priors.
 
-    Of the tiles that are asked for, that whose photos are nearest to where the device may be; the
-    first where only a height says so.
+    It is the requested tile whose photos are nearest to the position prior; without a position, the
+    first one.
 
     Args:
         outline: the set.
-        priors: in its frame, of which ``allowed_tiles`` leaves nothing.
-        within: (T,) the tiles that are asked for; None for all.
-
-    Returns:
-        Its row.
+        priors: in the set's frame; they exclude every tile.
+        within: (T,) the requested tiles; None for all.
 
     Raises:
-        NotFound: ``set.no_tile`` when none that is asked for is named.
+        NotFound: ``set.no_tile`` when no requested tile is named.
     """
     asked = allowed_tiles(outline, Priors(maps=priors.maps), within)
     center = None
@@ -149,14 +137,14 @@ def nearest_tile(
 
 
 def plan(scores: Sequence[TileScore]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Say which tiles are searched.
+    """Plan the search.
 
     Args:
         scores: at least one, best first.
 
     Returns:
-        Rows of the tiles that are searched at once, the best and those about as good; and of those
-        that are searched after them unless an answer is clear.
+        Rows of the tiles that are searched first, together: the best and those about as good. Rows
+        of the tiles that are searched next unless an answer is clear.
     """
     least = _CLOSE_SCORE * scores[0].score
     searched = scores[:MAX_SEARCHED]
@@ -165,7 +153,7 @@ def plan(scores: Sequence[TileScore]) -> tuple[tuple[int, ...], tuple[int, ...]]
 
 
 def is_clear(answer: InstantAnswer) -> bool:
-    """Tell whether no other tile needs to be searched: a pose of many inliers."""
+    """Tell whether a pose has so many inliers that no other tile needs to be searched."""
     return measured_pose(answer) is not None and answer.num_inliers >= CLEAR_INLIERS
 
 

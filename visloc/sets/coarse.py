@@ -1,10 +1,10 @@
-"""One coarse index over all photos of all tiles: which tiles a photo may show.
+"""A coarse index over all photos of all tiles, which ranks the tiles for a query.
 
 A photo's stored descriptors are pooled to one vector (``localvlad``, with one vocabulary and one
-projection for all tiles), of which the signs along some planes are kept: a code of a few bytes.
-A query looks at a few rows of every tile first, then at the codes of the photos of the best tiles,
-and at the best of these once more, with its own descriptor instead of its code. Nothing here loops
-over all tiles or photos in Python (docs/decisions/0022-map-sets.md).
+projection for all tiles). The signs of its products with some planes are its code of a few bytes.
+A query is compared with a few rows of every tile, then with the codes of the photos of the best
+tiles, and finally, with its descriptor instead of its code, with the best of these. Nothing here
+loops over all tiles or photos in Python (docs/decisions/0022-map-sets.md).
 """
 
 from __future__ import annotations
@@ -28,33 +28,28 @@ from visloc.types import LocalFeatures
 
 CoarseModel = Mapping[str, NDArray[np.float32]]
 
-# With 256, chance put more wrong tiles before the right one (docs/scale.md).
+# With 256, more wrong tiles came before the right one by chance (docs/scale.md).
 BITS = 512
-# Of a descriptor; those that tell more than chance come first.
+# Dimensions of a descriptor; the most informative come first.
 _MAX_DIMS = 256
-# Rows that stand for a tile: the middles of what its photos look like.
+# Cluster centres of the photos' descriptors, per tile.
 CENTROIDS = 4
-# Tiles whose photos are looked at: so many, or this share of a larger set.
+# Tiles whose codes are compared: so many, or this share of a larger set.
 _MIN_LOOKED_AT, _SHARE_LOOKED_AT = 400, 0.04
-# Of these, so many are looked at once more, and ranked.
+# Tiles that are compared with the descriptor, and ranked.
 MAX_RANKED = 50
-# A tile is as similar to a query as its best photos are on average: one alone may be so by chance.
+# A tile scores the mean of its best photos, as one alone may be similar by chance.
 _NUM_BEST = 3
-# Of a large set, so many tiles teach vocabulary and projection.
+# Tiles of a large set that vocabulary and projection are learned from.
 _MAX_TEACHERS = 256
 _BLOCK_ROWS, _BLOCK_PHOTOS = 2**18, 2**14
-_LEAST_SIDE = 1e-12  # of a query that nothing was seen in
+_LEAST_SIDE = 1e-12  # for a query without features
 _NO_PIXELS = np.empty((0, 0, 3), np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DescribedTile:
-    """What the index holds of one tile.
-
-    Attributes:
-        codes: (n, bits / 64) uint64, one row for each photo.
-        centroids: (CENTROIDS, D) unit rows.
-    """
+    """One tile in the index: (n, bits / 64) uint64 codes, (CENTROIDS, D) unit rows."""
 
     codes: NDArray[np.uint64]
     centroids: NDArray[np.float32]
@@ -66,11 +61,11 @@ def learn(
     """Learn the model of an index on a seeded sample of the tiles' photos.
 
     Args:
-        open_tile: opens a tile of the set by its row; each is asked for a few times, and one is
+        open_tile: opens a tile of the set by its row; called a few times for each, with one tile
             open at a time.
-        num_tiles: how many there are.
-        bits: of a photo's code, a multiple of 64.
-        seed: of the sample, the vocabulary and the planes.
+        num_tiles: number of tiles.
+        bits: length of a photo's code, a multiple of 64.
+        seed: for the sample, the vocabulary and the planes.
     """
     random = np.random.default_rng(seed)
     teachers = np.sort(
@@ -82,7 +77,7 @@ def learn(
         last = len(open_tile(tile).images) - 1
         some = np.unique(np.linspace(0, last, most).astype(int)).tolist()
         photos += [(tile, photo) for photo in some]
-    # One at a time: a process may have a thousand files open, and a map has several.
+    # One at a time, as a process may open about a thousand files and a map has several.
     opened: dict[int, Map] = {}
 
     def words_of(number: int) -> NDArray[np.float32]:
@@ -101,13 +96,13 @@ def learn_of_words(
     bits: int,
     random: np.random.Generator,
 ) -> CoarseModel:
-    """Learn the model of an index on some photos, whatever they are of.
+    """Learn the model of an index on some photos.
 
     Args:
-        words_of: returns the local descriptors (n, d) of a photo by its number; asked twice.
-        num_photos: how many there are.
-        bits: of a photo's code, a multiple of 64.
-        random: draws the words that are used, and the planes.
+        words_of: returns the local descriptors (n, d) of a photo by its number; called twice.
+        num_photos: number of photos.
+        bits: length of a photo's code, a multiple of 64.
+        random: for the sample of the descriptors, and the planes.
     """
     descriptor = _descriptor()
     most = KMEANS_MAX_WORDS // num_photos
@@ -128,37 +123,34 @@ def learn_of_words(
 
 
 def describe(opened: Map, model: CoarseModel, *, seed: int = 0) -> DescribedTile:
-    """Describe the photos of a tile by what the map stores of them.
+    """Describe the photos of a tile from their stored descriptors.
 
-    Args:
-        opened: the map.
-        model: of this set, or of another whose tiles have the same local features.
-        seed: of the clustering.
+    ``model`` is that of the set, or of another set with the same local features.
     """
     return described(descriptors_of(opened, model), model, seed=seed)
 
 
 def descriptors_of(opened: Map, model: CoarseModel) -> NDArray[np.float32]:
-    """Return the descriptors (n, D) of the photos of a map, of what it stores of them."""
+    """Return the descriptors (n, D) of a map's photos, from their stored local descriptors."""
     photos = range(len(opened.images))
     return np.array([descriptor_of(_words(opened, photo), model) for photo in photos])
 
 
 def descriptor_of(words: NDArray[np.float32], model: CoarseModel) -> NDArray[np.float32]:
-    """Return the descriptor (D,) of a photo by its local descriptors (n, d)."""
+    """Return the descriptor (D,) of a photo from its local descriptors (n, d)."""
     return _descriptor().describe(_NO_PIXELS, _local(words), model)
 
 
 def described(rows: NDArray[np.float32], model: CoarseModel, *, seed: int = 0) -> DescribedTile:
-    """Describe a tile by the descriptors (n, D) of its photos; as ``describe``."""
+    """Describe a tile from the descriptors (n, D) of its photos."""
     centers = unit_rows(learn_words(rows, CENTROIDS, seed))
-    # A tile of fewer photos has some rows again.
+    # A tile with fewer photos repeats rows.
     centroids = centers[np.arange(CENTROIDS) % len(centers)]
     return DescribedTile(codes_of(rows, model["planes"]), centroids)
 
 
 def coarse_index(described: Iterator[DescribedTile], model: CoarseModel) -> CoarseIndex:
-    """Return the index of tiles that were described one after another."""
+    """Join described tiles to an index."""
     codes, counts, centroids = [], [0], []
     for tile in described:
         codes.append(tile.codes)
@@ -176,7 +168,7 @@ def coarse_index(described: Iterator[DescribedTile], model: CoarseModel) -> Coar
 def rank_tiles(
     map_set: MapSet, local: LocalFeatures, allowed: NDArray[np.bool_] | None = None
 ) -> tuple[TileScore, ...]:
-    """Rank tiles by how much their photos look like a query, best first; 50 at most.
+    """Rank tiles by the similarity of their photos to a query, best first, at most 50.
 
     Args:
         map_set: the set.
@@ -184,8 +176,8 @@ def rank_tiles(
         allowed: (T,) the tiles that may be ranked; None for all.
 
     Raises:
-        Conflict: ``map.features`` when the index was made with another revision of the descriptor.
-        MapCorrupt: ``map.array`` when its vocabulary is of other local features.
+        Conflict: ``map.features`` for an index made with another revision of the descriptor.
+        MapCorrupt: ``map.array`` for a vocabulary of other local features.
     """
     check_descriptor(map_set)
     dim, expected = local.descriptors.shape[1], map_set.coarse.model["vocabulary"].shape[1]
@@ -202,7 +194,7 @@ def rank_tiles(
 
 
 def check_descriptor(map_set: MapSet) -> None:
-    """Refuse a set whose coarse index was made with another revision of the descriptor.
+    """Refuse an index made with another revision of the descriptor.
 
     Raises:
         Conflict: ``map.features``.
@@ -213,7 +205,7 @@ def check_descriptor(map_set: MapSet) -> None:
 def ranked(
     coarse: CoarseIndex, query: NDArray[np.float32], allowed: NDArray[np.bool_] | None = None
 ) -> tuple[TileScore, ...]:
-    """Rank tiles by a query's descriptor (D,); as ``rank_tiles``."""
+    """Rank tiles as ``rank_tiles`` does, for a query's descriptor (D,)."""
     tiles = _similar(coarse, query, _proposed(coarse, query, allowed))
     sides = query @ coarse.model["planes"]
     sides /= max(float(np.sqrt(np.mean(sides**2))), _LEAST_SIDE)
@@ -225,7 +217,7 @@ def ranked(
 def _similar(
     coarse: CoarseIndex, query: NDArray[np.float32], tiles: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """The tiles whose codes differ least from that of a query, in the order of the set."""
+    """The tiles whose codes differ least from the query's code, in the order of the set."""
     if len(tiles) <= MAX_RANKED:
         return tiles
     counts = coarse.offsets[tiles + 1] - coarse.offsets[tiles]
@@ -234,18 +226,18 @@ def _similar(
     rows = np.arange(len(place)) + np.repeat(coarse.offsets[tiles] - (ends - counts), counts)
     code = codes_of(query[None], coarse.model["planes"])[0]
     length = coarse.bits + 1
-    # Photos by tile and by how many bits differ; of which the fewest count.
+    # Photos by tile and by number of different bits.
     histogram = np.zeros((len(tiles), length), np.int64)
     for start in range(0, len(rows), _BLOCK_ROWS):
         some = slice(start, start + _BLOCK_ROWS)
         counted = np.bitwise_count(coarse.codes[rows[some]] ^ code)
         cells = place[some] * length
-        # Column by column: NumPy sums short rows slowly.
+        # Column by column, as NumPy sums short rows slowly.
         for column in counted.T:
             cells += column
         histogram += np.bincount(cells, minlength=histogram.size).reshape(histogram.shape)
     best = np.diff(np.minimum(np.cumsum(histogram, axis=1), _NUM_BEST), axis=1, prepend=0)
-    # Two vectors lie on different sides of a random plane as often as their angle says.
+    # The probability that a random plane separates two vectors is their angle over pi.
     cosines = np.cos(np.pi * np.arange(length) / coarse.bits)
     scores = best @ cosines / np.minimum(counts, _NUM_BEST)
     return np.sort(tiles[np.argpartition(-scores, MAX_RANKED)[:MAX_RANKED]])
@@ -257,16 +249,16 @@ def _score(coarse: CoarseIndex, tile: int, sides: NDArray[np.float32]) -> float:
     Args:
         coarse: the index.
         tile: row of the tile.
-        sides: (bits,) how far from each plane the query's descriptor lies, and on which side, in
-            units of their root mean square.
+        sides: (bits,) signed distances of the query's descriptor from the planes, in units of
+            their root mean square.
     """
     start, stop = int(coarse.offsets[tile]), int(coarse.offsets[tile + 1])
     best = np.empty(0, np.float32)
     for block in range(start, stop, _BLOCK_PHOTOS):
         codes = np.ascontiguousarray(coarse.codes[block : min(block + _BLOCK_PHOTOS, stop)], "<u8")
         bits = np.unpackbits(codes.view(np.uint8), axis=1, bitorder="little")
-        # That a photo lies beyond a plane says more, the further beyond it the query lies: of unit
-        # vectors at an angle, the mean of sign times distance is their cosine times this.
+        # A bit counts by the query's distance from the plane: for unit vectors, the mean of sign
+        # times distance is proportional to their cosine.
         signed = 2.0 * (bits.astype(np.float32) @ sides) - sides.sum()
         cosines = math.sqrt(math.pi / 2) / coarse.bits * signed
         best = np.sort(np.concatenate([best, cosines]))[-_NUM_BEST:]
@@ -282,7 +274,7 @@ def codes_of(rows: NDArray[np.float32], planes: NDArray[np.float32]) -> NDArray[
 def _proposed(
     coarse: CoarseIndex, query: NDArray[np.float32], allowed: NDArray[np.bool_] | None
 ) -> NDArray[np.int64]:
-    """The tiles whose photos are looked at, in the order of the set."""
+    """The tiles whose codes are compared, in the order of the set."""
     num_tiles = len(coarse.offsets) - 1
     tiles = np.arange(num_tiles) if allowed is None else np.flatnonzero(allowed)
     most = max(_MIN_LOOKED_AT, math.ceil(_SHARE_LOOKED_AT * num_tiles))
@@ -302,7 +294,7 @@ def _words(opened: Map, photo: int) -> NDArray[np.float32]:
 
 
 def _local(words: NDArray[np.float32]) -> LocalFeatures:
-    """Descriptors as local features; where they lie does not matter."""
+    """Descriptors as local features without positions."""
     nowhere = np.zeros(len(words), np.float32)
     return LocalFeatures(np.zeros((len(words), 2), np.float32), words, nowhere, nowhere)
 
@@ -316,7 +308,7 @@ def _sample(
 
 
 def random_planes(dim: int, bits: int, random: np.random.Generator) -> NDArray[np.float32]:
-    """Return normals (dim, bits) of planes, orthogonal to each other as far as there is room."""
+    """Return normals (dim, bits) of planes, orthogonal in groups of ``dim``."""
     blocks = []
     for start in range(0, bits, dim):
         square, _ = np.linalg.qr(random.normal(size=(dim, dim)))

@@ -1,4 +1,4 @@
-"""Between the frame of a set and that of one of its tiles, where a query is answered."""
+"""Transforms between the frame of a set and the frame of a tile, where queries are solved."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from visloc.types import InstantAnswer, RigPose
 
 
 def answer_in_set(answer: InstantAnswer, set_from_tile: Similarity) -> InstantAnswer:
-    """Move an answer of a tile to the set's frame and unit: its pose, and the rig."""
+    """Move the pose and the rig of a tile's answer to the set's frame and unit."""
     images = tuple(
         replace(image, cam_from_rig=scaled_device(image.cam_from_rig, set_from_tile.scale))
         for image in answer.images
@@ -25,14 +25,14 @@ def answer_in_set(answer: InstantAnswer, set_from_tile: Similarity) -> InstantAn
 
 
 def down_in_set(priors: Priors, down: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-    """Return the unit vector (3,) that points down in a set's frame; None where it does not matter.
+    """Return the unit vector (3,) that points down in a set's frame; None without a height prior.
 
     Args:
         priors: in the set's frame.
-        down: (3,) what the set knows of it; None where it does not.
+        down: (3,) the set's own direction; None when unknown.
 
     Raises:
-        InvalidInput: ``priors.height`` when it matters and neither of them knows.
+        InvalidInput: ``priors.height`` when neither the set nor the priors define it.
     """
     if priors.height is None:
         return None
@@ -52,18 +52,15 @@ def down_in_set(priors: Priors, down: NDArray[np.float64] | None) -> NDArray[np.
 def priors_in_tile(
     priors: Priors, set_from_tile: Similarity, down: NDArray[np.float64] | None
 ) -> Priors:
-    """Say what priors of the set's frame mean in that of a tile.
+    """Move priors from the set's frame to a tile's; without ``maps``, which chose the tile.
 
     Args:
         priors: in the set's frame.
-        set_from_tile: of the tile.
-        down: (3,) what the set knows of down in its frame; None where it does not.
-
-    Returns:
-        The same without ``maps``, which chose the tile.
+        set_from_tile: transform of the tile.
+        down: (3,) the set's own direction; None when unknown.
 
     Raises:
-        InvalidInput: as ``down_in_set``.
+        InvalidInput: ``priors.height``, as ``down_in_set``.
     """
     tile_from_set = set_from_tile.inverse()
     scale, position, height = tile_from_set.scale, priors.position, priors.height
@@ -71,8 +68,8 @@ def priors_in_tile(
     if position is not None:
         position = PositionPrior(tile_from_set.apply(position.position), scale * position.radius)
     if height is not None and down is not None:
-        # Heights count from each frame's own (0, 0, 0), but along the same down: by what a tile
-        # takes for it, far from its origin a floor would be another one.
+        # Heights count from each frame's origin, but along the set's down. The tile's own down may
+        # differ slightly, which far from its origin would move a band to another floor.
         lift = float(down @ set_from_tile.translation)
         x, y, z = (tile_from_set.rotation @ down).tolist()
         height = HeightBand(scale * (height.min + lift), scale * (height.max + lift), (x, y, z))
@@ -84,7 +81,7 @@ def priors_in_tile(
 
 
 def scaled_device(cam_from_rig: Pose, scale: float) -> Pose:
-    """Return where a camera sits in a rig, in units of which ``scale`` make an old one."""
+    """Scale the position of a camera in its rig."""
     return Pose(cam_from_rig.rotation, scale * cam_from_rig.translation)
 
 
@@ -102,6 +99,6 @@ def _position_std(
     pose: Pose, covariance: NDArray[np.float64], a_from_b: Similarity
 ) -> NDArray[np.float64]:
     """Standard deviations of a position along the axes of frame a, from the pose in frame b."""
-    # Taken in b: far from the origin of a, digits are lost.
+    # Computed in b, as digits are lost far from the origin of a.
     turned = a_from_b.rotation @ position_covariance(pose, covariance) @ a_from_b.rotation.T
     return np.asarray(a_from_b.scale * np.sqrt(np.maximum(np.diag(turned), 0.0)))

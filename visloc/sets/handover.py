@@ -1,4 +1,4 @@
-"""Whether a device that was in one tile of a set may be where another sees it a moment later."""
+"""Checks whether a device can have moved from its last pose in a set to one in another tile."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from visloc.pose.motion import default_motion_covariance
 from visloc.priors import PositionPrior
 from visloc.sequences.filling import Odometry
 
-# What no device exceeds of which no motion is known: a car on a country road.
+# Maximum speed of a device without odometry: a car on a country road.
 _FASTEST = 30.0  # m/s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """Where a device was last measured in a set, and how it has moved since.
+    """The last measured pose of a device in a set, and its motion since then.
 
     Attributes:
-        timestamp: of that instant.
+        timestamp: time of the measurement.
         pose: rig_from_set.
-        covariance: (6, 6) of it.
-        metre: in units of the set; None where that is not known.
-        odometry: of the newest instant; None where the chain is broken.
-        motion: rig_from_rig since that instant, metres.
+        covariance: (6, 6), of the pose.
+        metre: length of a metre in the set's unit; None when unknown.
+        odometry: the newest odometry; None where the chain is broken.
+        motion: rig_from_rig since the measurement, metres.
         drift: (6, 6) covariance of the motion.
     """
 
@@ -50,12 +50,12 @@ class Track:
         metre: float | None,
         odometry: Odometry | None,
     ) -> Track:
-        """Begin with an instant that was measured; attributes as of the class."""
+        """Begin with a measured pose."""
         nothing = np.zeros((6, 6))
         return Track(timestamp, pose, covariance, metre, odometry, Pose.identity(), nothing)
 
     def moved(self, odometry: Odometry | None) -> Track:
-        """Add the motion to one more instant; None when it has no odometry."""
+        """Add the motion to the next timestamp; None breaks the chain."""
         if odometry is None or self.odometry is None:
             return replace(self, odometry=None)
         step = odometry.rig_from_odometry @ self.odometry.rig_from_odometry.inverse()
@@ -66,24 +66,24 @@ class Track:
 
     @property
     def knows_motion(self) -> bool:
-        """Whether odometry tells where the device is now."""
+        """Whether odometry predicts the current pose."""
         return self.odometry is not None and self.metre is not None
 
     def area(self, outline: SetOutline) -> PositionPrior:
-        """Return where the device may be now, by its odometry, in the frame of the set."""
+        """Return where the device may be now according to odometry, in the set's frame."""
         tie = TIE_REACH_SHARE * float(outline.reaches.max())
         return PositionPrior(self._predicted().center, tie + STDS * self._std())
 
     def allows(
         self, pose: Pose, covariance: NDArray[np.float64], seconds: float, reach: float
     ) -> bool:
-        """Tell whether the device may be where another tile has it.
+        """Tell whether the device may have the pose that another tile measured.
 
         Args:
-            pose: there, rig_from_set.
-            covariance: (6, 6) of it.
-            seconds: since the instant that was measured.
-            reach: how far the photos of the two tiles see, which says how well they are tied.
+            pose: rig_from_set.
+            covariance: (6, 6), of the pose.
+            seconds: time since the last measurement.
+            reach: viewing distance of the two tiles, which bounds the error of their alignment.
         """
         tie = TIE_REACH_SHARE * reach
         spread = math.hypot(self._std(), largest_std(pose, covariance))
@@ -100,11 +100,11 @@ class Track:
         return away <= tie + STDS * spread and turned <= TIE_ANGLE + STDS * turn_std
 
     def _predicted(self) -> Pose:
-        assert self.metre is not None  # the caller has looked
+        assert self.metre is not None  # checked by the callers
         return Pose(self.motion.rotation, self.metre * self.motion.translation) @ self.pose
 
     def _std(self) -> float:
-        """Of the position, along its worst axis."""
+        """Standard deviation of the position along its worst axis."""
         known = largest_std(self.pose, self.covariance)
         if not self.knows_motion or self.metre is None:
             return known

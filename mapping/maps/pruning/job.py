@@ -12,7 +12,7 @@ from mapping.maps.editing import content_of, selected
 from mapping.maps.pruning.accuracy import Accuracy, of_held_out_photos
 from mapping.maps.pruning.choosing import LEFT_OUT, Kept, choose, least, num_landmarks, size_with
 from visloc.archive import Map, MapContent, MapStore, open_map
-from visloc.archive.store import outdated
+from visloc.archive.version_rules import outdated
 from visloc.errors import Conflict, InvalidInput
 
 Measure = Callable[[Map, Map], tuple[Accuracy, Accuracy]]

@@ -55,7 +55,7 @@ from mapping.methods.rgbd import (
 from mapping.methods.sfm import SfmSettings, landmarks_from_matches
 from visloc.archive import Map, MapContent, MapStore, open_map
 from visloc.archive.schema import photo_file
-from visloc.archive.store import outdated
+from visloc.archive.version_rules import outdated
 from visloc.errors import Unavailable
 from visloc.evaluation import pose_error
 from visloc.geometry import Similarity

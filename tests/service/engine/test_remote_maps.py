@@ -13,13 +13,15 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import fsspec
 import pytest
 from moto.server import ThreadedMotoServer
 
 from service.engine.stores import open_store
-from visloc.archive import MapStore, open_map, remote_store, verify_map
+from visloc.archive import MapStore, open_map, verify_map
+from visloc.archive.backends import published_index, storage
 from visloc.archive.checks import json_text, manifest_hash
 from visloc.archive.remote_store import RemoteMapStore
 from visloc.errors import (
@@ -151,8 +153,8 @@ def new_reader(shared: RemoteMapStore, tmp_path: Path) -> Callable[..., RemoteMa
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is remembered for longer than an instant."""
-    monkeypatch.setattr(remote_store, "INDEX_S", 0.0)
-    monkeypatch.setattr(remote_store, "AWAY_S", 0.1)
+    monkeypatch.setattr(published_index, "INDEX_S", 0.0)
+    monkeypatch.setattr(storage, "AWAY_S", 0.1)
 
 
 def files_of(bucket: str) -> set[str]:
@@ -200,13 +202,13 @@ def test_a_version_is_fetched_once(
 ) -> None:
     other = new_reader("other")
     fetches = []
-    fetch = other._fetch
+    fetch = other.backend._fetch
 
-    def counted(map_id: str, version: str) -> None:
+    def counted(map_id: str, version: str) -> Path:
         fetches.append((map_id, version))
-        fetch(map_id, version)
+        return fetch(map_id, version)
 
-    monkeypatch.setattr(other, "_fetch", counted)
+    monkeypatch.setattr(other.backend, "_fetch", counted)
 
     threads = [threading.Thread(target=other.folder, args=("room",)) for _ in range(4)]
     for thread in threads:
@@ -253,7 +255,7 @@ def test_what_another_server_changes_is_seen_soon(
     published.publish(make("v1", "hall"), "hall", "v1")
     assert other.current_version("room") == "v2"  # a few seconds old
 
-    monkeypatch.setattr(remote_store, "INDEX_S", 0.0)
+    monkeypatch.setattr(published_index, "INDEX_S", 0.0)
     assert other.current_version("room") == "v1"
     assert other.ids() == ["hall", "room"]
 
@@ -264,8 +266,8 @@ def test_what_is_unknown_is_looked_for_sooner(
     make: Callable[..., Path],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(remote_store, "INDEX_S", math.inf)
-    monkeypatch.setattr(remote_store, "UNKNOWN_S", 0.0)
+    monkeypatch.setattr(published_index, "INDEX_S", math.inf)
+    monkeypatch.setattr(published_index, "UNKNOWN_S", 0.0)
     other = new_store("other")
     assert other.ids() == ["room"]
 
@@ -279,7 +281,7 @@ def test_what_is_unknown_is_looked_for_sooner(
     assert other.folder("room@v3").name == "v3"
 
     # Within a second it is not asked again: nobody can make it ask all the time.
-    monkeypatch.setattr(remote_store, "UNKNOWN_S", math.inf)
+    monkeypatch.setattr(published_index, "UNKNOWN_S", math.inf)
     published.publish(make("v1", "cellar"), "cellar", "v1")
     with pytest.raises(NotFound) as caught:
         other.current_version("cellar")
@@ -345,15 +347,15 @@ def test_an_upload_that_was_interrupted_is_not_visible_and_can_be_repeated(
     bucket: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    put = published._fs.put_file
+    put = published.backend.storage.fs.put_file
 
-    def broken(source: str, target: str) -> None:
+    def broken(source: str, target: str, **options: Any) -> None:
         if target.endswith("manifest.json"):
             raise ConnectionError("reset")
-        put(source, target)
+        put(source, target, **options)
 
     with monkeypatch.context() as patched:
-        patched.setattr(published._fs, "put_file", broken)
+        patched.setattr(published.backend.storage.fs, "put_file", broken)
         with pytest.raises(Unavailable) as caught:
             published.publish(make("v3"), "room", "v3")
     assert caught.value.code == "maps.storage_away"
@@ -365,7 +367,7 @@ def test_an_upload_that_was_interrupted_is_not_visible_and_can_be_repeated(
     with pytest.raises(NotFound):
         published.folder("room@v3")
 
-    monkeypatch.setattr(published, "_away_until", remote_store.NEVER)
+    monkeypatch.setattr(published.backend.storage, "away_until", storage.NEVER)
     published.publish(make("v3", note="again"), "room", "v3")
     assert verify_map(new_store("third").folder("room")).ref == "room@v3"
     assert "room/v3/left-over.npy" not in files_of(bucket)
@@ -388,7 +390,7 @@ def test_objects_that_were_altered_are_never_served(
 
     with pytest.raises(MapCorrupt):
         other.folder("room")
-    assert not (other._copies.root / "room" / "v2").exists()
+    assert not (other.root / "room" / "v2").exists()
     assert other.folder("room@v1").is_dir()
 
 
@@ -453,7 +455,7 @@ def test_the_least_recently_used_copies_make_room(
 
     other.folder("room@v3")
 
-    assert sorted(path.name for path in (other._copies.root / "room").iterdir()) == ["v1", "v3"]
+    assert sorted(path.name for path in (other.root / "room").iterdir()) == ["v1", "v3"]
     assert other.folder("room@v2").is_dir()
 
 
@@ -517,15 +519,15 @@ def test_only_the_first_request_waits_for_a_storage_that_does_not_answer(
     new_reader: Callable[..., RemoteMapStore], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     new_reader().folder("room")
-    monkeypatch.setattr(remote_store, "CONNECT_TIMEOUT_S", 1)
-    monkeypatch.setattr(remote_store, "READ_TIMEOUT_S", 1)
+    monkeypatch.setattr(storage, "CONNECT_TIMEOUT_S", 1)
+    monkeypatch.setattr(storage, "READ_TIMEOUT_S", 1)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{silent.getsockname()[1]}")
         store = new_reader()
         start = time.monotonic()
         assert store.ids() == ["room"]
         assert time.monotonic() - start < 6
-        monkeypatch.setattr(remote_store, "AWAY_S", 0.0)
+        monkeypatch.setattr(storage, "AWAY_S", 0.0)
         start = time.monotonic()
         for _ in range(100):
             assert store.folder("room").name == "v2"

@@ -151,7 +151,7 @@ def test_a_cancelled_upload_leaves_all_or_nothing_and_can_be_repeated(
 
     match step:
         case "enter":
-            monkeypatch.setattr(store, "sweep", held(store.sweep))
+            monkeypatch.setattr(store.backend, "sweep", held(store.backend.sweep))
         case "unpack":
             monkeypatch.setattr("service.engine.uploads.unpack_map", held(unpack_map))
         case "publish":

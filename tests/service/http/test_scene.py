@@ -26,7 +26,8 @@ from service.security.key_file import Scope, edited_keys, new_key
 from service.values import MapFolder, ServedMap
 from tests.service.conftest import Doors
 from visloc.archive import Map, MapOutline, MapStore
-from visloc.drawing.detail_levels import detail_order, packed_points
+from visloc.drawing.detail_levels import detail_order
+from visloc.drawing.point_bytes import packed_points
 from visloc.errors import MapCorrupt, NotFound
 from visloc.geometry import Pose
 

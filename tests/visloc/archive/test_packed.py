@@ -11,6 +11,7 @@ import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -211,14 +212,14 @@ def test_compressed_entries_are_refused_whatever_size_they_tell(
         ("method", 99, "compressed"),
         ("packed", 1, "contradict"),
         ("size", 1, "contradict"),
-        ("size", 0xFFFFFFFF, "does not tell"),
+        ("size", 0xFFFFFFFF, "contradict"),
         ("disk", 1, "contradict"),
         ("offset", 1, "overlap"),
         ("offset", 0xFFFFFFF0, "overlap"),
-        ("name_length", 0, "name"),
-        ("name_length", 0xFFFF, "damaged"),
-        ("extra_length", 0xFFFF, "damaged"),
-        ("comment_length", 1, "damaged"),
+        ("name_length", 0, "Bad magic"),
+        ("name_length", 0xFFFF, "name"),
+        ("extra_length", 0xFFFF, "Corrupt extra"),
+        ("comment_length", 1, "Bad magic"),
     ],
 )
 def test_lies_in_the_list_of_entries_are_refused(
@@ -399,6 +400,21 @@ def test_a_list_of_entries_as_large_as_the_file_takes_no_memory(
         tracemalloc.stop()
 
 
+@pytest.mark.parametrize("told", [1, 3])
+def test_the_list_has_as_many_entries_as_the_end_says(
+    packed: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: int
+) -> None:
+    changed = bytearray(packed)
+    struct.pack_into("<2H", changed, len(packed) - 14, told, told)
+    monkeypatch.setattr(packed_module, "MAX_ENTRIES", told + 1 if told == 1 else LARGE)
+
+    error = refusal(bytes(changed), tmp_path)
+
+    assert error.code == "packed.format"
+    assert "than it says" in str(error)
+    assert not (tmp_path / "map").exists()
+
+
 def test_memory_does_not_grow_with_the_files(
     packed: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -468,8 +484,8 @@ def test_an_archive_that_shrinks_while_it_is_read_is_refused(
     file.write_bytes(packed)
     checked = packed_module._read_entries
 
-    def shrinking(source: io.BufferedReader, max_bytes: int) -> object:
-        entries = checked(source, max_bytes)
+    def shrinking(*given: Any) -> object:
+        entries = checked(*given)
         os.truncate(file, stop)
         return entries
 

@@ -17,16 +17,8 @@ from scipy.spatial import cKDTree
 
 from visloc.archive import Map, MapOutline, MapStore, checks, open_map, read_outline
 from visloc.archive.photos import read_photos
-from visloc.drawing.detail_levels import (
-    _LEVELS,
-    HEADER_BYTES,
-    ROW_BYTES,
-    _cells,
-    detail_order,
-    packed_points,
-    read_landmarks,
-    read_points,
-)
+from visloc.drawing.detail_levels import _LEVELS, _cells, detail_order, read_landmarks
+from visloc.drawing.point_bytes import HEADER_BYTES, ROW_BYTES, packed_points, read_points
 from visloc.errors import MapCorrupt
 from visloc.geometry import Pose
 
