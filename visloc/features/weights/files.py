@@ -77,24 +77,14 @@ def read_own_weights(feature: str, weights_dir: Path | None) -> Checkpoint | Non
     None too where the folder that was named is not there: whoever named it meant other weights.
 
     Raises:
-        WeightsError: ``weights.altered`` if the shipped file is not the one that was shipped; and
-            those of ``read_checkpoint``.
+        WeightsError: those of ``read_checkpoint``.
     """
     file_name = f"{feature}.safetensors"
     if weights_dir is not None and (weights_dir / file_name).is_file():
         return read_checkpoint(weights_dir / file_name)
     if feature not in SHIPPED or (weights_dir is not None and not weights_dir.is_dir()):
         return None
-    checkpoint = read_checkpoint(_SHIPPED_FOLDER / file_name)
-    if checkpoint.sha256 != SHIPPED[feature]:
-        raise WeightsError(
-            "weights.altered",
-            "not the weights that this version was shipped with; install it anew",
-            field=str(checkpoint.path),
-            expected=f"sha256 {SHIPPED[feature]}",
-            got=checkpoint.sha256,
-        )
-    return checkpoint
+    return read_checkpoint(_SHIPPED_FOLDER / file_name, sha256=SHIPPED[feature])
 
 
 def read_weights(weights_dir: Path | None, published: PublishedWeights) -> Checkpoint:
