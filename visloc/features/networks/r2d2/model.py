@@ -145,7 +145,7 @@ def load_faster2d2(
 def _load(
     architecture: Architecture, weights_dir: Path | None, inference: Inference, threads: int | None
 ) -> R2D2Extractor:
-    folded, weights_sha256 = _read_folded(architecture, weights_dir)
+    folded, weights_sha256 = read_network(architecture, weights_dir)
     chosen = choose_inference(inference)
     network: Network
     if chosen is Inference.TORCH:
@@ -161,7 +161,7 @@ def _load(
     return R2D2Extractor(architecture, weights_sha256, network)
 
 
-def _read_folded(architecture: Architecture, weights_dir: Path | None) -> tuple[FoldedNetwork, str]:
+def read_network(architecture: Architecture, weights_dir: Path | None) -> tuple[FoldedNetwork, str]:
     """Return the network and its file's sha256: the published one if there, else our own."""
     published = architecture.published
     if weights_dir is None or not (weights_dir / published.file_name).is_file():

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.features.backends.calibration import calibrate
+from visloc.features.backends.calibration import measure, ranges_of
 from visloc.features.backends.openvino import (
     Graph,
     GraphBuilder,
@@ -24,18 +24,25 @@ from visloc.features.networks.r2d2.model import MEAN, STD, FoldedNetwork, Seen
 def make_openvino_network(
     folded: FoldedNetwork, weights_sha256: str, *, in_8_bits: bool, threads: int | None
 ) -> OpenVinoNetwork:
-    """Compile the network; the first time in 8 bits this takes some seconds more, see calibrate."""
+    """Compile the network; see ``ranges_of`` for the first time in 8 bits."""
     if not in_8_bits:
         return OpenVinoNetwork(folded, None, threads)
-    # The first convolution stays in floats: a hundredth of the work, and most of the error.
-    quantized = [each.name for each in folded.convolutions[1:]]
-
-    def measure() -> Graph:
-        image, builder, _ = _trunk(folded, None)
-        return Graph([image], builder.extremes(quantized), threads)
-
-    ranges = calibrate(f"{folded.name}-{weights_sha256}", quantized, measure, _input)
+    ranges = ranges_of(
+        folded.name, weights_sha256, _quantized(folded), lambda: measure_ranges(folded, threads)
+    )
     return OpenVinoNetwork(folded, ranges, threads)
+
+
+def measure_ranges(folded: FoldedNetwork, threads: int | None = None) -> Ranges:
+    """Measure the ranges that ``OpenVinoNetwork`` takes."""
+    names = _quantized(folded)
+    image, builder, _ = _trunk(folded, None)
+    return measure(names, Graph([image], builder.extremes(names), threads), _input)
+
+
+def _quantized(folded: FoldedNetwork) -> list[str]:
+    # The first convolution stays in floats: a hundredth of the work, and most of the error.
+    return [each.name for each in folded.convolutions[1:]]
 
 
 class OpenVinoNetwork:

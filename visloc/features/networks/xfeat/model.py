@@ -68,6 +68,24 @@ def load_xfeat(
         WeightsError: the weights are missing, damaged, or of another network.
         InvalidInput: ``inference.unavailable``.
     """
+    layers, sha256 = read_network(weights_dir)
+    network: Network
+    chosen = choose_inference(inference)
+    if chosen is Inference.TORCH:
+        from visloc.features.networks.xfeat.torch import TorchNetwork
+
+        network = TorchNetwork(layers)
+    else:
+        from visloc.features.networks.xfeat.openvino import make_openvino_network
+
+        network = make_openvino_network(
+            layers, sha256, in_8_bits=chosen is Inference.INT8, threads=threads
+        )
+    return XFeatExtractor(sha256, network)
+
+
+def read_network(weights_dir: Path | None) -> tuple[dict[str, tuple[Layer, ...]], str]:
+    """Return the layers of each block, batch norms folded in, and the sha256 of the weights."""
     path = find_weights(
         "xfeat.pt",
         weights_dir,
@@ -86,20 +104,7 @@ def load_xfeat(
     }
     checkpoint = Checkpoint(path, checkpoint.sha256, used)
     check_shapes(checkpoint, _expected_shapes(), network="XFeat", held="another network")
-    layers = fold(checkpoint)
-    network: Network
-    chosen = choose_inference(inference)
-    if chosen is Inference.TORCH:
-        from visloc.features.networks.xfeat.torch import TorchNetwork
-
-        network = TorchNetwork(layers)
-    else:
-        from visloc.features.networks.xfeat.openvino import make_openvino_network
-
-        network = make_openvino_network(
-            layers, checkpoint.sha256, in_8_bits=chosen is Inference.INT8, threads=threads
-        )
-    return XFeatExtractor(checkpoint, network)
+    return fold(checkpoint), checkpoint.sha256
 
 
 def _expected_shapes() -> dict[str, tuple[int, ...]]:
@@ -192,7 +197,7 @@ class Network(Protocol):
 class XFeatExtractor:
     """Sparse XFeat keypoints at one scale."""
 
-    def __init__(self, checkpoint: Checkpoint, network: Network) -> None:
+    def __init__(self, weights_sha256: str, network: Network) -> None:
         self.network = network
         self.fingerprint = Fingerprint(
             name="xfeat",
@@ -203,7 +208,7 @@ class XFeatExtractor:
                 "nms_px": _NMS_PX,
                 "peak_reach_px": PEAK_REACH_PX,
             },
-            weights_sha256=checkpoint.sha256,
+            weights_sha256=weights_sha256,
         )
 
     @property

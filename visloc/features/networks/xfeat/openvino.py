@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.features.backends.calibration import calibrate
+from visloc.features.backends.calibration import measure, ranges_of
 from visloc.features.backends.openvino import (
     Graph,
     GraphBuilder,
@@ -23,7 +23,7 @@ _VARIANCE_EPSILON = 1e-5
 
 # In 8 bits the first block and the keypoint head, which see the image itself, would move every
 # fifth keypoint.
-_IN_8_BITS = ("block2", "block3", "block4", "block5", "block_fusion", "heatmap_head")
+_QUANTIZED_BLOCKS = ("block2", "block3", "block4", "block5", "block_fusion", "heatmap_head")
 
 Blocks = Mapping[str, tuple[Layer, ...]]
 
@@ -31,19 +31,25 @@ Blocks = Mapping[str, tuple[Layer, ...]]
 def make_openvino_network(
     blocks: Blocks, weights_sha256: str, *, in_8_bits: bool, threads: int | None
 ) -> OpenVinoNetwork:
-    """Compile the network; the first time in 8 bits this takes some seconds more, see calibrate."""
+    """Compile the network; see ``ranges_of`` for the first time in 8 bits."""
     if not in_8_bits:
         return OpenVinoNetwork(blocks, None, threads)
-    quantized = [layer.name for block in _IN_8_BITS for layer in blocks[block]]
-
-    def measure() -> Graph:
-        grey, builder, _ = _network(blocks, None)
-        return Graph([grey], builder.extremes(quantized), threads)
-
-    ranges = calibrate(
-        f"xfeat-{weights_sha256}", quantized, measure, lambda rgb: _input(network_input(rgb))
+    ranges = ranges_of(
+        "xfeat", weights_sha256, _quantized(blocks), lambda: measure_ranges(blocks, threads)
     )
     return OpenVinoNetwork(blocks, ranges, threads)
+
+
+def measure_ranges(blocks: Blocks, threads: int | None = None) -> Ranges:
+    """Measure the ranges that ``OpenVinoNetwork`` takes."""
+    names = _quantized(blocks)
+    grey, builder, _ = _network(blocks, None)
+    graph = Graph([grey], builder.extremes(names), threads)
+    return measure(names, graph, lambda rgb: _input(network_input(rgb)))
+
+
+def _quantized(blocks: Blocks) -> list[str]:
+    return [layer.name for block in _QUANTIZED_BLOCKS for layer in blocks[block]]
 
 
 class OpenVinoNetwork:
