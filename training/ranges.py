@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from samples import papers, surfaces
 from visloc.features.backends.calibration import PICTURE_HEIGHT_PX
 from visloc.features.backends.openvino import Ranges
 from visloc.features.networks.r2d2 import model as r2d2
 from visloc.features.networks.r2d2.openvino import measure_ranges as measure_r2d2
 from visloc.features.networks.xfeat import model as xfeat
 from visloc.features.networks.xfeat.openvino import measure_ranges as measure_xfeat
-from visloc.synthetic import papers, surfaces
 
 _SIZE = (480, 640)
 _MIDDLE = (slice(120, 120 + PICTURE_HEIGHT_PX), slice(160, 480))  # whole pictures take long
