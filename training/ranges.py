@@ -52,11 +52,11 @@ def record_ranges(folder: Path, weights_dir: Path | None) -> list[Path]:
 
 
 def _measured(weights_dir: Path | None) -> Iterator[tuple[str, Ranges]]:
-    blocks, sha256 = xfeat.read_network(None)
-    yield f"xfeat-{sha256}", measure_xfeat(blocks)
+    network, sha256 = xfeat.read_network(None)
+    yield f"xfeat-{sha256}", measure_xfeat(network)
     known: list[tuple[r2d2.Architecture, Path | None]] = [(r2d2.FAST_R2D2, None)]
     if weights_dir is not None:
         known += [(r2d2.FAST_R2D2, weights_dir), (r2d2.R2D2, weights_dir)]
     for architecture, folder in known:
-        folded, sha256 = r2d2.read_network(architecture, folder)
-        yield f"{architecture.name}-{sha256}", measure_r2d2(folded)
+        r2d2_network, sha256 = r2d2.read_network(architecture, folder)
+        yield f"{architecture.name}-{sha256}", measure_r2d2(r2d2_network)

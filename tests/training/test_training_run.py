@@ -22,7 +22,8 @@ from training.run import LOG_NAME, Trainer, learning_rate, resume, train
 from training.settings import PRESETS, Settings
 from training.validation import features_of, validate, validation_pairs
 from visloc.errors import InvalidInput
-from visloc.features.networks.r2d2.model import R2D2Extractor, load_faster2d2
+from visloc.features.networks.r2d2.extractor import R2D2Extractor
+from visloc.features.networks.r2d2.load import load_faster2d2
 from visloc.images import read_photo_file
 from visloc.types import Inference
 

@@ -43,10 +43,10 @@ __all__ = [
 LOCAL_FEATURES: Mapping[str, tuple[str, str]] = {
     "aliked": ("visloc.features.networks.aliked.model", "load_aliked"),
     "aliked-t16": ("visloc.features.networks.aliked.model", "load_aliked_t16"),
-    "faster2d2": ("visloc.features.networks.r2d2.model", "load_faster2d2"),
-    "r2d2": ("visloc.features.networks.r2d2.model", "load_r2d2"),
+    "faster2d2": ("visloc.features.networks.r2d2.load", "load_faster2d2"),
+    "r2d2": ("visloc.features.networks.r2d2.load", "load_r2d2"),
     "sift": ("visloc.features.local.sift", "load_sift"),
-    "xfeat": ("visloc.features.networks.xfeat.model", "load_xfeat"),
+    "xfeat": ("visloc.features.networks.xfeat.load", "load_xfeat"),
 }
 GLOBAL_FEATURES: Mapping[str, tuple[str, str]] = {
     "apgem": ("visloc.features.descriptors.apgem", "load_apgem"),

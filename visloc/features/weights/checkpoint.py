@@ -19,8 +19,8 @@ import pickletools
 import struct
 import threading
 import zipfile
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +110,10 @@ class Checkpoint:
     sha256: str
     tensors: Mapping[str, NDArray[Any]]
     pca: Mapping[str, PickledPca] = field(default_factory=dict)
+
+    def renamed(self, name_of: Callable[[str], str]) -> Checkpoint:
+        """Return it with other names of the tensors."""
+        return replace(self, tensors={name_of(name): a for name, a in self.tensors.items()})
 
 
 def read_checkpoint(

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.features.backends.openvino import Graph, GraphBuilder, import_openvino, openvino_with
+from visloc.features.backends.torch import fixed_convolution
 from visloc.features.networks.efficientnet.model import MAX_ACTIVATION, Block
 
 
@@ -24,11 +25,10 @@ class OpenVinoNetwork:
                 x = builder.convolution(
                     x,
                     layer.name,
-                    layer.weight,
-                    layer.bias,
-                    stride=layer.stride,
+                    fixed_convolution(
+                        layer.weight, layer.bias, stride=layer.stride, groups=layer.groups
+                    ),
                     padding=layer.padding,
-                    groups=layer.groups,
                 )
                 if layer.relu6:
                     x = operations.clamp(x, 0.0, MAX_ACTIVATION)
