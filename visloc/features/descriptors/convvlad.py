@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from visloc.features.base import Fingerprint, GlobalDescriptor
 from visloc.features.descriptors.vlad import VLAD_PARAMETERS, VladDescriptor
 from visloc.features.descriptors.whitening import unit_rows
+from visloc.features.networks.efficientnet.load import Network, make_network
 from visloc.features.networks.efficientnet.model import (
     MAX_LONG_SIDE_PX,
-    Network,
-    fold,
-    make_network,
+    blocks_of,
     network_input,
     read_efficientnet_lite0,
 )
@@ -43,7 +42,7 @@ def load_convvlad(
         InvalidInput: ``inference.unavailable``.
     """
     checkpoint = read_efficientnet_lite0(weights_dir)
-    network = make_network(fold(checkpoint)[:NUM_BLOCKS], inference, threads)
+    network = make_network(blocks_of(checkpoint)[:NUM_BLOCKS], inference, threads)
     return ConvVlad(network, checkpoint.sha256)
 
 

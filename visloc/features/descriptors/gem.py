@@ -16,11 +16,10 @@ from visloc.features.base import Fingerprint, GlobalDescriptor
 from visloc.features.descriptors.image_descriptor import ImageDescriptor
 from visloc.features.descriptors.pooling import generalized_mean
 from visloc.features.descriptors.whitening import WHITENING_PARAMETERS
+from visloc.features.networks.efficientnet.load import Network, make_network
 from visloc.features.networks.efficientnet.model import (
     MAX_LONG_SIDE_PX,
-    Network,
-    fold,
-    make_network,
+    blocks_of,
     network_input,
     read_efficientnet_lite0,
 )
@@ -43,7 +42,7 @@ def load_gem(
         InvalidInput: ``inference.unavailable``.
     """
     checkpoint = read_efficientnet_lite0(weights_dir)
-    network = make_network(fold(checkpoint), inference, threads)
+    network = make_network(blocks_of(checkpoint), inference, threads)
     return Gem(network, checkpoint.sha256)
 
 
