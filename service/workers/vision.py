@@ -62,7 +62,7 @@ from visloc.features import (
     make_local_features,
 )
 from visloc.features.local.readymade import is_ready_made
-from visloc.features.networks.lightglue.model import make_lightglue
+from visloc.features.networks.lightglue.load import make_lightglue
 from visloc.images import ImageLimits, Photo
 from visloc.localization.constraints import MapGeometry
 from visloc.localization.localizer import Localizer

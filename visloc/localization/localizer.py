@@ -17,7 +17,7 @@ from visloc.archive import Map
 from visloc.errors import InvalidInput
 from visloc.features import GlobalDescriptor, LocalFeatureExtractor, make_global_descriptor
 from visloc.features.local.readymade import is_ready_made
-from visloc.features.networks.lightglue.model import make_lightglue
+from visloc.features.networks.lightglue.load import make_lightglue
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo
 from visloc.localization.constraints import Constraints, MapGeometry
