@@ -38,7 +38,7 @@ from visloc.localization.solving import (
     solve_instant,
 )
 from visloc.matching.correspondences import CLEAR_RATIO, match_landmarks
-from visloc.matching.products import EightBitRows, in_eight_bits, start_threads
+from visloc.matching.products import EightBitRows, round_descriptors, start_threads
 from visloc.photo_features import extract_features
 from visloc.priors import NO_PRIORS, Priors
 from visloc.retrieval.fusion import LateFusion, chosen_fusion
@@ -373,7 +373,7 @@ class Localizer:
         scale = self.map.manifest.local_features.descriptor_scale
         observed = (self.map.observations(int(photo)) for photo in photos)
         pairs = match_landmarks(
-            in_eight_bits(local.descriptors),
+            round_descriptors(local.descriptors),
             ((landmarks, EightBitRows(rows, scale)) for landmarks, rows in observed),
             CLEAR_RATIO if options.matcher is Matcher.RATIO else None,
             None if rematching is None else lambda rank: rematching.match(int(photos[rank])),

@@ -55,7 +55,8 @@ class Gem(ImageDescriptor):
 
     def __init__(self, network: Network, weights_sha256: str) -> None:
         self._network = network
-        self._fingerprint = Fingerprint(
+        self.computed_with = network.computed_with
+        self.fingerprint = Fingerprint(
             "gem",
             revision=1,
             parameters={
@@ -65,16 +66,6 @@ class Gem(ImageDescriptor):
             },
             weights_sha256=weights_sha256,
         )
-
-    @property
-    def fingerprint(self) -> Fingerprint:
-        """Name, parameters and weights."""
-        return self._fingerprint
-
-    @property
-    def computed_with(self) -> str:
-        """What computes the network."""
-        return self._network.computed_with
 
     def look(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the raw vector (1280,), of unit length, of a photo (H, W, 3)."""

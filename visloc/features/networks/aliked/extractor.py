@@ -42,7 +42,7 @@ class Network(Protocol):
 
     @property
     def computed_with(self) -> str:
-        """What computes it, for people."""
+        """See ``LocalFeatureExtractor``."""
 
     def look(self, rgb: NDArray[np.uint8]) -> Seen:
         """Look at an image (H, W, 3) of any size."""
@@ -67,7 +67,6 @@ class AlikedExtractor:
 
     @property
     def computed_with(self) -> str:
-        """What computes it."""
         return self.network.computed_with
 
     def extract(

@@ -56,7 +56,7 @@ class Network(Protocol):
 
     @property
     def computed_with(self) -> str:
-        """What computes it, for people."""
+        """See ``LocalFeatureExtractor``."""
 
     def look(self, image: NDArray[np.float32]) -> AbstractContextManager[Seen]:
         """Look at RGB (H, W, 3) in 0 to 255; valid within the ``with`` statement only."""
@@ -64,6 +64,8 @@ class Network(Protocol):
 
 class R2D2Extractor:
     """Multi-scale extraction with R2D2 or Fast-R2D2."""
+
+    descriptor_dim = DESCRIPTOR_DIM
 
     def __init__(self, name: str, weights_sha256: str, network: Network) -> None:
         self.network = network
@@ -82,13 +84,7 @@ class R2D2Extractor:
         )
 
     @property
-    def descriptor_dim(self) -> int:
-        """Length of one descriptor: 128."""
-        return DESCRIPTOR_DIM
-
-    @property
     def computed_with(self) -> str:
-        """What computes it."""
         return self.network.computed_with
 
     def extract(

@@ -45,7 +45,7 @@ class Network(Protocol):
 
     @property
     def computed_with(self) -> str:
-        """What computes it, for people."""
+        """See ``LocalFeatureExtractor``."""
 
     def look(self, grey: NDArray[np.float32]) -> Seen:
         """Look at a grey image (H, W) whose sides are multiples of 32."""
@@ -53,6 +53,8 @@ class Network(Protocol):
 
 class XFeatExtractor:
     """Sparse XFeat keypoints at one scale."""
+
+    descriptor_dim = DESCRIPTOR_DIM
 
     def __init__(self, weights_sha256: str, network: Network) -> None:
         self.network = network
@@ -69,13 +71,7 @@ class XFeatExtractor:
         )
 
     @property
-    def descriptor_dim(self) -> int:
-        """Length of one descriptor: 64."""
-        return DESCRIPTOR_DIM
-
-    @property
     def computed_with(self) -> str:
-        """What computes it."""
         return self.network.computed_with
 
     def extract(
