@@ -60,7 +60,7 @@ def import_openvino() -> tuple[ModuleType, ModuleType]:
 
 
 def openvino_with(ranges: Ranges | None) -> str:
-    """Return what computes, for people: ``openvino 2026.4.1, int8, calibration 04aff650``."""
+    """Return library and numbers, to show: ``openvino 2026.4.1, int8, calibration 04aff650``."""
     version = importlib.metadata.version("openvino")
     if ranges is None:
         return f"openvino {version}, fp32"

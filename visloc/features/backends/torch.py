@@ -87,6 +87,6 @@ def torch_device() -> torch.device:
 
 
 def computed_with(device: torch.device) -> str:
-    """Return what computes, for people."""
+    """Return library and device, to show."""
     name = torch.cuda.get_device_name() if device.type == "cuda" else device.type
     return f"torch {torch.__version__} on {name}"

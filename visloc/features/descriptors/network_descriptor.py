@@ -1,4 +1,4 @@
-"""What the global descriptors with published weights share: the file, the photo, whitening."""
+"""Base of the global descriptors with published weights."""
 
 from __future__ import annotations
 

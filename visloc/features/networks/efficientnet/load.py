@@ -18,7 +18,7 @@ class Network(Protocol):
 
     @property
     def computed_with(self) -> str:
-        """What computes it, for people."""
+        """See ``LocalFeatureExtractor``."""
 
     def look(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return what the last block makes of what ``network_input`` gives.

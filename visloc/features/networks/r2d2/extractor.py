@@ -40,7 +40,7 @@ _MIN_REPEATABILITY_LOGIT = math.log(math.expm1(MIN_REPEATABILITY / (1 - MIN_REPE
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """What a network makes of one image.
+    """Output of a network for one image.
 
     Attributes:
         logits: (2, H, W) float32 of reliability and repeatability, for each pixel.

