@@ -33,6 +33,8 @@ from mapping.cluster.workers import Workers
 from mapping.report.held_out import hold_out
 from mapping.report.model import CoverageModel, Within, learn, tolerance_of
 from mapping.report.viewpoints import Viewpoints
+from samples.render import render_depth, render_photo
+from samples.scene import ROOM_SIZE_M, Scene, make_room
 from visloc.archive import Map, MapStore
 from visloc.evaluation import pose_error
 from visloc.features import make_global_descriptor, make_local_features
@@ -40,8 +42,6 @@ from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import Dataset, FileRecord, Sensor, read_dataset, write_dataset
 from visloc.localization.localizer import Localizer
-from visloc.synthetic.render import render_depth, render_photo
-from visloc.synthetic.scene import ROOM_SIZE_M, Scene, make_room
 from visloc.types import Localized, LocalizeOptions
 
 _SYNTHETIC_FEATURES = "sift"

@@ -97,7 +97,9 @@ def matched_as_floats() -> Iterator[None]:
         return mutual, best[mutual], similarity[mutual, best[mutual]]
 
     with (
-        patch.object(mapping.methods.matching, "in_eight_bits", lambda descriptors: descriptors),
+        patch.object(
+            mapping.methods.matching, "round_descriptors", lambda descriptors: descriptors
+        ),
         patch.object(mapping.methods.matching, "mutual_nearest_neighbours", nearest),
     ):
         yield

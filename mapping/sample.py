@@ -17,18 +17,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from visloc.errors import Conflict, InvalidInput
-from visloc.geometry import Pose
-from visloc.kapture import Dataset, FileRecord, GnssRecord, Sensor, write_dataset
-from visloc.synthetic.render import render_depth, render_photo
-from visloc.synthetic.scene import Scene, make_room
-from visloc.synthetic.textures import Image
-from visloc.synthetic.trajectories import (
+from samples.render import render_depth, render_photo
+from samples.scene import Scene, make_room
+from samples.textures import Image
+from samples.trajectories import (
     RigCamera,
     mapping_trajectory,
     query_trajectory,
     stereo_rig,
 )
+from visloc.errors import Conflict, InvalidInput
+from visloc.geometry import Pose
+from visloc.kapture import Dataset, FileRecord, GnssRecord, Sensor, write_dataset
 
 RIG_ID, GNSS_ID = "rig", "gnss"
 # The world's origin on the ellipsoid of WGS 84. The world is the local east-north-up frame

@@ -19,11 +19,13 @@ from training.pairs import Sources
 from training.parallax import pack_rooms, read_rooms
 from training.photos import pack_photos, read_pack
 from training.plots import draw
+from training.ranges import paint_pictures, record_ranges
 from training.run import Trainer, resume, train
 from training.settings import PRESETS, Settings
 from training.validation import Score, features_of, validate, validation_pairs
 from visloc.errors import Conflict, InvalidInput, VislocError
 from visloc.features import make_local_features
+from visloc.features.backends.calibration import PICTURES, RECORDED
 
 DATA = Path(".training")
 _CPU = torch.device("cpu")
@@ -94,6 +96,12 @@ def _parser() -> argparse.ArgumentParser:
     plots.add_argument("folder", type=Path, help="of the run")
     plots.add_argument("--beside", type=Path, help="what validate --output wrote of others")
     plots.set_defaults(run=_plots)
+
+    ranges = commands.add_parser("ranges", help="record activation ranges for 8-bit networks")
+    ranges.add_argument("--output", type=Path, default=RECORDED, help="folder of JSON files")
+    ranges.add_argument("--weights-dir", type=Path, help="with the published weights of R2D2")
+    ranges.add_argument("--pictures", action="store_true", help="paint the pictures again first")
+    ranges.set_defaults(run=_ranges)
     return parser
 
 
@@ -226,6 +234,14 @@ def _export(options: argparse.Namespace) -> int:
 
 def _plots(options: argparse.Namespace) -> int:
     for path in draw(options.folder, options.beside):
+        sys.stdout.write(f"{path}\n")
+    return 0
+
+
+def _ranges(options: argparse.Namespace) -> int:
+    if options.pictures:
+        paint_pictures(PICTURES)
+    for path in record_ranges(options.output, options.weights_dir):
         sys.stdout.write(f"{path}\n")
     return 0
 

@@ -1,8 +1,7 @@
 """The network while it learns: batch norms on their own, heads at full resolution.
 
-The table of layers is that of ``visloc.features.networks.r2d2.model``; what is learned here folds
-into what is
-loaded there (``training.export``).
+The layers are those of ``visloc.features.networks.r2d2.model``. ``folded`` makes the network there
+of the one that was trained here.
 """
 
 from __future__ import annotations
@@ -12,8 +11,10 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from training.interpolation import weighted_squares
+from visloc.features.backends.torch import for_inference
 from visloc.features.networks.r2d2.model import (
     DESCRIPTOR_DIM,
     FAST_R2D2,
@@ -21,10 +22,10 @@ from visloc.features.networks.r2d2.model import (
     R2D2,
     STD,
     Architecture,
+    R2D2Network,
 )
 
 ARCHITECTURES = {each.name: each for each in (R2D2, FAST_R2D2)}
-_BASE_WIDTH = 32
 
 
 class Maps(NamedTuple):
@@ -70,17 +71,10 @@ class TrainableR2D2(nn.Module):
         super().__init__()
         self.architecture = architecture
         convolutions, batch_norms = [], []
-        inputs = 3
-        for layer in architecture.layers:
-            outputs = layer.width * _BASE_WIDTH or DESCRIPTOR_DIM
-            convolutions.append(
-                nn.Conv2d(
-                    inputs, outputs, layer.kernel, dilation=layer.dilation, padding=layer.padding
-                )
-            )
+        for layer, convolution in architecture.convolutions():
+            convolutions.append(convolution)
             if layer.normalized:
-                batch_norms.append(nn.BatchNorm2d(outputs, affine=False))
-            inputs = outputs
+                batch_norms.append(nn.BatchNorm2d(convolution.out_channels, affine=False))
         self.convolutions = nn.ModuleList(convolutions)
         self.batch_norms = nn.ModuleList(batch_norms)
         self.heads = nn.Conv2d(DESCRIPTOR_DIM, 2, 1)
@@ -89,6 +83,19 @@ class TrainableR2D2(nn.Module):
             self.register_buffer(name, scaled, persistent=False)
         self.mean: Tensor
         self.std: Tensor
+
+    def folded(self) -> R2D2Network:
+        """Return the network for inference, the batch norms inside the convolutions."""
+        self.double().eval()
+        network = R2D2Network(self.architecture).fuse()
+        convolutions = [each for each in self.convolutions if isinstance(each, nn.Conv2d)]
+        for number, batch_norm in enumerate(self.batch_norms):
+            assert isinstance(batch_norm, nn.BatchNorm2d)
+            convolutions[number] = fuse_conv_bn_eval(convolutions[number], batch_norm)
+        for ours, trained in zip(network.convolutions(), convolutions, strict=True):
+            ours.load_state_dict(trained.state_dict(), assign=True)
+        network.heads.load_state_dict(self.heads.state_dict(), assign=True)
+        return for_inference(network)
 
     def features(self, images: Tensor) -> Tensor:
         """Return x (B, 128, H // stride, W // stride) for RGB (B, 3, H, W) in 0 to 1."""

@@ -15,13 +15,13 @@ from safetensors import SafetensorError
 from safetensors.numpy import load
 from torch import Tensor
 
+from samples.render import render_depth, render_photo
+from samples.scene import make_room
+from samples.trajectories import mapping_trajectory
 from training.files import write_tensors
 from training.homographies import rotation_about
 from visloc.errors import InvalidInput, NotFound
 from visloc.geometry import Camera, Pose
-from visloc.synthetic.render import render_depth, render_photo
-from visloc.synthetic.scene import make_room
-from visloc.synthetic.trajectories import mapping_trajectory
 
 WIDTH_PX, HEIGHT_PX = 480, 360
 _CAMERA = Camera("PINHOLE", WIDTH_PX, HEIGHT_PX, (360.0, 360.0, WIDTH_PX / 2, HEIGHT_PX / 2))

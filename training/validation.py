@@ -18,7 +18,7 @@ from training.homographies import Matrix, look, moved, random_looks
 from training.photos import Photo
 from visloc.features import LocalFeatureExtractor, make_local_features
 from visloc.matching.correspondences import mutual_nearest_neighbours
-from visloc.matching.products import in_eight_bits
+from visloc.matching.products import round_descriptors
 from visloc.types import Extraction, Inference
 
 THRESHOLDS_PX = (1.0, 3.0, 5.0)
@@ -100,7 +100,7 @@ def _scored(extractor: LocalFeatureExtractor, pair: Pair, max_keypoints: int) ->
     there = moved(pair.second_from_first, first.keypoints.astype(np.float64))
     gaps = np.linalg.norm(there[:, None] - second.keypoints[None], axis=2)
     in_first, in_second, _ = mutual_nearest_neighbours(
-        in_eight_bits(first.descriptors), in_eight_bits(second.descriptors)
+        round_descriptors(first.descriptors), round_descriptors(second.descriptors)
     )
     errors = gaps[in_first, in_second]
     height, width = pair.second.shape[:2]

@@ -22,7 +22,7 @@ from mapping.build.stages import Item, WorkFolder, key_of
 from mapping.cluster.executors import Executor
 from visloc.geometry import Camera, Pose
 from visloc.matching.correspondences import mutual_nearest_neighbours
-from visloc.matching.products import in_eight_bits
+from visloc.matching.products import round_descriptors
 from visloc.matching.verification import epipolar_errors
 from visloc.pose.colmap import colmap_camera, normalized_rays
 
@@ -140,10 +140,10 @@ class _MatchTask:
 
     def match(self, group: _Partners) -> None:
         def compute() -> Item:
-            own = in_eight_bits(self.features.read(group.photo).descriptors)
+            own = round_descriptors(self.features.read(group.photo).descriptors)
             found = []
             for partner in group.partners:
-                theirs = in_eight_bits(self.features.read(partner).descriptors)
+                theirs = round_descriptors(self.features.read(partner).descriptors)
                 i, j, _ = mutual_nearest_neighbours(own, theirs)
                 found.append(np.column_stack([i, j]).astype(np.uint32))
             return _item(found)

@@ -20,7 +20,7 @@ from visloc.features import (
     make_local_features,
 )
 from visloc.features.local.readymade import is_ready_made
-from visloc.features.networks.lightglue.model import make_lightglue
+from visloc.features.networks.lightglue.load import make_lightglue
 from visloc.localization.localizer import Localizer
 
 logger = logging.getLogger(__name__)

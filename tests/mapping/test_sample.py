@@ -15,11 +15,11 @@ from mapping.sample import (
     ANCHOR_LONGITUDE_DEG,
     write_sample,
 )
+from samples.render import render_depth, render_photo
+from samples.scene import Scene, make_room
 from visloc.errors import Conflict, InvalidInput
 from visloc.geometry import rotation_angle
 from visloc.kapture import FileRecord, read_dataset
-from visloc.synthetic.render import render_depth, render_photo
-from visloc.synthetic.scene import Scene, make_room
 
 SIZE = (96, 72)
 

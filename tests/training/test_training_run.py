@@ -11,6 +11,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from samples.papers import art_poster
 from training.__main__ import main
 from training.checkpoint import FILE_NAME, load_state
 from training.export import export
@@ -21,9 +22,9 @@ from training.run import LOG_NAME, Trainer, learning_rate, resume, train
 from training.settings import PRESETS, Settings
 from training.validation import features_of, validate, validation_pairs
 from visloc.errors import InvalidInput
-from visloc.features.networks.r2d2.model import R2D2Extractor, load_faster2d2
+from visloc.features.networks.r2d2.extractor import R2D2Extractor
+from visloc.features.networks.r2d2.load import load_faster2d2
 from visloc.images import read_photo_file
-from visloc.synthetic.papers import art_poster
 from visloc.types import Inference
 
 CPU = torch.device("cpu")

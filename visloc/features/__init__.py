@@ -1,6 +1,6 @@
 """Local features and global descriptors, by name.
 
-A further one is one file and one line in a registry below, or a package of its own
+To add one, write a file and a line in a registry below, or a plug-in
 (``visloc.features.plugins``). Nothing here loads torch or OpenCV until a feature is made.
 """
 
@@ -38,15 +38,14 @@ __all__ = [
     "make_local_features",
 ]
 
-# name -> module and function, which takes the folder with weights or None, how networks are
-# computed, and with how many threads.
+# name -> module and function (weights_dir, inference, threads) -> extractor.
 LOCAL_FEATURES: Mapping[str, tuple[str, str]] = {
-    "aliked": ("visloc.features.networks.aliked.model", "load_aliked"),
-    "aliked-t16": ("visloc.features.networks.aliked.model", "load_aliked_t16"),
-    "faster2d2": ("visloc.features.networks.r2d2.model", "load_faster2d2"),
-    "r2d2": ("visloc.features.networks.r2d2.model", "load_r2d2"),
+    "aliked": ("visloc.features.networks.aliked.load", "load_aliked"),
+    "aliked-t16": ("visloc.features.networks.aliked.load", "load_aliked_t16"),
+    "faster2d2": ("visloc.features.networks.r2d2.load", "load_faster2d2"),
+    "r2d2": ("visloc.features.networks.r2d2.load", "load_r2d2"),
     "sift": ("visloc.features.local.sift", "load_sift"),
-    "xfeat": ("visloc.features.networks.xfeat.model", "load_xfeat"),
+    "xfeat": ("visloc.features.networks.xfeat.load", "load_xfeat"),
 }
 GLOBAL_FEATURES: Mapping[str, tuple[str, str]] = {
     "apgem": ("visloc.features.descriptors.apgem", "load_apgem"),
@@ -63,12 +62,12 @@ DEFAULT_GLOBAL_FEATURES = ("densevlad", "localvlad")
 
 
 def local_feature_names() -> list[str]:
-    """Return the names of all local features at hand, those of other packages included."""
+    """Return the names of all installed local features, plug-ins included."""
     return sorted({*LOCAL_FEATURES, *plugin_names(LOCAL_FEATURES_GROUP)})
 
 
 def global_feature_names() -> list[str]:
-    """Return the names of all global descriptors at hand, those of other packages included."""
+    """Return the names of all installed global descriptors, plug-ins included."""
     return sorted({*GLOBAL_FEATURES, *plugin_names(GLOBAL_FEATURES_GROUP)})
 
 
@@ -81,8 +80,7 @@ def make_local_features(
     """Build the extractor that a command or a map names.
 
     Args:
-        name: of ``local_feature_names``. Where a package offers a name of ``LOCAL_FEATURES``, the
-            package's is never used.
+        name: one of ``local_feature_names``. Names of ``LOCAL_FEATURES`` come before plug-ins.
         weights_dir: folder with network weights.
         inference: how networks are computed.
         threads: processor threads for one photo; None for all processors.
@@ -101,19 +99,7 @@ def make_global_descriptor(
     inference: Inference = Inference.AUTO,
     threads: int | None = None,
 ) -> GlobalDescriptor:
-    """Build the global descriptor that a command or a map names.
-
-    Args:
-        name: of ``global_feature_names``. Where a package offers a name of ``GLOBAL_FEATURES``, the
-            package's is never used.
-        weights_dir: folder with network weights.
-        inference: how networks are computed.
-        threads: processor threads for one photo; None for all processors.
-
-    Raises:
-        InvalidInput: ``features.unknown``, ``features.plugin``, ``inference.unavailable``.
-        WeightsError: when its weights are missing or not its own.
-    """
+    """Build a global descriptor by name, as ``make_local_features`` does local features."""
     made = _make(GLOBAL_FEATURES, GLOBAL_FEATURES_GROUP, name, weights_dir, inference, threads)
     return cast("GlobalDescriptor", made)
 

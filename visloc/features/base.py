@@ -1,4 +1,4 @@
-"""What a local feature and a global descriptor must offer, and how each is identified."""
+"""Protocols of local features and global descriptors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class LocalFeatureExtractor(Protocol):
 
     @property
     def computed_with(self) -> str:
-        """What computes it, for instance ``torch 2.13.0 on cpu``: other bits, alike features."""
+        """Library and device, such as ``torch 2.13.0 on cpu``; features differ in last bits."""
 
     @property
     def descriptor_dim(self) -> int:
@@ -55,10 +55,7 @@ class GlobalDescriptor(Protocol):
 
     @property
     def computed_with(self) -> str | None:
-        """What computes it, for instance ``torch 2.13.0 on cpu``; None for plain code.
-
-        Other ways of computing give other bits, but alike vectors.
-        """
+        """Library and device, such as ``torch 2.13.0 on cpu``; None for plain code."""
 
     @property
     def needs_image(self) -> bool:

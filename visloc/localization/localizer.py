@@ -17,7 +17,7 @@ from visloc.archive import Map
 from visloc.errors import InvalidInput
 from visloc.features import GlobalDescriptor, LocalFeatureExtractor, make_global_descriptor
 from visloc.features.local.readymade import is_ready_made
-from visloc.features.networks.lightglue.model import make_lightglue
+from visloc.features.networks.lightglue.load import make_lightglue
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo
 from visloc.localization.constraints import Constraints, MapGeometry
@@ -39,7 +39,7 @@ from visloc.localization.solving import (
     solve_instant,
 )
 from visloc.matching.correspondences import CLEAR_RATIO, match_landmarks
-from visloc.matching.products import EightBitRows, in_eight_bits, start_threads
+from visloc.matching.products import EightBitRows, round_descriptors, start_threads
 from visloc.priors import NO_PRIORS, Priors
 from visloc.retrieval.fusion import LateFusion, chosen_fusion
 from visloc.retrieval.index import Retrieved, retrieve
@@ -368,7 +368,7 @@ class Localizer:
         scale = self.map.manifest.local_features.descriptor_scale
         observed = (self.map.observations(int(photo)) for photo in photos)
         pairs = match_landmarks(
-            in_eight_bits(local.descriptors),
+            round_descriptors(local.descriptors),
             ((landmarks, EightBitRows(rows, scale)) for landmarks, rows in observed),
             CLEAR_RATIO if options.matcher is Matcher.RATIO else None,
             None if rematching is None else lambda rank: rematching.match(int(photos[rank])),

@@ -39,7 +39,7 @@ class EightBitRows:
         return len(self.rows)
 
 
-def in_eight_bits(descriptors: NDArray[np.float32]) -> EightBitRows:
+def round_descriptors(descriptors: NDArray[np.float32]) -> EightBitRows:
     """Round unit descriptors (n, D) to 8 bits, with one scale so that rows stay comparable.
 
     Raises:

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from visloc.features.base import LocalFeatureExtractor
 from visloc.features.local.sift import load_sift
-from visloc.features.networks.aliked.model import load_aliked, load_aliked_t16
-from visloc.features.networks.r2d2.model import load_faster2d2, load_r2d2
-from visloc.features.networks.xfeat.model import load_xfeat
+from visloc.features.networks.aliked.load import load_aliked, load_aliked_t16
+from visloc.features.networks.r2d2.load import load_faster2d2, load_r2d2
+from visloc.features.networks.xfeat.load import load_xfeat
 from visloc.types import LocalFeatures
 
 LOADERS = {

@@ -17,7 +17,7 @@ from visloc.geometry import Camera, Pose
 from visloc.images import Photo, read_photo
 from visloc.localization.localizer import Localizer
 from visloc.matching.correspondences import NUM_REMATCHED, mutual_nearest_neighbours
-from visloc.matching.products import in_eight_bits
+from visloc.matching.products import round_descriptors
 from visloc.types import Localized, LocalizeOptions, Matcher
 
 LIGHTGLUE = LocalizeOptions(matcher=Matcher.LIGHTGLUE)
@@ -37,7 +37,9 @@ class NearestNeighbours:
 
     def match(self, a: SeenKeypoints, b: SeenKeypoints) -> Any:
         self.shown.append((a, b))
-        return mutual_nearest_neighbours(in_eight_bits(a.descriptors), in_eight_bits(b.descriptors))
+        return mutual_nearest_neighbours(
+            round_descriptors(a.descriptors), round_descriptors(b.descriptors)
+        )
 
 
 @pytest.fixture

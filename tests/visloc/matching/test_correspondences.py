@@ -11,7 +11,7 @@ from visloc.matching.correspondences import (
     match_landmarks,
     mutual_nearest_neighbours,
 )
-from visloc.matching.products import EightBitRows, in_eight_bits
+from visloc.matching.products import EightBitRows, round_descriptors
 
 
 def unit_rows(rng: np.random.Generator, n: int, dim: int = 16) -> NDArray[np.float32]:
@@ -27,7 +27,7 @@ def test_a_permuted_copy_is_matched_row_by_row() -> None:
     rng = np.random.default_rng(0)
     a = unit_rows(rng, 50)
     order = rng.permutation(50)
-    i, j, similarity = mutual_nearest_neighbours(in_eight_bits(a), in_eight_bits(a[order]))
+    i, j, similarity = mutual_nearest_neighbours(round_descriptors(a), round_descriptors(a[order]))
     assert i.tolist() == list(range(50))
     assert order[j].tolist() == i.tolist()
     assert similarity.dtype == np.float32
@@ -79,7 +79,7 @@ def test_pairs_are_those_of_the_definition(
 def at(*angles_deg: float) -> EightBitRows:
     """Unit vectors in the plane; a step of 1/127 is 0.45 degrees at most."""
     angles = np.radians(angles_deg)
-    return in_eight_bits(np.column_stack([np.cos(angles), np.sin(angles)]).astype(np.float32))
+    return round_descriptors(np.column_stack([np.cos(angles), np.sin(angles)]).astype(np.float32))
 
 
 @pytest.mark.parametrize(("second_deg", "clear"), [(40.0, True), (23.5, True), (21.0, False)])
@@ -106,7 +106,7 @@ def test_pairs_under_a_ratio_are_those_of_the_definition(
     if not has_integer_products:
         monkeypatch.setattr(products, "_has_integer_products", lambda: False)
     rng = np.random.default_rng(n)
-    a, b = in_eight_bits(unit_rows(rng, n, dim)), in_eight_bits(unit_rows(rng, m, dim))
+    a, b = round_descriptors(unit_rows(rng, n, dim)), round_descriptors(unit_rows(rng, m, dim))
     i, j, similarity = mutual_nearest_neighbours(a, b)
     cosines = a.rows[i].astype(np.float64) @ b.rows.T.astype(np.float64) * (a.scale * b.scale)
     distances = np.sqrt(2 - 2 * np.clip(cosines, -1, 1))
@@ -125,11 +125,11 @@ NEAR = np.array([[0.9, np.sqrt(1 - 0.81)]], dtype=np.float32)
 
 
 def seen(landmark: int, descriptor: NDArray[np.float32]) -> tuple[NDArray[np.int64], EightBitRows]:
-    return np.array([landmark]), in_eight_bits(descriptor)
+    return np.array([landmark]), round_descriptors(descriptor)
 
 
 def test_the_photo_most_like_the_query_wins_over_another_one() -> None:
-    pairs = match_landmarks(in_eight_bits(QUERY), [seen(3, NEAR), seen(7, QUERY)])
+    pairs = match_landmarks(round_descriptors(QUERY), [seen(3, NEAR), seen(7, QUERY)])
     assert (pairs.landmarks.tolist(), pairs.support.tolist()) == ([3], [1.0])
     assert pairs.similarities == pytest.approx([0.9], abs=0.005)
 
@@ -137,7 +137,7 @@ def test_the_photo_most_like_the_query_wins_over_another_one() -> None:
 def test_photos_that_agree_outvote_a_better_ranked_one() -> None:
     # 1 against 1/2 + 1/3 + 1/4
     others = [seen(7, NEAR), seen(7, NEAR), seen(7, QUERY)]
-    pairs = match_landmarks(in_eight_bits(QUERY), [seen(3, QUERY), *others])
+    pairs = match_landmarks(round_descriptors(QUERY), [seen(3, QUERY), *others])
     assert pairs.landmarks.tolist() == [7]
     assert pairs.support == pytest.approx([13 / 12])
     assert pairs.similarities == pytest.approx([1.0])
@@ -152,7 +152,7 @@ def photos() -> list[tuple[NDArray[np.int64], EightBitRows]]:
         rows = rng.permutation(200)[:120]
         noisy = QUERIES[rows] + 0.2 * rng.normal(size=(120, 16)).astype(np.float32)
         noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
-        images.append((rows // 2, in_eight_bits(noisy)))
+        images.append((rows // 2, round_descriptors(noisy)))
     return images
 
 
@@ -162,7 +162,7 @@ QUERIES = unit_rows(np.random.default_rng(1), 200)
 def test_each_keypoint_and_each_landmark_is_used_once(
     photos: list[tuple[NDArray[np.int64], EightBitRows]],
 ) -> None:
-    pairs = match_landmarks(in_eight_bits(QUERIES), photos)
+    pairs = match_landmarks(round_descriptors(QUERIES), photos)
     assert len(set(pairs.keypoints.tolist())) == len(pairs)
     assert len(set(pairs.landmarks.tolist())) == len(pairs)
     assert (pairs.landmarks == pairs.keypoints // 2).mean() > 0.95
@@ -175,7 +175,7 @@ def test_the_number_of_threads_changes_nothing(
     try:
         for num_threads in (1, 2, 3):
             torch.set_num_threads(num_threads)
-            found.append(match_landmarks(in_eight_bits(QUERIES), photos))
+            found.append(match_landmarks(round_descriptors(QUERIES), photos))
             assert torch.get_num_threads() == num_threads
     finally:
         torch.set_num_threads(before)
@@ -187,12 +187,12 @@ def test_the_number_of_threads_changes_nothing(
 
 
 def test_no_photos_give_no_pairs() -> None:
-    assert len(match_landmarks(in_eight_bits(np.ones((3, 4), np.float32)), [])) == 0
+    assert len(match_landmarks(round_descriptors(np.ones((3, 4), np.float32)), [])) == 0
 
 
 def test_the_photos_with_most_pairs_are_matched_again() -> None:
     # of five photos, the second, third and fourth have two pairs each, the others one
-    one, two = (in_eight_bits(QUERIES[:n]) for n in (1, 2))
+    one, two = (round_descriptors(QUERIES[:n]) for n in (1, 2))
     photos = [(np.arange(len(rows)), rows) for rows in (one, two, two, two, one)]
     asked: list[int] = []
 
@@ -200,7 +200,7 @@ def test_the_photos_with_most_pairs_are_matched_again() -> None:
         asked.append(photo)
         return np.array([5]), np.array([9 + photo]), np.array([0.5], np.float32)
 
-    pairs = match_landmarks(in_eight_bits(QUERIES[:6]), photos, rematch=rematch)
+    pairs = match_landmarks(round_descriptors(QUERIES[:6]), photos, rematch=rematch)
     assert sorted(asked) == [1, 2, 3]
     # what was found before in those photos does not count any more; of three for one keypoint the
     # best ranked photo's wins
@@ -210,7 +210,7 @@ def test_the_photos_with_most_pairs_are_matched_again() -> None:
 
 
 def test_ambiguous_pairs_do_not_vote() -> None:
-    double = in_eight_bits(np.concatenate([QUERY, QUERY]))
-    photos = [(np.array([3, 4]), double), (np.array([7]), in_eight_bits(NEAR))]
-    assert match_landmarks(in_eight_bits(QUERY), photos).landmarks.tolist() == [3]
-    assert match_landmarks(in_eight_bits(QUERY), photos, 0.9).landmarks.tolist() == [7]
+    double = round_descriptors(np.concatenate([QUERY, QUERY]))
+    photos = [(np.array([3, 4]), double), (np.array([7]), round_descriptors(NEAR))]
+    assert match_landmarks(round_descriptors(QUERY), photos).landmarks.tolist() == [3]
+    assert match_landmarks(round_descriptors(QUERY), photos, 0.9).landmarks.tolist() == [7]

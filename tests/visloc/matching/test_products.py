@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from visloc.matching import products
-from visloc.matching.products import in_eight_bits, in_threads, row_products
+from visloc.matching.products import in_threads, round_descriptors, row_products
 
 
 def test_eight_bits_are_within_half_a_step() -> None:
     rows = np.random.default_rng(0).uniform(-0.4, 0.4, (50, 8)).astype(np.float32)
     rows[3, 4] = -0.5
-    quantized = in_eight_bits(rows)
+    quantized = round_descriptors(rows)
     assert quantized.scale == pytest.approx(0.5 / 127)
     assert quantized.rows.min() == -127
     assert np.abs(quantized.rows * quantized.scale - rows).max() <= 0.5001 * quantized.scale
@@ -23,7 +23,7 @@ def test_eight_bits_are_within_half_a_step() -> None:
 
 @pytest.mark.parametrize("shape", [(0, 4), (3, 4)])
 def test_nothing_and_zeros_stay_what_they_are(shape: tuple[int, int]) -> None:
-    quantized = in_eight_bits(np.zeros(shape, np.float32))
+    quantized = round_descriptors(np.zeros(shape, np.float32))
     assert quantized.rows.shape == shape
     assert not quantized.rows.any()
 
@@ -31,7 +31,7 @@ def test_nothing_and_zeros_stay_what_they_are(shape: tuple[int, int]) -> None:
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_descriptors_that_are_not_finite_are_a_bug(value: float) -> None:
     with pytest.raises(ValueError, match="not finite"):
-        in_eight_bits(np.array([[0.5, value]], np.float32))
+        round_descriptors(np.array([[0.5, value]], np.float32))
 
 
 @pytest.mark.parametrize("lost", ["_int_mm", "_is_vnni_supported"])

@@ -1,7 +1,9 @@
 """The ranges of a network's activations, which its 8-bit numbers have to cover.
 
-They are measured once on pictures made by code, so that one network serves all maps, and kept
-in the user's cache folder. Nothing depends on that file: without it they are measured again.
+Those of known weights are recorded in ``visloc/features/weights/ranges``. For other weights they
+are measured once, on the pictures that lie there too, and kept in the user's cache folder. Nothing
+depends on the cache: without it they are measured again. ``python -m training ranges`` makes the
+records and the pictures.
 """
 
 from __future__ import annotations
@@ -14,68 +16,51 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from visloc.features.backends.openvino import Graph, Ranges
-from visloc.synthetic import papers, surfaces
 
 _LOGGER = logging.getLogger(__name__)
 _REVISION = 1  # raised whenever the pictures or the way of measuring change
+RECORDED = Path(__file__).parents[1] / "weights" / "ranges"
+PICTURES = RECORDED / "pictures.png"  # (8 * 240, 320) px, one below the other
+PICTURE_HEIGHT_PX = 240
 # Those of published networks are 3 to 24 wide. Others may be, but then the file is no help.
 _NARROWEST, _WIDEST = 1e-3, 1e4
-_SIZE = (480, 640)
-_MIDDLE = (slice(120, 360), slice(160, 480))  # what is shown of a picture, as that takes time
-_PICTURES = (
-    surfaces.book_shelf,
-    surfaces.mural_wall,
-    surfaces.pinboard_wall,
-    surfaces.brick_wall,
-    surfaces.desk,
-    papers.town_map,
-    papers.text_page,
-    papers.art_poster,
-)
 
 
-def calibrate(
-    network: str,
-    names: Sequence[str],
-    make_graph: Callable[[], Graph],
-    make_input: Callable[[NDArray[np.uint8]], NDArray[np.float32]],
+def ranges_of(
+    network: str, weights_sha256: str, names: Sequence[str], measure_them: Callable[[], Ranges]
 ) -> Ranges:
-    """Return the range of what enters each named convolution, from the cache or measured.
-
-    Args:
-        network: identifies architecture and weights; part of a file's name.
-        names: of the convolutions.
-        make_graph: makes a graph from the network's input to the smallest and largest value of
-            each, in the order of the names.
-        make_input: makes the network's input of RGB (H, W, 3).
-    """
+    """Return the range of the input of each named convolution: recorded, cached or measured."""
+    file_name = f"{network}-{weights_sha256}"
+    recorded = _read(RECORDED / f"{file_name}.json", names)
+    if recorded is not None:
+        return recorded
     folder = _cache_folder()
-    path = None if folder is None else folder / f"{network}-{_REVISION}.json"
+    path = None if folder is None else folder / f"{file_name}-{_REVISION}.json"
     ranges = None if path is None else _read(path, names)
     if ranges is None:
-        _LOGGER.info("calibrating %s for 8 bits", network)
-        ranges = _measure(names, make_graph(), make_input)
+        _LOGGER.info("measuring the ranges of %s for 8 bits", file_name)
+        ranges = measure_them()
         if path is not None:
             _write(path, ranges)
     return ranges
 
 
-def pictures() -> list[NDArray[np.uint8]]:
-    """Return what is measured: (240, 320, 3) RGB."""
-    return [
-        np.asarray(paint(np.random.default_rng(number), *_SIZE)[_MIDDLE], np.uint8)
-        for number, paint in enumerate(_PICTURES)
-    ]
-
-
-def _measure(
+def measure(
     names: Sequence[str],
     graph: Graph,
     make_input: Callable[[NDArray[np.uint8]], NDArray[np.float32]],
 ) -> Ranges:
-    """Return the extremes of each picture, averaged: outliers of one picture are cut off."""
+    """Return the extremes of each picture, averaged: outliers of one picture are cut off.
+
+    Args:
+        names: of the convolutions.
+        graph: from the network's input to the smallest and largest value of what enters each
+            convolution, in the order of the names.
+        make_input: makes the network's input of RGB (H, W, 3).
+    """
     extremes = np.mean(
         [[float(value) for value in graph(make_input(picture))] for picture in pictures()], axis=0
     )
@@ -84,6 +69,13 @@ def _measure(
     # Zero is always among what a convolution sees: it is the padding.
     lows, highs = [min(low, 0.0) for low in rounded[::2]], [max(h, 0.0) for h in rounded[1::2]]
     return dict(zip(names, zip(lows, highs, strict=True), strict=True))
+
+
+def pictures() -> list[NDArray[np.uint8]]:
+    """Return the pictures to measure on: (240, 320, 3) RGB."""
+    with Image.open(PICTURES) as image:
+        column = np.asarray(image.convert("RGB"))
+    return np.split(column, len(column) // PICTURE_HEIGHT_PX)
 
 
 def _cache_folder() -> Path | None:
@@ -96,19 +88,19 @@ def _cache_folder() -> Path | None:
 
 
 def _read(path: Path, names: Sequence[str]) -> Ranges | None:
-    """Return what the file holds, None if it is absent or not what was written."""
+    """Return the ranges in a file, None if it is absent or damaged."""
     try:
         held = json.loads(path.read_bytes())
         ranges = {name: (float(held[name][0]), float(held[name][1])) for name in names}
     except FileNotFoundError:
         return None
     except (OSError, ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
-        _LOGGER.info("%s is not usable and made anew: %s", path, error)
+        _LOGGER.info("%s is ignored: %s", path, error)
         return None
     if not all(
         low <= 0 <= high and _NARROWEST < high - low < _WIDEST for low, high in ranges.values()
     ):
-        _LOGGER.info("%s is not usable and made anew: not such ranges as networks have", path)
+        _LOGGER.info("%s is ignored: no network has such ranges", path)
         return None
     return ranges
 
@@ -120,4 +112,4 @@ def _write(path: Path, ranges: Ranges) -> None:
         partial.write_text(json.dumps(ranges), encoding="utf-8")
         partial.replace(path)
     except OSError as error:
-        _LOGGER.info("the calibration is not kept: %s", error)
+        _LOGGER.info("the ranges are not cached: %s", error)

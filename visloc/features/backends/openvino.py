@@ -15,10 +15,13 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from torch import nn
 
 _CONVERTER = "openvino.tools.ovc"
 _IMPORT_LOCK = threading.Lock()
@@ -57,7 +60,7 @@ def import_openvino() -> tuple[ModuleType, ModuleType]:
 
 
 def openvino_with(ranges: Ranges | None) -> str:
-    """Return what computes, for people: ``openvino 2026.4.1, int8, calibration 04aff650``."""
+    """Return library and numbers, to show: ``openvino 2026.4.1, int8, calibration 04aff650``."""
     version = importlib.metadata.version("openvino")
     if ranges is None:
         return f"openvino {version}, fp32"
@@ -88,33 +91,41 @@ class GraphBuilder:
         self,
         x: Any,
         name: str,
-        weight: NDArray[Any],
-        bias: NDArray[Any],
+        convolution: nn.Conv2d,
         *,
-        stride: int = 1,
-        dilation: int = 1,
-        padding: int | tuple[int, int] = 0,
-        groups: int = 1,
+        padding: tuple[int, int] | None = None,
         relu: bool = False,
     ) -> Any:
-        """Convolve x (1, I, h, w); weight (O, I / groups, k, k), bias (O,).
+        """Convolve x (1, I, h, w); in groups, always in floats.
 
-        Padding is added on all sides, or as many pixels (before, after) in both directions.
-        Convolutions in groups are computed in floats.
+        Args:
+            x: what enters.
+            name: of the convolution, among those of ``inputs`` and ranges.
+            convolution: with weights and a bias, on the processor.
+            padding: pixels before and after in both directions, if not the convolution's own.
+            relu: whether negative values become zero.
         """
         self.inputs[name] = x
+        assert convolution.bias is not None
+        weight, bias = (
+            np.ascontiguousarray(each.detach().numpy())
+            for each in (convolution.weight, convolution.bias)
+        )
         kernel = self.constant(weight)
         if name in self._ranges:
             x = self.quantized(x, name)
             largest = np.abs(weight).max(axis=(1, 2, 3), keepdims=True)
             largest = np.maximum(largest, np.finfo(np.float32).tiny)
             kernel = self._in_levels(kernel, -largest, largest, _WEIGHT_LEVELS)
-        before, after = (padding, padding) if isinstance(padding, int) else padding
+        own = convolution.padding[0]
+        assert isinstance(own, int)
+        before, after = padding or (own, own)
         convolve = self._operations.convolution
-        if groups > 1:
+        if convolution.groups > 1:
             convolve = self._operations.group_convolution
-            kernel = self.constant(weight.reshape(groups, -1, *weight.shape[1:]))
-        x = convolve(x, kernel, [stride] * 2, [before] * 2, [after] * 2, [dilation] * 2)
+            kernel = self.constant(weight.reshape(convolution.groups, -1, *weight.shape[1:]))
+        strides, dilations = list(convolution.stride), list(convolution.dilation)
+        x = convolve(x, kernel, strides, [before] * 2, [after] * 2, dilations)
         x = self._operations.add(x, self.constant(bias[None, :, None, None]))
         return self._operations.relu(x) if relu else x
 

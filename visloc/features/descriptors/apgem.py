@@ -6,8 +6,8 @@ Revaud et al., "Learning with average precision: training image retrieval with a
 
 The layout of the file is that of github.com/naver/deep-image-retrieval: torchvision's names for
 the network, ``adpool.p`` for the exponent, ``fc`` for the layer, and, beside the state dict,
-``pca["Landmarks_clean"]``, a PCA of scikit-learn. As no published weights were at hand, the
-architecture is proven against its definition, and its accuracy is not measured.
+``pca["Landmarks_clean"]``, a PCA of scikit-learn. No published weights were available here: the
+architecture is tested against its definition, the accuracy is not measured.
 """
 
 from __future__ import annotations

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from visloc.features.base import Fingerprint, GlobalDescriptor
 from visloc.features.descriptors.vlad import VLAD_PARAMETERS, VladDescriptor
 from visloc.features.descriptors.whitening import unit_rows
+from visloc.features.networks.efficientnet.load import Network, make_network
 from visloc.features.networks.efficientnet.model import (
     MAX_LONG_SIDE_PX,
-    Network,
-    fold,
-    make_network,
+    blocks_of,
     network_input,
     read_efficientnet_lite0,
 )
@@ -43,37 +42,25 @@ def load_convvlad(
         InvalidInput: ``inference.unavailable``.
     """
     checkpoint = read_efficientnet_lite0(weights_dir)
-    network = make_network(fold(checkpoint)[:NUM_BLOCKS], inference, threads)
+    network = make_network(blocks_of(checkpoint)[:NUM_BLOCKS], inference, threads)
     return ConvVlad(network, checkpoint.sha256)
 
 
 class ConvVlad(VladDescriptor):
     """A photo's words are the channels (112) of the network's cells."""
 
+    needs_image = True  # words lie on a grid, not at keypoints
+    needs_local_features = False
+
     def __init__(self, network: Network, weights_sha256: str) -> None:
         self._network = network
-        self._fingerprint = Fingerprint(
+        self.fingerprint = Fingerprint(
             "convvlad",
             revision=1,
             parameters={"max_long_side_px": MAX_LONG_SIDE_PX, **VLAD_PARAMETERS},
             weights_sha256=weights_sha256,
         )
         self.computed_with = network.computed_with
-
-    @property
-    def fingerprint(self) -> Fingerprint:
-        """Name, parameters and weights."""
-        return self._fingerprint
-
-    @property
-    def needs_image(self) -> bool:
-        """True: its words lie on a grid, not at keypoints."""
-        return True
-
-    @property
-    def needs_local_features(self) -> bool:
-        """False: its words lie on a grid."""
-        return False
 
     def words(
         self,

@@ -42,31 +42,20 @@ def load_densevlad(
 class DenseVlad(VladDescriptor):
     """A photo's words are RootSIFT descriptors (128) of overlapping patches all over it."""
 
-    @property
-    def fingerprint(self) -> Fingerprint:
-        """Name and parameters."""
-        return Fingerprint(
-            "densevlad",
-            revision=1,
-            parameters={
-                "cell_sizes_px": ",".join(map(str, CELL_SIZES_PX)),
-                "working_size_px": WORKING_SIZE_PX,
-                "cell_px": CELL_PX,
-                "smoothing_sigma_px": SMOOTHING_SIGMA_PX,
-                "min_contrast": MIN_CONTRAST,
-                **VLAD_PARAMETERS,
-            },
-        )
-
-    @property
-    def needs_image(self) -> bool:
-        """True: its words lie on a grid, not at keypoints."""
-        return True
-
-    @property
-    def needs_local_features(self) -> bool:
-        """False: its words lie on a grid."""
-        return False
+    fingerprint = Fingerprint(
+        "densevlad",
+        revision=1,
+        parameters={
+            "cell_sizes_px": ",".join(map(str, CELL_SIZES_PX)),
+            "working_size_px": WORKING_SIZE_PX,
+            "cell_px": CELL_PX,
+            "smoothing_sigma_px": SMOOTHING_SIGMA_PX,
+            "min_contrast": MIN_CONTRAST,
+            **VLAD_PARAMETERS,
+        },
+    )
+    needs_image = True  # words lie on a grid, not at keypoints
+    needs_local_features = False
 
     def words(
         self,

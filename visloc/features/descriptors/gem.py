@@ -16,11 +16,10 @@ from visloc.features.base import Fingerprint, GlobalDescriptor
 from visloc.features.descriptors.image_descriptor import ImageDescriptor
 from visloc.features.descriptors.pooling import generalized_mean
 from visloc.features.descriptors.whitening import WHITENING_PARAMETERS
+from visloc.features.networks.efficientnet.load import Network, make_network
 from visloc.features.networks.efficientnet.model import (
     MAX_LONG_SIDE_PX,
-    Network,
-    fold,
-    make_network,
+    blocks_of,
     network_input,
     read_efficientnet_lite0,
 )
@@ -43,7 +42,7 @@ def load_gem(
         InvalidInput: ``inference.unavailable``.
     """
     checkpoint = read_efficientnet_lite0(weights_dir)
-    network = make_network(fold(checkpoint), inference, threads)
+    network = make_network(blocks_of(checkpoint), inference, threads)
     return Gem(network, checkpoint.sha256)
 
 
@@ -56,7 +55,8 @@ class Gem(ImageDescriptor):
 
     def __init__(self, network: Network, weights_sha256: str) -> None:
         self._network = network
-        self._fingerprint = Fingerprint(
+        self.computed_with = network.computed_with
+        self.fingerprint = Fingerprint(
             "gem",
             revision=1,
             parameters={
@@ -66,16 +66,6 @@ class Gem(ImageDescriptor):
             },
             weights_sha256=weights_sha256,
         )
-
-    @property
-    def fingerprint(self) -> Fingerprint:
-        """Name, parameters and weights."""
-        return self._fingerprint
-
-    @property
-    def computed_with(self) -> str:
-        """What computes the network."""
-        return self._network.computed_with
 
     def look(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the raw vector (1280,), of unit length, of a photo (H, W, 3)."""

@@ -19,34 +19,15 @@ class ImageDescriptor(WhitenedDescriptor):
     (R, D), D at most 1024 and at most one less than the map has photos.
     """
 
-    @property
-    @abstractmethod
-    def fingerprint(self) -> Fingerprint:
-        """Name, parameters and weights; kept in the manifest of every map."""
-
-    @property
-    def computed_with(self) -> str | None:
-        """What computes it; None for plain code."""
-        return None
+    fingerprint: Fingerprint
+    computed_with: str | None = None  # plain code
+    needs_image = True
+    needs_local_features = False
+    needs_vocabulary = False
 
     @abstractmethod
     def look(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the raw vector (R,), of unit length, of a photo (H, W, 3)."""
-
-    @property
-    def needs_image(self) -> bool:
-        """True."""
-        return True
-
-    @property
-    def needs_local_features(self) -> bool:
-        """False."""
-        return False
-
-    @property
-    def needs_vocabulary(self) -> bool:
-        """False."""
-        return False
 
     def training_words(
         self,
@@ -54,7 +35,6 @@ class ImageDescriptor(WhitenedDescriptor):
         local: LocalFeatures,  # noqa: ARG002
         seed: int,  # noqa: ARG002
     ) -> NDArray[np.float32]:
-        """Return no words."""
         return np.empty((0, 1), np.float32)
 
     def learn_vocabulary(
@@ -62,7 +42,6 @@ class ImageDescriptor(WhitenedDescriptor):
         words: NDArray[np.float32],  # noqa: ARG002
         seed: int,  # noqa: ARG002
     ) -> dict[str, NDArray[np.float32]]:
-        """Learn nothing."""
         return {}
 
     def pool(
@@ -71,5 +50,4 @@ class ImageDescriptor(WhitenedDescriptor):
         local: LocalFeatures,  # noqa: ARG002 - not needed
         vocabulary: Mapping[str, NDArray[np.float32]],  # noqa: ARG002 - there is none
     ) -> NDArray[np.float32]:
-        """Return the raw vector (R,) of a photo."""
         return self.look(rgb)

@@ -24,20 +24,10 @@ def load_localvlad(
 class LocalVlad(VladDescriptor):
     """A photo's words are the descriptors of its local features, whatever their length."""
 
-    @property
-    def fingerprint(self) -> Fingerprint:
-        """Name and parameters; the local features have a fingerprint of their own."""
-        return Fingerprint("localvlad", revision=1, parameters=dict(VLAD_PARAMETERS))
-
-    @property
-    def needs_image(self) -> bool:
-        """False: the local features say it all."""
-        return False
-
-    @property
-    def needs_local_features(self) -> bool:
-        """True: its words are their descriptors."""
-        return True
+    # The local features have a fingerprint of their own.
+    fingerprint = Fingerprint("localvlad", revision=1, parameters=dict(VLAD_PARAMETERS))
+    needs_image = False
+    needs_local_features = True
 
     def words(
         self,

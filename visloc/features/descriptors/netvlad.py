@@ -11,7 +11,7 @@ Two layouts of weights are understood, told apart by the tensors that are there:
   ``pool.centroids`` and the whitening ``WPCA.0``;
 - github.com/Nanne/pytorch-NetVlad: the same without ``WPCA.0``; whitening is learned on the map.
 
-As no published weights were at hand, the architecture is proven against its definition, and its
+No published weights were available here: the architecture is tested against its definition, the
 accuracy is not measured.
 """
 

@@ -1,4 +1,4 @@
-"""What the global descriptors with published weights share: the file, the photo, whitening."""
+"""Base of the global descriptors with published weights."""
 
 from __future__ import annotations
 
@@ -42,23 +42,14 @@ class NetworkDescriptor(ImageDescriptor):
         whitened: bool,
     ) -> None:
         self.device = device
+        self.computed_with = computed_with(device)
         self.whitened = whitened
-        self._fingerprint = Fingerprint(
+        self.fingerprint = Fingerprint(
             name,
             revision=1,
             parameters=parameters if whitened else {**parameters, **WHITENING_PARAMETERS},
             weights_sha256=checkpoint.sha256,
         )
-
-    @property
-    def fingerprint(self) -> Fingerprint:
-        """Name, parameters and weights."""
-        return self._fingerprint
-
-    @property
-    def computed_with(self) -> str:
-        """Torch and its device."""
-        return computed_with(self.device)
 
     def learn_projection(self, pooled: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
         """Learn nothing if the weights whiten, else ``mean`` (R,) and ``axes`` (R, D)."""

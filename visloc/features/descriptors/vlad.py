@@ -76,26 +76,10 @@ class VladDescriptor(WhitenedDescriptor):
     Its model holds ``vocabulary`` (K, d), ``mean`` (R,) and ``axes`` (R, D), R = K * d.
     """
 
-    @property
-    @abstractmethod
-    def fingerprint(self) -> Fingerprint:
-        """Name and parameters; kept in the manifest of every map."""
-
-    @property
-    @abstractmethod
-    def needs_image(self) -> bool:
-        """Whether it looks at the pixels; if not, ``rgb`` may be an image without any."""
-
-    @property
-    @abstractmethod
-    def needs_local_features(self) -> bool:
-        """Whether it is made of local features; if not, ``local`` may be empty."""
-
-    @property
-    def needs_vocabulary(self) -> bool:
-        """True: the centres that words are compared with."""
-        return True
-
+    fingerprint: Fingerprint
+    needs_image: bool
+    needs_local_features: bool
+    needs_vocabulary = True
     computed_with: str | None = None  # plain code
 
     @abstractmethod

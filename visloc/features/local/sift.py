@@ -45,15 +45,8 @@ class SiftExtractor:
         },
     )
 
-    @property
-    def descriptor_dim(self) -> int:
-        """Length of one descriptor: 128."""
-        return DESCRIPTOR_DIM
-
-    @property
-    def computed_with(self) -> str:
-        """What computes it."""
-        return f"OpenCV {cv2.__version__}"
+    descriptor_dim = DESCRIPTOR_DIM
+    computed_with = f"OpenCV {cv2.__version__}"
 
     def extract(
         self,

@@ -11,13 +11,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
+import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from visloc.features.backends.convolution import fold_batch_norm
-from visloc.features.backends.torch import fixed_convolution
+from visloc.features.backends.torch import for_inference
 
 BLOCKS: Mapping[int, tuple[int, ...]] = {50: (3, 4, 6, 3), 101: (3, 4, 23, 3)}
 FEATURES = 2048
@@ -73,16 +73,24 @@ class _Step:
             yield f"{norm}.{part}", (self.outputs,)
 
     def make(self, tensors: _Tensors) -> nn.Conv2d:
-        """Return one convolution: g (w * x - mean) / sqrt(variance + 1e-5) + b."""
-        convolution, norm = self.names
-        gain, shift, mean, variance = (
-            tensors[f"{norm}.{part}"] for part in ("weight", "bias", "running_mean", "running_var")
+        """Return the convolution with the batch norm inside."""
+        name, norm_name = self.names
+        padding = self.kernel // 2
+        convolution = nn.Conv2d(
+            self.inputs, self.outputs, self.kernel, self.stride, padding, bias=False
         )
-        plain = tensors[f"{convolution}.weight"]
-        weight, bias = fold_batch_norm(
-            plain, np.zeros(self.outputs), mean, variance, gain=gain, shift=shift
-        )
-        return fixed_convolution(weight, bias, stride=self.stride, padding=self.kernel // 2)
+        norm = nn.BatchNorm2d(self.outputs)
+        for module, prefix in ((convolution, name), (norm, norm_name)):
+            parts = {part: tensors.get(f"{prefix}.{part}") for part in module.state_dict()}
+            module.load_state_dict(
+                {
+                    # The counter of batches is not needed.
+                    part: torch.tensor(0 if array is None else array)
+                    for part, array in parts.items()
+                }
+            )
+            module.double().eval()
+        return for_inference(fuse_conv_bn_eval(convolution, norm))
 
 
 def expected_shapes(depth: int, layout: Layout) -> dict[str, tuple[int, ...]]:

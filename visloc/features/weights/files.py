@@ -1,9 +1,9 @@
-"""Network weights: where they come from, and whether a file holds the right ones.
+"""Finds weights files and checks that they fit a network.
 
-Published ones are neither shipped nor fetched: they come with a package, or whoever runs the
-software downloads them and says in which folder they lie. Some, R2D2's for one, are for
-non-commercial use. Our own of Fast-R2D2 (``training``, docs/models/fast-r2d2.md) are free to use,
-and lie beside this module.
+Published weights are neither shipped nor downloaded. They come with a package, or the operator
+downloads them and names the folder. Some, such as R2D2's, are for non-commercial use only. Our own
+weights of Fast-R2D2 (``training``, docs/models/fast-r2d2.md) are free to use and lie beside this
+module.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class PublishedWeights:
 
     Attributes:
         file_name: as published, and as looked for in the weights folder.
-        network: the network it belongs to, for people.
+        network: name to show.
         source: where to download it.
-        licence: under which licence, with what it means.
-        sha256: of the file as published; None where no published file was at hand.
-        max_bytes: how large a file is read at most.
+        licence: name and consequence.
+        sha256: of the published file; None if it was never seen here.
+        max_bytes: a larger file is not read.
     """
 
     file_name: str
@@ -72,37 +72,26 @@ _SHIPPED_FOLDER = Path(__file__).parent / "trained"
 
 
 def read_own_weights(feature: str, weights_dir: Path | None) -> Checkpoint | None:
-    """Read ``FEATURE.safetensors`` from the weights folder, or else what is shipped, if any is.
+    """Read ``FEATURE.safetensors`` from the weights folder, else the shipped file, if there is one.
 
-    None too where the folder that was named is not there: whoever named it meant other weights.
+    Returns None for a weights folder that does not exist: its name was meant for other weights.
 
     Raises:
-        WeightsError: ``weights.altered`` if the shipped file is not the one that was shipped; and
-            those of ``read_checkpoint``.
+        WeightsError: those of ``read_checkpoint``.
     """
     file_name = f"{feature}.safetensors"
     if weights_dir is not None and (weights_dir / file_name).is_file():
         return read_checkpoint(weights_dir / file_name)
     if feature not in SHIPPED or (weights_dir is not None and not weights_dir.is_dir()):
         return None
-    checkpoint = read_checkpoint(_SHIPPED_FOLDER / file_name)
-    if checkpoint.sha256 != SHIPPED[feature]:
-        raise WeightsError(
-            "weights.altered",
-            "not the weights that this version was shipped with; install it anew",
-            field=str(checkpoint.path),
-            expected=f"sha256 {SHIPPED[feature]}",
-            got=checkpoint.sha256,
-        )
-    return checkpoint
+    return read_checkpoint(_SHIPPED_FOLDER / file_name, sha256=SHIPPED[feature])
 
 
 def read_weights(weights_dir: Path | None, published: PublishedWeights) -> Checkpoint:
     """Read the named file from the weights folder.
 
-    A file with another sha256 than the published one is read as well, because people train
-    their own; its sha256 goes into the features' fingerprint, and ``check_shapes`` tells whether
-    the network fits.
+    A file with another sha256 is read too, because people train their own. Its sha256 goes into
+    the features' fingerprint, and ``check_shapes`` tells whether it fits the network.
 
     Raises:
         WeightsError: ``weights.missing`` with what to download, from where, under which licence,
@@ -134,11 +123,11 @@ def find_weights(
     """Look for a file in the weights folder, then in an installed package that carries it.
 
     Args:
-        file_name: of the weights, as published.
+        file_name: as published.
         weights_dir: the weights folder.
-        package: a package's name in Python; it is located, never imported.
-        folder: where the package has the file.
-        missing: what to tell people where there is no such file.
+        package: Python name of the package, which is located but never imported.
+        folder: of the file inside the package.
+        missing: message of the error.
         field: of the error.
 
     Raises:
@@ -162,17 +151,17 @@ def find_weights(
 
 
 def check_shapes(checkpoint: Checkpoint, expected: Shapes, *, network: str, held: str) -> None:
-    """Make sure that a checkpoint has exactly the tensors of a network, all of them finite.
+    """Check that a checkpoint has exactly the tensors of a network, all of them finite.
 
     Args:
-        checkpoint: what was read.
+        checkpoint: to check.
         expected: the shape of every tensor by name.
-        network: the network wanted, for the message.
-        held: what the file seems to hold instead, for the message.
+        network: the expected network, for the message.
+        held: the network that the file seems to hold, for the message.
 
     Raises:
-        WeightsError: ``weights.network`` for tensors that are missing, surplus or of another
-            shape; ``weights.values`` for numbers that no network has.
+        WeightsError: ``weights.network`` for missing, surplus or misshapen tensors;
+            ``weights.values`` for numbers that are not finite and for negative variances.
     """
     found = {name: array.shape for name, array in checkpoint.tensors.items()}
     if found != dict(expected):

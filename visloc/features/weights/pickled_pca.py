@@ -2,20 +2,21 @@
 
 Published AP-GeM weights hold, beside the network, the whitening learned by
 ``sklearn.decomposition.PCA``: an object whose attributes are numpy arrays. The classes below stand
-in for the names that such a pickle needs; all they can do is keep what the file says about them.
-Nothing is computed of it, and no bytes are copied, before ``principal_components`` is called.
+in for the names in such a pickle; they only keep what the file says. ``principal_components``
+checks it and computes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import prod
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-_DTYPES: dict[str, np.dtype[Any]] = {"f4": np.dtype("<f4"), "f8": np.dtype("<f8")}
+_DTYPES: Mapping[str, np.dtype[Any]] = {"f4": np.dtype("<f4"), "f8": np.dtype("<f8")}
 _MAX_DIMENSIONS = 2
 
 
@@ -37,22 +38,19 @@ class PrincipalComponents:
 
 
 class Pickled:
-    """Stands in for something in a pickle. Compared by identity, so that no hash recurses."""
+    """Stands in for an object in a pickle."""
 
     __slots__ = ("arguments", "state")
+    arguments: tuple[Any, ...]
+    state: Any
 
-    def __init__(self, *arguments: Any) -> None:
-        self.arguments = arguments
+    def __new__(cls, *arguments: Any) -> Self:
+        made = super().__new__(cls)
+        made.arguments, made.state = arguments, None
+        return made
 
-    # Instances and, as it then fails, the class itself: a file can change no attribute otherwise.
     def __setstate__(self, state: Any) -> None:
         self.state = state
-
-
-class _Bytes(Pickled):
-    """``_codecs.encode(text, "latin1")``: how the pickle protocol 2 writes bytes."""
-
-    __slots__ = ()
 
 
 class _Array(Pickled):
@@ -69,29 +67,17 @@ class PickledPca(Pickled):
     __slots__ = ()
 
 
-class _Number(Pickled):
-    """A number of numpy's, which nobody asks for."""
-
-    __slots__ = ()
-
-
 # Under the module names before and after scikit-learn 0.22 and numpy 2.
-_STAND_INS: dict[tuple[str, str], type[Pickled] | str] = {
-    ("_codecs", "encode"): _Bytes,
-    ("numpy", "ndarray"): "ndarray",  # only ever an argument of _reconstruct
-    ("numpy", "dtype"): _Dtype,
-    ("numpy.core.multiarray", "_reconstruct"): _Array,
-    ("numpy._core.multiarray", "_reconstruct"): _Array,
-    ("numpy.core.multiarray", "scalar"): _Number,
-    ("numpy._core.multiarray", "scalar"): _Number,
-    ("sklearn.decomposition.pca", "PCA"): PickledPca,
-    ("sklearn.decomposition._pca", "PCA"): PickledPca,
+STAND_INS: Mapping[str, type[Pickled]] = {
+    "numpy.ndarray": Pickled,  # only ever an argument of _reconstruct
+    "numpy.dtype": _Dtype,
+    "numpy.core.multiarray._reconstruct": _Array,
+    "numpy._core.multiarray._reconstruct": _Array,
+    "numpy.core.multiarray.scalar": Pickled,
+    "numpy._core.multiarray.scalar": Pickled,
+    "sklearn.decomposition.pca.PCA": PickledPca,
+    "sklearn.decomposition._pca.PCA": PickledPca,
 }
-
-
-def stand_in(module: str, name: str) -> type[Pickled] | str | None:
-    """Return what takes the place of a name in a pickle; None if the name is not known here."""
-    return _STAND_INS.get((module, name))
 
 
 def principal_components(pickled: PickledPca) -> PrincipalComponents:
@@ -100,8 +86,7 @@ def principal_components(pickled: PickledPca) -> PrincipalComponents:
     Raises:
         ValueError: with the reason, when it is not whole or holds numbers that no PCA has.
     """
-    attributes = getattr(pickled, "state", None)
-    attributes = attributes if isinstance(attributes, dict) else {}
+    attributes = pickled.state if isinstance(pickled.state, dict) else {}
     mean, components, variances = (
         _array(name, attributes.get(name))
         for name in ("mean_", "components_", "explained_variance_")
@@ -126,22 +111,15 @@ def principal_components(pickled: PickledPca) -> PrincipalComponents:
 
 
 def _array(name: str, pickled: object) -> NDArray[np.float64]:
-    """Return an array that numpy pickled, as float64.
-
-    Its state is (version, shape, dtype, whether columns come first in memory, its bytes).
-    """
-    state = getattr(pickled, "state", None)
-    if not (isinstance(pickled, _Array) and isinstance(state, tuple) and len(state) == 5):
-        raise ValueError(f"the PCA's {name} is no array")
-    _version, shape, dtype, by_columns, data = state
-    if not (
-        isinstance(shape, tuple)
-        and len(shape) <= _MAX_DIMENSIONS
-        and all(type(side) is int and 0 <= side < 2**20 for side in shape)
-        and isinstance(by_columns, bool)
-    ):
-        raise ValueError(f"the PCA's {name} has an odd description")
-    numbers = np.frombuffer(_encoded(name, data), _dtype(name, dtype))
+    """Return an array that numpy pickled as (version, shape, dtype, is Fortran order, bytes)."""
+    state = pickled.state if isinstance(pickled, _Array) else None
+    match state:
+        case (_, tuple(shape), dtype, bool(by_columns), bytes(data)) if len(
+            shape
+        ) <= _MAX_DIMENSIONS and all(type(side) is int and 0 <= side < 2**20 for side in shape):
+            numbers = np.frombuffer(data, _dtype(name, dtype))
+        case _:
+            raise ValueError(f"the PCA's {name} is no array, or has an odd description")
     if numbers.size != prod(shape):
         raise ValueError(f"the PCA's {name} holds {numbers.size} numbers, not {shape}")
     array = numbers.reshape(shape, order="F" if by_columns else "C").astype(np.float64)
@@ -151,29 +129,9 @@ def _array(name: str, pickled: object) -> NDArray[np.float64]:
 
 
 def _dtype(name: str, pickled: object) -> np.dtype[Any]:
-    """Return the type of numbers; the state of a pickled one is (version, byte order, ...)."""
-    arguments: tuple[Any, ...] = getattr(pickled, "arguments", ())
-    state: Any = getattr(pickled, "state", None)
-    code = arguments[0] if isinstance(pickled, _Dtype) and arguments else None
-    if not (
-        isinstance(code, str)
-        and code in _DTYPES
-        and isinstance(state, tuple)
-        and len(state) >= 2
-        and state[1] == "<"
-    ):
-        raise ValueError(f"the PCA's {name} is not of little-endian floats")
-    return _DTYPES[code]
-
-
-def _encoded(name: str, pickled: object) -> bytes:
-    arguments: tuple[Any, ...] = getattr(pickled, "arguments", ())
-    if not (
-        isinstance(pickled, _Bytes)
-        and len(arguments) == 2
-        and isinstance(arguments[0], str)
-        and arguments[1] == "latin1"
-    ):
-        raise ValueError(f"the PCA's {name} has no bytes")
-    encoded: bytes = arguments[0].encode("latin1")
-    return encoded
+    """Return the type of numbers that numpy pickled with the state (version, byte order, ...)."""
+    if isinstance(pickled, _Dtype):
+        match pickled.arguments, pickled.state:
+            case (("f4" | "f8") as code, *_), (_, "<", *_):
+                return _DTYPES[code]
+    raise ValueError(f"the PCA's {name} is not of little-endian floats")

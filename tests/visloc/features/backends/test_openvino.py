@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from visloc.features.backends.openvino import Graph, GraphBuilder, import_openvino
+from visloc.features.backends.torch import fixed_convolution
 
 _SIDES = (8, 256, 16)
 
@@ -20,8 +21,8 @@ def doubling() -> Graph:
     """Doubles images of one channel."""
     _, operations = import_openvino()
     x = operations.parameter([1, 1, -1, -1], np.float32, name="x")
-    kernel, bias = np.full((1, 1, 1, 1), 2, np.float32), np.zeros(1, np.float32)
-    return Graph([x], [GraphBuilder().convolution(x, "only", kernel, bias)], 1)
+    double = fixed_convolution(np.full((1, 1, 1, 1), 2), np.zeros(1))
+    return Graph([x], [GraphBuilder().convolution(x, "only", double)], 1)
 
 
 def _image(side: int, value: float) -> NDArray[np.float32]:

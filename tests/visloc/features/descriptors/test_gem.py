@@ -15,14 +15,15 @@ from PIL import Image
 from torch import Tensor
 
 from visloc.errors import WeightsError
+from visloc.features.backends.torch import shapes_of
 from visloc.features.descriptors.convvlad import load_convvlad
 from visloc.features.descriptors.gem import load_gem
 from visloc.features.descriptors.pooling import generalized_mean
 from visloc.features.networks.efficientnet import model as efficientnet_lite
+from visloc.features.networks.efficientnet.load import Network
 from visloc.features.networks.efficientnet.model import (
-    Network,
-    expected_shapes,
-    fold,
+    EfficientNetLite0,
+    blocks_of,
     network_input,
 )
 from visloc.features.networks.efficientnet.openvino import OpenVinoNetwork
@@ -44,7 +45,9 @@ def random_weights() -> Checkpoint:
     """Weights of the published names and shapes that keep activations of the order of one."""
     random = np.random.default_rng(0)
     tensors: dict[str, NDArray[np.float32]] = {}
-    for name, shape in expected_shapes().items():
+    with torch.device("meta"):
+        shapes = shapes_of(EfficientNetLite0())
+    for name, shape in shapes.items():
         values = random.normal(0, 1, shape)
         if len(shape) > 1:
             values *= np.sqrt(2 / np.prod(shape[1:]))
@@ -90,7 +93,7 @@ def reference(checkpoint: Checkpoint, pixels: NDArray[np.float32]) -> NDArray[np
 @pytest.mark.parametrize("way", ["torch", "openvino"])
 @pytest.mark.parametrize("size", [(32, 32), (96, 160)])
 def test_both_ways_compute_the_network_of_the_paper(way: str, size: tuple[int, int]) -> None:
-    blocks = fold(random_weights())
+    blocks = blocks_of(random_weights())
     network: Network = TorchNetwork(blocks) if way == "torch" else OpenVinoNetwork(blocks, 1)
     pixels = np.random.default_rng(1).uniform(-1, 1, (1, 3, *size)).astype(np.float32)
     seen = network.look(pixels)
@@ -108,7 +111,7 @@ def test_the_published_weights_know_a_uniform_when_they_see_one() -> None:
     # military uniform.
     with Image.open(get_sample_data("grace_hopper.jpg", asfileobj=False)) as photo:
         pixels = network_input(np.asarray(photo.resize((224, 256), Image.Resampling.BILINEAR)))
-    blocks = fold(checkpoint)
+    blocks = blocks_of(checkpoint)
     features = TorchNetwork(blocks).look(pixels)
     logits = checkpoint.tensors["_fc.weight"] @ features.mean(axis=(1, 2))
     logits = logits + checkpoint.tensors["_fc.bias"]
@@ -216,7 +219,7 @@ def test_vlad_of_cells_takes_the_layer_of_16_px(weights_dir: Path) -> None:
     np.testing.assert_allclose(np.linalg.norm(words, axis=1), 1, atol=1e-6)
     # What enters the block that halves the resolution for the last time, by torch.
     seen: list[Tensor] = []
-    network = TorchNetwork(fold(random_weights()))
+    network = TorchNetwork(blocks_of(random_weights()))
     network._network[12].register_forward_pre_hook(lambda _module, entered: seen.append(entered[0]))
     network.look(network_input(photo))
     cells = seen[0][0].reshape(112, -1).T.numpy()

@@ -15,22 +15,25 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from visloc.errors import WeightsError
-from visloc.features.networks.aliked.model import (
-    N16,
-    T16,
+from visloc.features.backends.torch import shapes_of
+from visloc.features.networks.aliked.extractor import (
     AlikedExtractor,
-    Architecture,
     Seen,
-    expected_shapes,
-    fold,
-    load_aliked,
-    load_aliked_t16,
     network_input,
     padding_of,
     peaks,
     refined,
 )
-from visloc.features.networks.aliked.torch import TorchNetwork, deformable_convolution
+from visloc.features.networks.aliked.load import load_aliked, load_aliked_t16
+from visloc.features.networks.aliked.model import (
+    N16,
+    T16,
+    AlikedNetwork,
+    Architecture,
+    deformable_convolution,
+    read_network,
+)
+from visloc.features.networks.aliked.torch import TorchNetwork
 from visloc.features.weights.checkpoint import read_checkpoint
 from visloc.types import Inference
 
@@ -42,7 +45,9 @@ def _random_state(architecture: Architecture) -> dict[str, Tensor]:
     """Return weights that keep the size of what passes through."""
     generator = torch.Generator().manual_seed(0)
     state = {}
-    for name, shape in expected_shapes(architecture).items():
+    with torch.device("meta"):
+        shapes = shapes_of(AlikedNetwork(architecture))
+    for name, shape in shapes.items():
         if not shape:
             state[name] = torch.tensor(1)
         elif len(shape) == 1:
@@ -172,9 +177,9 @@ def test_network_equals_the_plain_one_of_the_paper(
     name: str, size: tuple[int, int], tmp_path: Path
 ) -> None:
     architecture, state = ARCHITECTURES[name], _random_state(ARCHITECTURES[name])
-    path = _save(tmp_path, architecture, state) / architecture.file_name
+    network, _ = read_network(architecture, _save(tmp_path, architecture, state))
     rgb = _picture(*size)
-    seen = TorchNetwork(fold(read_checkpoint(path))).look(rgb)
+    seen = TorchNetwork(network).look(rgb)
     features, scores = _reference(state, rgb)
     assert scores.std() > 0.05
     np.testing.assert_allclose(seen.scores, scores.numpy(), atol=1e-4)

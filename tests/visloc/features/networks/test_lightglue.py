@@ -12,14 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 from visloc.errors import InvalidInput, WeightsError
-from visloc.features.networks.lightglue.model import (
-    LIGHTGLUE,
-    Design,
-    SeenKeypoints,
-    expected_shapes,
-    make_lightglue,
-    read_tensors,
-)
+from visloc.features.networks.lightglue.load import LIGHTGLUE, make_lightglue, read_tensors
+from visloc.features.networks.lightglue.model import Design, SeenKeypoints, expected_shapes
 from visloc.features.networks.lightglue.torch import LightGlue
 from visloc.features.weights.checkpoint import Checkpoint
 

@@ -15,23 +15,25 @@ from safetensors.numpy import save
 from torch import Tensor
 
 from visloc.errors import WeightsError
-from visloc.features.networks.r2d2.model import (
-    FAST_R2D2,
+from visloc.features.networks.r2d2.extractor import (
     PATCH_PX,
-    R2D2,
     R2D2Extractor,
     Seen,
     _log_odds_of_repeatability,
-    fold,
-    load_faster2d2,
-    load_r2d2,
-    pack_folded,
     pyramid,
     pyramid_sizes,
-    unpack_folded,
+)
+from visloc.features.networks.r2d2.load import load_faster2d2, load_r2d2
+from visloc.features.networks.r2d2.model import (
+    FAST_R2D2,
+    R2D2,
+    R2D2Network,
+    pack,
+    read_network,
+    unpack,
 )
 from visloc.features.networks.r2d2.openvino import OpenVinoNetwork, make_openvino_network
-from visloc.features.networks.r2d2.torch import R2D2Network, TorchNetwork
+from visloc.features.networks.r2d2.torch import TorchNetwork
 from visloc.features.weights import files as weights
 from visloc.features.weights.checkpoint import read_checkpoint
 from visloc.types import Extraction, Inference, LocalFeatures
@@ -96,6 +98,12 @@ def _save(folder: Path, name: str, state: dict[str, Tensor]) -> Path:
     return path
 
 
+def _network(folder: Path, name: str) -> R2D2Network:
+    """Read the network with random weights."""
+    _save(folder, name, _random_state(name))
+    return read_network(ARCHITECTURES[name], folder)[0]
+
+
 def _reference(name: str, state: dict[str, Tensor], image: Tensor) -> tuple[Tensor, ...]:
     """Evaluate the network layer by layer, nothing folded: x, clf and sal logits, descriptors."""
     x = image
@@ -124,8 +132,7 @@ def _reference(name: str, state: dict[str, Tensor], image: Tensor) -> tuple[Tens
 @BOTH
 def test_folded_strip_wise_network_equals_the_plain_one(name: str, tmp_path: Path) -> None:
     state = _random_state(name)
-    checkpoint = read_checkpoint(_save(tmp_path, name, state))
-    network = R2D2Network(fold(ARCHITECTURES[name], checkpoint)).eval()
+    network = _network(tmp_path, name)
     image = torch.randn((1, 3, 151, 90), generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
         _, clf, sal, descriptors = _reference(name, state, image)
@@ -318,9 +325,9 @@ def _cosines(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray
 def test_openvino_computes_what_torch_does(
     name: str, size: tuple[int, int], tmp_path: Path
 ) -> None:
-    folded = fold(ARCHITECTURES[name], read_checkpoint(_save(tmp_path, name, _random_state(name))))
+    network = _network(tmp_path, name)
     image = _picture(*size).astype(np.float32)
-    by_torch, by_openvino = TorchNetwork(folded), OpenVinoNetwork(folded, None, threads=1)
+    by_torch, by_openvino = TorchNetwork(network), OpenVinoNetwork(network, None, threads=1)
     with by_torch.look(image) as expected, by_openvino.look(image) as ours:
         assert ours.logits.shape == expected.logits.shape
         np.testing.assert_allclose(ours.logits, expected.logits, rtol=1e-3, atol=2e-3)
@@ -332,10 +339,10 @@ def test_openvino_computes_what_torch_does(
 @BOTH
 @pytest.mark.usefixtures("eight_bits")
 def test_8_bits_describe_nearly_the_same_and_twice_the_same(name: str, tmp_path: Path) -> None:
-    folded = fold(ARCHITECTURES[name], read_checkpoint(_save(tmp_path, name, _random_state(name))))
+    network = _network(tmp_path, name)
     image = _picture(120, 161).astype(np.float32)
     rounded, again = (
-        make_openvino_network(folded, f"random-{name}", in_8_bits=True, threads=threads)
+        make_openvino_network(network, f"random-{name}", in_8_bits=True, threads=threads)
         for threads in (1, 2)
     )
     assert "int8, calibration " in rounded.computed_with
@@ -348,7 +355,7 @@ def test_8_bits_describe_nearly_the_same_and_twice_the_same(name: str, tmp_path:
         with network.look(image) as seen:
             return seen.logits.copy(), seen.descriptors(x, y)
 
-    _, exact = logits_and_descriptors(OpenVinoNetwork(folded, None, threads=1))
+    _, exact = logits_and_descriptors(OpenVinoNetwork(network, None, threads=1))
     logits, descriptors = logits_and_descriptors(rounded)
     logits_again, descriptors_again = logits_and_descriptors(again)
     # Equal would mean that nothing is in 8 bits.
@@ -420,41 +427,42 @@ def test_less_effort_looks_at_some_of_the_scales(tmp_path: Path) -> None:
     assert min(scales[Extraction.ACCURATE]) == PATCH_PX
 
 
-def _save_own(folder: Path, name: str, state: dict[str, Tensor]) -> Path:
-    checkpoint = read_checkpoint(_save(folder, name, state))
-    checkpoint.path.unlink()
+def _save_own(folder: Path, name: str) -> Path:
+    network = _network(folder, name)
+    (folder / FILE_NAMES[name]).unlink()
     path = folder / f"{name}.safetensors"
-    path.write_bytes(save(pack_folded(fold(ARCHITECTURES[name], checkpoint))))
+    path.write_bytes(save(pack(network)))
     return path
 
 
 @BOTH
 def test_weights_of_our_own_are_the_network_in_16_bits(name: str, tmp_path: Path) -> None:
-    state = _random_state(name)
-    expected = fold(ARCHITECTURES[name], read_checkpoint(_save(tmp_path, name, state)))
-    own = read_checkpoint(_save_own(tmp_path, name, state))
-    unpacked = unpack_folded(ARCHITECTURES[name], own)
-    assert (unpacked.name, unpacked.stride) == (expected.name, expected.stride)
-    for ours, theirs in zip(unpacked.convolutions, expected.convolutions, strict=True):
-        np.testing.assert_allclose(ours.weight, theirs.weight, rtol=1e-3, atol=1e-6)
-        np.testing.assert_array_equal(ours.bias, theirs.bias)
-        for part in ("dilation", "padding", "relu", "pool"):
-            assert getattr(ours, part) == getattr(theirs, part)
-    np.testing.assert_allclose(unpacked.head_weight, expected.head_weight, rtol=1e-3, atol=1e-6)
+    expected = _network(tmp_path, name)
+    own = read_checkpoint(_save_own(tmp_path, name))
+    assert own.tensors[f"{name}.heads.weight"].shape == (2, 128)
+    unpacked = unpack(ARCHITECTURES[name], own)
+    assert unpacked.stride == expected.stride
+    assert [str(step) for step in unpacked.ops] == [str(step) for step in expected.ops]
+    for ours, theirs in zip(unpacked.convolutions(), expected.convolutions(), strict=True):
+        torch.testing.assert_close(ours.weight, theirs.weight, rtol=1e-3, atol=1e-6)
+        assert ours.bias is not None
+        assert theirs.bias is not None
+        assert torch.equal(ours.bias, theirs.bias)
+    torch.testing.assert_close(unpacked.heads.weight, expected.heads.weight, rtol=1e-3, atol=1e-6)
     extractor = LOADERS[name](tmp_path, Inference.FP32)
     assert extractor.fingerprint.weights_sha256 == own.sha256
 
 
 @BOTH
 def test_published_weights_come_before_our_own(name: str, tmp_path: Path) -> None:
-    _save_own(tmp_path, name, _random_state(name))
+    _save_own(tmp_path, name)
     published = _save(tmp_path, name, _random_state(name))
     extractor = LOADERS[name](tmp_path, Inference.FP32)
     assert extractor.fingerprint.weights_sha256 == read_checkpoint(published).sha256
 
 
 def test_our_own_weights_of_another_network_are_refused(tmp_path: Path) -> None:
-    path = _save_own(tmp_path, "faster2d2", _random_state("faster2d2"))
+    path = _save_own(tmp_path, "faster2d2")
     path.rename(tmp_path / "r2d2.safetensors")
     with pytest.raises(WeightsError, match="not the weights of R2D2"):
         load_r2d2(tmp_path)
@@ -475,7 +483,7 @@ def test_a_weights_folder_that_is_not_there_is_not_passed_over(tmp_path: Path) -
 def test_shipped_weights_that_were_changed_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _save_own(tmp_path, "faster2d2", _random_state("faster2d2"))
+    _save_own(tmp_path, "faster2d2")
     monkeypatch.setattr(weights, "_SHIPPED_FOLDER", tmp_path)
     with pytest.raises(WeightsError) as caught:
         load_faster2d2(None)

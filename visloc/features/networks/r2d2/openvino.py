@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.features.backends.calibration import calibrate
+from visloc.features.backends.calibration import measure, ranges_of
 from visloc.features.backends.openvino import (
     Graph,
     GraphBuilder,
@@ -18,58 +18,67 @@ from visloc.features.backends.openvino import (
     openvino_with,
 )
 from visloc.features.networks.interpolated import squared_heads, squared_heads_at_double_resolution
-from visloc.features.networks.r2d2.model import MEAN, STD, FoldedNetwork, Seen
+from visloc.features.networks.r2d2.extractor import Seen
+from visloc.features.networks.r2d2.model import MEAN, STD, R2D2Network
 
 
 def make_openvino_network(
-    folded: FoldedNetwork, weights_sha256: str, *, in_8_bits: bool, threads: int | None
+    network: R2D2Network, weights_sha256: str, *, in_8_bits: bool, threads: int | None
 ) -> OpenVinoNetwork:
-    """Compile the network; the first time in 8 bits this takes some seconds more, see calibrate."""
+    """Compile the network; see ``ranges_of`` for the first time in 8 bits."""
     if not in_8_bits:
-        return OpenVinoNetwork(folded, None, threads)
+        return OpenVinoNetwork(network, None, threads)
+    name, names = network.architecture.name, _names(network)[1:]
+    ranges = ranges_of(name, weights_sha256, names, lambda: measure_ranges(network, threads))
+    return OpenVinoNetwork(network, ranges, threads)
+
+
+def measure_ranges(network: R2D2Network, threads: int | None = None) -> Ranges:
+    """Measure the ranges that ``OpenVinoNetwork`` takes."""
     # The first convolution stays in floats: a hundredth of the work, and most of the error.
-    quantized = [each.name for each in folded.convolutions[1:]]
+    names = _names(network)[1:]
+    image, builder, _ = _trunk(network, None)
+    return measure(names, Graph([image], builder.extremes(names), threads), _input)
 
-    def measure() -> Graph:
-        image, builder, _ = _trunk(folded, None)
-        return Graph([image], builder.extremes(quantized), threads)
 
-    ranges = calibrate(f"{folded.name}-{weights_sha256}", quantized, measure, _input)
-    return OpenVinoNetwork(folded, ranges, threads)
+def _names(network: R2D2Network) -> list[str]:
+    return [f"convolutions.{number}" for number, _ in enumerate(network.convolutions())]
 
 
 class OpenVinoNetwork:
     """Computes the network with OpenVINO; in 8 bits if there are ranges."""
 
-    def __init__(self, folded: FoldedNetwork, ranges: Ranges | None, threads: int | None) -> None:
-        image, _, features = _trunk(folded, ranges)
+    def __init__(self, network: R2D2Network, ranges: Ranges | None, threads: int | None) -> None:
+        image, _, features = _trunk(network, ranges)
         self._graph = Graph([image], [features], threads)
-        self._folded = folded
+        self._stride = network.stride
+        weight, bias = network.heads.weight[:, :, 0, 0].numpy(), network.heads.bias
+        assert bias is not None
+        self._heads = np.ascontiguousarray(weight), bias.numpy()
         self.computed_with = openvino_with(ranges)
 
     @contextmanager
     def look(self, image: NDArray[np.float32]) -> Iterator[Seen]:
         """Look at RGB (H, W, 3) in 0 to 255."""
-        folded = self._folded
-        heads = squared_heads if folded.stride == 1 else squared_heads_at_double_resolution
+        heads = squared_heads if self._stride == 1 else squared_heads_at_double_resolution
         # 39 MB at 640 x 480: copying them takes 2 to 4 % of the time.
         with self._graph.computed(_input(image)) as (batch,):
             features = batch[0]
 
             def descriptors(x: NDArray[np.intp], y: NDArray[np.intp]) -> NDArray[np.float32]:
-                sampled = _sampled(features, x, y, folded.stride)
+                sampled = _sampled(features, x, y, self._stride)
                 norms = np.maximum(np.linalg.norm(sampled, axis=1, keepdims=True), 1e-12)
                 unit: NDArray[np.float32] = sampled / norms
                 return unit
 
-            yield Seen(heads(features, folded.head_weight, folded.head_bias), descriptors)
+            yield Seen(heads(features, *self._heads), descriptors)
 
 
 def _input(image: NDArray[Any]) -> NDArray[np.float32]:
     return np.ascontiguousarray(image[None], np.float32)
 
 
-def _trunk(folded: FoldedNetwork, ranges: Ranges | None) -> tuple[Any, GraphBuilder, Any]:
+def _trunk(network: R2D2Network, ranges: Ranges | None) -> tuple[Any, GraphBuilder, Any]:
     """Return the input (1, H, W, 3) in 0 to 255, the builder, and x (1, 128, h, w)."""
     _, operations = import_openvino()
     builder = GraphBuilder(ranges)
@@ -78,19 +87,12 @@ def _trunk(folded: FoldedNetwork, ranges: Ranges | None) -> tuple[Any, GraphBuil
     mean, deviation = (np.array(values)[None, :, None, None] for values in (MEAN, STD))
     x = operations.subtract(x, builder.constant(mean))
     x = operations.multiply(x, builder.constant(1 / deviation))
-    for number, each in enumerate(folded.convolutions):
-        x = builder.convolution(
-            x,
-            each.name,
-            each.weight,
-            each.bias,
-            dilation=each.dilation,
-            padding=each.padding,
-            relu=each.relu,
-        )
-        if each.pool:
-            following = folded.convolutions[number + 1].name
-            x = builder.max_pool(builder.quantized(x, following))
+    architecture, names = network.architecture, _names(network)
+    for number, convolution in enumerate(network.convolutions()):
+        relu = architecture.layers[number].relu
+        x = builder.convolution(x, names[number], convolution, relu=relu)
+        if number + 1 == architecture.pool_after:
+            x = builder.max_pool(builder.quantized(x, names[number + 1]))
     return image, builder, x
 
 

@@ -6,87 +6,19 @@ import contextlib
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
-from torch import Tensor, nn
 
-from visloc.features.backends.torch import computed_with, fixed_convolution, torch_device
-from visloc.features.networks.r2d2.model import MEAN, STD, FoldedNetwork, Seen
-
-_STRIP_ROWS = 32  # rows of x that the heads see at a time: bounds their memory
-
-
-class R2D2Network(nn.Module):
-    """The network at inference, batch norms folded into the convolutions."""
-
-    def __init__(self, folded: FoldedNetwork) -> None:
-        super().__init__()
-        steps: list[nn.Module] = []
-        for each in folded.convolutions:
-            steps.append(
-                fixed_convolution(
-                    each.weight, each.bias, dilation=each.dilation, padding=each.padding
-                )
-            )
-            if each.relu:
-                steps.append(nn.ReLU(inplace=True))
-            if each.pool:
-                steps.append(nn.MaxPool2d(2))
-        self.stride = folded.stride
-        self.trunk = nn.Sequential(*steps)
-        self.heads = fixed_convolution(folded.head_weight[:, :, None, None], folded.head_bias)
-
-    def forward(self, image: Tensor) -> Tensor:
-        """Return x, (1, 128, H // stride, W // stride), for a normalized image (1, 3, H, W)."""
-        features: Tensor = self.trunk(image)
-        return features
-
-    def logits(self, features: Tensor) -> Tensor:
-        """Return (2, H, W) logits of reliability and repeatability, at full resolution."""
-        rows = features.shape[2]
-        strips = []
-        for top in range(0, rows, _STRIP_ROWS):
-            bottom = min(top + _STRIP_ROWS, rows)
-            if self.stride == 1:
-                strip = features[:, :, top:bottom]
-            else:  # one row more on either side makes the strips' seams exact
-                first = max(top - 1, 0)
-                strip = F.interpolate(
-                    features[:, :, first : bottom + 1],
-                    scale_factor=self.stride,
-                    mode="bilinear",
-                    align_corners=False,
-                )
-                strip = strip[:, :, self.stride * (top - first) : self.stride * (bottom - first)]
-            strips.append(self.heads(strip.square()))
-        return torch.cat(strips, dim=2)[0]
-
-    def descriptors(self, features: Tensor, x: Tensor, y: Tensor) -> Tensor:
-        """Return unit rows (N, 128) for pixels (x, y) of the full-resolution maps."""
-        grid = features[0].permute(1, 2, 0)
-        if self.stride == 1:
-            return F.normalize(grid[y, x], dim=1)
-        left, right, x_weight = _neighbours(x, self.stride, grid.shape[1])
-        above, below, y_weight = _neighbours(y, self.stride, grid.shape[0])
-        upper = torch.lerp(grid[above, left], grid[above, right], x_weight)
-        lower = torch.lerp(grid[below, left], grid[below, right], x_weight)
-        return F.normalize(torch.lerp(upper, lower, y_weight), dim=1)
-
-
-def _neighbours(index: Tensor, stride: int, size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return both neighbours at low resolution and the second one's weight, (N,), (N,), (N, 1)."""
-    position = ((index + 0.5) / stride - 0.5).clamp(0, size - 1)
-    lower = position.floor()
-    upper = (lower + 1).clamp(max=size - 1)
-    return lower.long(), upper.long(), (position - lower)[:, None]
+from visloc.features.backends.torch import computed_with, torch_device
+from visloc.features.networks.r2d2.extractor import Seen
+from visloc.features.networks.r2d2.model import MEAN, STD, R2D2Network
 
 
 class TorchNetwork:
     """Computes the network with torch, on a CUDA GPU where there is one."""
 
-    def __init__(self, folded: FoldedNetwork) -> None:
+    def __init__(self, network: R2D2Network) -> None:
         self._device = torch_device()
-        self.network = R2D2Network(folded).eval().to(self._device)
+        self.network = network.to(self._device)
         self._mean = torch.tensor(MEAN, device=self._device)[:, None, None]
         self._std = torch.tensor(STD, device=self._device)[:, None, None]
         self.computed_with = computed_with(self._device)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import nn
 
-from visloc.features.backends.calibration import calibrate
+from visloc.features.backends.calibration import measure, ranges_of
 from visloc.features.backends.openvino import (
     Graph,
     GraphBuilder,
@@ -16,41 +17,53 @@ from visloc.features.backends.openvino import (
     import_openvino,
     openvino_with,
 )
-from visloc.features.networks.xfeat.model import CELL_PX, Layer, Seen, network_input
+from visloc.features.networks.xfeat.extractor import Seen, network_input
+from visloc.features.networks.xfeat.model import CELL_PX, XFeatNetwork
 
 _VARIANCE_EPSILON = 1e-5
 
 
 # In 8 bits the first block and the keypoint head, which see the image itself, would move every
 # fifth keypoint.
-_IN_8_BITS = ("block2", "block3", "block4", "block5", "block_fusion", "heatmap_head")
-
-Blocks = Mapping[str, tuple[Layer, ...]]
+_QUANTIZED_BLOCKS = ("block2", "block3", "block4", "block5", "block_fusion", "heatmap_head")
 
 
 def make_openvino_network(
-    blocks: Blocks, weights_sha256: str, *, in_8_bits: bool, threads: int | None
+    network: XFeatNetwork, weights_sha256: str, *, in_8_bits: bool, threads: int | None
 ) -> OpenVinoNetwork:
-    """Compile the network; the first time in 8 bits this takes some seconds more, see calibrate."""
+    """Compile the network; see ``ranges_of`` for the first time in 8 bits."""
     if not in_8_bits:
-        return OpenVinoNetwork(blocks, None, threads)
-    quantized = [layer.name for block in _IN_8_BITS for layer in blocks[block]]
-
-    def measure() -> Graph:
-        grey, builder, _ = _network(blocks, None)
-        return Graph([grey], builder.extremes(quantized), threads)
-
-    ranges = calibrate(
-        f"xfeat-{weights_sha256}", quantized, measure, lambda rgb: _input(network_input(rgb))
+        return OpenVinoNetwork(network, None, threads)
+    ranges = ranges_of(
+        "xfeat", weights_sha256, _quantized(network), lambda: measure_ranges(network, threads)
     )
-    return OpenVinoNetwork(blocks, ranges, threads)
+    return OpenVinoNetwork(network, ranges, threads)
+
+
+def measure_ranges(network: XFeatNetwork, threads: int | None = None) -> Ranges:
+    """Measure the ranges that ``OpenVinoNetwork`` takes."""
+    names = _quantized(network)
+    grey, builder, _ = _network(network, None)
+    graph = Graph([grey], builder.extremes(names), threads)
+    return measure(names, graph, lambda rgb: _input(network_input(rgb)))
+
+
+def _quantized(network: XFeatNetwork) -> list[str]:
+    return [name for block in _QUANTIZED_BLOCKS for name, _, _ in _convolutions(network, block)]
+
+
+def _convolutions(network: XFeatNetwork, block: str) -> Iterator[tuple[str, nn.Conv2d, bool]]:
+    """Yield name and convolution of each layer of a block, and whether a ReLU follows."""
+    for name, module in network.get_submodule(block).named_modules(prefix=block):
+        if isinstance(module, nn.Conv2d):
+            yield name.replace(".layer.0", ".layer"), module, ".layer." in name
 
 
 class OpenVinoNetwork:
     """Computes the network with OpenVINO; in 8 bits if there are ranges."""
 
-    def __init__(self, blocks: Blocks, ranges: Ranges | None, threads: int | None) -> None:
-        grey, _, outputs = _network(blocks, ranges)
+    def __init__(self, network: XFeatNetwork, ranges: Ranges | None, threads: int | None) -> None:
+        grey, _, outputs = _network(network, ranges)
         self._graph = Graph([grey], outputs, threads)
         self.computed_with = openvino_with(ranges)
 
@@ -64,22 +77,14 @@ def _input(grey: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.ascontiguousarray(grey)[None, None]
 
 
-def _network(blocks: Blocks, ranges: Ranges | None) -> tuple[Any, GraphBuilder, list[Any]]:
+def _network(network: XFeatNetwork, ranges: Ranges | None) -> tuple[Any, GraphBuilder, list[Any]]:
     """Return the input (1, 1, H, W), the builder, and what ``Seen`` holds."""
     _, operations = import_openvino()
     builder = GraphBuilder(ranges)
 
     def block(name: str, x: Any) -> Any:
-        for layer in blocks[name]:
-            x = builder.convolution(
-                x,
-                layer.name,
-                layer.weight,
-                layer.bias,
-                stride=layer.stride,
-                padding=layer.weight.shape[2] // 2,
-                relu=layer.relu,
-            )
+        for convolution_name, convolution, relu in _convolutions(network, name):
+            x = builder.convolution(x, convolution_name, convolution, relu=relu)
         return x
 
     def enlarged(x: Any, times: float) -> Any:

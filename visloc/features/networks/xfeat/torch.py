@@ -3,67 +3,23 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
-from torch import Tensor, nn
 
-from visloc.features.backends.torch import computed_with, fixed_convolution, torch_device
-from visloc.features.networks.xfeat.model import CELL_PX, Layer, Seen
-
-
-class XFeatNetwork(nn.Module):
-    """The network at inference, batch norms folded into the convolutions."""
-
-    def __init__(self, blocks: Mapping[str, tuple[Layer, ...]]) -> None:
-        super().__init__()
-        for block, layers in blocks.items():
-            steps: list[nn.Module] = [nn.AvgPool2d(4)] if block == "skip1" else []
-            for layer in layers:
-                padding = layer.weight.shape[2] // 2
-                steps.append(
-                    fixed_convolution(
-                        layer.weight, layer.bias, stride=layer.stride, padding=padding
-                    )
-                )
-                if layer.relu:
-                    steps.append(nn.ReLU(inplace=True))
-            self.add_module(block, nn.Sequential(*steps))
-
-    def forward(self, grey: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Look at a grey image (1, 1, H, W) in 0..1 whose sides are multiples of 32.
-
-        Returns, for cells of 8 x 8 pixels: features (1, 64, H/8, W/8), keypoint logits
-        (1, 65, H/8, W/8) and reliability (1, 1, H/8, W/8) in 0..1.
-        """
-        image = F.instance_norm(grey)
-        quarter = self.get_submodule("block2")(
-            self.get_submodule("block1")(image) + self.get_submodule("skip1")(image)
-        )
-        eighth = self.get_submodule("block3")(quarter)
-        sixteenth = self.get_submodule("block4")(eighth)
-        thirty_second = self.get_submodule("block5")(sixteenth)
-        size = eighth.shape[2:]
-        fused = eighth + _resized(sixteenth, size) + _resized(thirty_second, size)
-        features = self.get_submodule("block_fusion")(fused)
-        reliability = torch.sigmoid(self.get_submodule("heatmap_head")(features))
-        cells = F.pixel_unshuffle(image, CELL_PX)
-        return features, self.get_submodule("keypoint_head")(cells), reliability
-
-
-def _resized(image: Tensor, size: tuple[int, ...]) -> Tensor:
-    return F.interpolate(image, size, mode="bilinear", align_corners=False)
+from visloc.features.backends.torch import computed_with, torch_device
+from visloc.features.networks.xfeat.extractor import Seen
+from visloc.features.networks.xfeat.model import CELL_PX, XFeatNetwork
 
 
 class TorchNetwork:
     """Computes the network with torch, on a CUDA GPU where there is one."""
 
-    def __init__(self, blocks: Mapping[str, tuple[Layer, ...]]) -> None:
+    def __init__(self, network: XFeatNetwork) -> None:
         self._device = torch_device()
-        self.network = XFeatNetwork(blocks).eval().to(self._device)
+        self.network = network.to(self._device)
         self.computed_with = computed_with(self._device)
 
     @torch.inference_mode()

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.synthetic import papers, surfaces
-from visloc.synthetic.lighting import light
-from visloc.synthetic.textures import Image, Paint
+from samples import papers, surfaces
+from samples.lighting import light
+from samples.textures import Image, Paint
 
 ROOM_SIZE_M = (6.0, 4.5, 2.8)
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.synthetic.textures import Image, stretch
+from samples.textures import Image, stretch
 
 Vector = NDArray[np.float64]
 

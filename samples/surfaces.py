@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.synthetic.papers import (
+from samples.papers import (
     BRIGHT_COLOURS,
     PAPER_COLOURS,
     code_card,
@@ -22,7 +22,7 @@ from visloc.synthetic.papers import (
     text_page,
     town_map,
 )
-from visloc.synthetic.textures import (
+from samples.textures import (
     Colour,
     Image,
     canvas,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from visloc.synthetic.textures import (
+from samples.textures import (
     Colour,
     Image,
     Paint,

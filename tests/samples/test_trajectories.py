@@ -5,10 +5,10 @@ import itertools
 import numpy as np
 import pytest
 
+from samples.render import render_depth
+from samples.scene import Scene
+from samples.trajectories import mapping_trajectory, query_trajectory, stereo_rig
 from visloc.geometry import Camera, Pose, rotation_angle
-from visloc.synthetic.render import render_depth
-from visloc.synthetic.scene import Scene
-from visloc.synthetic.trajectories import mapping_trajectory, query_trajectory, stereo_rig
 
 
 def apart(first: Pose, second: Pose) -> tuple[float, float]:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from visloc.synthetic.scene import Scene, make_room
+from samples.scene import Scene, make_room
 
 
 @pytest.fixture(scope="session")

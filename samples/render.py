@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from samples.scene import Rectangle, Scene
+from samples.textures import Image
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
-from visloc.synthetic.scene import Rectangle, Scene
-from visloc.synthetic.textures import Image
 
 _NEAR_M = 0.01
 # Rays per pixel side for photos; 2 x 2 rays on prefiltered pictures leave no visible stairs.

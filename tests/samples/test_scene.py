@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from samples import surfaces
+from samples.render import render_depth, render_photo
+from samples.scene import ROOM_SIZE_M, Scene, make_room
+from samples.trajectories import mapping_trajectory, query_trajectory, stereo_rig
 from visloc.geometry import Camera, Pose
-from visloc.synthetic import surfaces
-from visloc.synthetic.render import render_depth, render_photo
-from visloc.synthetic.scene import ROOM_SIZE_M, Scene, make_room
-from visloc.synthetic.trajectories import mapping_trajectory, query_trajectory, stereo_rig
 
 
 def sift(photo: NDArray[np.uint8]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:

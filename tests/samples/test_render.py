@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from samples.render import render_depth, render_photo
+from samples.scene import Rectangle, Scene, picture_levels
+from samples.trajectories import mapping_trajectory
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
-from visloc.synthetic.render import render_depth, render_photo
-from visloc.synthetic.scene import Rectangle, Scene, picture_levels
-from visloc.synthetic.trajectories import mapping_trajectory
 
 CAMERA = Camera("PINHOLE", 160, 120, (113.0, 116.0, 82.3, 57.9))
 # About x, y and z at once, so that no axis can be mixed up unnoticed.
