@@ -26,12 +26,12 @@ _ARRAYS: dict[str, tuple[str, int | None]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImportedPoints:
-    """Points and who sees them, in the photos of a map.
+    """Points and their observations in the photos of a map.
 
     Attributes:
         points: (P, 3) float64 in the world.
-        colors: (P, 3) uint8; None without.
-        keypoint_offsets: (n + 1,) int64; rows of ``keypoints`` by photo of the map.
+        colors: (P, 3) uint8, or None.
+        keypoint_offsets: (n + 1,) int64 rows of ``keypoints``, by photo of the map.
         keypoints: (K, 2) float32 pixels.
         observations: (M, 3) int64 rows: point, photo, keypoint of that photo.
     """
@@ -57,9 +57,7 @@ class ImportedPoints:
 
 
 def read_imported_points(opened: Map) -> ImportedPoints | None:
-    """Read what a map keeps of the reconstruction that it was imported from, if it was.
-
-    Everything is checked: whoever verifies a map calls this for its errors.
+    """Read and check the imported points of a map; None if it has none.
 
     Raises:
         MapCorrupt: ``map.imported_points``.
