@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -36,36 +35,6 @@ _REVISION = 2
 _TURN = "turn"
 
 
-class LocalFeaturesSource(Protocol):
-    """Source of the local features of mapping photos. It is sent to workers."""
-
-    @property
-    def fingerprint(self) -> Fingerprint: ...
-
-    @property
-    def descriptor_dim(self) -> int: ...
-
-    @property
-    def computed_with(self) -> str | None:
-        """The library and device that compute them; None if they were computed elsewhere."""
-
-    @property
-    def max_keypoints(self) -> int:
-        """Most keypoints that a photo has."""
-
-    def key(self, photo: MappingPhoto) -> str:
-        """Identify a photo's features in the keys of what depends on them."""
-
-    def prepare(self, photo: MappingPhoto) -> None:
-        """Extract or check a photo's features, so that reading them is quick."""
-
-    def read(self, photo: MappingPhoto) -> LocalFeatures:
-        """Return the features of a photo; extract them if necessary."""
-
-    def turn(self, photo: MappingPhoto) -> int:
-        """EXIF orientation by which the photo was turned before extraction."""
-
-
 @dataclass(frozen=True, slots=True)
 class ExtractedFeatures:
     """Local features extracted from the photos, and kept in the work folder.
@@ -87,7 +56,6 @@ class ExtractedFeatures:
     computed_with: str
 
     def key(self, photo: MappingPhoto) -> str:
-        """Name of a photo's features in the work folder."""
         return key_of(
             "local_features",
             _REVISION,
@@ -112,6 +80,7 @@ class ExtractedFeatures:
         return LocalFeatures(**{name: item[name] for name in item if name != _TURN})
 
     def turn(self, photo: MappingPhoto) -> int:
+        """EXIF orientation by which the photo was turned before extraction."""
         return int(self._get(photo)[_TURN])
 
     def _get(self, photo: MappingPhoto) -> Item:
@@ -148,7 +117,7 @@ class ReadyMadeFeatures:
 
     @property
     def computed_with(self) -> None:
-        """Unknown."""
+        """Unknown, unlike for extracted features."""
 
     @property
     def max_keypoints(self) -> int:
@@ -194,6 +163,14 @@ class ReadyMadeFeatures:
     def turn(self, _photo: MappingPhoto) -> int:
         """Unknown; the photo is assumed to be as stored."""
         return 1
+
+
+LocalFeaturesSource = ExtractedFeatures | ReadyMadeFeatures
+"""Source of the local features of mapping photos; it is sent to workers.
+
+``key`` identifies a photo's features in the keys of results that depend on them. ``prepare`` makes
+reading them quick.
+"""
 
 
 def local_features_source(

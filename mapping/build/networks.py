@@ -24,7 +24,7 @@ class Networks:
     inference: Inference
 
     def extractor(self, name: str) -> LocalFeatureExtractor:
-        """Return the extractor of this process.
+        """Return this process's extractor.
 
         Raises:
             WeightsError, InvalidInput: what ``make_local_features`` raises.
@@ -32,24 +32,19 @@ class Networks:
         return open_extractor(name, self)
 
     def descriptor(self, name: str) -> GlobalDescriptor:
-        """Return the global descriptor of this process.
-
-        Raises:
-            WeightsError, InvalidInput: what ``make_global_descriptor`` raises.
-        """
+        """Return this process's global descriptor; raises what ``extractor`` raises."""
         return open_descriptor(name, self)
 
 
-# All executors use one thread per item.
 @cache
 def open_extractor(name: str, networks: Networks) -> LocalFeatureExtractor:
-    """Make an extractor, or return the one that this process has."""
+    """Make an extractor once per process, for one thread, as executors need it."""
     return make_local_features(name, networks.weights_dir, networks.inference, threads=1)
 
 
 @cache
 def open_descriptor(name: str, networks: Networks) -> GlobalDescriptor:
-    """Make a global descriptor, or return the one that this process has."""
+    """Make a global descriptor once per process, for one thread."""
     return make_global_descriptor(name, networks.weights_dir, networks.inference, threads=1)
 
 

@@ -111,23 +111,12 @@ def collect_photos(
     Raises:
         DatasetError: ``dataset.no_photos`` when none is left.
     """
-
-    def why_unusable(record: FileRecord) -> str | None:
-        if with_files and not dataset.has_file(record):
-            return "are listed, but the file is absent"
-        if has_features is not None and not has_features(record.path):
-            return "have no ready-made features"
-        if posed and dataset.sensors[record.sensor_id].camera is None:
-            return "have a camera of unknown model"
-        if posed and dataset.pose(record) is None:
-            return "have no pose"
-        return None
-
+    wanted = _Wanted(dataset, posed, with_files, has_features)
     photos: list[MappingPhoto] = []
     left_out: dict[str, list[str]] = {}
     matcher = DepthMatcher(dataset, depth_sensor) if with_depth else None
     for done, record in enumerate(dataset.images, 1):
-        why = why_unusable(record)
+        why = wanted.why_not(record)
         if why is None:
             depth = matcher.match(record) if matcher else None
             if matcher and depth is None:
@@ -141,18 +130,41 @@ def collect_photos(
         for why, names in left_out.items()
     ]
     if not photos:
-        needed = [
-            *(["a file"] if with_files else []),
-            *(["ready-made features"] if has_features is not None else []),
-            *(["a camera of a known model", "a pose"] if posed else []),
-        ]
         raise DatasetError(
             "dataset.no_photos",
             "no photo of the dataset can be used" + "".join(f"; {note}" for note in notes),
             field=str(dataset.root / "sensors" / "records_camera.txt"),
-            expected=f"photos with {', '.join(needed)}",
+            expected=f"photos with {', '.join(wanted.parts())}",
         )
     return photos, notes
+
+
+@dataclass(frozen=True, slots=True)
+class _Wanted:
+    """The parts that a photo must have, as for ``collect_photos``."""
+
+    dataset: Dataset
+    posed: bool
+    with_files: bool
+    has_features: Callable[[str], bool] | None
+
+    def why_not(self, record: FileRecord) -> str | None:
+        if self.with_files and not self.dataset.has_file(record):
+            return "are listed, but the file is absent"
+        if self.has_features is not None and not self.has_features(record.path):
+            return "have no ready-made features"
+        if self.posed and self.dataset.sensors[record.sensor_id].camera is None:
+            return "have a camera of unknown model"
+        if self.posed and self.dataset.pose(record) is None:
+            return "have no pose"
+        return None
+
+    def parts(self) -> list[str]:
+        return [
+            *(["a file"] if self.with_files else []),
+            *(["ready-made features"] if self.has_features is not None else []),
+            *(["a camera of a known model", "a pose"] if self.posed else []),
+        ]
 
 
 def some(names: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""Depth maps: finding the one of a photo, reading it, seeing it from the photo, looking it up.
+"""Depth maps: find a photo's depth map, read it, register it to the photo, look depth up.
 
 A depth map here is (H, W) float32: metres along the optical axis of its camera, NaN where unknown.
 """
@@ -6,8 +6,6 @@ A depth map here is (H, W) float32: metres along the optical axis of its camera,
 from __future__ import annotations
 
 import math
-import struct
-import zlib
 from dataclasses import dataclass
 from functools import lru_cache
 from io import BytesIO
@@ -28,8 +26,6 @@ MAX_DEPTH_PIXELS = 16_000_000
 # Published float maps still hold the recorder's code for "none", 65535 mm, as a distance.
 _NO_DEPTH_FROM_M = 65.5
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_PNG_HEADER_BYTES = 33
-_PNG_GREY = 0
 
 # Poses are written with few digits; this much moves a pixel by less than a tenth.
 _SAME_ROTATION_RAD = 1e-4
@@ -54,9 +50,8 @@ class DepthMatch:
     """The depth map of a photo.
 
     Attributes:
-        record: its record.
-        camera: the camera it was seen by.
-        cam_from_depth: from that camera's frame to that of the photo's camera.
+        camera: of the depth map.
+        cam_from_depth: from its frame to the frame of the photo's camera.
     """
 
     record: FileRecord
@@ -69,7 +64,7 @@ class DepthMatcher:
 
     Args:
         dataset: the photos and depth maps.
-        depth_sensor: id of the only depth sensor to use; None to find it by rig, pose and size.
+        depth_sensor: id of the only depth sensor to use; None to choose by rig, pose and size.
 
     Raises:
         DatasetError: ``depth.sensor`` if the sensor named is no depth sensor with intrinsics.
@@ -101,12 +96,12 @@ class DepthMatcher:
     def match(self, image: FileRecord) -> DepthMatch | None:
         """Return the depth map of a photo, None if there is none of its timestamp.
 
-        Of several, the one that was registered to the photo wins (same pose, same aspect), then
-        the only one of the photo's rig, then the only one with a pose of its own.
+        Of several, the one registered to the photo wins (same pose, same aspect), then the only
+        one of the photo's rig, then the only one with a pose of its own.
 
         Raises:
-            DatasetError: ``depth.ambiguous`` if that leaves several, ``depth.pose`` if nothing
-                tells where the named sensor is relative to the photo's camera.
+            DatasetError: ``depth.ambiguous`` if that leaves several, ``depth.pose`` if the pose of
+                the named sensor relative to the photo's camera is unknown.
         """
         of_rig: list[DepthMatch] = []
         of_world: list[DepthMatch] = []
@@ -162,7 +157,7 @@ class DepthMatcher:
 def photo_depth(
     dataset: Dataset, match: DepthMatch, camera: Camera, depth_scale: float
 ) -> tuple[NDArray[np.float32], Camera]:
-    """Read the depth map of a photo and register it to the photo's camera unless it is already.
+    """Read the depth map of a photo, and register it to the photo's camera if necessary.
 
     Returns:
         The depth map and the camera that sees it: the photo's, maybe of another size.
@@ -179,7 +174,7 @@ def photo_depth(
 def read_depth(path: Path, camera: Camera, depth_scale: float) -> NDArray[np.float32]:
     """Read a depth map: raw little-endian float32 metres, or a 16-bit grey PNG.
 
-    The content tells which, not the name. Invalid are 0, negative and not finite values, in a raw
+    The content decides, not the name. Invalid values are 0, negative and non-finite ones; in a raw
     map also 65.5 m and more, in a PNG 65535.
 
     Args:
@@ -209,11 +204,8 @@ def read_depth(path: Path, camera: Camera, depth_scale: float) -> NDArray[np.flo
             got=f"{camera.width} x {camera.height}",
         )
     try:
-        with path.open("rb") as file:
-            header = file.read(_PNG_HEADER_BYTES)
-        if header.startswith(_PNG_SIGNATURE):
-            _check_png_header(path, header, camera)
-            units = _decode_png(path)
+        if _is_png(path):
+            units = _read_png(path, camera)
             depth = units.astype(np.float32) * np.float32(depth_scale)
             invalid = (units == 0) | (units == 65535)
         else:
@@ -243,50 +235,47 @@ def _read_raw(path: Path, camera: Camera) -> NDArray[np.float32]:
     return values.reshape(camera.height, camera.width)
 
 
-def _check_png_header(path: Path, header: bytes, camera: Camera) -> None:
-    if len(header) < _PNG_HEADER_BYTES or header[12:16] != b"IHDR":
-        raise _damaged(path, "no header")
-    width, height, bit_depth, color_type = struct.unpack_from(">IIBB", header, 16)
-    if (bit_depth, color_type) != (16, _PNG_GREY):
+def _is_png(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(_PNG_SIGNATURE)) == _PNG_SIGNATURE
+
+
+def _read_png(path: Path, camera: Camera) -> NDArray[np.uint16]:
+    content = BytesIO(path.read_bytes())
+    try:
+        with Image.open(content, formats=("PNG",)) as image:
+            _check_png(path, image, camera)
+            # Decoding leaves the checksums of pixels unchecked; a flipped bit would move the map.
+            image.verify()
+        with Image.open(content, formats=("PNG",)) as image:
+            return np.array(image).astype(np.uint16, copy=False)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise DatasetError(
+            "depth.damaged",
+            "the PNG is damaged",
+            field=str(path),
+            expected="a whole PNG",
+            got=str(error),
+        ) from error
+
+
+def _check_png(path: Path, image: Image.Image, camera: Camera) -> None:
+    if image.mode != "I;16":
         raise DatasetError(
             "depth.format",
             "the PNG is not a depth map",
             field=str(path),
             expected="16 bits per pixel, grey",
-            got=f"{bit_depth} bits per channel, PNG colour type {color_type}",
+            got=f"Pillow's mode {image.mode}",
         )
-    if (width, height) != (camera.width, camera.height):
+    if image.size != (camera.width, camera.height):
         raise DatasetError(
             "depth.size",
             "the depth map has the wrong size",
             field=str(path),
             expected=f"{camera.width} x {camera.height} as its sensor",
-            got=f"{width} x {height}",
+            got=f"{image.width} x {image.height}",
         )
-
-
-def _decode_png(path: Path) -> NDArray[np.uint16]:
-    content = path.read_bytes()
-    # Pillow leaves checksums of pixels unchecked, and a flipped bit would move the map.
-    position = len(_PNG_SIGNATURE)
-    while position < len(content):
-        length = int.from_bytes(content[position : position + 4], "big")
-        end = position + 8 + length
-        checksum = zlib.crc32(content[position + 4 : end]).to_bytes(4, "big")
-        if content[end : end + 4] != checksum:
-            raise _damaged(path, "wrong checksum, or cut short")
-        position = end + 4
-    try:
-        with Image.open(BytesIO(content), formats=("PNG",)) as image:
-            return np.array(image).astype(np.uint16, copy=False)
-    except (OSError, SyntaxError, ValueError, EOFError) as error:  # what Pillow raises
-        raise _damaged(path, str(error)) from error
-
-
-def _damaged(path: Path, got: str) -> DatasetError:
-    return DatasetError(
-        "depth.damaged", "the PNG is damaged", field=str(path), expected="a whole PNG", got=got
-    )
 
 
 def register_depth(
@@ -294,10 +283,9 @@ def register_depth(
 ) -> tuple[NDArray[np.float32], Camera]:
     """Show a depth map as the photo's camera sees it; the nearest surface wins.
 
-    Every pixel of the map becomes a point, which goes into the pixel where it is seen, so that
-    depth on a slanted surface may be that of half a pixel beside. Where the photo is finer than
-    the map, the result is smaller than the photo, so that no holes open through which hidden
-    surfaces would show.
+    Every pixel of the map becomes a point, which goes into the pixel that sees it; depth on a
+    slanted surface may thus be off by half a pixel. If the photo is finer than the map, the result
+    is smaller than the photo, or hidden surfaces would show through holes.
 
     Args:
         depth: (H, W) float32 as seen by ``depth_camera``.
@@ -339,8 +327,8 @@ def depth_at(depth: NDArray[np.float32], pixels: NDArray[np.floating]) -> NDArra
         pixels: (N, 2), x and y in pixels of the depth map; the first centre is at (0.5, 0.5).
 
     Returns:
-        (N,) float32; NaN where one of the four is missing or outside, or where they differ by
-        more than 3 %: a silhouette, where a point between the surfaces would be on neither.
+        (N,) float32. NaN if one of the four is missing or outside, or if they differ by more than
+        3 %: at a silhouette, a point between the two surfaces would lie on neither.
     """
     height, width = depth.shape
     result = np.full(len(pixels), np.nan, dtype=np.float32)
@@ -397,7 +385,7 @@ def _is_resized(depth_camera: Camera, camera: Camera) -> bool:
 
 @lru_cache(maxsize=4)
 def _pixel_rays(camera: Camera) -> NDArray[np.float64]:
-    """Return where each pixel looks, (H * W, 3) at depth 1; one camera serves many photos."""
+    """Return the rays (H * W, 3) of all pixels at depth 1; one camera serves many photos."""
     rows, columns = np.indices((camera.height, camera.width))
     centres = np.column_stack([columns.ravel(), rows.ravel()]) + 0.5
     rays = normalized_rays(camera, centres)

@@ -45,15 +45,9 @@ class ImportedPoints:
     def write(self, folder: Path) -> None:
         """Write them into the folder of a map."""
         colors = np.empty((0, 3), np.uint8) if self.colors is None else self.colors
-        arrays = {
-            "points": self.points,
-            "colors": colors,
-            "keypoint_offsets": self.keypoint_offsets,
-            "keypoints": self.keypoints,
-            "observations": self.observations,
-        }
+        arrays = {name: getattr(self, name) for name in _ARRAYS} | {"colors": colors}
         with (folder / FILE_NAME).open("wb") as file:
-            np.savez(file, **arrays)  # type: ignore[arg-type]  # the stub knows no **arrays
+            np.savez(file, **arrays)
 
 
 def read_imported_points(opened: Map) -> ImportedPoints | None:

@@ -16,7 +16,13 @@ from mapping.build.context import BuildContext
 from mapping.build.landmarks import MadeLandmarks, View, assemble_landmarks
 from mapping.build.photos import MappingPhoto, some
 from mapping.frames.anchor import align_positions, known_positions
-from mapping.methods.intrinsics import CAMERAS, CameraOrigin, notes_on, origin_of
+from mapping.methods.intrinsics import (
+    CAMERAS,
+    CameraOrigin,
+    names_by_sensor,
+    notes_on,
+    origin_of,
+)
 from mapping.methods.matching import Verification, match_pairs
 from mapping.methods.model_stage import make_model
 from mapping.methods.scenes import find_pairs, make_scene
@@ -63,8 +69,11 @@ def landmarks_from_matches(
     matches, matches_key = match_pairs(context, photos, pairs.rows, verification)
     rigs = known_rigs(dataset, {photo.record.sensor_id for photo in photos})
     model = make_model(context, photos, rigs, matches, matches_key, settings)
-    origins = _origins(dataset, photos, model)
-    notes = [*_notes_on_absent(photos, model), *notes_on(origins, _names_by_sensor(photos))]
+    names = names_by_sensor((photo.record.sensor_id, photo.name) for photo in photos)
+    origins = {
+        sensor: origin_of(dataset.sensors[sensor], model.doubts.get(sensor)) for sensor in names
+    }
+    notes = [*_notes_on_absent(photos, model), *notes_on(origins, names)]
     made = replace(
         _placed_landmarks(dataset, photos, model, settings, metric=metric),
         settings={**settings.record(), **_origins_record(origins, settings)},
@@ -119,16 +128,6 @@ def _notes_on_absent(photos: Sequence[MappingPhoto], model: SparseModel) -> list
     return [f"{len(absent)} of {len(photos)} photos found no place: {some(absent)}"]
 
 
-def _origins(
-    dataset: Dataset, photos: Sequence[MappingPhoto], model: SparseModel
-) -> dict[str, CameraOrigin]:
-    """Return the source of each camera's focal length, by sensor."""
-    return {
-        sensor: origin_of(dataset.sensors[sensor], model.doubts.get(sensor))
-        for sensor in _names_by_sensor(photos)
-    }
-
-
 def _origins_record(
     origins: Mapping[str, CameraOrigin], settings: SfmSettings
 ) -> dict[str, JsonValue]:
@@ -136,13 +135,6 @@ def _origins_record(
     if not (settings.estimate_poses or "intrinsics" in settings.refine):
         return {}
     return {CAMERAS: {sensor: one.model_dump() for sensor, one in origins.items()}}
-
-
-def _names_by_sensor(photos: Sequence[MappingPhoto]) -> dict[str, list[str]]:
-    names: dict[str, list[str]] = {}
-    for photo in photos:
-        names.setdefault(photo.record.sensor_id, []).append(photo.name)
-    return names
 
 
 def known_rigs(

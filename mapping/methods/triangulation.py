@@ -14,7 +14,13 @@ import pycolmap
 from mapping.methods.adjustment import error_rises, refine_model
 from mapping.methods.colmap_calls import interruptible
 from mapping.methods.colmap_scene import ColmapScene, Rigs, colmap_database
-from mapping.methods.intrinsics import Doubt, doubt_of, is_plausible, no_lens
+from mapping.methods.intrinsics import (
+    Doubt,
+    doubt_of,
+    is_plausible,
+    names_by_sensor,
+    no_lens,
+)
 from mapping.methods.matching import Matches
 from mapping.methods.sparse_model import MapperConfig, SfmPhoto, SparseModel, without_bad_points
 from visloc.errors import InvalidInput
@@ -98,7 +104,8 @@ def reconstruct(
             if models:
                 return max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()))
             if left_out:
-                raise no_lens({sensor: doubts[sensor] for sensor in left_out}, _names(photos))
+                names = names_by_sensor((photo.sensor, photo.name) for photo in photos)
+                raise no_lens({sensor: doubts[sensor] for sensor in left_out}, names)
             raise InvalidInput(
                 "sfm.no_model",
                 "no two photos could be placed relative to each other"
@@ -231,14 +238,6 @@ def _judge(
         for camera_id, sensor in free.items()
         if (doubt := doubt_of(model.camera(camera_id), priors[sensor], rises.get(camera_id)))
     }
-
-
-def _names(photos: Sequence[SfmPhoto]) -> dict[str, list[str]]:
-    """Return the names of photos by sensor."""
-    names: dict[str, list[str]] = {}
-    for photo in photos:
-        names.setdefault(photo.sensor, []).append(photo.name)
-    return names
 
 
 def _pipeline_options(config: MapperConfig) -> pycolmap.IncrementalPipelineOptions:
