@@ -7,6 +7,8 @@ from contextlib import contextmanager
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage, how many of its items are done, and how many it has."""
+ItemProgress = Callable[[int, int], None]
+"""The progress of one stage: called with how many items are done, and how many there are."""
 
 
 @contextmanager

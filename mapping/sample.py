@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from mapping.progress import ItemProgress
 from visloc.errors import Conflict, InvalidInput
 from visloc.geometry import Pose
 from visloc.kapture import Dataset, FileRecord, GnssRecord, Sensor, write_dataset
@@ -49,7 +50,7 @@ def write_sample(
     images: int = 60,
     seed: int = 0,
     size: tuple[int, int] = (640, 480),
-    progress: Callable[[int, int], None] | None = None,
+    progress: ItemProgress | None = None,
 ) -> None:
     """Render the sample and write it; nothing is left under ``root`` if this fails.
 

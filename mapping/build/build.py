@@ -54,11 +54,6 @@ def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None =
     If it is killed, the same call finds its finished work again. The version that was current
     before stays current until the new one is complete and verified.
 
-    Args:
-        settings: of the build.
-        progress: called as stages advance.
-        costs: measures the stages.
-
     Returns:
         The folder of the new version; for maps at a URL, of the local copy.
 

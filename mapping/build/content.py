@@ -38,17 +38,7 @@ def build_content(
     made: MadeLandmarks,
     notes: tuple[str, ...],
 ) -> MapContent:
-    """Return the content of a new map.
-
-    Args:
-        settings: of the build.
-        dataset: of the photos.
-        photos: n photos that the landmarks were made of.
-        features: of the photos.
-        global_features: (n, D) each.
-        made: the landmarks.
-        notes: on photos that were left out earlier.
-    """
+    """Return the content of a new map, from n photos and their global descriptors (n, D)."""
     gravity, gravity_notes = _gravity(settings.gravity, made.anchor)
     return MapContent(
         metric=made.metric,
@@ -80,11 +70,8 @@ def photo_content(
     """Return the fields of ``MapContent`` about photos, cameras and landmarks.
 
     Args:
-        dataset: of the photos.
         photos: n photos that the landmarks were made of.
-        names: n, of the photos in the map.
-        features: of the photos.
-        made: the landmarks.
+        names: n names of these photos in the map.
     """
     placed = [photos[row] for row in made.photos]
 

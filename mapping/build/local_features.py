@@ -186,10 +186,8 @@ def local_features_source(
     """Return the source of local features that a name stands for.
 
     Args:
-        work: where extracted features are kept.
         dataset: kapture folder.
         name: an extractor, or ``kapture:TYPE`` for features that come with the dataset.
-        networks: run the extractor.
         max_keypoints: strongest ones kept per photo; of ready-made features all are taken.
         features_dir: folder of ready-made features, if not the dataset.
         pixel_origin: of the coordinates of ready-made keypoints.

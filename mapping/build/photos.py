@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mapping.methods.depth import DepthMatch, DepthMatcher
+from mapping.progress import ItemProgress
 from visloc.archive import sha256_of
 from visloc.errors import DatasetError
 from visloc.geometry import Camera, Pose
@@ -92,7 +93,7 @@ def collect_photos(
     has_features: Callable[[str], bool] | None = None,
     with_depth: bool = False,
     depth_sensor: str | None = None,
-    progress: Callable[[int, int], None],
+    progress: ItemProgress,
 ) -> tuple[list[MappingPhoto], list[str]]:
     """Collect the usable photos and their depth maps.
 

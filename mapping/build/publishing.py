@@ -57,7 +57,7 @@ def publish_content(
     """Write content beside the files that a folder has already, and publish it.
 
     Raises:
-        Conflict: ``map.outdated``, as ``MapStore.publish``.
+        Conflict: ``map.outdated``.
     """
     version = write_content(incoming, content, map_id)
     return store.publish(incoming, map_id, version, based_on=based_on)

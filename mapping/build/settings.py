@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -37,6 +38,8 @@ from visloc.geometry import PixelOrigin
 from visloc.retrieval.fusion import LateFusion
 from visloc.types import Fusion, Inference
 
+_cluster_option = partial(typer.Option, rich_help_panel=CLUSTER_PANEL)
+
 METHODS = ("rgbd", "sfm", "model")
 
 
@@ -55,10 +58,6 @@ def _weights_in(text: str) -> Mapping[str, float]:
             got=text,
         )
     return weights
-
-
-def _work_place(text: str) -> Path:
-    return place_of(text, "--work-dir")
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,37 +130,33 @@ class BuildSettings:
     workers: WorkersOption = 1
     executor: Annotated[
         str,
-        typer.Option(
-            help="Where the workers run. local: on this machine. ray: on a Ray cluster.",
-            rich_help_panel=CLUSTER_PANEL,
+        _cluster_option(
+            help="Where the workers run. local: on this machine. ray: on a Ray cluster."
         ),
     ] = EXECUTORS[0]
     ray_address: Annotated[
         str,
-        typer.Option(
+        _cluster_option(
             metavar="ADDRESS",
             help="Address of the cluster: HOST:PORT or ray://HOST:PORT. auto: the cluster of "
             "RAY_ADDRESS or of this machine. local: a new one on this machine, which ends with "
             "the build.",
-            rich_help_panel=CLUSTER_PANEL,
         ),
     ] = "auto"
     work_dir: Annotated[
         Path | None,
-        typer.Option(
+        _cluster_option(
             metavar="FOLDER|URL",
             help="Where to keep finished work until the map is published, in .work/MAP. All "
             "machines must share it. Default: --maps-dir.",
-            rich_help_panel=CLUSTER_PANEL,
         ),
-        OnCommandLine(_work_place),
+        OnCommandLine(partial(place_of, option="--work-dir")),
     ] = None
     cache_dir: Annotated[
         Path,
-        typer.Option(
+        _cluster_option(
             envvar="VISLOC_CACHE_DIR",
             help="Folder for local copies of maps, if --maps-dir is a URL.",
-            rich_help_panel=CLUSTER_PANEL,
         ),
     ] = Path("maps-cache")
     force: ForceOption = False

@@ -87,12 +87,9 @@ def write_report(
     Finished runs are kept in ``work_dir`` until the report is written.
 
     Args:
-        opened: the map.
         target: the HTML file; an existing one is replaced.
         work_dir: where work in progress is kept, in ``.report``.
-        workers: processes that localize.
         command: that makes the report again, for the reader.
-        progress: called as stages advance.
 
     Returns:
         The contents of the report: ``ReportData`` of ``web/src/report/data.ts``.

@@ -9,6 +9,7 @@ from typing import Protocol, TypeVar
 
 from mapping.cluster.stage_timings import Spent
 from mapping.cluster.workers import Workers
+from mapping.progress import ItemProgress
 from visloc.errors import InvalidInput
 
 T = TypeVar("T")
@@ -37,9 +38,7 @@ class Executor(Protocol):
     def spent(self) -> Spent:
         """Resources that other processes have used for finished items."""
 
-    def run(
-        self, task: Callable[[T], object], items: Sequence[T], progress: Callable[[int, int], None]
-    ) -> None:
+    def run(self, task: Callable[[T], object], items: Sequence[T], progress: ItemProgress) -> None:
         """Do a task for every item; report progress as items are finished.
 
         Raises:
@@ -48,10 +47,7 @@ class Executor(Protocol):
         """
 
     def run_one(
-        self,
-        task: Callable[[T, Callable[[int, int], None]], object],
-        item: T,
-        progress: Callable[[int, int], None],
+        self, task: Callable[[T, ItemProgress], object], item: T, progress: ItemProgress
     ) -> None:
         """Do one long task. It reports progress itself if it runs in this process.
 

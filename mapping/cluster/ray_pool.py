@@ -16,6 +16,7 @@ import ray
 
 from mapping.cluster.stage_timings import Spent
 from mapping.cluster.workers import ONE_THREAD, do_batch, in_batches
+from mapping.progress import ItemProgress
 from visloc import __version__
 from visloc.errors import Unavailable
 
@@ -81,9 +82,7 @@ class RayPool:
     def spent(self) -> Spent:
         return self._spent
 
-    def run(
-        self, task: Callable[[T], object], items: Sequence[T], progress: Callable[[int, int], None]
-    ) -> None:
+    def run(self, task: Callable[[T], object], items: Sequence[T], progress: ItemProgress) -> None:
         """Do a task for every item; report progress after each batch.
 
         Raises:
@@ -113,15 +112,12 @@ class RayPool:
             raise
 
     def run_one(
-        self,
-        task: Callable[[T, Callable[[int, int], None]], object],
-        item: T,
-        progress: Callable[[int, int], None],
+        self, task: Callable[[T, ItemProgress], object], item: T, progress: ItemProgress
     ) -> None:
         self.run(partial(_do_one, task), [item], progress)
 
 
-def _do_one(task: Callable[[T, Callable[[int, int], None]], object], item: T) -> None:
+def _do_one(task: Callable[[T, ItemProgress], object], item: T) -> None:
     task(item, lambda _done, _total: None)  # progress is not sent between machines
 
 

@@ -17,6 +17,7 @@ import cv2
 from threadpoolctl import threadpool_limits
 
 from mapping.cluster.stage_timings import Spent, spent_here
+from mapping.progress import ItemProgress
 from visloc.errors import Unavailable
 
 T = TypeVar("T")
@@ -67,9 +68,7 @@ class Workers:
     def spent(self) -> Spent:
         return self._spent
 
-    def run(
-        self, task: Callable[[T], object], items: Sequence[T], progress: Callable[[int, int], None]
-    ) -> None:
+    def run(self, task: Callable[[T], object], items: Sequence[T], progress: ItemProgress) -> None:
         progress(0, len(items))
         if self._pool is None or len(items) == 1:
             with one_thread_here():
@@ -95,10 +94,7 @@ class Workers:
             ) from error
 
     def run_one(
-        self,
-        task: Callable[[T, Callable[[int, int], None]], object],
-        item: T,
-        progress: Callable[[int, int], None],
+        self, task: Callable[[T, ItemProgress], object], item: T, progress: ItemProgress
     ) -> None:
         with one_thread_here():
             task(item, progress)

@@ -180,11 +180,7 @@ class ColmapScene:
     ) -> SparseModel:
         """Return a reconstruction as a model.
 
-        Args:
-            model: pycolmap's reconstruction.
-            photos: as given.
-            changed: ``poses``, ``intrinsics``; the others are taken from the photos.
-            doubts: to be kept in the model.
+        What ``changed`` does not name, ``poses`` or ``intrinsics``, is taken from the photos.
         """
         rows_of_images = {image.image_id: row for row, image in enumerate(self.images)}
         views: list[View | None] = [None] * len(photos)

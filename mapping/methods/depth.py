@@ -60,10 +60,9 @@ class DepthMatch:
 
 
 class DepthMatcher:
-    """Finds the depth map of each photo of a dataset. Files that do not exist do not count.
+    """Finds the depth map of each photo of a dataset; files that do not exist do not count.
 
     Args:
-        dataset: the photos and depth maps.
         depth_sensor: id of the only depth sensor to use; None to choose by rig, pose and size.
 
     Raises:
@@ -178,7 +177,6 @@ def read_depth(path: Path, camera: Camera, depth_scale: float) -> NDArray[np.flo
     map also 65.5 m and more, in a PNG 65535.
 
     Args:
-        path: of the file.
         camera: the depth sensor's, for the size; a raw map has no header.
         depth_scale: metres per unit of a PNG.
 
@@ -289,7 +287,6 @@ def register_depth(
 
     Args:
         depth: (H, W) float32 as seen by ``depth_camera``.
-        depth_camera: of H x W.
         camera: the photo's.
         cam_from_depth: from the frame of ``depth_camera`` to that of ``camera``.
 

@@ -48,11 +48,9 @@ def landmarks_from_reconstruction(
     observations is applied, since the tool that made them had its own.
 
     Args:
-        context: with the photos' features.
-        dataset: with points, observations and the keypoints that observe.
         photos: with poses.
         origin: of the coordinates of the dataset's keypoints.
-        settings: how photos are matched again; the pairs are those that share points.
+        settings: for matching again; the pairs are those that share points.
         metric: whether a unit of the dataset's poses is a metre.
 
     Raises:

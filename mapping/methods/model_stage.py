@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 
@@ -19,6 +19,7 @@ from mapping.methods.matching import Matches, camera_values, pose_values
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
 from mapping.methods.triangulation import reconstruct, triangulate
+from mapping.progress import ItemProgress
 from visloc.geometry import Camera, Pose
 
 # Raised when the code of the stage changes what comes out.
@@ -35,13 +36,7 @@ def make_model(
 ) -> SparseModel:
     """Triangulate the matches, or find poses with them, as the settings say.
 
-    Args:
-        context: with the photos' features.
-        photos: that were matched.
-        rigs: of their cameras.
-        matches: verified.
-        matches_key: stands for the matches in the key of the model.
-        settings: with the thresholds.
+    ``matches_key`` stands for the matches in the key of the model.
 
     Raises:
         InvalidInput: ``sfm.*``.
@@ -66,7 +61,7 @@ class _ModelTask:
     matches: Sequence[Matches]
     settings: SfmSettings
 
-    def make(self, key: str, progress: Callable[[int, int], None]) -> None:
+    def make(self, key: str, progress: ItemProgress) -> None:
         def compute() -> Item:
             given = [self._given(photo) for photo in self.photos]
             config, refine = MAPPER_CONFIGS[self.settings.mapper], self.settings.refine

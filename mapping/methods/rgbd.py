@@ -75,8 +75,6 @@ def landmarks_from_depth(
     """Lift the keypoints of all photos and merge them.
 
     Args:
-        context: with the photos' features.
-        dataset: of the photos.
         photos: with poses in the dataset's frame, and depth in its unit.
         settings: the voxel size is in the unit of the world.
         metric: whether a unit of the world is a metre.

@@ -46,11 +46,8 @@ def landmarks_from_matches(
     """Pair, match and verify the photos, and make landmarks of the matches.
 
     Args:
-        context: with the photos' features.
-        dataset: of the photos.
         photos: with poses, unless the settings estimate them.
-        global_features: of the photos, for the pairing retrieval.
-        settings: of all steps.
+        global_features: for the pairing retrieval.
         metric: whether a unit of the dataset's poses is a metre.
 
     Raises:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -18,12 +19,10 @@ from visloc.archive import Map, sha256_of
 
 POSES = ("given", "estimate")
 
+_option = partial(typer.Option, rich_help_panel=SFM_PANEL)
 PairsOption = Annotated[
     Names,
-    typer.Option(
-        help=f"Which photos to match. Comma-separated: {', '.join(PAIRINGS)}.",
-        rich_help_panel=SFM_PANEL,
-    ),
+    _option(help=f"Which photos to match. Comma-separated: {', '.join(PAIRINGS)}."),
 ]
 
 
@@ -40,33 +39,27 @@ class SfmSettings:
     pairing: PairSettings = field(default_factory=PairSettings)
     pairs_file: Annotated[
         Path | None,
-        typer.Option(
-            help="File with pairs to match instead of --pairs, such as pairs.txt of a map.",
-            rich_help_panel=SFM_PANEL,
-        ),
+        _option(help="File with pairs to match instead of --pairs, such as pairs.txt of a map."),
     ] = None
     covisible_in: Map | None = None
     mapper: Annotated[
         str,
-        typer.Option(
-            help=f"Thresholds of the published mapper: {' or '.join(MAPPER_CONFIGS)} (relaxed).",
-            rich_help_panel=SFM_PANEL,
+        _option(
+            help=f"Thresholds of the published mapper: {' or '.join(MAPPER_CONFIGS)} (relaxed)."
         ),
     ] = "config1"
     refine: Annotated[
         Names,
-        typer.Option(
+        _option(
             help="What bundle adjustment may change after triangulation. Comma-separated: "
-            f"{', '.join(REFINABLE)}.",
-            rich_help_panel=SFM_PANEL,
+            f"{', '.join(REFINABLE)}."
         ),
     ] = ()
     poses: Annotated[
         str,
-        typer.Option(
+        _option(
             help="given: use the dataset's poses. estimate: estimate all poses; known poses or "
-            "GNSS of some photos then only place the map.",
-            rich_help_panel=SFM_PANEL,
+            "GNSS of some photos then only place the map."
         ),
     ] = POSES[0]
 

@@ -23,6 +23,7 @@ from mapping.methods.intrinsics import (
 )
 from mapping.methods.matching import Matches
 from mapping.methods.sparse_model import MapperConfig, SfmPhoto, SparseModel, without_bad_points
+from mapping.progress import ItemProgress
 from visloc.errors import InvalidInput
 
 # After so many models that put cameras in doubt, no camera with a prior is refined any more.
@@ -77,7 +78,7 @@ def reconstruct(
     config: MapperConfig,
     refine: Sequence[str],
     work: Path,
-    progress: Callable[[int, int], None],
+    progress: ItemProgress,
 ) -> SparseModel:
     """Find poses and points by incremental mapping, in an arbitrary frame and unit.
 
@@ -125,7 +126,7 @@ class _Placed:
     """Counts the photos in the current model, and reports them."""
 
     total: int
-    progress: Callable[[int, int], None]
+    progress: ItemProgress
     count: int = 0
 
     def first_pair(self) -> None:

@@ -72,18 +72,13 @@ _TIED_BY = 16
 class UpdateRecord:
     """What the manifest keeps of an update, in ``updates`` of the method's settings.
 
+    The figures from ``tried`` on are those of ``Placement``.
+
     Attributes:
         capture: its name, or the name of its folder.
         photos: added photos.
         landmarks: added landmarks.
         observations: added observations, of old and new landmarks.
-        tried: photos that were to be localized.
-        not_localized: how many of them were not, by reason.
-        tied: photos whose own pose, moved, agrees with what they see of the map.
-        pixels: median reprojection error of the tied photos' inliers.
-        position: median distance between the tied photos' localized and own (moved) positions, in
-            units of the map.
-        orientation_deg: the same of orientations.
         scale: units of the map per unit of the dataset.
     """
 
@@ -333,7 +328,7 @@ class _Job:
             world_from_dataset=map_from_dataset,
         )
         centers = np.array([view.cam_from_world.center for view in made.views])
-        corner = np.round(centers.mean(axis=0))  # as merging has it
+        corner = np.round(centers.mean(axis=0))  # like merging
         return made, landmarks_in_same_voxel(content.landmarks, made.landmarks, corner, voxel_size)
 
     def _record(self, placement: Placement, before: MapContent, after: MapContent) -> UpdateRecord:

@@ -30,10 +30,7 @@ def part_of_map(
     Args:
         content: the map.
         dataset: of the capture, with rigs in the map's unit.
-        capture: the photos that ``made`` was made of.
-        features: of the photos, of the map's kind.
-        made: in the map's frame.
-        notes: on photos that were left out.
+        made: from the capture, in the map's frame.
     """
     return replace(
         content,

@@ -60,7 +60,6 @@ def localize_photos(
 
     Args:
         context: with local features of the map's kind.
-        opened: the map.
         photos: n photos.
         described: global descriptors (n, D) by name, by the map's models.
     """
