@@ -189,7 +189,7 @@ def _check_sfm(settings: BuildSettings) -> None:
 
 
 def refuse_early(settings: BuildSettings, dataset: Dataset, photos: Sequence[MappingPhoto]) -> None:
-    """Refuse photos without depth, points, positions or pairs, as far as that is known already.
+    """Refuse photos without depth, points, positions or pairs, if that is known already.
 
     Pairing twice takes seconds; finding features first would take hours.
 

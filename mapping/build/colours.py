@@ -30,7 +30,7 @@ def landmark_colours(
     no photo sees is black. It takes about 100 bytes of memory per landmark.
 
     Args:
-        photos: n photos, those of the landmarks' observations, with their files.
+        photos: the n photos that observe the landmarks, with their files.
 
     Raises:
         VislocError: what ``MappingPhoto.read`` raises.

@@ -1,4 +1,4 @@
-"""What all stages of a job work with."""
+"""The shared inputs of all stages of a job."""
 
 from __future__ import annotations
 
@@ -18,15 +18,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class BuildContext:
-    """What all stages of a build or an update work with.
-
-    Attributes:
-        work: keeps finished work.
-        features: source of the photos' local features.
-        networks: compute local and global features.
-        workers: do the work.
-        progress: is told how far each stage is.
-    """
+    """The shared inputs of all stages of a build or an update."""
 
     work: WorkFolder
     features: LocalFeaturesSource

@@ -18,7 +18,7 @@ from visloc.types import Inference
 
 @dataclass(frozen=True, slots=True)
 class Networks:
-    """Where weights lie, and how networks are run."""
+    """The folder of weights, and the way to run networks."""
 
     weights_dir: Path | None
     inference: Inference

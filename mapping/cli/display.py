@@ -8,6 +8,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -18,6 +20,7 @@ from mapping.frames.rig_calibration import OUTLIER_MULTIPLE, RigCalibration, Spr
 from mapping.importers import ImportSummary
 from mapping.maps.cameras import camera_lines, cameras_of
 from visloc.archive import Map
+from visloc.archive.places import GeoCircle
 from visloc.archive.schema import photo_file
 from visloc.retrieval.fusion import EQUAL_GHARM
 
@@ -85,10 +88,8 @@ def print_map(opened: Map) -> None:
         "extent": " x ".join(f"{side:.2f}" for side in sides)
         + (" m" if summary["world"]["metric"] else " (not metric)"),
         "world": _world(opened),
-        "gravity": "not known"
-        if opened.gravity is None
-        else f"down is ({', '.join(f'{value:.6g}' for value in opened.gravity)})",
-        "place": _place(opened),
+        "gravity": gravity_text(opened.gravity),
+        "place": place_text(opened.place) + _scale(opened),
         "method": summary["method"]["name"],
         "keeps": ", ".join(summary["keeps"]) or "neither photos nor colours",
         "size": f"{summary['size_bytes'] / 2**20:.1f} MiB, "
@@ -134,15 +135,28 @@ def _world(opened: Map) -> str:
     return f"{unit}, fixed by {fixed_by}{off}"
 
 
-def _place(opened: Map) -> str:
-    place, geodetic = opened.place, opened.geodetic
-    if place is None or geodetic is None:
+def gravity_text(down: NDArray[np.float64] | None) -> str:
+    """Return the direction of gravity, for people."""
+    if down is None:
+        return "not known"
+    return f"down is ({', '.join(f'{value:.6g}' for value in down)})"
+
+
+def place_text(place: GeoCircle | None) -> str:
+    """Return where a map or a set lies on Earth, for people."""
+    if place is None:
         return "not anchored to the Earth"
-    scale = "" if geodetic.scale == 1 else f", {geodetic.scale:.6g} m per unit"
     return (
         f"latitude {place.latitude:.7f}, longitude {place.longitude:.7f}, "
-        f"within {place.radius:.0f} m{scale}"
+        f"within {place.radius:.0f} m"
     )
+
+
+def _scale(opened: Map) -> str:
+    geodetic = opened.geodetic
+    if geodetic is None or geodetic.scale == 1:
+        return ""
+    return f", {geodetic.scale:.6g} m per unit"
 
 
 def print_georeference(found: Georeference) -> None:

@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from mapping.cli.display import ERR, OUT, say, say_notes
+from mapping.cli.display import ERR, OUT, gravity_text, place_text, say, say_notes
 from mapping.cli.progress import StageProgress
 from mapping.frames.set_poses import poses_on_earth, read_poses
 from mapping.maps.sets import publish_set
@@ -111,21 +111,14 @@ def print_set(opened: MapSet) -> None:
     OUT.print(table)
     if len(manifest.tiles) > _SHOWN_TILES:
         say(f"and {len(manifest.tiles) - _SHOWN_TILES} more tiles")
-    down = opened.gravity
-    place = opened.place
     for name, value in {
         "tiles": f"{manifest.counts.tiles}, of {manifest.counts.images} photos and "
         f"{manifest.counts.landmarks} landmarks together",
         "local features": manifest.local_features.name,
         "coarse index": f"{manifest.coarse.bits} bits of a photo, {opened.size_bytes} bytes",
         "world": "metric" if world.metric else "not metric",
-        "gravity": "not known"
-        if down is None
-        else f"down is ({', '.join(f'{value:.6g}' for value in down)})",
-        "place": "not anchored to the Earth"
-        if place is None
-        else f"latitude {place.latitude:.7f}, longitude {place.longitude:.7f}, within "
-        f"{place.radius:.0f} m",
+        "gravity": gravity_text(opened.gravity),
+        "place": place_text(opened.place),
         "created": manifest.created,
         "folder": str(opened.path),
     }.items():

@@ -51,7 +51,7 @@ class LiftedKeypoints:
 
 @dataclass(frozen=True, slots=True)
 class DepthSettings:
-    """How depth becomes landmarks."""
+    """Settings for landmarks from depth."""
 
     voxel_size: Annotated[
         float,

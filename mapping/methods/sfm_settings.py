@@ -28,7 +28,7 @@ PairsOption = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class SfmSettings:
-    """How landmarks are made from matches.
+    """Settings for landmarks from matches.
 
     Attributes:
         covisible_in: a map whose observations tell which photos share points, for the pairing

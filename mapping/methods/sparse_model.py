@@ -20,11 +20,11 @@ class MapperConfig:
 
     Attributes:
         min_num_matches: fewest verified matches of a pair.
-        init_min_num_inliers: of the first pair, when poses are estimated.
-        abs_pose_min_num_inliers: of a photo that joins, when poses are estimated.
-        abs_pose_min_inlier_ratio: the same.
-        ba_local_max_num_iterations: of bundle adjustment around a photo that joined.
-        abs_pose_max_error: pixels, of an inlier of a photo that joins.
+        init_min_num_inliers: fewest inliers of the first pair, when poses are estimated.
+        abs_pose_min_num_inliers: fewest inliers of a photo that joins, when poses are estimated.
+        abs_pose_min_inlier_ratio: least share of inliers of a photo that joins.
+        ba_local_max_num_iterations: for bundle adjustment around a photo that joined.
+        abs_pose_max_error: largest error of an inlier of a photo that joins, pixels.
         filter_max_reproj_error: pixels; observations further from their point are dropped, and
             matches further from their epipolar line.
         min_track_length: photos that must see a landmark. Not in the paper. COLMAP drops tracks

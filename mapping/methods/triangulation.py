@@ -176,8 +176,6 @@ def solve_with_priors(
     Args:
         solve: makes a model, given doubts. Sensors in doubt that have a prior keep it; photos of
             the others are left out.
-        scene: of the photos.
-        photos: of the model.
         refined: sensors whose intrinsics ``solve`` refines.
         poses: whether it refines poses too.
 
