@@ -6,6 +6,8 @@ A depth map here is (H, W) float32: metres along the optical axis of its camera,
 from __future__ import annotations
 
 import math
+import struct
+import zlib
 from dataclasses import dataclass
 from functools import lru_cache
 from io import BytesIO
@@ -26,6 +28,8 @@ MAX_DEPTH_PIXELS = 16_000_000
 # Published float maps still hold the recorder's code for "none", 65535 mm, as a distance.
 _NO_DEPTH_FROM_M = 65.5
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_HEADER_BYTES = 33
+_PNG_GREY = 0
 
 # Poses are written with few digits; this much moves a pixel by less than a tenth.
 _SAME_ROTATION_RAD = 1e-4
@@ -202,8 +206,11 @@ def read_depth(path: Path, camera: Camera, depth_scale: float) -> NDArray[np.flo
             got=f"{camera.width} x {camera.height}",
         )
     try:
-        if _is_png(path):
-            units = _read_png(path, camera)
+        with path.open("rb") as file:
+            header = file.read(_PNG_HEADER_BYTES)
+        if header.startswith(_PNG_SIGNATURE):
+            _check_png_header(path, header, camera)
+            units = _decode_png(path)
             depth = units.astype(np.float32) * np.float32(depth_scale)
             invalid = (units == 0) | (units == 65535)
         else:
@@ -233,47 +240,50 @@ def _read_raw(path: Path, camera: Camera) -> NDArray[np.float32]:
     return values.reshape(camera.height, camera.width)
 
 
-def _is_png(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(len(_PNG_SIGNATURE)) == _PNG_SIGNATURE
-
-
-def _read_png(path: Path, camera: Camera) -> NDArray[np.uint16]:
-    content = BytesIO(path.read_bytes())
-    try:
-        with Image.open(content, formats=("PNG",)) as image:
-            _check_png(path, image, camera)
-            # Decoding leaves the checksums of pixels unchecked; a flipped bit would move the map.
-            image.verify()
-        with Image.open(content, formats=("PNG",)) as image:
-            return np.array(image).astype(np.uint16, copy=False)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise DatasetError(
-            "depth.damaged",
-            "the PNG is damaged",
-            field=str(path),
-            expected="a whole PNG",
-            got=str(error),
-        ) from error
-
-
-def _check_png(path: Path, image: Image.Image, camera: Camera) -> None:
-    if image.mode != "I;16":
+def _check_png_header(path: Path, header: bytes, camera: Camera) -> None:
+    if len(header) < _PNG_HEADER_BYTES or header[12:16] != b"IHDR":
+        raise _damaged(path, "no header")
+    width, height, bit_depth, color_type = struct.unpack_from(">IIBB", header, 16)
+    if (bit_depth, color_type) != (16, _PNG_GREY):
         raise DatasetError(
             "depth.format",
             "the PNG is not a depth map",
             field=str(path),
             expected="16 bits per pixel, grey",
-            got=f"Pillow's mode {image.mode}",
+            got=f"{bit_depth} bits per channel, PNG colour type {color_type}",
         )
-    if image.size != (camera.width, camera.height):
+    if (width, height) != (camera.width, camera.height):
         raise DatasetError(
             "depth.size",
             "the depth map has the wrong size",
             field=str(path),
             expected=f"{camera.width} x {camera.height} as its sensor",
-            got=f"{image.width} x {image.height}",
+            got=f"{width} x {height}",
         )
+
+
+def _decode_png(path: Path) -> NDArray[np.uint16]:
+    content = path.read_bytes()
+    # Pillow does not check the checksums of pixels; a flipped bit would move the map.
+    position = len(_PNG_SIGNATURE)
+    while position < len(content):
+        length = int.from_bytes(content[position : position + 4], "big")
+        end = position + 8 + length
+        checksum = zlib.crc32(content[position + 4 : end]).to_bytes(4, "big")
+        if content[end : end + 4] != checksum:
+            raise _damaged(path, "wrong checksum, or cut short")
+        position = end + 4
+    try:
+        with Image.open(BytesIO(content), formats=("PNG",)) as image:
+            return np.array(image).astype(np.uint16, copy=False)
+    except (OSError, SyntaxError, ValueError, EOFError) as error:  # what Pillow raises
+        raise _damaged(path, str(error)) from error
+
+
+def _damaged(path: Path, got: str) -> DatasetError:
+    return DatasetError(
+        "depth.damaged", "the PNG is damaged", field=str(path), expected="a whole PNG", got=got
+    )
 
 
 def register_depth(
