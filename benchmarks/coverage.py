@@ -27,7 +27,8 @@ import typer
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
-from mapping.build.build import BuildSettings, build_map
+from mapping.build.build import build_map
+from mapping.build.settings import BuildSettings
 from mapping.build.stages import WorkFolder
 from mapping.cluster.workers import Workers
 from mapping.report.held_out import hold_out

@@ -19,8 +19,9 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from mapping.build.build import BuildSettings, build_map
-from mapping.methods.sfm import SfmSettings
+from mapping.build.build import build_map
+from mapping.build.settings import BuildSettings
+from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import Map, open_map
 from visloc.evaluation import pose_error
 from visloc.features import DEFAULT_LOCAL_FEATURES, make_global_descriptor, make_local_features

@@ -25,10 +25,11 @@ from numpy.typing import NDArray
 import mapping.methods.matching
 from clients.evaluation.queries import read_queries
 from clients.evaluation.readers import FeatureReader
-from mapping.build.build import BuildSettings, build_map
-from mapping.build.features import ReadyMadeFeatures
+from mapping.build.build import build_map
+from mapping.build.local_features import ReadyMadeFeatures
 from mapping.build.photos import MappingPhoto
-from mapping.methods.sfm import SfmSettings
+from mapping.build.settings import BuildSettings
+from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import Map, open_map
 from visloc.evaluation import pose_error
 from visloc.geometry import PixelOrigin

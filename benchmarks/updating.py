@@ -25,7 +25,8 @@ import numpy as np
 import typer
 
 from benchmarks.map_methods import BINS, Stopwatch, measure
-from mapping.build.build import BuildSettings, build_map
+from mapping.build.build import build_map
+from mapping.build.settings import BuildSettings
 from mapping.maps.updating import UpdateSettings, update_map
 from visloc.archive import Map, open_map
 from visloc.errors import Conflict
@@ -108,8 +109,8 @@ def main(
     watch = Stopwatch()
     rows = [row_of("first half", open_map(build_map(build, watch)), watch, queries, weights_dir)]
     update = UpdateSettings(
-        second,
         "grown",
+        second,
         maps,
         poses=poses,
         weights_dir=weights_dir,

@@ -1,4 +1,4 @@
-"""A sample dataset for a machine that has none: `mapping sample DIR`.
+"""A synthetic sample dataset: `mapping sample DIR`.
 
 ``DIR/mapping`` and ``DIR/query`` become kapture 1.1 datasets of the same room, with exact poses.
 A rig of two cameras and a GNSS receiver walks through it; the mapping run has a depth map
@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from mapping.progress import ItemProgress
 from samples.render import render_depth, render_photo
 from samples.scene import Scene, make_room
 from samples.textures import Image
@@ -49,7 +50,7 @@ def write_sample(
     images: int = 60,
     seed: int = 0,
     size: tuple[int, int] = (640, 480),
-    progress: Callable[[int, int], None] | None = None,
+    progress: ItemProgress | None = None,
 ) -> None:
     """Render the sample and write it; nothing is left under ``root`` if this fails.
 
@@ -57,11 +58,11 @@ def write_sample(
 
     Args:
         root: absent or an empty folder.
-        images: mapping photos in total. The rig takes two at a time; if the number is odd, the
-            last one comes from the left camera alone. There are a third as many queries.
-        seed: of all pictures in the room, sensor noise and GNSS errors.
+        images: mapping photos in total. The rig takes two at a time; an odd last one comes from
+            the left camera alone. There are a third as many queries.
+        seed: of pictures in the room, sensor noise and GNSS errors.
         size: width, height in pixels.
-        progress: called after each photo with (photos done, photos in all).
+        progress: called after each photo with the photos done, and the total.
 
     Raises:
         Conflict: ``sample.exists`` if the folder holds something already.
@@ -73,7 +74,7 @@ def write_sample(
     runs = _runs(images, num_queries)
     rig = stereo_rig(*size)
     partial = root.with_name(f".{root.name}.{os.getpid()}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # of a process of the same id that was killed
+    shutil.rmtree(partial, ignore_errors=True)  # of a killed process with the same id
     try:
         partial.mkdir(parents=True)
         scene = make_room(seed)
@@ -86,7 +87,7 @@ def write_sample(
         readme = _readme(images, num_queries, seed, size)
         (partial / "README.txt").write_text(readme, encoding="utf-8")
         if root.exists():
-            root.rmdir()  # empty, as checked; fails if someone has put something there since
+            root.rmdir()  # empty, as checked; fails if that has changed
         partial.rename(root)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
@@ -98,13 +99,10 @@ class _Run:
     """One walk of the rig.
 
     Attributes:
-        name: folder and first part of every image name.
-        number: 1 for mapping, 2 for query; part of the seed of its noise.
+        name: folder, and first part of every image name.
+        number: part of the seed of its noise.
         rig_from_world: pose at each instant.
-        num_photos: two per instant, except that the last right one may be missing.
-        start_ms: time of the first instant.
-        step_ms: time between two instants.
-        with_depth: whether there is a depth map for each photo.
+        num_photos: two per instant; the last right one may be missing.
     """
 
     name: str
@@ -212,7 +210,7 @@ def _sensors(rig: Mapping[str, RigCamera], *, with_depth: bool) -> dict[str, Sen
 
 
 def _mounting(rig: Mapping[str, RigCamera], *, with_depth: bool) -> dict[str, Pose | None]:
-    """Return ``sensor_from_rig``; depth is registered to the photos, the antenna is the origin."""
+    """Return ``sensor_from_rig``. Depth is registered to the photos; the antenna is the origin."""
     mounting: dict[str, Pose | None] = {name: each.cam_from_rig for name, each in rig.items()}
     if with_depth:
         mounting |= {_depth_id(name): each.cam_from_rig for name, each in rig.items()}
@@ -222,8 +220,8 @@ def _mounting(rig: Mapping[str, RigCamera], *, with_depth: bool) -> dict[str, Po
 def _gnss(run: _Run, noise: np.random.Generator) -> tuple[GnssRecord, ...]:
     """Return one noisy fix per instant.
 
-    Over a few metres, the ellipsoid is a plane scaled by its radii of curvature (meridian M,
-    prime vertical N) at the anchor: the error is below a micrometre.
+    Over a few metres, a plane scaled by the radii of curvature (meridian, prime vertical) at the
+    anchor replaces the ellipsoid with an error below a micrometre.
     """
     latitude = math.radians(ANCHOR_LATITUDE_DEG)
     bend = 1.0 - _WGS84_E2 * math.sin(latitude) ** 2

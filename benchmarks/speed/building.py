@@ -10,8 +10,9 @@ from typing import Any
 
 from benchmarks.speed.dataset import Bench
 from benchmarks.speed.machine import num_threads
-from mapping.build.build import BuildSettings, build_map
-from mapping.methods.sfm import SfmSettings
+from mapping.build.build import build_map
+from mapping.build.settings import BuildSettings
+from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import open_map
 from visloc.types import Inference
 

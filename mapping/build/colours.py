@@ -1,4 +1,4 @@
-"""Colours of landmarks, for maps that are to show what a place looks like."""
+"""Colours of landmarks, for pictures of a map."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.features import Progress
+from mapping.build.context import BuildContext
 from mapping.build.photos import MappingPhoto
 from mapping.build.stages import Item, WorkFolder, key_of
-from mapping.cluster.executors import Executor
 from visloc.archive import Landmarks
 
 # Raised when the code of the stage changes what comes out.
@@ -22,24 +21,16 @@ _REVISION = 1
 
 
 def landmark_colours(
-    work: WorkFolder,
-    photos: Sequence[MappingPhoto],
-    landmarks: Landmarks,
-    workers: Executor,
-    progress: Progress,
+    context: BuildContext, photos: Sequence[MappingPhoto], landmarks: Landmarks
 ) -> NDArray[np.uint8]:
     """Return the mean colour (P, 3) RGB of the pixels where the photos see each landmark.
 
-    The mean, because sums of whole numbers need no more memory for more photos and are the same
-    in any order; of the two or three photos that see most landmarks a median tells little else.
-    A landmark that no photo sees is black. It takes about 100 bytes of memory per landmark.
+    A mean of whole numbers does not depend on the order of the photos, and its memory does not grow
+    with them. A median would add little for landmarks that two or three photos see. A landmark that
+    no photo sees is black. It takes about 100 bytes of memory per landmark.
 
     Args:
-        work: where finished work is kept.
-        photos: n photos, those of the landmarks' observations, with their files.
-        landmarks: with observations by these photos.
-        workers: who reads the photos.
-        progress: told how far it is.
+        photos: the n photos that observe the landmarks, with their files.
 
     Raises:
         VislocError: what ``MappingPhoto.read`` raises.
@@ -49,14 +40,14 @@ def landmark_colours(
         _Item(photo, landmarks.keypoints[first:end])
         for photo, (first, end) in zip(photos, bounds, strict=True)
     ]
-    workers.run(partial(_sample, work), items, partial(progress, "colours"))
+    context.run("colours", partial(_sample, context.work), items)
     num = len(landmarks.points)
     sums, counts = np.zeros((3, num), dtype=np.int64), np.zeros(num, dtype=np.int64)
     for item, (first, end) in zip(items, bounds, strict=True):
-        observed = landmarks.observed[first:end]  # twice the same, where a photo sees it twice
+        observed = landmarks.observed[first:end]  # may name a landmark twice
         np.add.at(counts, observed, 1)
-        # NumPy is quick with single columns of one type.
-        pixels = work.read(item.key)["rgb"].astype(np.int64)
+        # np.add.at is fast for single columns of one type only.
+        pixels = context.work.read(item.key)["rgb"].astype(np.int64)
         for channel, values in zip(sums, pixels.T, strict=True):
             np.add.at(channel, observed, values)
     counts = np.maximum(counts, 1)
@@ -81,7 +72,7 @@ def _sample(work: WorkFolder, item: _Item) -> None:
 
 
 def _pixels(item: _Item) -> Item:
-    """The pixels (m, 3) that the keypoints lie in."""
+    """Return the pixels (m, 3) that contain the keypoints."""
     photo = item.photo.read()
     # Coordinates count from the corner of the first pixel. Those of other tools may lie on the far
     # edge or a little beyond.

@@ -1,4 +1,4 @@
-"""From points and their observations to the landmarks of a map, whatever made them."""
+"""The landmarks of a map, from points and their observations."""
 
 from __future__ import annotations
 
@@ -22,12 +22,7 @@ _MAX_DIRECTIONS = 4_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """Where a photo was taken, and with what.
-
-    Attributes:
-        camera: intrinsics.
-        cam_from_world: pose.
-    """
+    """A photo's intrinsics and pose."""
 
     camera: Camera
     cam_from_world: Pose
@@ -35,13 +30,13 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """Who sees what: one row per sighting of a point in a photo.
+    """Observations of points in photos, one per row.
 
     Attributes:
         points: (M,) int64 rows of the points.
         views: (M,) int64 rows of the photos.
         rows: (M,) int64 rows of the photo's features.
-        pixels: (M, 2) float32 where it is seen.
+        pixels: (M, 2) float32.
     """
 
     points: NDArray[np.int64]
@@ -61,21 +56,20 @@ class Observations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MadeLandmarks:
-    """What a mapping method made.
+    """The result of a mapping method.
 
     Attributes:
-        photos: (n,) int64 rows of the photos that have a place in the map.
-        views: of them.
+        photos: (n,) int64 rows of the photos that have a pose in the map.
+        views: n, of these photos.
         landmarks: with observations by these photos, in their order.
-        rows: of each of these photos, the rows of its features that observe the landmarks.
-        settings: what the manifest says of how they were made.
+        rows: for each of these photos, the rows of its features that observe the landmarks.
+        settings: of the method, for the manifest.
         metric: whether a unit of the world is a metre.
         anchor: how the world was fixed.
-        rig_scale: what distances on the dataset's rigs are multiplied by to be in the world's
-            unit; None when that is not known.
+        rig_scale: units of the world per unit of the dataset's rigs; None when it is unknown.
         notes: what was left out, one sentence each.
-        imported: points of the reconstruction that was matched anew, if one was.
-        pairs: the pairs that were matched, with the scene they belong to, if any were.
+        imported: the points of an imported reconstruction whose photos were matched again.
+        pairs: the matched pairs, with their scene.
     """
 
     photos: NDArray[np.int64]
@@ -99,17 +93,14 @@ def assemble_landmarks(
     angles_deg: NDArray[np.float32] | None = None,
     colors: NDArray[np.uint8] | None = None,
 ) -> tuple[Landmarks, list[NDArray[np.int64]]]:
-    """Put points (P, 3) in the world and their observations in the map's order.
+    """Make landmarks of points (P, 3) in the world and their observations by n views.
 
     Args:
-        views: n photos.
-        points: (P, 3) in the world.
-        observations: of the points; sorted by photo here.
-        angles_deg: (P,); NaN without.
+        angles_deg: (P,) largest angle between two rays; NaN if not given.
         colors: (P, 3).
 
     Returns:
-        The landmarks, and of each photo the rows of its features that observe them.
+        The landmarks, and for each photo the rows of its features that observe them.
     """
     if (np.diff(observations.views) < 0).any():
         observations = observations.take(np.argsort(observations.views, kind="stable"))
@@ -137,7 +128,7 @@ def assemble_landmarks(
 def reprojection_errors(
     views: Sequence[View], points: NDArray[np.float64], observations: Observations
 ) -> NDArray[np.float64]:
-    """Return the distance in pixels (M,) between sightings and projections; NaN behind a camera."""
+    """Return the distances (M,) in pixels of observations from projections; NaN behind a camera."""
     errors = np.empty(len(observations))
     for row, own in rows_by_value(observations.views):
         view = views[row]
@@ -147,7 +138,7 @@ def reprojection_errors(
 
 
 def rows_by_value(values: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Yield each value that occurs, with the rows where it does."""
+    """Yield each distinct value with the rows that have it."""
     if len(values) == 0:
         return
     order = np.argsort(values, kind="stable")
@@ -178,7 +169,7 @@ def triangulation_angles(
 
 
 def _choose_origin(views: Sequence[View]) -> NDArray[np.float64]:
-    """Whole units near the photos when they are so far off that float32 would lose millimetres."""
+    """Return whole units near the photos if float32 would lose millimetres there, else zeros."""
     center = np.mean([view.cam_from_world.center for view in views], axis=0)
     far_off = np.abs(center).max() > 1000.0
     return np.asarray(np.round(center) if far_off else np.zeros(3), dtype=np.float64)

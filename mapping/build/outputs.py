@@ -1,4 +1,4 @@
-"""Results that are complete or not there."""
+"""Outputs that are complete or absent."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from visloc.errors import Conflict
 
 
 def refuse_existing(output: Path, code: str) -> None:
-    """Refuse to write where something is.
+    """Refuse to overwrite a file or folder.
 
     Raises:
         Conflict: ``code``.
@@ -28,7 +28,7 @@ def refuse_existing(output: Path, code: str) -> None:
 
 @contextmanager
 def complete_output(output: Path, code: str) -> Iterator[Path]:
-    """Give a path beside ``output``, for a file or folder that gets its name when all went well.
+    """Give a path beside ``output``, which is renamed to ``output`` if the block succeeds.
 
     Raises:
         Conflict: ``code`` if ``output`` exists, before or after the work.

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mapping.methods.depth import DepthMatch, DepthMatcher
+from mapping.progress import ItemProgress
 from visloc.archive import sha256_of
 from visloc.errors import DatasetError
 from visloc.geometry import Camera, Pose
@@ -14,20 +15,18 @@ from visloc.images import Photo, read_photo_file, upright
 from visloc.kapture import Dataset, FileRecord
 from visloc.localization.query_camera import GUESSED_FOCAL
 
+# More names than a note needs.
+_NAMED = 3
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappingPhoto:
     """A photo with all that is known of it.
 
     Attributes:
-        record: its name, sensor and timestamp in the dataset.
         path: the file; it exists when ``sha256`` is not None.
-        sha256: of the file; of one below a URL, what its storage says instead.
-        camera: intrinsics.
-        camera_known: whether they are the dataset's; else a guess to start from.
-        cam_from_world: pose, when known.
-        depth: its depth map, if it has one.
-        depth_sha256: of the depth map's file.
+        sha256: of the file; for a dataset at a URL, the storage's own tag of the content.
+        camera_known: whether the intrinsics are the dataset's; else they are a guess.
     """
 
     record: FileRecord
@@ -59,12 +58,11 @@ class MappingPhoto:
 def read_in_frame(path: Path, size: tuple[int, int], sensor_id: str) -> Photo:
     """Decode a photo of a dataset in the frame of its camera: the pixels as stored.
 
-    If the camera has the size of the upright picture instead (width and height swapped, EXIF
-    orientation 5 to 8), whatever made the dataset turned the pixels when it read them. Camera,
-    pose and depth map are then those of the upright picture, and so is what this returns.
+    If the camera has the size of a photo on its side (width and height swapped, EXIF orientation 5
+    to 8), the tool that made the dataset turned the pixels when it read them. Camera, pose and
+    depth map then belong to the upright picture, which is returned.
 
     Args:
-        path: the file.
         size: width and height of the camera, pixels.
         sensor_id: of the camera, for the error.
 
@@ -95,76 +93,100 @@ def collect_photos(
     has_features: Callable[[str], bool] | None = None,
     with_depth: bool = False,
     depth_sensor: str | None = None,
-    progress: Callable[[int, int], None],
+    progress: ItemProgress,
 ) -> tuple[list[MappingPhoto], list[str]]:
-    """Gather the photos that can be used, and their depth maps.
+    """Collect the usable photos and their depth maps.
 
     Args:
-        dataset: the dataset.
-        posed: take only photos with intrinsics and a pose; else those without get guessed
-            intrinsics (SIMPLE_RADIAL) and stay without a pose.
+        posed: take only photos with intrinsics and a pose. Otherwise photos without them get
+            guessed intrinsics (SIMPLE_RADIAL) and no pose.
         with_files: take only photos whose file exists.
         has_features: tells whether a photo, by name, has ready-made features; others are left out.
         with_depth: look for depth maps.
-        depth_sensor: the depth sensor to use, when several go with a photo.
-        progress: told how many photos are done, and how many there are.
+        depth_sensor: the depth sensor to use if a photo has several depth maps.
+        progress: called with how many photos are done, and how many there are.
 
     Returns:
-        The photos in the dataset's order, and notes on what was left out.
+        The photos in the dataset's order, and notes on those left out.
 
     Raises:
         DatasetError: ``dataset.no_photos`` when none is left.
     """
+    wanted = _Wanted(dataset, posed, with_files, has_features)
     photos: list[MappingPhoto] = []
     left_out: dict[str, list[str]] = {}
     matcher = DepthMatcher(dataset, depth_sensor) if with_depth else None
     for done, record in enumerate(dataset.images, 1):
-        path = dataset.path_of(record)
-        camera = dataset.sensors[record.sensor_id].camera
-        pose = dataset.pose(record)
-        if with_files and not dataset.has_file(record):
-            left_out.setdefault("are listed, but the file is absent", []).append(record.path)
-        elif has_features is not None and not has_features(record.path):
-            left_out.setdefault("have no ready-made features", []).append(record.path)
-        elif posed and camera is None:
-            left_out.setdefault("have a camera of unknown model", []).append(record.path)
-        elif posed and pose is None:
-            left_out.setdefault("have no pose", []).append(record.path)
-        else:
+        why = wanted.why_not(record)
+        if why is None:
             depth = matcher.match(record) if matcher else None
             if matcher and depth is None:
                 left_out.setdefault("have no depth map: retrieval only", []).append(record.path)
-            photos.append(
-                MappingPhoto(
-                    record,
-                    path,
-                    _checksum(dataset, record) if with_files else None,
-                    camera or _guessed_camera(dataset, record),
-                    camera is not None,
-                    pose,
-                    depth,
-                    _checksum(dataset, depth.record) if depth else None,
-                )
-            )
+            photos.append(_mapping_photo(dataset, record, depth, with_file=with_files))
+        else:
+            left_out.setdefault(why, []).append(record.path)
         progress(done, len(dataset.images))
     notes = [
-        f"{len(names)} of {len(dataset.images)} photos {why}: {', '.join(names[:3])}"
-        + (", ..." if len(names) > 3 else "")
+        f"{len(names)} of {len(dataset.images)} photos {why}: {some(names)}"
         for why, names in left_out.items()
     ]
     if not photos:
-        needed = [
-            *(["a file"] if with_files else []),
-            *(["ready-made features"] if has_features is not None else []),
-            *(["a camera of a known model", "a pose"] if posed else []),
-        ]
         raise DatasetError(
             "dataset.no_photos",
             "no photo of the dataset can be used" + "".join(f"; {note}" for note in notes),
             field=str(dataset.root / "sensors" / "records_camera.txt"),
-            expected=f"photos with {', '.join(needed)}",
+            expected=f"photos with {', '.join(wanted.parts())}",
         )
     return photos, notes
+
+
+@dataclass(frozen=True, slots=True)
+class _Wanted:
+    """The parts that a photo must have, as for ``collect_photos``."""
+
+    dataset: Dataset
+    posed: bool
+    with_files: bool
+    has_features: Callable[[str], bool] | None
+
+    def why_not(self, record: FileRecord) -> str | None:
+        if self.with_files and not self.dataset.has_file(record):
+            return "are listed, but the file is absent"
+        if self.has_features is not None and not self.has_features(record.path):
+            return "have no ready-made features"
+        if self.posed and self.dataset.sensors[record.sensor_id].camera is None:
+            return "have a camera of unknown model"
+        if self.posed and self.dataset.pose(record) is None:
+            return "have no pose"
+        return None
+
+    def parts(self) -> list[str]:
+        return [
+            *(["a file"] if self.with_files else []),
+            *(["ready-made features"] if self.has_features is not None else []),
+            *(["a camera of a known model", "a pose"] if self.posed else []),
+        ]
+
+
+def some(names: Sequence[str]) -> str:
+    """Return a few names, for a note."""
+    return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+
+
+def _mapping_photo(
+    dataset: Dataset, record: FileRecord, depth: DepthMatch | None, *, with_file: bool
+) -> MappingPhoto:
+    camera = dataset.sensors[record.sensor_id].camera
+    return MappingPhoto(
+        record,
+        dataset.path_of(record),
+        _checksum(dataset, record) if with_file else None,
+        camera or _guessed_camera(dataset, record),
+        camera is not None,
+        dataset.pose(record),
+        depth,
+        _checksum(dataset, depth.record) if depth else None,
+    )
 
 
 def _guessed_camera(dataset: Dataset, record: FileRecord) -> Camera:

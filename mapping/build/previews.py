@@ -1,4 +1,4 @@
-"""Small pictures of the mapping photos, for maps that are to show them."""
+"""Small copies of the mapping photos, for maps that show them."""
 
 from __future__ import annotations
 
@@ -8,37 +8,30 @@ from pathlib import Path
 
 import cv2
 
-from mapping.build.features import Progress
+from mapping.build.context import BuildContext
 from mapping.build.photos import MappingPhoto
 from mapping.build.stages import Item, WorkFolder, key_of
-from mapping.cluster.executors import Executor
 from visloc.archive.schema import MAX_PHOTO_SIDE, photo_file
 
 _JPEG_QUALITY = 80
-# Raised when the code here changes what comes out.
+# Raised when the code of the stage changes what comes out.
 _REVISION = 1
 
 
-def keep_photos(
-    work: WorkFolder,
-    folder: Path,
-    photos: Sequence[MappingPhoto],
-    workers: Executor,
-    progress: Progress,
-) -> None:
+def keep_photos(context: BuildContext, folder: Path, photos: Sequence[MappingPhoto]) -> None:
     """Write small JPEGs of the photos, in this order, into the folder of a map.
 
-    They hold pixels in the frame of the photo's camera and nothing else: no EXIF, no place, no
+    They hold pixels in the frame of the photo's camera, and no metadata such as EXIF, place or
     time.
 
     Raises:
         VislocError: what ``MappingPhoto.read`` raises.
     """
-    workers.run(partial(_keep, work), photos, partial(progress, "small photos"))
+    context.run("small photos", partial(_keep, context.work), photos)
     for row, photo in enumerate(photos):
         output = folder / photo_file(row)
         output.parent.mkdir(parents=True, exist_ok=True)
-        output.write_bytes(work.read(_key(photo))["jpeg"].tobytes())
+        output.write_bytes(context.work.read(_key(photo))["jpeg"].tobytes())
 
 
 def _key(photo: MappingPhoto) -> str:

@@ -1,4 +1,4 @@
-"""Publishing what a job made: how versions are named, and what lies beside the arrays."""
+"""Publishing the results of jobs: names of versions, and the files beside a map's arrays."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PAIRS = "pairs.txt"
 
 
 def photo_files(opened: Map) -> list[Path]:
-    """The small pictures that a map keeps of its photos, in their order; none without them."""
+    """Return a map's small photos in their order; none if it keeps none."""
     names = [photo_file(row) for row in range(len(opened.images))]
     return [opened.path / name for name in names if name in opened.manifest.files]
 
@@ -27,14 +27,11 @@ def publish_edited(
     photos: Sequence[Path] = (),
     based_on: str | None = None,
 ) -> Path:
-    """Publish content that was made from maps as the current version of a map.
+    """Publish content made from maps as the current version of a map.
 
     Args:
-        store: where.
-        content: the map.
-        map_id: its id.
-        photos: small pictures of all photos, in their order; or none.
-        based_on: the version that it was made from, if it is one of the same map.
+        photos: small copies of all photos, in their order; or none.
+        based_on: the version that the content was made from, if it is one of the same map.
 
     Returns:
         The folder of the new version.
@@ -57,17 +54,17 @@ def publish_content(
     *,
     based_on: str | None = None,
 ) -> Path:
-    """Write content beside the files that are in a folder already, and publish it.
+    """Write content beside the files that a folder has already, and publish it.
 
     Raises:
-        Conflict: ``map.outdated``, as ``MapStore.publish``.
+        Conflict: ``map.outdated``.
     """
     version = write_content(incoming, content, map_id)
     return store.publish(incoming, map_id, version, based_on=based_on)
 
 
 def link_photos(folder: Path, photos: Sequence[Path]) -> None:
-    """Give a map small pictures of its photos, in their order, that another one has."""
+    """Give a map the small photos, in their order, of another map."""
     for row, path in enumerate(photos):
         target = folder / photo_file(row)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -75,12 +72,12 @@ def link_photos(folder: Path, photos: Sequence[Path]) -> None:
 
 
 def write_content(folder: Path, content: MapContent, map_id: str) -> str:
-    """Write content beside the files that are in a folder already; return its version."""
+    """Write content beside the files that a folder has already; return its version."""
     version, created = new_version()
     return write_map(folder, content, map_id=map_id, version=version, created=created)
 
 
 def new_version() -> tuple[str, str]:
-    """Name a version by this moment: a prefix for its content hash, and ISO 8601 in UTC."""
+    """Name a version after the current time: a prefix for its content hash, and ISO 8601 in UTC."""
     now = datetime.now(UTC)
     return now.strftime("%Y%m%dT%H%M%S.%f")[:-3] + "Z-", now.isoformat(timespec="seconds")

@@ -1,11 +1,11 @@
-"""Resumable work: every result is a file named by the hash of all that it depends on.
+"""Resumable work: every result is a file named by the hash of all its inputs.
 
-A stage asks for an item by its key. If the file is there it is read, otherwise the work is done
-and the file appears by one atomic rename. A build that was killed finds its finished items again;
-a build whose photos, settings, weights or code changed finds none of those that depend on them.
+A stage asks for an item by its key. If the file exists, it is read; otherwise the work is done and
+the file appears by one atomic rename. A build that was killed finds its finished items again. A
+build whose photos, settings, weights or code changed does not find the items that depend on them.
 
-Nobody waits until an item is on the disk: that took longer than making most of them. A machine that
-loses power may leave damaged ones; their checksums tell, and they are made again.
+Files are not synced to disk: that took longer than making most of them. A power loss may leave
+damaged items; their checksums show it, and they are made again.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from mapping.cluster.storage import is_remote, remove_folder
 from visloc.archive.npz import read_npz
 from visloc.errors import Conflict, InvalidInput, Unavailable
 
-# Tells that a folder is one of finished work, which may be removed.
+# Marks a folder of finished work, which may be removed.
 _MARKER = "visloc-work.txt"
 _MARKER_TEXT = b"Finished work of a build. It is removed when the map is published.\n"
-# NumPy's letters of what items hold: numbers, truth values, text.
+# NumPy's letters for the arrays of items: numbers, booleans, text.
 _KINDS = "biufU"
 
 Item = Mapping[str, NDArray[Any]]
 
 
 def key_of(stage: str, revision: int, **inputs: object) -> str:
-    """Name of a result: the stage, the revision of its code, and all that goes in.
+    """Return the name of a result, from the stage, the revision of its code, and all inputs.
 
     Args:
-        stage: name of the stage; the folder of its items.
-        revision: raised whenever the code changes what comes out.
-        inputs: JSON values: settings, and the keys of the items that it reads.
+        stage: also the folder of its items.
+        revision: raised whenever the code changes the result.
+        inputs: JSON values: settings, and keys of the items that the stage reads.
     """
     text = json.dumps([stage, revision, inputs], sort_keys=True)
     return f"{stage}/{hashlib.sha256(text.encode()).hexdigest()[:32]}"
@@ -58,7 +58,7 @@ class WorkFolder:
     """Finished items of a build, found again after an interruption.
 
     Attributes:
-        root: a folder, or a URL of object storage, where what is written appears whole.
+        root: a folder, or a URL of object storage, where files appear whole.
     """
 
     root: Path
@@ -69,10 +69,10 @@ class WorkFolder:
         return Path(tempfile.gettempdir()) if is_remote(self.root) else self.root
 
     def claim(self) -> None:
-        """Mark the folder as one of finished work, so that it may be removed.
+        """Mark the folder as finished work, so that it may be removed.
 
         Raises:
-            InvalidInput: ``build.work_dir`` for a folder of somebody else's files.
+            InvalidInput: ``build.work_dir`` for a folder with other files.
         """
         marker = self.root / _MARKER
         if marker.is_file():
@@ -91,14 +91,12 @@ class WorkFolder:
         marker.write_bytes(_MARKER_TEXT)
 
     def remove(self) -> None:
-        """Remove the folder with all that is in it."""
         if is_remote(self.root):
             remove_folder(self.root)
         else:
             shutil.rmtree(self.root, ignore_errors=True)
 
     def has(self, key: str) -> bool:
-        """Tell whether an item is finished."""
         return self._path(key).is_file()
 
     def read(self, key: str) -> Item:
@@ -150,7 +148,7 @@ class WorkFolder:
     def _load(self, key: str) -> Item:
         path = self._path(key)
         arrays = read_npz(path.read_bytes() if is_remote(path) else path, _KINDS)
-        # Copied, to be writable as what was computed is.
+        # Copies are writable, like computed arrays.
         return {name: array.copy() for name, array in arrays.items()}
 
     def _path(self, key: str) -> Path:
@@ -159,15 +157,15 @@ class WorkFolder:
 
 @contextmanager
 def exclusive(lock: Path) -> Iterator[None]:
-    """Hold a lock file against a second build; released when the process ends, however it ends.
+    """Hold a lock file against a second build; it is released when the process ends.
 
-    The file stays: removing it would let two builds hold locks of the same name.
+    The file stays, since two builds could hold locks of the same name if it were removed.
 
     Raises:
         Conflict: ``build.running``.
     """
     lock.parent.mkdir(parents=True, exist_ok=True)
-    with lock.open("a") as file:  # whatever it is, it stays as it is
+    with lock.open("a") as file:  # an existing file keeps its content
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

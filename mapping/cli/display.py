@@ -1,13 +1,15 @@
-"""What the ``mapping`` command shows of maps and imports."""
+"""The output of the ``mapping`` command about maps and imports."""
 
 from __future__ import annotations
 
 import math
 import resource
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -18,15 +20,29 @@ from mapping.frames.rig_calibration import OUTLIER_MULTIPLE, RigCalibration, Spr
 from mapping.importers import ImportSummary
 from mapping.maps.cameras import camera_lines, cameras_of
 from visloc.archive import Map
+from visloc.archive.places import GeoCircle
 from visloc.archive.schema import photo_file
 from visloc.retrieval.fusion import EQUAL_GHARM
 
+OUT = Console()
+ERR = Console(stderr=True)
 # More lines than anyone reads.
 _SHOWN_RESIDUALS = 20
 
 
+def say(text: str) -> None:
+    """Print a line as it is, however long."""
+    OUT.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def say_notes(notes: Iterable[str]) -> None:
+    """Print notes, one in a line."""
+    for note in notes:
+        say(f"note: {note}")
+
+
 def summary_of(opened: Map) -> dict[str, Any]:
-    """Return what a map holds, for programs."""
+    """Return the contents of a map, for programs."""
     manifest = opened.manifest.model_dump(exclude={"files"}, mode="json")
     counts = manifest["counts"]
     return {
@@ -37,7 +53,7 @@ def summary_of(opened: Map) -> dict[str, Any]:
         "cameras": len(opened.cameras),
         "focal_lengths": {name: asdict(one) for name, one in cameras_of(opened).items()},
         "rigs": {rig: sorted(members) for rig, members in opened.rigs.items()},
-        # What a geodetic anchor tells of it is not in every manifest.
+        # Not in every manifest: a geodetic anchor implies it.
         "gravity": None if opened.gravity is None else opened.gravity.tolist(),
         "keeps": [
             *(["photos"] if photo_file(0) in opened.manifest.files else []),
@@ -47,8 +63,8 @@ def summary_of(opened: Map) -> dict[str, Any]:
     }
 
 
-def print_map(out: Console, opened: Map) -> None:
-    """Show what a map holds."""
+def print_map(opened: Map) -> None:
+    """Print the contents of a map."""
     summary = summary_of(opened)
     counts, local = summary["counts"], summary["local_features"]
     extent = summary["world"]["extent"]
@@ -72,10 +88,8 @@ def print_map(out: Console, opened: Map) -> None:
         "extent": " x ".join(f"{side:.2f}" for side in sides)
         + (" m" if summary["world"]["metric"] else " (not metric)"),
         "world": _world(opened),
-        "gravity": "not known"
-        if opened.gravity is None
-        else f"down is ({', '.join(f'{value:.6g}' for value in opened.gravity)})",
-        "place": _place(opened),
+        "gravity": gravity_text(opened.gravity),
+        "place": place_text(opened.place) + _scale(opened),
         "method": summary["method"]["name"],
         "keeps": ", ".join(summary["keeps"]) or "neither photos nor colours",
         "size": f"{summary['size_bytes'] / 2**20:.1f} MiB, "
@@ -85,13 +99,12 @@ def print_map(out: Console, opened: Map) -> None:
     }
     for name, value in rows.items():
         table.add_row(name, escape(value))
-    out.print(table)
-    for note in summary["notes"]:
-        out.print(f"note: {note}", markup=False, soft_wrap=True)
+    OUT.print(table)
+    say_notes(summary["notes"])
 
 
 def _retrieval(opened: Map) -> dict[str, str]:
-    """How global features are fused, where the map was given another way than the usual."""
+    """Return how global features are fused, if not in the usual way."""
     if opened.fusion == EQUAL_GHARM:
         return {}
     weights = opened.fusion.weights
@@ -104,7 +117,7 @@ def _retrieval(opened: Map) -> dict[str, str]:
 
 
 def _world(opened: Map) -> str:
-    """Whether a unit is a metre, and what fixed the frame."""
+    """Return whether a unit is a metre, and what fixed the frame."""
     world = opened.manifest.world
     unit = "metric" if world.metric else "not metric"
     if world.anchor is None:
@@ -122,51 +135,60 @@ def _world(opened: Map) -> str:
     return f"{unit}, fixed by {fixed_by}{off}"
 
 
-def _place(opened: Map) -> str:
-    place, geodetic = opened.place, opened.geodetic
-    if place is None or geodetic is None:
+def gravity_text(down: NDArray[np.float64] | None) -> str:
+    """Return the direction of gravity, for people."""
+    if down is None:
+        return "not known"
+    return f"down is ({', '.join(f'{value:.6g}' for value in down)})"
+
+
+def place_text(place: GeoCircle | None) -> str:
+    """Return where a map or a set lies on Earth, for people."""
+    if place is None:
         return "not anchored to the Earth"
-    scale = "" if geodetic.scale == 1 else f", {geodetic.scale:.6g} m per unit"
     return (
         f"latitude {place.latitude:.7f}, longitude {place.longitude:.7f}, "
-        f"within {place.radius:.0f} m{scale}"
+        f"within {place.radius:.0f} m"
     )
 
 
-def print_georeference(out: Console, found: Georeference) -> None:
-    """Show how well what was known agrees with where a map was put."""
+def _scale(opened: Map) -> str:
+    geodetic = opened.geodetic
+    if geodetic is None or geodetic.scale == 1:
+        return ""
+    return f", {geodetic.scale:.6g} m per unit"
+
+
+def print_georeference(found: Georeference) -> None:
+    """Print how well the known positions agree with the map's place on Earth."""
     geodetic = found.anchor.geodetic
-    assert geodetic is not None  # what a georeference is
+    assert geodetic is not None  # a georeference has one
     if found.names:
-        table = Table(box=None, title="metres from where it was said to be", title_justify="left")
-        for name in ("place", "east", "north", "up", ""):
-            table.add_column(name, justify="left" if name in ("place", "") else "right")
-        off = found.residuals_m
-        # The worst tell most.
-        order = sorted(range(len(off)), key=lambda row: -float((off[row] ** 2).sum()))
-        for row in order[:_SHOWN_RESIDUALS]:
-            numbers = (f"{value:.2f}" for value in off[row])
-            table.add_row(
-                escape(found.names[row]), *numbers, "" if found.agrees[row] else "left out"
-            )
-        out.print(table)
-        if len(order) > _SHOWN_RESIDUALS:
-            out.print(f"and {len(order) - _SHOWN_RESIDUALS} that are nearer", highlight=False)
-        rms = math.sqrt((off[found.agrees] ** 2).sum(axis=1).mean())
-        out.print(
-            f"{found.agrees.sum()} of {len(off)} agree, within {rms:.3g} m (RMS)",
-            highlight=False,
-        )
-    out.print(
+        _print_residuals(found)
+    say(
         f"place: latitude {geodetic.latitude_deg:.9f}, longitude {geodetic.longitude_deg:.9f}, "
-        f"altitude {geodetic.altitude_m:.3f} m; {geodetic.scale:.6g} m per unit",
-        highlight=False,
-        soft_wrap=True,
+        f"altitude {geodetic.altitude_m:.3f} m; {geodetic.scale:.6g} m per unit"
     )
+
+
+def _print_residuals(found: Georeference) -> None:
+    table = Table(box=None, title="metres from the given position", title_justify="left")
+    for name in ("place", "east", "north", "up", ""):
+        table.add_column(name, justify="left" if name in ("place", "") else "right")
+    off = found.residuals_m
+    worst_first = sorted(range(len(off)), key=lambda row: -float((off[row] ** 2).sum()))
+    for row in worst_first[:_SHOWN_RESIDUALS]:
+        numbers = (f"{value:.2f}" for value in off[row])
+        table.add_row(escape(found.names[row]), *numbers, "" if found.agrees[row] else "left out")
+    OUT.print(table)
+    if len(off) > _SHOWN_RESIDUALS:
+        say(f"and {len(off) - _SHOWN_RESIDUALS} that are nearer")
+    rms = math.sqrt((off[found.agrees] ** 2).sum(axis=1).mean())
+    say(f"{found.agrees.sum()} of {len(off)} agree, within {rms:.3g} m (RMS)")
 
 
 def print_costs(out: Console, costs: Sequence[StageCost]) -> None:
-    """Show what each stage of a build cost."""
+    """Print the cost of each stage of a build."""
     table = Table(box=None)
     table.add_column("stage")
     for name in ("items", "seconds", "CPU seconds", "MiB written"):
@@ -182,28 +204,26 @@ def print_costs(out: Console, costs: Sequence[StageCost]) -> None:
     out.print(table)
 
 
-def peak_memory_bytes() -> int:
-    """The largest of this process and its workers, each at its peak."""
+def say_peak_memory() -> None:
+    """Print the peak memory of this process or its largest worker."""
     kinds = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    return max(resource.getrusage(kind).ru_maxrss for kind in kinds) * 1024
+    peak_bytes = max(resource.getrusage(kind).ru_maxrss for kind in kinds) * 1024
+    say(f"peak memory {peak_bytes / 2**30:.2f} GiB")
 
 
-def print_import(out: Console, summary: ImportSummary) -> None:
-    """Show what an import brought."""
-    out.print(
+def print_import(summary: ImportSummary) -> None:
+    """Print the contents of an import."""
+    say(
         f"{summary.images} photos by {summary.cameras} cameras, {summary.posed} with a pose, "
         f"{summary.depth_maps} with depth, {summary.gnss} GNSS fixes; {summary.points} points, "
         f"{summary.observations} observations"
-        + (", metric" if summary.metric else ", not known to be metric"),
-        highlight=False,
-        soft_wrap=True,
+        + (", metric" if summary.metric else ", not known to be metric")
     )
-    for note in summary.notes:
-        out.print(f"note: {note}", markup=False, soft_wrap=True)
+    say_notes(summary.notes)
 
 
-def print_rig(out: Console, calibration: RigCalibration) -> None:
-    """Show where the cameras of a rig are, and how well their instants agree."""
+def print_rig(calibration: RigCalibration) -> None:
+    """Print where the cameras of a rig are, and how well their instants agree."""
     table = Table(
         box=None,
         title=f"rig {escape(calibration.rig)}, its frame is camera {escape(calibration.reference)}",
@@ -221,15 +241,12 @@ def print_rig(out: Console, calibration: RigCalibration) -> None:
             *(escape(name), escape(camera.relative_to), str(found.instants), str(found.outliers)),
             *(_deviation(found.rotation_deg), _deviation(found.position), position),
         )
-    out.print(table)
-    out.print(
+    OUT.print(table)
+    say(
         "degrees, units: deviation of the instants from the estimate, median / 90 %; "
-        f"outliers: instants {OUTLIER_MULTIPLE:g} times further off than the median",
-        soft_wrap=True,
-        highlight=False,
+        f"outliers: instants {OUTLIER_MULTIPLE:g} times further off than the median"
     )
-    for note in calibration.notes:
-        out.print(f"note: {note}", markup=False, soft_wrap=True)
+    say_notes(calibration.notes)
 
 
 def _deviation(spread: Spread) -> str:
@@ -237,5 +254,5 @@ def _deviation(spread: Spread) -> str:
 
 
 def _figure(value: float) -> str:
-    """Four digits, and 0 for round-off."""
+    """Return four digits, and 0 for round-off."""
     return f"{value:.4g}" if abs(value) > 1e-9 else "0"

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 
-from mapping.cli.options import MapsDirOption
+from mapping.cli.display import ERR, say, say_notes
 from mapping.cli.progress import StageProgress
 from mapping.maps.merging.job import MIN_OVERLAP, Merged, join_as_set, merge_maps
+from mapping.options import MapsDirOption
 from visloc.archive import MapStore
 from visloc.geometry import Pose
-
-_out = Console()
-_err = Console(stderr=True)
 
 
 def merge(
@@ -26,26 +22,26 @@ def merge(
     map_id: Annotated[str, typer.Option("--map", help="Id of the new map, or set.")],
     as_set: Annotated[
         bool,
-        typer.Option("--as-set", help="Leave both as they are, and publish a set of them."),
+        typer.Option("--as-set", help="Publish a set of both instead, and leave them as they are."),
     ] = False,
     min_overlap: Annotated[
         float,
-        typer.Option(help="Least part of the photos of B that must be found in A, 0 to 1."),
+        typer.Option(help="Least share of B's photos that must be localized in A, 0 to 1."),
     ] = MIN_OVERLAP,
     maps_dir: MapsDirOption = Path("maps"),
 ) -> None:
-    """Register a map in another one that shows the same place, and make one map of both."""
+    """Register a map in another map of the same place, and make one map of both."""
     store = MapStore(maps_dir)
     join = join_as_set if as_set else merge_maps
-    with StageProgress(_err, if_stopped="nothing was published") as progress:
+    with StageProgress(ERR, if_stopped="nothing was published") as progress:
         merged = join(store, a, b, map_id, progress, min_overlap=min_overlap)
     print_merged(merged, map_id)
 
 
 def print_merged(merged: Merged, map_id: str) -> None:
-    """Show how well two maps fit each other, and what became of them."""
+    """Print how well two maps fit, and the map that was made of them."""
     found, unit = merged.registration, "m" if merged.a.manifest.world.metric else "units"
-    tie, say = found.tie, partial(_out.print, markup=False, highlight=False, soft_wrap=True)
+    tie = found.tie
     tied, moved_by = tie.tied, tie.there_from_here
     w, x, y, z = Pose(moved_by.rotation, moved_by.translation).rotation_wxyz
     distance, angle = (np.median(values[tied]) for values in (tie.distances, tie.angles_deg))
@@ -61,6 +57,5 @@ def print_merged(merged: Merged, map_id: str) -> None:
         f"A from B: scale {moved_by.scale:.6g}, rotation {w:.6f} {x:.6f} {y:.6f} {z:.6f}, "
         "translation " + " ".join(f"{value:.4f}" for value in moved_by.translation)
     )
-    for note in merged.notes:
-        say(f"note: {note}")
+    say_notes(merged.notes)
     say(f"published: {map_id}@{merged.folder.name}")

@@ -1,14 +1,12 @@
-"""Progress of a long command: bars on a terminal; in a log, a line per stage and every ten seconds.
+"""Progress of a long command: bars on a terminal, lines in a log.
 
-A stage of one long step shows that it moves by the time that it has taken.
+A log gets a line at the end of each stage, and every ten seconds.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from types import TracebackType
 
 from rich.console import Console
@@ -27,20 +25,12 @@ from rich.progress import (
 _LINE_EVERY_S = 10.0
 
 
-@contextmanager
-def one_step(progress: Callable[[str, int, int], None], stage: str) -> Iterator[None]:
-    """Tell the progress of a stage that consists of one step: what is done within."""
-    progress(stage, 0, 1)
-    yield
-    progress(stage, 1, 1)
-
-
 class StageProgress:
-    """Shows how far each stage is. Call it with the stage, how much is done, and how much is.
+    """A ``mapping.progress.Progress`` that prints.
 
     Args:
-        console: where to.
-        if_stopped: what Ctrl-C leaves, for the person who pressed it.
+        console: to print to.
+        if_stopped: told to the user after Ctrl-C.
     """
 
     def __init__(
@@ -83,13 +73,13 @@ class StageProgress:
             self._console.print(f"stopped; {self._if_stopped}")
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        """Tell that ``done`` of ``total`` items of a stage are finished."""
+        """Show that ``done`` of ``total`` items of a stage are finished."""
         if stage not in self._tasks:
             self._tasks[stage] = self._bars.add_task(stage, total=total)
             self._started[stage] = time.monotonic()
         self._bars.update(self._tasks[stage], completed=done, total=total)
         seconds = time.monotonic() - self._started[stage]
-        # The end of a step that was over before a line told of it is not worth one.
+        # A single step that ends before its first line gets no line at all.
         is_told = total > 1 or seconds >= _LINE_EVERY_S
         if done == total and is_told and not self._console.is_terminal:
             self._console.print(f"{stage}: {done}/{total} in {seconds:.1f} s", highlight=False)

@@ -8,48 +8,45 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
-from mapping.cli.options import MapsDirOption, WeightsDirOption
+from mapping.cli.display import ERR, OUT, say
 from mapping.cli.progress import StageProgress
 from mapping.maps.pruning.accuracy import BINS, Accuracy, lost, of_queries
 from mapping.maps.pruning.job import Pruned, prune_map
+from mapping.options import MapsDirOption, WeightsDirOption
 from visloc.archive import Map, MapStore
 from visloc.errors import InvalidInput
 from visloc.features import make_global_descriptor, make_local_features
 
-# More than this part of the queries, and than two of them, is more than noise.
+# More lost queries than this share of all, and than this number, are more than noise.
 _NOISE_SHARE, _NOISE_QUERIES = 0.05, 2
 _UNITS = {"": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
 _SIZE = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?(%|[KMG]i?B|)", re.IGNORECASE)
-
-_out = Console()
-_err = Console(stderr=True)
 
 
 def prune(
     map_id: Annotated[str, typer.Argument(metavar="MAP", help="Id of the map, or id@version.")],
     max_bytes: Annotated[
         str | None,
-        typer.Option(help="Most that the map may take, such as 200MB, or 50% of what it takes."),
+        typer.Option(help="Largest size of the map, such as 200MB, or 50% of its size now."),
     ] = None,
     max_landmarks: Annotated[
-        int | None, typer.Option(min=1, help="Or the most landmarks that it may have.")
+        int | None, typer.Option(min=1, help="Or the largest number of landmarks.")
     ] = None,
     queries: Annotated[
         Path | None,
         typer.Option(
-            help="A kapture folder of photos with poses in the map's frame, to measure accuracy "
-            "with; left out: photos of the map, localized without themselves."
+            help="kapture folder of photos with poses in the map's frame, to measure accuracy. "
+            "Default: photos of the map, each localized without itself."
         ),
     ] = None,
     maps_dir: MapsDirOption = Path("maps"),
     weights_dir: WeightsDirOption = None,
 ) -> None:
-    """Make a map smaller: keep of each photo what localization needs most. A new version.
+    """Make a map smaller: keep what localization needs most of each photo.
 
-    Prints the accuracy before and after. The version before stays.
+    A new version is published; the old one stays. The accuracy before and after is printed.
     """
     if (max_bytes is None) == (max_landmarks is None):
         raise InvalidInput(
@@ -60,7 +57,7 @@ def prune(
         )
     store = MapStore(maps_dir)
     opened = store.open(map_id)
-    with StageProgress(_err, if_stopped="nothing was published") as progress:
+    with StageProgress(ERR, if_stopped="nothing was published") as progress:
         measure = None
         if queries is not None:
             local = opened.manifest.local_features.fingerprint.name
@@ -77,7 +74,7 @@ def prune(
 
         pruned = prune_map(
             store,
-            opened.ref,  # a part of its size means nothing of another version
+            opened.ref,  # a percentage refers to the size of this version
             max_bytes=None if max_bytes is None else parse_size(max_bytes, opened.size_bytes),
             max_landmarks=max_landmarks,
             measure=measure,
@@ -87,7 +84,7 @@ def prune(
 
 
 def parse_size(text: str, whole: int) -> int:
-    """Return how many bytes are meant by ``200MB``, ``1.5 GiB``, ``50%`` or a number.
+    """Return the bytes meant by ``200MB``, ``1.5 GiB``, ``50%`` or a number.
 
     Raises:
         InvalidInput: ``prune.max_bytes``.
@@ -109,10 +106,9 @@ def parse_size(text: str, whole: int) -> int:
 
 
 def print_pruned(pruned: Pruned, asked: str) -> None:
-    """Show what became smaller, and what that did to the accuracy."""
+    """Print sizes and accuracy before and after."""
     before, after = pruned.before, pruned.after
     metric = after.manifest.world.metric
-    say = partial(_out.print, markup=False, highlight=False, soft_wrap=True)
     say(f"map {after.ref}")
     table = Table(box=None)
     for name in ("", "before", "after"):
@@ -131,7 +127,7 @@ def print_pruned(pruned: Pruned, asked: str) -> None:
     ]
     for row in rows:
         table.add_row(*row)
-    _out.print(table, highlight=False)
+    OUT.print(table, highlight=False)
     first, second = pruned.accuracy
     say(f"accuracy is that of {first.queries} {asked}")
     worst = lost(first, second, metric=metric)
@@ -143,7 +139,7 @@ def print_pruned(pruned: Pruned, asked: str) -> None:
 
 
 def accuracy_rows(accuracies: tuple[Accuracy, ...], *, metric: bool) -> list[tuple[str, ...]]:
-    """The rows of a table of accuracies: of each, how many within the bins, and the medians."""
+    """Return rows of a table of accuracies: queries within each bin, and medians."""
     rows = [("localized", *(f"{len(one.errors)} of {one.queries}" for one in accuracies))]
     if metric:
         for bin_ in BINS:

@@ -8,20 +8,22 @@ import os
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path, PurePath
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from mapping.build.stages import WorkFolder, exclusive
-from mapping.cli.options import MapArgument, MapsDirOption, is_map_folder, map_folder
+from mapping.cli.display import ERR, OUT, say
 from mapping.cli.progress import StageProgress
+from mapping.cluster.storage import is_map_folder, map_folder
 from mapping.cluster.workers import DEFAULT_WORKERS, Workers
+from mapping.options import MapArgument, MapsDirOption
+from mapping.progress import Progress
 from mapping.report import make_report_data
 from mapping.report.data import UP_IS_A_GUESS, decimals_of
 from mapping.report.html import report_page
@@ -36,9 +38,6 @@ MAX_POINTS = 150_000
 # More names than anyone reads in a terminal; the file has them all.
 _SHOWN_NAMES = 20
 
-_out = Console()
-_err = Console(stderr=True)
-
 
 def report(
     map_ref: MapArgument,
@@ -46,28 +45,30 @@ def report(
         Path | None,
         typer.Option(
             "--output",
-            help="The HTML file to write, over one that is there; left out: ID-report.html here.",
+            help="HTML file to write; an existing file is replaced. Default: ID-report.html here.",
         ),
     ] = None,
     maps_dir: MapsDirOption = Path("maps"),
     workers: Annotated[
         int,
         typer.Option(
-            min=1, max=256, help="Processes that localize; they do not change the report."
+            min=1,
+            max=256,
+            help="Worker processes that localize. Their number does not change the report.",
         ),
     ] = DEFAULT_WORKERS,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
 ) -> None:
-    """Tell where a map is weak: where, and looking which way, would a photo be localized?
+    """Report where a map is weak: from which places and directions would a photo be localized?
 
-    Writes one HTML file that needs neither network nor server, and says the main points here.
-    Photos of the map are localized without themselves; no photo is needed for that.
+    Writes one HTML file that needs neither network nor server, and prints the main points. Each
+    photo of the map is localized without itself, from stored features; no photo is needed.
     """
     opened = open_map(map_folder(map_ref, maps_dir))
     target = Path(f"{opened.manifest.id}-report.html") if output is None else output
-    # Beside the report where the map is in no folder of maps.
+    # Beside the report if the map is not in a folder of maps.
     work_dir = target.parent if is_map_folder(map_ref) else maps_dir
-    with StageProgress(_err) as progress:
+    with StageProgress(ERR) as progress:
         data = write_report(
             opened, target, work_dir, workers=workers, command=_typed(), progress=progress
         )
@@ -80,40 +81,53 @@ def report(
 
 
 def write_report(
-    opened: Map,
-    target: Path,
-    work_dir: Path,
-    *,
-    workers: int,
-    command: str,
-    progress: Callable[[str, int, int], None],
+    opened: Map, target: Path, work_dir: Path, *, workers: int, command: str, progress: Progress
 ) -> dict[str, Any]:
-    """Write the report of a map, whole or not at all, and return what it shows.
+    """Write the report of a map, whole or not at all.
 
     Finished runs are kept in ``work_dir`` until the report is written.
 
     Args:
-        opened: the map.
-        target: the HTML file; one that exists is replaced.
+        target: the HTML file; an existing one is replaced.
         work_dir: where work in progress is kept, in ``.report``.
-        workers: processes that localize.
-        command: how to make it again, for the reader.
-        progress: told the stage, how much is done, and how much there is.
+        command: that makes the report again, for the reader.
 
     Returns:
-        A ``ReportData`` as ``web/src/report/data.ts`` has it.
+        The contents of the report: ``ReportData`` of ``web/src/report/data.ts``.
 
     Raises:
         Conflict: ``report.output`` or ``report.work`` if nothing can be written there;
             ``report.running``.
         Unavailable: ``page.not_built``.
     """
-    # What can go wrong at the end is tried before the long work.
+    # Errors that would come at the end are provoked before the long work.
     script, style = report_parts()
     unfinished = _begun(target)
+    root = work_dir / ".report" / opened.manifest.id
+    try:
+        with _work_folder(root) as work:
+            with Workers(workers) as pool:
+                data = make_report_data(
+                    opened, work, command=command, workers=pool, progress=progress
+                )
+            points = packed_points(opened, detail_order(opened.landmarks), 0, MAX_POINTS)
+            data["points"] = base64.b64encode(points).decode("ascii")
+            unfinished.write_text(report_page(data, script, style), "utf-8")
+            unfinished.replace(target)
+            shutil.rmtree(root, ignore_errors=True)
+    finally:
+        unfinished.unlink(missing_ok=True)
+    return data
+
+
+@contextmanager
+def _work_folder(root: Path) -> Iterator[WorkFolder]:
+    """Hold a folder for finished runs, against another report of the map.
+
+    Raises:
+        Conflict: ``report.running``, ``report.work``.
+    """
     with ExitStack() as held:
-        held.callback(unfinished.unlink, missing_ok=True)
-        root = work_dir / ".report" / opened.manifest.id
         try:
             held.enter_context(exclusive(root.with_name(f"{root.name}.lock")))
             root.mkdir(exist_ok=True)
@@ -130,26 +144,16 @@ def write_report(
                 "that is given as a folder",
                 got=error.strerror,
             ) from error
-        with Workers(workers) as pool:
-            data = make_report_data(
-                opened, WorkFolder(root), command=command, workers=pool, progress=progress
-            )
-        order = detail_order(opened.landmarks)
-        points = packed_points(opened, order, 0, MAX_POINTS)
-        data["points"] = base64.b64encode(points).decode("ascii")
-        unfinished.write_text(report_page(data, script, style), "utf-8")
-        unfinished.replace(target)
-        shutil.rmtree(root, ignore_errors=True)
-    return data
+        yield WorkFolder(root)
 
 
 def summary_of_report(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return the main points of a report, for programs.
 
-    Each photo counts by the run that left out the fewest others. ``likely`` and ``unlikely`` are
-    the shares of places and directions with a chance of 90 % and more, and of less than 10 %.
-    ``cameras`` are in words. ``up`` is ``gravity``, or ``cameras`` where it was guessed from how
-    these were held.
+    A photo counts by the run that left out the fewest others. ``likely`` and ``unlikely`` are the
+    shares of places and directions with a chance of at least 90 %, and of less than 10 %.
+    ``cameras`` are descriptions. ``up`` is ``gravity``, or ``cameras`` if it was guessed from how
+    they were held.
     """
     within = data["coverage"]["within"]
     kindest: dict[int, Mapping[str, Any]] = {}
@@ -179,7 +183,7 @@ def summary_of_report(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _begun(target: Path) -> Path:
-    """Make the file, still empty, that is to take the place of the target.
+    """Make an empty file that will replace the target.
 
     Raises:
         Conflict: ``report.output``.
@@ -208,7 +212,7 @@ def _no_output(target: Path, message: str, why: str) -> Conflict:
 
 
 def _typed() -> str:
-    """The command as it was typed, for whoever gets the file: of paths their last parts only."""
+    """Return the command as typed, for the reader: only the last parts of paths."""
     options = ("--output=", "--maps-dir=")
     words = []
     for word in sys.argv[1:]:
@@ -219,9 +223,6 @@ def _typed() -> str:
 
 
 def _print_summary(summary: Mapping[str, Any], *, metric: bool, decimals: int) -> None:
-    def say(text: str) -> None:
-        _out.print(text, markup=False, highlight=False, soft_wrap=True)
-
     for line in summary["cameras"]:
         say(f"cameras: {line}")
     within, unit = summary["within"], " m" if metric else " units"
@@ -250,7 +251,7 @@ def _print_summary(summary: Mapping[str, Any], *, metric: bool, decimals: int) -
                 f"{100 * spot['probability']:.0f} %",
                 escape(spot["why"]),
             )
-        _out.print(table, highlight=False)
+        OUT.print(table, highlight=False)
         say("looking: as a clock on the plan of the report, where 12 is up")
     if summary["up"] != "gravity":
         say(f"note: {UP_IS_A_GUESS}")
@@ -258,5 +259,5 @@ def _print_summary(summary: Mapping[str, Any], *, metric: bool, decimals: int) -
 
 
 def _clock(heading_deg: float) -> str:
-    """Hour of a direction, 0 degrees being to the right."""
+    """Return the hour of a direction; 0 degrees is to the right."""
     return f"{round((90 - heading_deg) % 360 / 30) % 12 or 12} o'clock"

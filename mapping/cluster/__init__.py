@@ -1,1 +1,1 @@
-"""Where the work of a build is done, and where its results lie."""
+"""Executors of a build's work, and the storage of its results."""

@@ -1,4 +1,4 @@
-"""Where the work of a build is done: in processes of this machine, or on a Ray cluster."""
+"""The executors of a build's work: processes of this machine, or a Ray cluster."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Protocol, TypeVar
 
 from mapping.cluster.stage_timings import Spent
 from mapping.cluster.workers import Workers
+from mapping.progress import ItemProgress
 from visloc.errors import InvalidInput
 
 T = TypeVar("T")
 
 EXECUTORS = ("local", "ray")
-# Ray reads these when it is loaded. Nothing is reported to anyone; no worker is shown other GPUs
-# than its machine has; an address where nothing listens is an error within a minute, not thirteen;
-# a batch for which there is not enough memory is tried as often as one whose worker died, not for
-# ever.
+# Ray reads these when it is loaded. It reports no usage statistics. Workers see the GPUs of their
+# machine. An address where nothing listens is an error within a minute, not thirteen. A batch that
+# runs out of memory is retried as often as one whose worker died, not for ever.
 _RAY_SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
@@ -27,51 +27,38 @@ _RAY_SETTINGS = {
 
 
 class Executor(Protocol):
-    """Does a task for many items, in any order, with one thread for each.
+    """Does a task for many items, in any order, with one thread per item.
 
-    A task and its items travel to other processes: the task is a module's function, a method of a
-    dataclass or a ``functools.partial`` of one, and leaves its result in the work folder. It may be
-    done twice, where a worker died.
+    Tasks and items are pickled for other processes. A task is a module's function, a method of a
+    dataclass, or a ``functools.partial`` of one; it leaves its result in the work folder. It may
+    run twice if a worker dies.
     """
 
     @property
     def spent(self) -> Spent:
-        """What other processes have used up so far for the items that are done."""
-        ...
+        """Resources that other processes have used for finished items."""
 
-    def run(
-        self, task: Callable[[T], object], items: Sequence[T], progress: Callable[[int, int], None]
-    ) -> None:
-        """Do the task for every item; tell the progress as items are done.
+    def run(self, task: Callable[[T], object], items: Sequence[T], progress: ItemProgress) -> None:
+        """Do a task for every item; report progress as items are finished.
 
         Raises:
             Unavailable: ``build.worker_died``.
             Exception: what the task raised first; waiting items are dropped.
         """
-        ...
 
     def run_one(
-        self,
-        task: Callable[[T, Callable[[int, int], None]], object],
-        item: T,
-        progress: Callable[[int, int], None],
+        self, task: Callable[[T, ItemProgress], object], item: T, progress: ItemProgress
     ) -> None:
-        """Do one long task; it tells the progress itself where it is done in this process.
+        """Do one long task. It reports progress itself if it runs in this process.
 
         Raises:
             Unavailable: ``build.worker_died``.
             Exception: what the task raised.
         """
-        ...
 
 
 def open_executor(name: str, workers: int, ray_address: str) -> AbstractContextManager[Executor]:
-    """Return an executor, which ends with its ``with`` block.
-
-    Args:
-        name: of ``EXECUTORS``.
-        workers: how many items are worked on at a time.
-        ray_address: of the cluster, for ``ray``.
+    """Return an executor of ``EXECUTORS``, which ends with its ``with`` block.
 
     Raises:
         InvalidInput: ``build.no_ray``.

@@ -1,7 +1,7 @@
-"""Work on a Ray cluster: the same task for many items, in batches that Ray schedules and retries.
+"""Work on a Ray cluster, in batches that Ray schedules and retries.
 
-What a task needs is put into Ray's object store once; what it makes goes into the work folder. So
-a machine that dies takes nothing along but the batches that it was at, which Ray does again.
+A task is put into Ray's object store once; its results go into the work folder. A machine that dies
+thus loses only its current batches, which Ray does again.
 """
 
 from __future__ import annotations
@@ -10,33 +10,33 @@ import logging
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import islice
-from types import TracebackType
 from typing import Any, TypeVar
 
 import ray
 
 from mapping.cluster.stage_timings import Spent
 from mapping.cluster.workers import ONE_THREAD, do_batch, in_batches
+from mapping.progress import ItemProgress
 from visloc import __version__
 from visloc.errors import Unavailable
 
 T = TypeVar("T")
 
-# An address of its own: a cluster of this machine that ends with the build.
+# The address of a new cluster on this machine, which ends with the build.
 LOCAL = "local"
-# How often Ray does a batch again whose worker or machine died; of those that ended for want of
-# memory it keeps a count of its own, see ``executors``.
+# How often Ray retries a batch whose worker or machine died. Batches that ran out of memory have
+# their own limit, see ``executors``.
 _RETRIES = 3
 # Tasks and items are small: results do not travel through it.
 _OBJECT_STORE_BYTES = 256 * 2**20
 
 
 class RayPool:
-    """Does work on a cluster, ``count`` batches at a time, each on one processor.
+    """An ``Executor`` on a cluster: ``count`` batches at a time, each on one processor.
 
     Args:
-        count: processors that are asked for; a cluster that scales itself gets as many.
-        address: ``local``, ``auto``, HOST:PORT or ``ray://HOST:PORT``, as Ray has them.
+        count: processors to ask for; an autoscaling cluster grows to them.
+        address: ``local``, ``auto``, HOST:PORT or ``ray://HOST:PORT``, as in Ray.
 
     Raises:
         Unavailable: ``build.no_cluster``.
@@ -75,28 +75,20 @@ class RayPool:
     def __enter__(self) -> RayPool:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         ray.shutdown()
 
     @property
     def spent(self) -> Spent:
-        """What the batches that are done have used up."""
         return self._spent
 
-    def run(
-        self, task: Callable[[T], object], items: Sequence[T], progress: Callable[[int, int], None]
-    ) -> None:
-        """Do the task for every item; tell the progress after each batch.
+    def run(self, task: Callable[[T], object], items: Sequence[T], progress: ItemProgress) -> None:
+        """Do a task for every item; report progress after each batch.
 
         Raises:
             Unavailable: ``build.worker_died`` when a batch ended with its worker every time;
                 ``build.other_version`` when the cluster has another visloc.
-            Exception: what the task raised first; what is under way is cancelled.
+            Exception: what the task raised first; running batches are cancelled.
         """
         progress(0, len(items))
         batches = iter(in_batches(items))
@@ -120,33 +112,24 @@ class RayPool:
             raise
 
     def run_one(
-        self,
-        task: Callable[[T, Callable[[int, int], None]], object],
-        item: T,
-        progress: Callable[[int, int], None],
+        self, task: Callable[[T, ItemProgress], object], item: T, progress: ItemProgress
     ) -> None:
-        """Do one long task on the cluster, of which only the begin and the end are told.
-
-        Raises:
-            Unavailable: as ``run``.
-            Exception: what the task raised.
-        """
         self.run(partial(_do_one, task), [item], progress)
 
 
-def _do_one(task: Callable[[T, Callable[[int, int], None]], object], item: T) -> None:
-    task(item, lambda _done, _total: None)  # progress does not travel from machine to machine
+def _do_one(task: Callable[[T, ItemProgress], object], item: T) -> None:
+    task(item, lambda _done, _total: None)  # progress is not sent between machines
 
 
 def _reason(error: BaseException) -> str:
-    """What went wrong first, in a line: Ray quotes the traceback of another process."""
+    """Return the first cause in one line; Ray quotes the traceback of another process."""
     while error.__cause__ is not None:
         error = error.__cause__
     return str(error).strip().splitlines()[-1]
 
 
 def _do_batch(version: str, task: Callable[[T], object], items: Sequence[T]) -> tuple[int, Spent]:
-    """What runs on the cluster."""
+    """Do a batch; this runs on the cluster."""
     if version != __version__:
         raise Unavailable(
             "build.other_version",

@@ -1,24 +1,19 @@
-"""What each stage of a build cost: time, work of all processes, and bytes that were kept."""
+"""The cost of each stage of a build: time, work of all processes, and bytes written."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-Progress = Callable[[str, int, int], None]
+from mapping.progress import Progress
+
 _written_bytes = 0
 
 
 @dataclass(frozen=True, slots=True)
 class Spent:
-    """What processes have used up.
-
-    Attributes:
-        cpu_s: seconds of processors, of all threads.
-        written_bytes: of finished work and of maps.
-    """
+    """Resources that processes have used: CPU seconds of all threads, and bytes written."""
 
     cpu_s: float = 0.0
     written_bytes: int = 0
@@ -37,18 +32,17 @@ def wrote(num_bytes: int) -> None:
 
 
 def spent_here() -> Spent:
-    """Return what this process has used up so far."""
+    """Return the resources that this process has used so far."""
     return Spent(time.process_time(), _written_bytes)
 
 
 @dataclass(frozen=True, slots=True)
 class StageCost:
-    """What one stage cost.
+    """The cost of one stage.
 
     Attributes:
-        stage: its name.
-        items: how many it had; None for more than one stage.
-        wall_s: seconds from its begin to its end.
+        items: how many it had; None for several stages together.
+        wall_s: seconds from its start to its end.
         spent: by all processes.
     """
 
@@ -61,12 +55,12 @@ class StageCost:
 class _Workers(Protocol):
     @property
     def spent(self) -> Spent:
-        """What other processes have used up so far."""
+        """Used by other processes so far."""
         ...
 
 
 class Costs:
-    """Measures the stages of a build, which come one after the other."""
+    """Measures the stages of a build, which follow one another."""
 
     def __init__(self) -> None:
         self._workers: _Workers | None = None
@@ -75,7 +69,7 @@ class Costs:
         self._start = self._now()
 
     def measured(self, progress: Progress, workers: _Workers) -> Progress:
-        """Return a progress that measures what it is told, and tells it to ``progress``."""
+        """Return a progress that measures stages and passes calls on to ``progress``."""
         self._workers = workers
 
         def note(stage: str, done: int, total: int) -> None:
@@ -87,7 +81,7 @@ class Costs:
         return note
 
     def table(self) -> list[StageCost]:
-        """Return the finished stages, what lies between them, and the whole so far."""
+        """Return the finished stages, the time between them, and the whole so far."""
         stages = list(self._stages.values())
         whole = _cost("in all", None, self._start, self._now())
         between = StageCost(

@@ -1,6 +1,6 @@
-"""Places that a build reads from and writes to: folders, and URLs that fsspec knows.
+"""The places that a build reads and writes: folders, and URLs that fsspec knows.
 
-A URL is a ``UPath``, which has the interface of a ``Path`` as far as it is used here.
+A URL is a ``UPath``, which has the part of ``Path``'s interface that is used here.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from visloc.archive import MapStore, sha256_of
 from visloc.errors import InvalidInput
 from visloc.kapture import Dataset, read_dataset
 
-# What kapture keeps in text of a dataset; all else is read where it lies.
+# kapture's text files are fetched; everything else is read where it lies.
 _TABLES = ("sensors/*.txt", "reconstruction/*.txt")
 _DATA = "sensors/records_data"
 
 
 def place_of(text: str, option: str) -> Path:
-    """Return the place that a folder's name or a URL stands for.
+    """Return the place of a folder's name or a URL.
 
     Raises:
         InvalidInput: ``build.url`` for one that cannot be used.
@@ -39,7 +39,7 @@ def place_of(text: str, option: str) -> Path:
 
         # Other machines write there too.
         place = UPath(text, use_listings_cache=False)
-        place.fs  # noqa: B018  raises where the library of this kind of URL is missing
+        place.fs  # noqa: B018  raises if the library for this kind of URL is missing
     except (ImportError, ValueError) as error:
         raise _bad_url(option, str(error)) from error
     return cast("Path", place)
@@ -62,20 +62,20 @@ def is_remote(place: Path) -> bool:
 
 
 def remove_folder(place: Path) -> None:
-    """Remove a folder of a URL, if it is there, with all that is in it."""
+    """Remove the folder at a URL, if it exists."""
     remote: Any = place
     if remote.fs.exists(remote.path):
         remote.fs.rm(remote.path, recursive=True)
 
 
 def storage_errors() -> tuple[type[Exception], ...]:
-    """Return what a storage that fails raises, as far as libraries of URLs are in use."""
+    """Return the errors that failing storage raises, with the libraries in use."""
     botocore = sys.modules.get("botocore.exceptions")
     return (OSError,) if botocore is None else (OSError, botocore.BotoCoreError)
 
 
 def open_store(maps_dir: Path, cache_dir: Path) -> MapStore:
-    """Return the store of a folder, or of a URL with copies in a folder."""
+    """Return the store of a folder, or of a URL with local copies in ``cache_dir``."""
     if not is_remote(maps_dir):
         return MapStore(maps_dir)
     from visloc.archive.remote_store import RemoteMapStore  # its libraries are optional
@@ -83,8 +83,18 @@ def open_store(maps_dir: Path, cache_dir: Path) -> MapStore:
     return RemoteMapStore(str(maps_dir), cache_dir, sys.maxsize)
 
 
+def is_map_folder(ref: str) -> bool:
+    """Tell whether a map is given as a folder, not as id or id@version."""
+    return (Path(ref) / "manifest.json").is_file()
+
+
+def map_folder(ref: str, maps_dir: Path) -> Path:
+    """Return the folder of a map: id, id@version, or the folder itself."""
+    return Path(ref) if is_map_folder(ref) else MapStore(maps_dir).folder(ref)
+
+
 def lies_in(place: Path, other: Path) -> bool:
-    """Tell whether a place is in another, or is the same."""
+    """Tell whether a place is inside another, or equal to it."""
     if is_remote(place) != is_remote(other):
         return False
     if is_remote(place):
@@ -93,12 +103,12 @@ def lies_in(place: Path, other: Path) -> bool:
 
 
 def work_place(place: Path, map_id: str) -> Path:
-    """Return where a place keeps finished work of a map: in a folder that is only for that."""
+    """Return the folder, of its own, for finished work of a map."""
     return place / ".work" / map_id
 
 
 def scratch_folder(maps_dir: Path, cache_dir: Path, map_id: str) -> Path:
-    """Return where a build of a map keeps what only this machine needs, beside its maps."""
+    """Return the folder for files of a build that only this machine needs."""
     if not is_remote(maps_dir):
         return maps_dir / ".work" / map_id
     name = hashlib.sha256(str(maps_dir).encode()).hexdigest()[:16]
@@ -107,7 +117,7 @@ def scratch_folder(maps_dir: Path, cache_dir: Path, map_id: str) -> Path:
 
 @contextmanager
 def opened_dataset(place: Path) -> Iterator[Dataset]:
-    """Read a dataset; of a URL its tables are fetched, and its photos read where they lie.
+    """Read a dataset; at a URL, fetch its tables and leave photos where they are.
 
     Raises:
         DatasetError: what ``read_dataset`` raises.
@@ -135,8 +145,7 @@ class _RemoteFiles:
     """Photos and depth maps below a URL, listed once.
 
     Attributes:
-        folder: the URL.
-        tags: of each file by name, what its storage calls its content; "" where that does not tell.
+        tags: the storage's tag of each file's content, by name; "" if it has none.
     """
 
     folder: Path

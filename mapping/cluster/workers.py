@@ -1,4 +1,4 @@
-"""Worker processes of this machine: the same task for many items, in any order."""
+"""Worker processes of this machine."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from types import TracebackType
 from typing import TypeVar
 
 import cv2
 from threadpoolctl import threadpool_limits
 
 from mapping.cluster.stage_timings import Spent, spent_here
+from mapping.progress import ItemProgress
 from visloc.errors import Unavailable
 
 T = TypeVar("T")
 
-# Processes of a build unless told otherwise: more than this few machines have memory for.
+# Few machines have memory for more than eight processes of a build.
 DEFAULT_WORKERS = min(os.cpu_count() or 1, 8)
 
-# Each library would otherwise start as many threads as there are processors, in every worker. They
-# read these when they are loaded; torch reads the first.
+# Without these, each library starts as many threads as there are processors, in every worker.
+# Libraries read them when they are loaded; torch reads the first.
 ONE_THREAD = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
@@ -34,18 +34,17 @@ ONE_THREAD = {
     "OPENCV_FOR_THREADS_NUM": "1",
 }
 
-# Items that travel together: few, so that progress is seen, and all workers have work to the end.
+# Items sent together: few, so that progress shows and all workers stay busy to the end.
 _MAX_BATCH, _MIN_BATCHES = 16, 200
 
 
 class Workers:
-    """Does work in ``count`` processes, which end with the ``with`` block; one means this process.
+    """An ``Executor`` of ``count`` processes, which end with the ``with`` block; 1: this process.
 
-    A single item is done in this process as well: Ctrl-C ends it at once, where it would wait for
-    another one, and it can tell how far it is. Every process uses one thread, so that their number
-    does not change what comes out.
-    Where a task of this process is the first to load torch, it uses all: for products of whole
-    numbers, which are the same with any number of threads.
+    A single item is done in this process as well: Ctrl-C then ends it at once, and it can report
+    progress. Every process uses one thread, so that their number does not change the result. Only
+    if a task of this process is the first to load torch, torch uses all threads: for products of
+    integers, which are the same with any number of threads.
     """
 
     def __init__(self, count: int) -> None:
@@ -61,29 +60,15 @@ class Workers:
     def __enter__(self) -> Workers:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._pool is not None:
             self._pool.shutdown(wait=True, cancel_futures=True)
 
     @property
     def spent(self) -> Spent:
-        """What the other processes have used up for the items that are done."""
         return self._spent
 
-    def run(
-        self, task: Callable[[T], object], items: Sequence[T], progress: Callable[[int, int], None]
-    ) -> None:
-        """Do the task for every item; tell the progress after each.
-
-        Raises:
-            Unavailable: ``build.worker_died``.
-            Exception: what the task raised first; waiting items are dropped.
-        """
+    def run(self, task: Callable[[T], object], items: Sequence[T], progress: ItemProgress) -> None:
         progress(0, len(items))
         if self._pool is None or len(items) == 1:
             with one_thread_here():
@@ -109,24 +94,20 @@ class Workers:
             ) from error
 
     def run_one(
-        self,
-        task: Callable[[T, Callable[[int, int], None]], object],
-        item: T,
-        progress: Callable[[int, int], None],
+        self, task: Callable[[T, ItemProgress], object], item: T, progress: ItemProgress
     ) -> None:
-        """Do one long task in this process; it tells the progress itself."""
         with one_thread_here():
             task(item, progress)
 
 
 def in_batches(items: Sequence[T]) -> list[Sequence[T]]:
-    """Return the items in batches: many share one journey of the task."""
+    """Return the items in batches, to pickle the task less often."""
     size = max(1, min(_MAX_BATCH, len(items) // _MIN_BATCHES))
     return [items[start : start + size] for start in range(0, len(items), size)]
 
 
 def do_batch(task: Callable[[T], object], items: Sequence[T]) -> tuple[int, Spent]:
-    """Do the task for the items in this process; return how many, and what that used up."""
+    """Do a task for items in this process; return their number and the resources used."""
     before = spent_here()
     for item in items:
         task(item)
@@ -139,7 +120,7 @@ def _start_worker() -> None:
 
 
 def _end_with_parent() -> None:
-    """A worker of a build that was killed would wait for work forever."""
+    """End a worker whose build was killed; it would wait for work forever."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
@@ -148,9 +129,9 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _interrupted_later() -> Iterator[None]:
-    """Let Ctrl-C wait while processes start: half a start would end in a traceback.
+    """Delay Ctrl-C while processes start: half a start would end in a traceback.
 
-    The processes that start meanwhile never hear of it: it is the parent's to handle.
+    The new processes never receive it: the parent handles it.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -169,9 +150,8 @@ def _interrupted_later() -> Iterator[None]:
 
 @contextmanager
 def one_thread_here() -> Iterator[None]:
-    """Compute as a worker does: results differ in the last bits with the number of threads."""
-    # A network that torch computes was made before, with torch. Without one it would take seconds
-    # to load for nothing; matching may load it later.
+    """Compute like a worker: the number of threads changes the last bits of results."""
+    # Do not load torch here: it takes seconds. A network that needs it has loaded it already.
     torch = sys.modules.get("torch")
     before = cv2.getNumThreads(), torch.get_num_threads() if torch else 0
     cv2.setNumThreads(1)
@@ -188,7 +168,7 @@ def one_thread_here() -> Iterator[None]:
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Processes that start meanwhile use one thread in libraries that read the environment."""
+    """Give processes that start meanwhile an environment for one thread."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(ONE_THREAD)
     try:

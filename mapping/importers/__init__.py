@@ -15,10 +15,9 @@ from pathlib import Path
 
 from mapping.build.outputs import refuse_existing
 from mapping.build.stages import exclusive
-from mapping.cli.progress import one_step
-from mapping.cluster.stage_timings import Progress
 from mapping.importers.dataset import write_imported
 from mapping.importers.model import ImportedImage, ImportedModel
+from mapping.progress import Progress, one_step
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.build.publishing import new_version
-from mapping.cli.progress import one_step
 from mapping.maps.editing import moved_anchor
+from mapping.progress import one_step
 from visloc.archive import (
     Anchor,
     FingerprintRecord,

@@ -1,1 +1,1 @@
-"""How landmarks are made: depth, matches, or a known model."""
+"""Methods that make landmarks: from depth, matches, or a known model."""

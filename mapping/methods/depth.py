@@ -1,4 +1,4 @@
-"""Depth maps: finding the one of a photo, reading it, seeing it from the photo, looking it up.
+"""Depth maps: find a photo's depth map, read it, register it to the photo, look depth up.
 
 A depth map here is (H, W) float32: metres along the optical axis of its camera, NaN where unknown.
 """
@@ -54,9 +54,8 @@ class DepthMatch:
     """The depth map of a photo.
 
     Attributes:
-        record: its record.
-        camera: the camera it was seen by.
-        cam_from_depth: from that camera's frame to that of the photo's camera.
+        camera: of the depth map.
+        cam_from_depth: from its frame to the frame of the photo's camera.
     """
 
     record: FileRecord
@@ -65,11 +64,10 @@ class DepthMatch:
 
 
 class DepthMatcher:
-    """Finds the depth map of each photo of a dataset. Files that do not exist do not count.
+    """Finds the depth map of each photo of a dataset; files that do not exist do not count.
 
     Args:
-        dataset: the photos and depth maps.
-        depth_sensor: id of the only depth sensor to use; None to find it by rig, pose and size.
+        depth_sensor: id of the only depth sensor to use; None to choose by rig, pose and size.
 
     Raises:
         DatasetError: ``depth.sensor`` if the sensor named is no depth sensor with intrinsics.
@@ -101,12 +99,12 @@ class DepthMatcher:
     def match(self, image: FileRecord) -> DepthMatch | None:
         """Return the depth map of a photo, None if there is none of its timestamp.
 
-        Of several, the one that was registered to the photo wins (same pose, same aspect), then
-        the only one of the photo's rig, then the only one with a pose of its own.
+        Of several, the one registered to the photo wins (same pose, same aspect), then the only
+        one of the photo's rig, then the only one with a pose of its own.
 
         Raises:
-            DatasetError: ``depth.ambiguous`` if that leaves several, ``depth.pose`` if nothing
-                tells where the named sensor is relative to the photo's camera.
+            DatasetError: ``depth.ambiguous`` if that leaves several, ``depth.pose`` if the pose of
+                the named sensor relative to the photo's camera is unknown.
         """
         of_rig: list[DepthMatch] = []
         of_world: list[DepthMatch] = []
@@ -162,7 +160,7 @@ class DepthMatcher:
 def photo_depth(
     dataset: Dataset, match: DepthMatch, camera: Camera, depth_scale: float
 ) -> tuple[NDArray[np.float32], Camera]:
-    """Read the depth map of a photo and register it to the photo's camera unless it is already.
+    """Read the depth map of a photo, and register it to the photo's camera if necessary.
 
     Returns:
         The depth map and the camera that sees it: the photo's, maybe of another size.
@@ -179,11 +177,10 @@ def photo_depth(
 def read_depth(path: Path, camera: Camera, depth_scale: float) -> NDArray[np.float32]:
     """Read a depth map: raw little-endian float32 metres, or a 16-bit grey PNG.
 
-    The content tells which, not the name. Invalid are 0, negative and not finite values, in a raw
+    The content decides, not the name. Invalid values are 0, negative and non-finite ones; in a raw
     map also 65.5 m and more, in a PNG 65535.
 
     Args:
-        path: of the file.
         camera: the depth sensor's, for the size; a raw map has no header.
         depth_scale: metres per unit of a PNG.
 
@@ -267,7 +264,7 @@ def _check_png_header(path: Path, header: bytes, camera: Camera) -> None:
 
 def _decode_png(path: Path) -> NDArray[np.uint16]:
     content = path.read_bytes()
-    # Pillow leaves checksums of pixels unchecked, and a flipped bit would move the map.
+    # Pillow does not check the checksums of pixels; a flipped bit would move the map.
     position = len(_PNG_SIGNATURE)
     while position < len(content):
         length = int.from_bytes(content[position : position + 4], "big")
@@ -294,14 +291,12 @@ def register_depth(
 ) -> tuple[NDArray[np.float32], Camera]:
     """Show a depth map as the photo's camera sees it; the nearest surface wins.
 
-    Every pixel of the map becomes a point, which goes into the pixel where it is seen, so that
-    depth on a slanted surface may be that of half a pixel beside. Where the photo is finer than
-    the map, the result is smaller than the photo, so that no holes open through which hidden
-    surfaces would show.
+    Every pixel of the map becomes a point, which goes into the pixel that sees it; depth on a
+    slanted surface may thus be off by half a pixel. If the photo is finer than the map, the result
+    is smaller than the photo, or hidden surfaces would show through holes.
 
     Args:
         depth: (H, W) float32 as seen by ``depth_camera``.
-        depth_camera: of H x W.
         camera: the photo's.
         cam_from_depth: from the frame of ``depth_camera`` to that of ``camera``.
 
@@ -339,8 +334,8 @@ def depth_at(depth: NDArray[np.float32], pixels: NDArray[np.floating]) -> NDArra
         pixels: (N, 2), x and y in pixels of the depth map; the first centre is at (0.5, 0.5).
 
     Returns:
-        (N,) float32; NaN where one of the four is missing or outside, or where they differ by
-        more than 3 %: a silhouette, where a point between the surfaces would be on neither.
+        (N,) float32. NaN if one of the four is missing or outside, or if they differ by more than
+        3 %: at a silhouette, a point between the two surfaces would lie on neither.
     """
     height, width = depth.shape
     result = np.full(len(pixels), np.nan, dtype=np.float32)
@@ -397,7 +392,7 @@ def _is_resized(depth_camera: Camera, camera: Camera) -> bool:
 
 @lru_cache(maxsize=4)
 def _pixel_rays(camera: Camera) -> NDArray[np.float64]:
-    """Return where each pixel looks, (H * W, 3) at depth 1; one camera serves many photos."""
+    """Return the rays (H * W, 3) of all pixels at depth 1; one camera serves many photos."""
     rows, columns = np.indices((camera.height, camera.width))
     centres = np.column_stack([columns.ravel(), rows.ravel()]) + 0.5
     rays = normalized_rays(camera, centres)

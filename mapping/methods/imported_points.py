@@ -26,12 +26,12 @@ _ARRAYS: dict[str, tuple[str, int | None]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImportedPoints:
-    """Points and who sees them, in the photos of a map.
+    """Points and their observations in the photos of a map.
 
     Attributes:
         points: (P, 3) float64 in the world.
-        colors: (P, 3) uint8; None without.
-        keypoint_offsets: (n + 1,) int64; rows of ``keypoints`` by photo of the map.
+        colors: (P, 3) uint8, or None.
+        keypoint_offsets: (n + 1,) int64 rows of ``keypoints``, by photo of the map.
         keypoints: (K, 2) float32 pixels.
         observations: (M, 3) int64 rows: point, photo, keypoint of that photo.
     """
@@ -45,21 +45,13 @@ class ImportedPoints:
     def write(self, folder: Path) -> None:
         """Write them into the folder of a map."""
         colors = np.empty((0, 3), np.uint8) if self.colors is None else self.colors
-        arrays = {
-            "points": self.points,
-            "colors": colors,
-            "keypoint_offsets": self.keypoint_offsets,
-            "keypoints": self.keypoints,
-            "observations": self.observations,
-        }
+        arrays = {name: getattr(self, name) for name in _ARRAYS} | {"colors": colors}
         with (folder / FILE_NAME).open("wb") as file:
-            np.savez(file, **arrays)  # type: ignore[arg-type]  # the stub knows no **arrays
+            np.savez(file, **arrays)
 
 
 def read_imported_points(opened: Map) -> ImportedPoints | None:
-    """Read what a map keeps of the reconstruction that it was imported from, if it was.
-
-    Everything is checked: whoever verifies a map calls this for its errors.
+    """Read and check the imported points of a map; None if it has none.
 
     Raises:
         MapCorrupt: ``map.imported_points``.

@@ -1,15 +1,14 @@
-"""Which refined intrinsics are believed, and what is told of those that are not.
+"""Which refined intrinsics to believe, and notes on the others.
 
-Where the focal length of a camera comes from EXIF or a calibration, that is a prior: bundle
-adjustment may correct it, not replace it. ``mapping.methods.triangulation`` judges every camera
-that it refined by the rules here, and holds the ones in doubt at their prior
-(docs/decisions/0024-focal-lengths-have-priors.md).
+A focal length from EXIF or a calibration is a prior: bundle adjustment may correct it, not replace
+it. ``mapping.methods.triangulation`` judges every refined camera by the rules here, and keeps
+cameras in doubt at their prior (docs/decisions/0024-focal-lengths-have-priors.md).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -18,6 +17,7 @@ import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
 from pydantic import BaseModel, ConfigDict
 
+from mapping.build.photos import some
 from visloc.errors import InvalidInput
 from visloc.kapture import Sensor
 
@@ -26,25 +26,25 @@ from visloc.kapture import Sensor
 MAX_MOVE = 0.1
 # A focal length is determined if a change by this share ...
 STEP = 0.05
-# ... raises the reprojection errors by this share of the longer side of the photo, a tenth of a
-# pixel of 1600. A lens that does not quite fit its model and a rolling shutter leave about that
-# much, which no number of matches averages out: with less, they decide where the focal length goes.
-# Flat ground from straight above measured 0.03 px of 1600, facades, rooms and courtyards 0.15 to 1.
+# ... raises the reprojection errors by this share of the photo's longer side, a tenth of a pixel of
+# 1600. A lens that does not quite fit its model, or a rolling shutter, causes errors of that size,
+# which no number of matches averages out; below it, they would decide the focal length. Measured
+# for 1600 pixels: flat ground from straight above 0.03 px; facades, rooms and courtyards 0.15 to 1.
 MIN_RISE = 0.1 / 1600
 # Focal lengths of the longer side of the photo: 9 to 360 mm on 35 mm film.
 _FOCAL_RANGE = (0.25, 10.0)
-# Distance of a ray from the axis, of what it would be without distortion.
+# Distance of a ray from the axis, relative to a lens without distortion.
 _STRETCH_RANGE = (2 / 3, 2.0)
-# That far towards the corners: models of one coefficient fit a wide lens well, and fail beyond.
+# Tested this far towards the corners: beyond, one-coefficient models of a wide lens fail.
 _INNER_SHARE = 0.75
-# Models of lenses that bend rays by design.
+# Models of lenses that distort by design.
 _FISHEYE = ("FISHEYE", "FOV", "EUCM", "EQUIRECTANGULAR", "DIVISION")
 _SAMPLES = 32
 _ROUND_TRIP_PX = 0.5
 _NAMED = 3
-# Where the settings in a manifest have the origins of the map's cameras.
+# Key of the origins of a map's cameras in the settings of its manifest.
 CAMERAS = "cameras"
-# Ends the name of a sensor whose focal length is EXIF's.
+# Suffix of the name of a sensor whose focal length is from EXIF.
 FROM_EXIF = "(EXIF)"
 
 Reason = Literal["implausible", "undetermined", "moved", "unsettled"]
@@ -55,11 +55,11 @@ class Doubt:
     """Why refined intrinsics of a camera are not believed.
 
     Attributes:
-        reason: ``implausible``: no lens has them. ``undetermined``: the photos fit other focal
-            lengths as well. ``moved``: too far from the prior. ``unsettled``: not in doubt itself,
-            but each time some cameras were kept, others came in doubt.
-        focal_length_px: what refinement made of it; may be negative or not finite, and is NaN for
-            an unsettled one that was in no photo of the last model that refined.
+        reason: ``implausible``: no lens has them. ``undetermined``: other focal lengths fit the
+            photos as well. ``moved``: too far from the prior. ``unsettled``: not in doubt itself,
+            but whenever some cameras were kept, others came in doubt.
+        focal_length_px: as refined; may be negative or not finite. NaN for an unsettled camera
+            without a photo in the last refined model.
     """
 
     reason: Reason
@@ -70,10 +70,10 @@ class CameraOrigin(BaseModel):
     """The source of a camera's focal length, as the manifest stores it.
 
     Attributes:
-        source: ``exif``, ``given`` (by the dataset), or ``estimated``: from the photos alone.
+        source: ``exif``, ``given`` (by the dataset), or ``estimated`` from the photos alone.
         prior_px: the focal length of EXIF or the dataset; None if estimated.
-        doubt: why the prior was kept; of an estimated one, why it may be far off.
-        refined_px: what refinement made of a doubted one; None where that is no number.
+        doubt: why the prior was kept; if estimated, why it may be far off.
+        refined_px: the refined value of a camera in doubt; None if it is not finite.
     """
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
@@ -85,7 +85,7 @@ class CameraOrigin(BaseModel):
 
 
 def origin_of(sensor: Sensor, doubt: Doubt | None) -> CameraOrigin:
-    """Tell where the focal length of a dataset's camera comes from, and why it is in doubt."""
+    """Return the source of the focal length of a dataset's camera, and why it is in doubt."""
     refined = None if doubt is None else doubt.focal_length_px
     return CameraOrigin(
         source="estimated"
@@ -97,11 +97,19 @@ def origin_of(sensor: Sensor, doubt: Doubt | None) -> CameraOrigin:
     )
 
 
+def names_by_sensor(photos: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    """Return the names of photos by sensor, from pairs of sensor and name."""
+    names: dict[str, list[str]] = {}
+    for sensor, name in photos:
+        names.setdefault(sensor, []).append(name)
+    return names
+
+
 def is_plausible(camera: pycolmap.Camera) -> bool:
     """Tell whether a lens for photos may have these intrinsics.
 
-    Its focal length is within a range. From the principal point towards the edges of the photo,
-    rays go outwards too, neither stretched nor squeezed beyond what lenses do.
+    Its focal length must be in a range. From the principal point towards the edges of the photo,
+    rays must go outwards too, and be stretched or squeezed no more than by real lenses.
     """
     if not np.isfinite(camera.params).all():
         return False
@@ -139,9 +147,9 @@ def doubt_of(
 
     Args:
         camera: refined.
-        prior_px: its focal length before; None where nothing was known of it.
-        rise_px: of the reprojection errors in its photos, as its focal length changes by ``STEP``
-            and all else adapts to that: root mean square. None for a camera that is not plausible.
+        prior_px: its focal length before; None if it was unknown.
+        rise_px: root mean square rise of the reprojection errors in its photos, if its focal length
+            changes by ``STEP`` and all else adapts. None for an implausible camera.
     """
     focal = float(camera.mean_focal_length())
     if rise_px is None:
@@ -154,7 +162,7 @@ def doubt_of(
 
 
 def notes_on(origins: Mapping[str, CameraOrigin], photos: Mapping[str, Sequence[str]]) -> list[str]:
-    """Tell which cameras are not what refinement made of them, and what to do: a note per reason.
+    """Return a note per reason: the cameras in doubt, and what to do about them.
 
     Args:
         origins: of cameras, by id.
@@ -213,7 +221,7 @@ def _note_on_estimated(
     if reason == "implausible":
         return (
             f"{len(photos)} photos were left out: nothing tells their focal length, and "
-            f"{_WHY[reason]}: {_some(photos)}. If these photos matter, {_CALIBRATE}"
+            f"{_WHY[reason]}: {some(photos)}. If these photos matter, {_CALIBRATE}"
         )
     return (
         f"nothing tells the focal length for {_count(doubted, photos)}, and {_WHY[reason]}. "
@@ -249,12 +257,8 @@ def no_lens(doubts: Mapping[str, Doubt], photos: Mapping[str, Sequence[str]]) ->
         "sfm.camera",
         "the camera that was estimated for these photos is one that no lens has, so no map can "
         "be made of them",
-        field=_some(names),
+        field=some(names),
         expected="photos with a focal length in EXIF, more photos that overlap, from more places, "
         f"or a camera {_IN_SENSORS}",
-        got=f"a focal length of {_some(focal)}, with its distortion",
+        got=f"a focal length of {some(focal)}, with its distortion",
     )
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")

@@ -1,9 +1,9 @@
-"""Landmarks from a reconstruction that the dataset brings along: an imported one.
+"""Landmarks from a reconstruction that comes with the dataset, such as an imported one.
 
 With the features that the reconstruction was made of, its points are the landmarks. Other features
-do not see its points: its photos are matched anew, with its poses, between the photos that it says
-see the same. Its points then stay in the map beside the landmarks, so that the map can be exported
-as the reconstruction that it was.
+do not observe its points. Then the photos are matched again, with their poses, in the pairs that
+share points of the reconstruction; and its points stay in the map beside the landmarks, so that the
+map can be exported as the same reconstruction.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.features import LocalFeaturesSource, Progress, ReadyMadeFeatures
+from mapping.build.context import BuildContext
 from mapping.build.landmarks import (
     MadeLandmarks,
     Observations,
@@ -22,11 +22,11 @@ from mapping.build.landmarks import (
     assemble_landmarks,
     triangulation_angles,
 )
+from mapping.build.local_features import ReadyMadeFeatures
 from mapping.build.photos import MappingPhoto
-from mapping.build.stages import WorkFolder
-from mapping.cluster.executors import Executor
 from mapping.methods.imported_points import ImportedPoints
-from mapping.methods.sfm import SfmSettings, landmarks_from_matches
+from mapping.methods.sfm import landmarks_from_matches
+from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import Anchor
 from visloc.errors import DatasetError
 from visloc.geometry import PixelOrigin
@@ -34,49 +34,56 @@ from visloc.kapture import Dataset, FeatureSet, Reconstruction, open_features, r
 
 
 def landmarks_from_reconstruction(
-    work: WorkFolder,
+    context: BuildContext,
     dataset: Dataset,
     photos: Sequence[MappingPhoto],
-    features: LocalFeaturesSource,
     origin: PixelOrigin,
     settings: SfmSettings,
+    *,
     metric: bool,
-    workers: Executor,
-    progress: Progress,
 ) -> MadeLandmarks:
-    """Take the dataset's points as landmarks, or match its photos anew.
+    """Take the dataset's points as landmarks, or match its photos again.
 
-    As landmarks the points are taken as they are: no threshold of reprojection error, angle or
-    number of observations is applied, since what made them had its own.
+    Points are taken as they are: no threshold of reprojection error, angle or number of
+    observations is applied, since the tool that made them had its own.
 
     Args:
-        work: where finished work is kept.
-        dataset: it has points, observations and the keypoints that observe.
         photos: with poses.
-        features: of the photos.
-        origin: what the dataset's keypoints count from.
-        settings: how photos are matched anew; the pairs are those that see the same points.
+        origin: of the coordinates of the dataset's keypoints.
+        settings: for matching again; the pairs are those that share points.
         metric: whether a unit of the dataset's poses is a metre.
-        workers: who works.
-        progress: told how far it is.
 
     Raises:
         DatasetError: ``model.no_points``, ``kapture.index`` for an observation by a keypoint that
             does not exist, and what reading raises.
         InvalidInput: what matching raises.
     """
-    known, keypoints = _read(dataset, features)
-    imported, notes = _imported_points(known, keypoints, photos, origin)
-    anchor = Anchor(kind="model", images=len(photos))
-    if not (
+    known = read_reconstruction(dataset.root)
+    if known is None or known.keypoints_type is None or len(known.observations) == 0:
+        raise _no_points(dataset)
+    features, anchor = context.features, Anchor(kind="model", images=len(photos))
+    if (
         isinstance(features, ReadyMadeFeatures)
         and features.keypoints.type_name == known.keypoints_type
     ):
-        anew = replace(settings, pairs=("covisibility",), covisible_in=None, pairs_file=None)
-        made = landmarks_from_matches(
-            work, dataset, photos, features, (), anew, metric, workers, progress
-        )
-        return replace(made, anchor=anchor, imported=imported, notes=(*made.notes, *notes))
+        imported, notes = _imported_points(known, features.keypoints, photos, origin)
+        return _landmarks_of(imported, photos, anchor, notes, metric=metric)
+    keypoints = open_features(dataset.root, "keypoints", known.keypoints_type)
+    imported, notes = _imported_points(known, keypoints, photos, origin)
+    again = replace(settings, pairs=("covisibility",), covisible_in=None, pairs_file=None)
+    made = landmarks_from_matches(context, dataset, photos, (), again, metric=metric)
+    return replace(made, anchor=anchor, imported=imported, notes=(*made.notes, *notes))
+
+
+def _landmarks_of(
+    imported: ImportedPoints,
+    photos: Sequence[MappingPhoto],
+    anchor: Anchor,
+    notes: tuple[str, ...],
+    *,
+    metric: bool,
+) -> MadeLandmarks:
+    """Take points as landmarks."""
     views = [View(photo.camera, photo.pose) for photo in photos]
     observations = _observations(imported)
     landmarks, rows = assemble_landmarks(
@@ -99,7 +106,7 @@ def landmarks_from_reconstruction(
 
 
 def refuse_without_points(dataset: Dataset) -> None:
-    """Refuse a dataset that does not even have the files.
+    """Refuse a dataset without the files of a reconstruction.
 
     Raises:
         DatasetError: ``model.no_points``.
@@ -119,26 +126,13 @@ def _no_points(dataset: Dataset) -> DatasetError:
     )
 
 
-def _read(dataset: Dataset, features: LocalFeaturesSource) -> tuple[Reconstruction, FeatureSet]:
-    """The reconstruction, and the keypoints that see its points."""
-    known = read_reconstruction(dataset.root)
-    if known is None or known.keypoints_type is None or len(known.observations) == 0:
-        raise _no_points(dataset)
-    if (
-        isinstance(features, ReadyMadeFeatures)
-        and features.keypoints.type_name == known.keypoints_type
-    ):
-        return known, features.keypoints
-    return known, open_features(dataset.root, "keypoints", known.keypoints_type)
-
-
 def _imported_points(
     known: Reconstruction,
     keypoints: FeatureSet,
     photos: Sequence[MappingPhoto],
     origin: PixelOrigin,
 ) -> tuple[ImportedPoints, tuple[str, ...]]:
-    """The reconstruction as far as these photos see it, in their order, and what was left out."""
+    """Return what these photos observe of a reconstruction, in their order, and notes."""
     row_of_name = {photo.name: row for row, photo in enumerate(photos)}
     photo_of_image = np.array([row_of_name.get(name, -1) for name in known.images], dtype=np.int64)
     pixels = [
@@ -190,7 +184,7 @@ def _check_rows(
 
 
 def _observations(imported: ImportedPoints) -> Observations:
-    """Every point once per photo: of several sightings in a photo the first counts."""
+    """Return the first observation of each point in each photo."""
     table: NDArray[np.int64] = imported.observations
     order = np.lexsort((table[:, 2], table[:, 0], table[:, 1]))
     table = table[order]

@@ -1,25 +1,24 @@
 """The matching stages: mutual nearest neighbours of paired photos, then geometric verification.
 
-With known poses a match must fit the epipolar geometry of the poses; without, pycolmap estimates
-the two-view geometry of the pair.
+With known poses, a match must fit their epipolar geometry. Without, pycolmap estimates the two-view
+geometry of the pair.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
 from numpy.typing import NDArray
 
-from mapping.build.features import LocalFeaturesSource, Progress
+from mapping.build.context import BuildContext
 from mapping.build.landmarks import View
+from mapping.build.local_features import LocalFeaturesSource
 from mapping.build.photos import MappingPhoto
 from mapping.build.stages import Item, WorkFolder, key_of
-from mapping.cluster.executors import Executor
 from visloc.geometry import Camera, Pose
 from visloc.matching.correspondences import mutual_nearest_neighbours
 from visloc.matching.products import round_descriptors
@@ -37,7 +36,7 @@ class Matches:
     Attributes:
         first: row of a photo.
         second: row of a later photo.
-        rows: (k, 2) uint32 rows of their features.
+        rows: (k, 2) uint32 rows of the features of both.
     """
 
     first: int
@@ -47,12 +46,12 @@ class Matches:
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """When a match of two photos is believed.
+    """The test that matches of two photos must pass.
 
     Attributes:
         max_error_px: largest distance to the epipolar line, pixels.
-        min_matches: a pair with fewer verified matches has none.
-        poses_known: verify with the poses of the photos; else by two-view geometry.
+        min_matches: fewest verified matches of a pair; a pair with fewer is dropped.
+        poses_known: verify with the poses of the photos; otherwise by two-view geometry.
     """
 
     max_error_px: float
@@ -62,51 +61,47 @@ class Verification:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Partners:
-    """A photo and those that it is matched with."""
+    """A photo and its partners in pairs."""
 
     photo: MappingPhoto
     partners: tuple[MappingPhoto, ...]
 
 
 def match_pairs(
-    work: WorkFolder,
+    context: BuildContext,
     photos: Sequence[MappingPhoto],
-    features: LocalFeaturesSource,
     pairs: NDArray[np.int64],
     verification: Verification,
-    workers: Executor,
-    progress: Progress,
 ) -> tuple[list[Matches], str]:
     """Match and verify pairs (m, 2) of photos.
 
     Returns:
-        The pairs that have matches, and a name for all that went into them.
+        The pairs that have matches, and a key for all their inputs.
     """
-    groups = []
-    for first in np.unique(pairs[:, 0]).tolist():
-        seconds = pairs[pairs[:, 0] == first, 1].tolist()
-        groups.append((first, seconds))
-    tasks = [
+    groups = [
+        (first, pairs[pairs[:, 0] == first, 1].tolist())
+        for first in np.unique(pairs[:, 0]).tolist()
+    ]
+    partners = [
         _Partners(photos[first], tuple(photos[second] for second in seconds))
         for first, seconds in groups
     ]
-    task = _MatchTask(work, features, verification)
-    workers.run(task.match, tasks, partial(progress, "matches"))
-    workers.run(task.verify, tasks, partial(progress, "verified"))
-    found = []
-    for (first, seconds), partners in zip(groups, tasks, strict=True):
-        item = work.read(task.verified_key(partners))
-        for order, second in enumerate(seconds):
-            rows = item["rows"][item["offsets"][order] : item["offsets"][order + 1]]
-            if len(rows):
-                found.append(Matches(first, second, rows))
-    keys = [task.verified_key(partners) for partners in tasks]
+    task = _MatchTask(context.work, context.features, verification)
+    context.run("matches", task.match, partners)
+    context.run("verified", task.verify, partners)
+    keys = [task.verified_key(group) for group in partners]
+    found = [
+        Matches(first, second, rows)
+        for (first, seconds), key in zip(groups, keys, strict=True)
+        for second, rows in zip(seconds, _rows_by_partner(context.work.read(key)), strict=True)
+        if len(rows)
+    ]
     return found, key_of("all_matches", 1, keys=keys, groups=groups)
 
 
 @dataclass(frozen=True, slots=True)
 class _MatchTask:
-    """What workers do for a photo and its partners."""
+    """A worker's part: one photo and its partners."""
 
     work: WorkFolder
     features: LocalFeaturesSource
@@ -153,11 +148,10 @@ class _MatchTask:
 
     def verify(self, group: _Partners) -> None:
         def compute() -> Item:
-            item = self.work.read(self.matches_key(group))
+            matches = _rows_by_partner(self.work.read(self.matches_key(group)))
             own = self.features.read(group.photo).keypoints
             found = []
-            for order, partner in enumerate(group.partners):
-                rows = item["rows"][item["offsets"][order] : item["offsets"][order + 1]]
+            for partner, rows in zip(group.partners, matches, strict=True):
                 theirs = self.features.read(partner).keypoints
                 a, b = own[rows[:, 0]], theirs[rows[:, 1]]
                 good = self._verified(group.photo, partner, a, b)
@@ -231,16 +225,20 @@ def _with_prior(photo: MappingPhoto) -> pycolmap.Camera:
     return camera
 
 
+def _rows_by_partner(item: Item) -> list[NDArray[np.uint32]]:
+    return np.split(item["rows"], item["offsets"][1:-1])
+
+
 def _item(found: list[NDArray[np.uint32]]) -> Item:
     offsets = np.cumsum([0, *(len(rows) for rows in found)])
     return {"offsets": offsets, "rows": np.concatenate([*found, np.empty((0, 2), np.uint32)])}
 
 
 def camera_values(camera: Camera) -> list[str | float]:
-    """All of a camera, as JSON values for a key."""
+    """Return all of a camera, as JSON values for a key."""
     return [camera.model, camera.width, camera.height, *camera.params]
 
 
 def pose_values(pose: Pose) -> list[float]:
-    """All of a pose, as JSON values for a key."""
+    """Return all of a pose, as JSON values for a key."""
     return [*pose.rotation.ravel().tolist(), *pose.translation.tolist()]

@@ -1,26 +1,29 @@
 """Landmarks from depth: keypoints lifted to 3D and merged across photos in a voxel grid.
 
-The mapping strategy for RGB-D data of Humenberger et al. 2020, with a sub-pixel
-depth lookup, and with landmarks at the mean of what fell into their cell instead of at the first
-point.
+The mapping strategy for RGB-D data of Humenberger et al. 2020, with two changes: depth is looked
+up at sub-pixel positions, and a landmark is the mean of the points in its cell instead of the first
+of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from typing import Annotated
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 
-from mapping.build.features import LocalFeaturesSource, Progress
+from mapping.build.context import BuildContext
 from mapping.build.landmarks import MadeLandmarks, Observations, View, assemble_landmarks
+from mapping.build.local_features import LocalFeaturesSource
 from mapping.build.photos import MappingPhoto
 from mapping.build.stages import Item, WorkFolder, key_of
-from mapping.cluster.executors import Executor
 from mapping.methods.depth import depth_at, photo_depth
 from mapping.methods.matching import camera_values, pose_values
+from mapping.options import RGBD_PANEL, DepthScaleOption
+from mapping.progress import one_step
 from visloc.archive import Anchor, Landmarks
 from visloc.errors import DatasetError, InvalidInput
 from visloc.geometry import Similarity
@@ -33,11 +36,11 @@ _LIFTED_REVISION = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiftedKeypoints:
-    """Keypoints of one photo that have a depth.
+    """The keypoints of a photo that have a depth.
 
     Attributes:
         rows: (m,) int64 rows of the photo's features, strongest first.
-        pixels: (m, 2) float32 where the photo sees them.
+        pixels: (m, 2) float32 in the photo.
         points: (m, 3) float64 in the world.
     """
 
@@ -48,55 +51,49 @@ class LiftedKeypoints:
 
 @dataclass(frozen=True, slots=True)
 class DepthSettings:
-    """How depth becomes landmarks.
+    """Settings for landmarks from depth."""
 
-    Attributes:
-        voxel_size: edge in which lifted keypoints become one landmark, in metres.
-        depth_scale: metres per unit of 16-bit PNG depth.
-    """
-
-    voxel_size: float = 0.01
-    depth_scale: float = 0.001
+    voxel_size: Annotated[
+        float,
+        typer.Option(
+            help="Points within one cell of this edge become one landmark, metres.",
+            rich_help_panel=RGBD_PANEL,
+        ),
+    ] = 0.01
+    depth_scale: DepthScaleOption = 0.001
 
 
 def landmarks_from_depth(
-    work: WorkFolder,
+    context: BuildContext,
     dataset: Dataset,
     photos: Sequence[MappingPhoto],
-    features: LocalFeaturesSource,
     settings: DepthSettings,
+    *,
     metric: bool,
-    workers: Executor,
-    progress: Progress,
     world_from_dataset: Similarity | None = None,
 ) -> MadeLandmarks:
     """Lift the keypoints of all photos and merge them.
 
     Args:
-        work: keeps finished photos.
-        dataset: what the photos are of.
         photos: with poses in the dataset's frame, and depth in its unit.
-        features: of the photos.
         settings: the voxel size is in the unit of the world.
         metric: whether a unit of the world is a metre.
-        workers: who lifts.
-        progress: told how far it is.
-        world_from_dataset: where the dataset lies in the world; None: its frame is the world.
+        world_from_dataset: None if the dataset's frame is the world.
 
     Raises:
         DatasetError: what ``lift_keypoints`` raises.
         InvalidInput: what ``merge_landmarks`` raises.
     """
-    task = _LiftTask(work, dataset.without_records(), features, settings.depth_scale)
-    workers.run(task.lift, photos, partial(progress, "depth"))
-    progress("landmarks", 0, 1)
-    lifted = (LiftedKeypoints(**work.read(task.key(photo))) for photo in photos)
-    if world_from_dataset is not None:
-        move = world_from_dataset
-        lifted = (replace(one, points=move.apply(one.points)) for one in lifted)
-        photos = [replace(photo, cam_from_world=move.move(photo.pose)) for photo in photos]
-    landmarks, rows = merge_landmarks(photos, lifted, settings.voxel_size)
-    progress("landmarks", 1, 1)
+    work = context.work
+    task = _LiftTask(work, dataset.without_records(), context.features, settings.depth_scale)
+    context.run("depth", task.lift, photos)
+    with one_step(context.progress, "landmarks"):
+        lifted = (LiftedKeypoints(**work.read(task.key(photo))) for photo in photos)
+        if world_from_dataset is not None:
+            move = world_from_dataset
+            lifted = (replace(one, points=move.apply(one.points)) for one in lifted)
+            photos = [replace(photo, cam_from_world=move.move(photo.pose)) for photo in photos]
+        landmarks, rows = merge_landmarks(photos, lifted, settings.voxel_size)
     return MadeLandmarks(
         photos=np.arange(len(photos)),
         views=tuple(View(photo.camera, photo.pose) for photo in photos),
@@ -126,7 +123,7 @@ def refuse_without_depth(dataset: Dataset, photos: Sequence[MappingPhoto]) -> No
 
 @dataclass(frozen=True, slots=True)
 class _LiftTask:
-    """What workers do for a photo."""
+    """A worker's part: one photo."""
 
     work: WorkFolder
     dataset: Dataset
@@ -160,10 +157,10 @@ class _LiftTask:
 def lift_keypoints(
     dataset: Dataset, photo: MappingPhoto, keypoints: NDArray[np.float32], depth_scale: float
 ) -> LiftedKeypoints:
-    """Give keypoints (n, 2) of a photo their place in the world, where its depth map allows.
+    """Lift the keypoints (n, 2) of a photo that have a depth into the world.
 
     Raises:
-        DatasetError: when the depth map is not what its sensor says.
+        DatasetError: when the depth map does not fit its sensor.
     """
     if photo.depth is None:
         rows = np.empty(0, dtype=np.int64)
@@ -182,16 +179,16 @@ def merge_landmarks(
 ) -> tuple[Landmarks, list[NDArray[np.int64]]]:
     """Merge the lifted keypoints of all photos: one landmark per occupied voxel, at their mean.
 
-    Of several keypoints of one photo in a voxel (a corner found at several scales) the strongest
+    If a photo has several keypoints in a voxel (a corner found at several scales), the strongest
     stays. It takes about 150 bytes of memory per keypoint.
 
     Args:
         photos: n photos.
-        lifted: of each photo, its lifted keypoints.
+        lifted: n, the lifted keypoints of each photo.
         voxel_size: edge of a voxel in the unit of the world.
 
     Returns:
-        The landmarks, and of each photo the rows of its features that observe them.
+        The landmarks, and for each photo the rows of its features that observe them.
 
     Raises:
         InvalidInput: ``rgbd.no_landmarks`` or ``rgbd.voxel_size``.
@@ -200,7 +197,7 @@ def merge_landmarks(
         *((one.points, one.pixels, one.rows) for one in lifted), strict=True
     )
     seen_in = np.repeat(np.arange(len(rows_of)), [len(rows) for rows in rows_of])
-    # One after the other, so that little is there twice.
+    # One after the other, so that memory holds few of them twice.
     points = np.concatenate(points_of)
     del points_of
     pixels = np.concatenate(pixels_of)
@@ -214,11 +211,11 @@ def merge_landmarks(
             field="dataset",
             expected="depth maps that go with the photos; see --depth-sensor and --depth-scale",
         )
-    # Voxels are counted from near the photos, wherever in the world they are.
+    # Voxels are counted from near the photos, to keep precision far from the world's origin.
     origin = np.round(np.mean([photo.pose.center for photo in photos], axis=0))
     points -= origin
     landmark, num_landmarks = _voxel_index(points, voxel_size)
-    # np.unique gives the first row of each pair, which is the strongest keypoint.
+    # np.unique returns the first row of each pair, which is the strongest keypoint.
     kept = np.sort(np.unique(landmark * len(photos) + seen_in, return_index=True)[1])
     points, pixels, rows = points[kept], pixels[kept], rows[kept]
     landmark, seen_in = landmark[kept], seen_in[kept]
@@ -234,7 +231,7 @@ def merge_landmarks(
 
 
 def _voxel_index(points: NDArray[np.float64], voxel_size: float) -> tuple[NDArray[np.int64], int]:
-    """Number the occupied voxels in the order of their cells; return (rows, how many)."""
+    """Number the occupied voxels in the order of their cells; return (numbers, how many)."""
     cells = points / voxel_size
     np.floor(cells, out=cells)
     cells -= cells.min(axis=0)

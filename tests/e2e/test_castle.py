@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapping.build.build import BuildSettings, build_map
-from mapping.methods.sfm import SfmSettings
+from mapping.build.build import build_map
+from mapping.build.settings import BuildSettings
+from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import open_map
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features

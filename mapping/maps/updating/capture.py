@@ -1,4 +1,4 @@
-"""The photos of a new capture, with the features that the map has of its own."""
+"""The photos of a new capture, with features of the map's kinds."""
 
 from __future__ import annotations
 
@@ -9,39 +9,33 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.features import (
+from mapping.build.context import BuildContext
+from mapping.build.global_features import describe_with_model, read_global_features
+from mapping.build.local_features import (
     LocalFeaturesSource,
-    Progress,
     ReadyMadeFeatures,
-    describe_with_model,
-    find_local_features,
     local_features_source,
-    open_descriptor,
-    read_global_features,
 )
-from mapping.build.photos import MappingPhoto, collect_photos
+from mapping.build.networks import Networks
+from mapping.build.photos import MappingPhoto, collect_photos, some
 from mapping.build.stages import WorkFolder
-from mapping.cluster.executors import Executor
 from mapping.maps.updating.localizing import Placed
 from mapping.maps.updating.settings import UpdateSettings
 from visloc.archive import Map
 from visloc.archive.schema import photo_file
 from visloc.errors import Conflict, DatasetError
-from visloc.features.local.readymade import is_ready_made, ready_made_type
-from visloc.kapture import Dataset, open_features
+from visloc.features.local.readymade import is_ready_made
+from visloc.kapture import Dataset
 from visloc.localization.fingerprints import check_fingerprint
-
-# More names than a note needs.
-_NAMED = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """Photos that are to join a map.
+    """Photos to join a map.
 
     Attributes:
         photos: n photos with known cameras.
-        names: what they are called in the map.
+        names: n names in the map.
         described: their global descriptors (n, D) by name, by the map's models.
     """
 
@@ -50,7 +44,7 @@ class Capture:
     described: dict[str, NDArray[np.float32]]
 
     def take(self, rows: Sequence[int]) -> Capture:
-        """Return some of them."""
+        """Return the photos of some rows."""
         return Capture(
             [self.photos[row] for row in rows],
             [self.names[row] for row in rows],
@@ -59,20 +53,20 @@ class Capture:
 
 
 def collect_capture(
+    context: BuildContext,
     settings: UpdateSettings,
     opened: Map,
     dataset: Dataset,
-    features: LocalFeaturesSource,
     *,
     with_depth: bool,
-    progress: Progress,
 ) -> tuple[Capture, list[str]]:
-    """Gather the photos that can be used, not described yet, and notes on the others.
+    """Collect the usable photos, not described yet, and notes on the others.
 
     Raises:
         Conflict: ``update.photos`` when the map has photos of these names.
         DatasetError: ``dataset.no_photos``, and what ``collect_photos`` raises.
     """
+    features = context.features
     ready_made = isinstance(features, ReadyMadeFeatures)
     shown = keeps_photos(opened) or opened.colors is not None
     photos, notes = collect_photos(
@@ -82,7 +76,7 @@ def collect_capture(
         has_features=features.has if isinstance(features, ReadyMadeFeatures) else None,
         with_depth=with_depth,
         depth_sensor=settings.depth_sensor,
-        progress=partial(progress, "photos"),
+        progress=partial(context.progress, "photos"),
     )
     unknown = [photo.name for photo in photos if not photo.camera_known]
     if unknown:
@@ -122,12 +116,12 @@ def keeps_photos(opened: Map) -> bool:
 
 
 def open_map_features(
-    settings: UpdateSettings, opened: Map, work: WorkFolder
+    settings: UpdateSettings, opened: Map, work: WorkFolder, networks: Networks
 ) -> LocalFeaturesSource:
-    """Open the map's kind of local features, of the dataset; check the global ones as well.
+    """Open the dataset's local features of the map's kind; check the global ones as well.
 
     Raises:
-        Conflict: ``map.features`` when those at hand are others than those of the map.
+        Conflict: ``map.features`` when they are not the same features as the map's.
         WeightsError, InvalidInput, DatasetError: what opening them raises.
     """
     local = opened.manifest.local_features
@@ -135,63 +129,46 @@ def open_map_features(
         work,
         settings.dataset,
         local.fingerprint.name,
+        networks=networks,
         max_keypoints=local.max_keypoints,
-        weights_dir=settings.weights_dir,
-        inference=settings.inference,
         features_dir=settings.features_dir,
         pixel_origin=settings.pixel_origin,
     )
     check_fingerprint(local.fingerprint, features.fingerprint, opened.ref)
     for record in opened.manifest.global_features:
-        if not is_ready_made(record.fingerprint.name):
-            descriptor = open_descriptor(
-                record.fingerprint.name, settings.weights_dir, settings.inference
-            )
-            check_fingerprint(record.fingerprint, descriptor.fingerprint, opened.ref)
+        name = record.fingerprint.name
+        if not is_ready_made(name):
+            here = networks.descriptor(name).fingerprint
+            check_fingerprint(record.fingerprint, here, opened.ref)
     return features
 
 
 def describe_capture(
+    context: BuildContext,
     settings: UpdateSettings,
     opened: Map,
     dataset: Dataset,
-    features: LocalFeaturesSource,
     capture: Capture,
-    work: WorkFolder,
-    workers: Executor,
-    progress: Progress,
 ) -> Capture:
-    """Find the local features of the photos, and describe them as the map describes its own.
+    """Find the local features of the photos, and describe them by the map's models.
 
     Raises:
         DatasetError: with the file that is wrong.
     """
-    find_local_features(features, capture.photos, workers, progress)
-    found = {}
+    context.run("local features", context.features.prepare, capture.photos)
+    described = {}
     for record in opened.manifest.global_features:
         name = record.fingerprint.name
         if is_ready_made(name):
-            files = open_features(
-                dataset.root, "global_features", ready_made_type(name), settings.features_dir
-            )
-            found[name] = read_global_features(files, capture.photos).descriptors
+            read = read_global_features(dataset, name, settings.features_dir, capture.photos)
+            described[name] = read.descriptors
         else:
-            found[name] = describe_with_model(
-                opened,
-                work,
-                capture.photos,
-                features,
-                name,
-                settings.weights_dir,
-                settings.inference,
-                workers,
-                progress,
-            )
-    return replace(capture, described=found)
+            described[name] = describe_with_model(context, opened, capture.photos, name)
+    return replace(capture, described=described)
 
 
 def where_localized(capture: Capture, placed: Sequence[Placed]) -> tuple[Capture, list[str]]:
-    """Return the photos that were localized, with these poses, and the names of the others."""
+    """Return the localized photos, with the poses that were found, and the names of the others."""
     rows = [row for row, one in enumerate(placed) if one.localized]
     found = capture.take(rows)
     photos = [
@@ -200,8 +177,3 @@ def where_localized(capture: Capture, placed: Sequence[Placed]) -> tuple[Capture
     ]
     pairs = zip(capture.names, placed, strict=True)
     return replace(found, photos=photos), [name for name, one in pairs if not one.localized]
-
-
-def some(names: Sequence[str]) -> str:
-    """A few names, for a note."""
-    return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")

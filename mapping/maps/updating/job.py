@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.build.colours import landmark_colours
-from mapping.build.features import LocalFeaturesSource, Progress
+from mapping.build.context import BuildContext
 from mapping.build.landmarks import MadeLandmarks
-from mapping.build.photos import MappingPhoto
+from mapping.build.networks import Networks
+from mapping.build.photos import MappingPhoto, some
 from mapping.build.previews import keep_photos
 from mapping.build.publishing import photo_files, publish_edited
 from mapping.build.stages import WorkFolder, exclusive
-from mapping.cli.options import map_folder
-from mapping.cluster.executors import Executor
+from mapping.cluster.storage import map_folder, work_place
 from mapping.cluster.workers import Workers
 from mapping.maps.editing import content_of, joined
 from mapping.maps.updating.capture import (
@@ -26,11 +26,10 @@ from mapping.maps.updating.capture import (
     collect_capture,
     describe_capture,
     open_map_features,
-    some,
     where_localized,
 )
 from mapping.maps.updating.joining import landmarks_in_same_voxel, part_of_map, scaled_rigs
-from mapping.maps.updating.localizing import LocalizeTask, Placed, localize_photos
+from mapping.maps.updating.localizing import Placed, localize_photos
 from mapping.maps.updating.placing import (
     Placement,
     beside,
@@ -52,7 +51,9 @@ from mapping.methods.rgbd import (
     lift_keypoints,
     refuse_without_depth,
 )
-from mapping.methods.sfm import SfmSettings, landmarks_from_matches
+from mapping.methods.sfm import landmarks_from_matches
+from mapping.methods.sfm_settings import SfmSettings
+from mapping.progress import Progress, one_step
 from visloc.archive import Map, MapContent, MapStore, open_map
 from visloc.archive.schema import photo_file
 from visloc.archive.version_rules import outdated
@@ -61,32 +62,24 @@ from visloc.evaluation import pose_error
 from visloc.geometry import Similarity
 from visloc.kapture import Dataset, read_dataset
 
-# Photos that are localized before the long work begins, to refuse what does not fit.
+# Photos that are localized before the long work begins, to refuse a capture of another place.
 _TRIED_FIRST = 8
-# Photos that the tie rests on, evenly spread.
+# Photos that the tie is computed from, evenly spread.
 _TIED_BY = 16
 
 
 @dataclass(frozen=True, slots=True)
 class UpdateRecord:
-    """What is known of an update; the manifest keeps it in ``updates`` of the method's settings.
+    """What the manifest keeps of an update, in ``updates`` of the method's settings.
+
+    The figures from ``tried`` on are those of ``Placement``.
 
     Attributes:
-        capture: what it is called, or the name of its folder.
-        poses: a name of ``POSES``.
-        method: a name of ``METHODS``.
-        photos: that were added.
-        landmarks: that were added.
-        observations: that were added, of old and new landmarks.
-        tried: photos that were to be localized.
-        localized: those of them that were.
-        not_localized: how many of the others by reason.
-        tied: those whose own pose, moved, agrees with what they see of the map.
-        pixels: median distance between where these see landmarks and the projections.
-        position: median distance between where these were localized and their own pose, moved, in
-            units of the map.
-        orientation_deg: the same of directions.
-        scale: units of the map in one unit of the dataset.
+        capture: its name, or the name of its folder.
+        photos: added photos.
+        landmarks: added landmarks.
+        observations: added observations, of old and new landmarks.
+        scale: units of the map per unit of the dataset.
     """
 
     capture: str
@@ -107,12 +100,12 @@ class UpdateRecord:
 
 @dataclass(frozen=True, slots=True)
 class Updated:
-    """What an update made.
+    """The result of an update.
 
     Attributes:
         folder: of the new version.
-        record: what its manifest says of the update.
-        notes: that the update added: what was left out, one sentence each.
+        record: as in its manifest.
+        notes: on photos that were left out, one sentence each.
     """
 
     folder: Path
@@ -123,8 +116,8 @@ class Updated:
 def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
     """Add a new capture to a map, as a new version, which becomes current.
 
-    Killed at any moment, the same call finds its finished work again; the version that was current
-    before stays so until the new one is complete and verified.
+    If it is killed, the same call finds its finished work again. The version that was current
+    before stays current until the new one is complete and verified.
 
     Raises:
         Conflict: ``update.elsewhere`` for a capture that does not fit the map; ``update.photos``
@@ -140,59 +133,52 @@ def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
     method = method_for(settings, opened)
     refuse_strange_settings(opened)
     dataset = read_dataset(settings.dataset).with_pixels_from(settings.pixel_origin)
-    work_root = settings.maps_dir / ".work" / map_id
-    work = WorkFolder(work_root)
-    features = open_map_features(settings, opened, work)
+    work = WorkFolder(work_place(settings.maps_dir, map_id))
+    networks = Networks(settings.weights_dir, settings.inference)
+    features = open_map_features(settings, opened, work, networks)
     try:
-        with exclusive(work_root.with_name(f"{map_id}.lock")):
+        with exclusive(work.root.with_name(f"{map_id}.lock")):
             if (current := store.current_version(map_id)) != version:
                 raise outdated(map_id, version, current)
             with Workers(settings.workers) as workers:
-                job = _Job(settings, opened, dataset, features, method, work, workers, progress)
-                content, pictures, record, notes = job.run()
-            progress("archive", 0, 1)
-            folder = publish_edited(store, content, map_id, photos=pictures, based_on=version)
-            progress("archive", 1, 1)
-            shutil.rmtree(work_root, ignore_errors=True)
+                context = BuildContext(work, features, networks, workers, progress)
+                content, pictures, record, notes = _Job(
+                    settings, opened, dataset, method, context
+                ).run()
+            with one_step(progress, "archive"):
+                folder = publish_edited(store, content, map_id, photos=pictures, based_on=version)
+            shutil.rmtree(work.root, ignore_errors=True)
     except OSError as error:
         raise Unavailable(
             "storage.failed",
             f"reading or writing failed: {error.strerror or error}; "
             "finished work is kept, the same command resumes",
-            field=str(error.filename or work_root),
+            field=str(error.filename or work.root),
         ) from error
     return Updated(folder, record, notes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Job:
-    """One update, with all that its stages need."""
+    """One update, with all that its steps need."""
 
     settings: UpdateSettings
     opened: Map
     dataset: Dataset
-    features: LocalFeaturesSource
     method: str
-    work: WorkFolder
-    workers: Executor
-    progress: Progress
+    context: BuildContext
 
     def run(self) -> tuple[MapContent, list[Path], UpdateRecord, tuple[str, ...]]:
-        """Return the updated map, its small pictures if it keeps such, the record, and notes."""
+        """Return the updated map, its small photos if it keeps them, the record, and notes."""
         settings, by_depth = self.settings, self.method == "rgbd"
         capture, notes = collect_capture(
-            settings,
-            self.opened,
-            self.dataset,
-            self.features,
-            with_depth=by_depth,
-            progress=self.progress,
+            self.context, settings, self.opened, self.dataset, with_depth=by_depth
         )
         count = len(capture.photos)
         if not by_depth:
             refuse_few(count)
         rows = evenly(range(count), count if settings.poses == "localize" else _TIED_BY)
-        # What does not fit is refused before the long work begins.
+        # A capture of another place is refused before the long work begins.
         first = self._described(capture.take(evenly(rows, _TRIED_FIRST)))
         refuse_elsewhere(self.opened, self._localized(first))
         if by_depth:
@@ -223,9 +209,10 @@ class _Job:
     def _without_contradicted(
         self, capture: Capture, placed: dict[int, Placed], map_from_dataset: Similarity
     ) -> tuple[Capture, list[str]]:
-        """The photos whose poses the map does not contradict, and notes on the others.
+        """Return the photos whose poses the map does not contradict, and notes on the others.
 
-        Who stands beside a contradicted photo is tried as well, and goes when the map cannot tell.
+        Neighbours of a contradicted photo are tried as well, and left out if they are not
+        localized.
         """
         count = len(capture.photos)
 
@@ -266,27 +253,10 @@ class _Job:
         return lifted.rows, lifted.points
 
     def _described(self, capture: Capture) -> Capture:
-        return describe_capture(
-            self.settings,
-            self.opened,
-            self.dataset,
-            self.features,
-            capture,
-            self.work,
-            self.workers,
-            self.progress,
-        )
+        return describe_capture(self.context, self.settings, self.opened, self.dataset, capture)
 
     def _localized(self, capture: Capture) -> list[Placed]:
-        task = LocalizeTask(
-            self.work,
-            self.opened.path,
-            self.opened.manifest.content_hash,
-            self.features,
-            self.settings.weights_dir,
-            self.settings.inference,
-        )
-        return localize_photos(task, capture.photos, capture.described, self.workers, self.progress)
+        return localize_photos(self.context, self.opened, capture.photos, capture.described)
 
     def _joined(
         self, capture: Capture, placement: Placement, notes: Sequence[str]
@@ -297,33 +267,22 @@ class _Job:
         content = content_of(self.opened)
         map_from_dataset = placement.map_from_dataset
         if self.settings.poses == "localize" and not (self.settings.metric and content.metric):
-            # Photos that are placed one by one do not tell how long a rig is in the map's unit.
+            # Photos localized one by one do not tell the length of a rig in the map's unit.
             dataset = replace(self.dataset, rigs={})
         else:
             dataset = scaled_rigs(self.dataset, map_from_dataset.scale)
         made, same = self._landmarks(content, dataset, capture, map_from_dataset)
         placed = [capture.photos[row] for row in made.photos]
         if content.landmarks.colors is not None and made.landmarks.colors is None:
-            colours = landmark_colours(
-                self.work, placed, made.landmarks, self.workers, self.progress
-            )
+            colours = landmark_colours(self.context, placed, made.landmarks)
             made = replace(made, landmarks=replace(made.landmarks, colors=colours))
-        part = part_of_map(
-            content,
-            dataset,
-            capture.photos,
-            capture.names,
-            self.features,
-            capture.described,
-            made,
-            notes,
-        )
-        # Those of two captures are two, though they say the same.
+        part = part_of_map(content, dataset, capture, self.context.features, made, notes)
+        # Equal notes on two captures are two notes.
         part = replace(part, notes=tuple(f"{self._name}: {note}" for note in part.notes))
         pictures = photo_files(self.opened)
         if pictures:
-            folder = self.work.root / "small_photos"
-            keep_photos(self.work, folder, placed, self.workers, self.progress)
+            folder = self.context.work.root / "small_photos"
+            keep_photos(self.context, folder, placed)
             pictures += [folder / photo_file(row) for row in range(len(placed))]
         whole = joined(content, part, same)
         record = self._record(placement, content, whole)
@@ -334,7 +293,6 @@ class _Job:
 
     @property
     def _name(self) -> str:
-        """What the capture is called."""
         return self.settings.capture or self.settings.dataset.resolve().name
 
     def _landmarks(
@@ -344,7 +302,7 @@ class _Job:
         capture: Capture,
         map_from_dataset: Similarity,
     ) -> tuple[MadeLandmarks, NDArray[np.int64] | None]:
-        """Landmarks of the new photos in the map's frame; which of them the map has already."""
+        """Return landmarks of the new photos in the map's frame, and the map's rows for them."""
         if self.method == "sfm":
             photos = [
                 replace(photo, cam_from_world=map_from_dataset.move(photo.pose))
@@ -355,33 +313,22 @@ class _Job:
                 for one in content.global_features
             ]
             made = landmarks_from_matches(
-                self.work,
-                dataset,
-                photos,
-                self.features,
-                described,
-                SfmSettings(),
-                content.metric,
-                self.workers,
-                self.progress,
+                self.context, dataset, photos, described, SfmSettings(), metric=content.metric
             )
             return made, None
         of_map = content.settings.get("voxel_size")  # of maps by depth
         usual = DepthSettings().voxel_size * map_from_dataset.scale
         voxel_size = float(of_map) if isinstance(of_map, int | float) else usual
         made = landmarks_from_depth(
-            self.work,
+            self.context,
             self.dataset,
             capture.photos,
-            self.features,
             DepthSettings(voxel_size, self.settings.depth_scale),
-            content.metric,
-            self.workers,
-            self.progress,
-            map_from_dataset,
+            metric=content.metric,
+            world_from_dataset=map_from_dataset,
         )
         centers = np.array([view.cam_from_world.center for view in made.views])
-        corner = np.round(centers.mean(axis=0))  # as merging has it
+        corner = np.round(centers.mean(axis=0))  # like merging
         return made, landmarks_in_same_voxel(content.landmarks, made.landmarks, corner, voxel_size)
 
     def _record(self, placement: Placement, before: MapContent, after: MapContent) -> UpdateRecord:

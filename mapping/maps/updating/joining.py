@@ -1,18 +1,18 @@
-"""What a new capture brings, as a part of the map that it joins."""
+"""A new capture as a part of the map that it joins."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.features import LocalFeaturesSource
+from mapping.build.content import photo_content
 from mapping.build.landmarks import MadeLandmarks
-from mapping.build.photos import MappingPhoto
-from mapping.methods.sfm import known_rigs
-from visloc.archive import ImageRecord, Landmarks, MapContent, pose_row
+from mapping.build.local_features import LocalFeaturesSource
+from mapping.maps.updating.capture import Capture
+from visloc.archive import Landmarks, MapContent
 from visloc.geometry import Pose
 from visloc.kapture import Dataset
 
@@ -20,59 +20,26 @@ from visloc.kapture import Dataset
 def part_of_map(
     content: MapContent,
     dataset: Dataset,
-    photos: Sequence[MappingPhoto],
-    names: Sequence[str],
+    capture: Capture,
     features: LocalFeaturesSource,
-    described: Mapping[str, NDArray[np.float32]],
     made: MadeLandmarks,
     notes: Sequence[str],
 ) -> MapContent:
-    """Return the photos that found a place as content of the map's kind, in its frame.
+    """Return the capture's photos that have a pose as content of the map's kind, in its frame.
 
     Args:
         content: the map.
-        dataset: what the photos are of, with rigs in the map's unit.
-        photos: those that ``made`` was made of.
-        names: what they are called in the map.
-        features: of the photos, of the map's kind.
-        described: global descriptors (n, D) of the photos by name, by the map's models.
-        made: in the map's frame.
-        notes: on what was left out.
+        dataset: of the capture, with rigs in the map's unit.
+        made: from the capture, in the map's frame.
     """
-    placed = [photos[row] for row in made.photos]
-
-    def descriptors() -> Iterator[NDArray[np.float32]]:
-        for photo, rows in zip(placed, made.rows, strict=True):
-            yield features.read(photo).descriptors[rows]
-
-    sensors = {photo.record.sensor_id for photo in placed}
     return replace(
         content,
         notes=(*notes, *made.notes),
-        cameras={
-            photo.record.sensor_id: view.camera
-            for photo, view in zip(placed, made.views, strict=True)
-        },
-        rigs={
-            rig: {sensor: pose_row(pose) for sensor, pose in members.items()}
-            for rig, members in known_rigs(dataset, sensors).items()
-        },
-        images=tuple(
-            ImageRecord(
-                names[row],
-                photos[row].record.sensor_id,
-                photos[row].record.timestamp,
-                features.turn(photos[row]),
-            )
-            for row in made.photos
-        ),
-        image_poses=np.array([pose_row(view.cam_from_world) for view in made.views]),
-        landmarks=made.landmarks,
-        descriptors=descriptors,
         global_features=tuple(
-            replace(one, descriptors=described[one.fingerprint.name][made.photos])
+            replace(one, descriptors=capture.described[one.fingerprint.name][made.photos])
             for one in content.global_features
         ),
+        **photo_content(dataset, capture.photos, capture.names, features, made),
     )
 
 
@@ -93,7 +60,7 @@ def scaled_rigs(dataset: Dataset, scale: float) -> Dataset:
 def landmarks_in_same_voxel(
     old: Landmarks, new: Landmarks, origin: NDArray[np.float64], voxel_size: float
 ) -> NDArray[np.int64]:
-    """Find for each new landmark (P,) the old one in its voxel, the nearest of several; else -1.
+    """Find for each new landmark (P,) the nearest old one in its voxel; -1 without one.
 
     Args:
         old: landmarks of the map.
@@ -121,7 +88,7 @@ def landmarks_in_same_voxel(
 
 
 def _codes(cells: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.int64]:
-    """One number for each cell (n, 3) of a box."""
+    """Number the cells (n, 3) of a box."""
     # As merging has it, the box has fewer than 2**62 cells.
     x, y, z = cells.astype(np.int64).T
     return np.asarray((x * int(size[1]) + y) * int(size[2]) + z)

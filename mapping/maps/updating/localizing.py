@@ -1,4 +1,4 @@
-"""Photos of a new capture, localized in the map that they are to join."""
+"""Localizing the photos of a new capture in the map that they join."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.features import LocalFeaturesSource, Progress, open_descriptor
+from mapping.build.context import BuildContext
+from mapping.build.local_features import LocalFeaturesSource
+from mapping.build.networks import Networks
 from mapping.build.photos import MappingPhoto
 from mapping.build.stages import Item, WorkFolder, key_of
-from mapping.cluster.executors import Executor
 from mapping.methods.matching import camera_values
 from visloc import __version__
-from visloc.archive import open_map
+from visloc.archive import Map, open_map
 from visloc.geometry import Pose
 from visloc.localization.localizer import Localizer
-from visloc.types import Inference, Localized, LocalizeOptions, QueryFeatures
+from visloc.types import Localized, LocalizeOptions, QueryFeatures
 
 # Raised when the code of the stage changes what comes out.
 _REVISION = 1
@@ -30,13 +31,13 @@ _MAX_KEYPOINTS = 2500
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """Where a photo was localized.
+    """The answer of the map to a photo.
 
     Attributes:
-        reason: why it was not; "" when it was.
-        cam_from_map: pose; the identity without.
-        pixels: (n, 2) float64, where it sees landmarks.
-        points: (n, 3) float64 those landmarks, in the map's frame.
+        reason: why the photo was not localized; "" if it was.
+        cam_from_map: pose; the identity if the photo was not localized.
+        pixels: (n, 2) float64 inlier keypoints.
+        points: (n, 3) float64 their landmarks, in the map's frame.
     """
 
     reason: str
@@ -46,32 +47,35 @@ class Placed:
 
     @property
     def localized(self) -> bool:
-        """Whether the map gave a pose."""
         return self.reason == ""
 
 
 def localize_photos(
-    task: LocalizeTask,
+    context: BuildContext,
+    opened: Map,
     photos: Sequence[MappingPhoto],
     described: Mapping[str, NDArray[np.float32]],
-    workers: Executor,
-    progress: Progress,
 ) -> list[Placed]:
-    """Localize photos from the features that were found already, as queries are.
+    """Localize photos, like queries, from the features that were extracted for mapping.
 
     Args:
-        task: the map, and where features are and answers are kept.
-        photos: with their cameras.
-        described: global descriptors (n, D) of these photos by name, as the map describes them.
-        workers: where they are localized.
-        progress: told how far it is.
+        context: with local features of the map's kind.
+        photos: n photos.
+        described: global descriptors (n, D) by name, by the map's models.
     """
+    task = _LocalizeTask(
+        context.work,
+        opened.path,
+        opened.manifest.content_hash,
+        context.features,
+        context.networks,
+    )
     queries = [
         _Query(photo, {name: rows[row] for name, rows in described.items()})
         for row, photo in enumerate(photos)
     ]
-    workers.run(task.localize, queries, partial(progress, "localized"))
-    return [_placed(task.work.read(task.key(query))) for query in queries]
+    context.run("localized", task.localize, queries)
+    return [_placed(context.work.read(task.key(query))) for query in queries]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,21 +85,14 @@ class _Query:
 
 
 @dataclass(frozen=True, slots=True)
-class LocalizeTask:
-    """What workers do for a photo.
-
-    Attributes:
-        work: keeps finished photos.
-        folder: of the map, with its ``content_hash``.
-        features: local features of the photos, of the map's kind.
-    """
+class _LocalizeTask:
+    """A worker's part: one photo."""
 
     work: WorkFolder
     folder: Path
     content_hash: str
     features: LocalFeaturesSource
-    weights_dir: Path | None
-    inference: Inference
+    networks: Networks
 
     def key(self, query: _Query) -> str:
         return key_of(
@@ -117,7 +114,7 @@ class LocalizeTask:
             self.work.get(key, partial(self._compute, query))
 
     def _compute(self, query: _Query) -> Item:
-        localizer = _open_localizer(self.folder, self.weights_dir, self.inference)
+        localizer = _open_localizer(self.folder, self.networks)
         found = self.features.read(query.photo)  # strongest first
         features = QueryFeatures(
             localizer.map.manifest.local_features.fingerprint.name,
@@ -150,7 +147,6 @@ def _placed(item: Item) -> Placed:
 
 
 @cache
-def _open_localizer(folder: Path, weights_dir: Path | None, inference: Inference) -> Localizer:
-    """The localizer of this process; it takes features, so it needs no extractor."""
-    make_descriptor = partial(open_descriptor, weights_dir=weights_dir, inference=inference)
-    return Localizer(open_map(folder), None, make_descriptor)
+def _open_localizer(folder: Path, networks: Networks) -> Localizer:
+    """Return the localizer of this process; it takes features, so it needs no extractor."""
+    return Localizer(open_map(folder), None, networks.descriptor)

@@ -1,4 +1,4 @@
-"""Where a new capture lies in the map that it is to join, and whether it fits at all."""
+"""Where a new capture lies in the map that it joins, and whether it fits at all."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from visloc.types import LocalizeOptions
 
 T = TypeVar("T")
 Lift = Callable[[MappingPhoto, NDArray[np.float64]], tuple[NDArray[np.int64], NDArray[np.float64]]]
-"""Tells which of some pixels (n, 2) of a photo have a depth, (m,), and their place in the photo's
-own frame of the world (m, 3)."""
+"""Takes a photo and pixels (n, 2). Returns the rows (m,) of the pixels that have a depth, and their
+points (m, 3) in the photo's own world."""
 
-# Of the photos that are tried, this part must be localized, and of those agree.
+# This part of the tried photos must be localized, and this part of those must agree.
 _MIN_PART = 0.5
-# Matches with depth that a tie is refined on; of fewer, projections tell more.
+# Fewest matches with depth to refine a tie; with fewer, projections are more accurate.
 _MIN_LIFTED = 100
 # Photos whose depth is compared with the map, evenly chosen.
 _LIFTED_BY = 16
@@ -55,14 +55,13 @@ class Placement:
     """Where a capture lies in a map.
 
     Attributes:
-        map_from_dataset: takes the dataset's frame to the map's.
         tried: photos that were to be localized.
         not_localized: how many of them were not, by reason.
         tied: photos whose own pose, moved, agrees with what they see of the map.
-        pixels: median distance between where they see landmarks and their projections.
-        position: median distance between where they were localized and their own pose, moved, in
-            units of the map.
-        orientation_deg: the same of directions.
+        pixels: median reprojection error of their inliers.
+        position: median distance between their localized and own (moved) positions, in units of
+            the map.
+        orientation_deg: the same of orientations.
     """
 
     map_from_dataset: Similarity
@@ -105,20 +104,20 @@ def place_capture(
     *,
     metric: bool,
 ) -> Placement:
-    """Find where a capture lies, from where its photos were localized.
+    """Find where a capture lies, from the poses at which its photos were localized.
 
     Args:
         opened: the map.
-        photos: those that were tried; with poses of their own but for ``localize``.
-        placed: where they were localized.
+        photos: the photos that were tried; with poses of their own, except for ``localize``.
+        placed: the map's answers to them.
         poses: a name of ``mapping.maps.updating.settings.POSES``.
-        lift: gives pixels their place by the depth of their photo, which is compared with the map
-            and makes a tie better; None without depth.
+        lift: lifts pixels by the depth of their photo. Depth is compared with the map, and refines
+            a tie. None without depth.
         metric: whether a unit of the photos' own poses is a metre.
 
     Raises:
         Conflict: ``update.elsewhere`` when too few are localized, or do not agree, or their depth
-            contradicts where they lie.
+            contradicts the map.
     """
     refuse_elsewhere(opened, placed)
     both = [(photo, one) for photo, one in zip(photos, placed, strict=True) if one.localized]
@@ -127,7 +126,7 @@ def place_capture(
     )
     if poses == "tie":
         rigid = metric and opened.manifest.world.metric
-        similarity, agrees = _tied(localized, both, lift, metric=metric, rigid=rigid)
+        similarity, agrees = _tie(both, localized, lift, rigid=rigid, metric=metric)
         own = [similarity.move(photo.pose) for photo, _ in both]
         return _placement(similarity, placed, both, own, agrees)
     if poses == "localize":
@@ -135,31 +134,26 @@ def place_capture(
         agrees = [True] * len(both)
     else:
         agrees = [_fits(photo, one) for photo, one in both]
-        if sum(agrees) <= len(both) / 2:  # as a tie needs more than half
+        if sum(agrees) <= len(both) / 2:  # a tie needs more than half, too
             raise _elsewhere(
                 f"{localized}, but only {sum(agrees)} where --poses given has them",
                 "poses in the map's frame, or --poses tie",
             )
     if lift is not None:
         _refuse_depth(localized, _all_lifted(both, agrees, lift), Similarity.identity())
-    return _placement(
-        Similarity.identity(), placed, both, [photo.pose for photo, _ in both], agrees
-    )
+    own = [photo.pose for photo, _ in both]
+    return _placement(Similarity.identity(), placed, both, own, agrees)
 
 
-def _tied(
-    localized: str,
+def _tie(
     both: Sequence[tuple[MappingPhoto, Placed]],
+    localized: str,
     lift: Lift | None,
     *,
-    metric: bool,
     rigid: bool,
+    metric: bool,
 ) -> tuple[Similarity, list[bool]]:
-    """Tie the frame of the photos' own poses to the map's, with depth where there is any.
-
-    Returns:
-        The similarity, and whether each photo agrees with it.
-    """
+    """Return where the photos' own frame lies in the map, and which photos agree."""
     seen = [_seen(photo, one) for photo, one in both]
     found = tie(seen, rigid=rigid)
     if isinstance(found, NoTie):
@@ -181,31 +175,31 @@ def _tied(
             f"{_MIN_LIFTED} points with depth, or --method sfm",
         )
     _refuse_depth(localized, lifted, similarity)
-    if count < _MIN_LIFTED:
-        return similarity, agrees
-    similarity = refined_by_depth(lifted, similarity, rigid=rigid)
-    tied = agreeing(seen, similarity)
-    if (few := too_few(tied)) is not None:
-        raise _elsewhere(f"{localized}, but with depth {few}", _GOOD_DEPTH)
-    return similarity, tied.tolist()
+    if count >= _MIN_LIFTED:
+        similarity = refined_by_depth(lifted, similarity, rigid=rigid)
+        tied = agreeing(seen, similarity)
+        if (few := too_few(tied)) is not None:
+            raise _elsewhere(f"{localized}, but with depth {few}", _GOOD_DEPTH)
+        agrees = tied.tolist()
+    return similarity, agrees
 
 
 def contradicted(
     photos: Sequence[MappingPhoto], placed: Mapping[int, Placed], map_from_dataset: Similarity
 ) -> list[int]:
-    """Rows of the photos that were localized where their own pose, moved, cannot be."""
+    """Return the rows of localized photos that contradict their own pose, moved."""
     rows = [row for row, one in placed.items() if one.localized]
     wrong = contradicting([_seen(photos[row], placed[row]) for row in rows], map_from_dataset)
     return sorted(row for row, is_wrong in zip(rows, wrong, strict=True) if is_wrong)
 
 
 def beside(wrong: Collection[int], localized: Collection[int], count: int) -> list[int]:
-    """Rows of photos that are not localized and of whose neighbours that are one is wrong.
+    """Return the rows of photos that are not localized, and have a wrong localized neighbour.
 
     Args:
         wrong: rows of photos that the map contradicts.
-        localized: rows of all that are localized, these among them.
-        count: of all photos, which are in the order in which they were taken.
+        localized: rows of all localized photos, including the wrong ones.
+        count: of all photos, in the order in which they were taken.
     """
     known = sorted(localized)
     found = []
@@ -226,7 +220,7 @@ def _refuse_depth(localized: str, lifted: Sequence[Seen], map_from_dataset: Simi
 def _all_lifted(
     both: Sequence[tuple[MappingPhoto, Placed]], agrees: Sequence[bool], lift: Lift
 ) -> list[Seen]:
-    """Photos that agree, with those of their matches whose place their depth tells as well."""
+    """Return the photos that agree, with their matches that have a depth."""
     agreed = [pair for pair, agree in zip(both, agrees, strict=True) if agree]
     return [_lifted(_seen(*pair), pair[0], lift) for pair in evenly(agreed, _LIFTED_BY)]
 
@@ -236,7 +230,7 @@ def _seen(photo: MappingPhoto, one: Placed) -> Seen:
 
 
 def _lifted(seen: Seen, photo: MappingPhoto, lift: Lift) -> Seen:
-    """A photo with those of its matches whose place its depth tells as well."""
+    """Return a photo with its matches that have a depth."""
     rows, points = lift(photo, seen.pixels)
     return replace(seen, pixels=seen.pixels[rows], points=seen.points[rows], own_points=points)
 
@@ -262,13 +256,13 @@ def _placement(
 
 
 def _fits(photo: MappingPhoto, one: Placed) -> bool:
-    """Whether a photo's own pose explains most of what it sees, as poses of queries must."""
+    """Tell whether a photo's own pose explains most of its inliers, by the limit of queries."""
     most = registration_for(LocalizeOptions(), [photo.camera]).max_error_px
     return bool(np.mean(_errors_px(photo, one, photo.pose) <= most) >= _MIN_PART)
 
 
 def _errors_px(photo: MappingPhoto, one: Placed, pose: Pose) -> NDArray[np.float64]:
-    """Distances (n,) in pixels between where a photo sees landmarks and where they project."""
+    """Return the distances (n,) in pixels of keypoints from the projections of their landmarks."""
     view = MatchedView(photo.camera, Pose.identity(), one.pixels, one.points)
     return reprojection_errors(view, pose)
 

@@ -1,66 +1,88 @@
-"""What an update is made of."""
+"""The settings of an update, which are also the options of ``mapping update``."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from mapping.methods.rgbd import DepthSettings
+from mapping.options import (
+    DatasetArgument,
+    DepthScaleOption,
+    DepthSensorOption,
+    FeaturesDirOption,
+    InferenceOption,
+    MapArgument,
+    MapsDirOption,
+    PixelOriginOption,
+    WeightsDirOption,
+    WorkersOption,
+)
 from visloc.archive import Map
 from visloc.archive.schema import ID_PATTERN
 from visloc.errors import Conflict, InvalidInput
 from visloc.geometry import PixelOrigin
 from visloc.types import Inference
 
-# What is known of where the photos were taken.
 POSES = ("tie", "given", "localize")
-# How landmarks of the new photos are made.
 METHODS = ("rgbd", "sfm")
 
 
 @dataclass(frozen=True, slots=True)
 class UpdateSettings:
-    """What an update is made of.
+    """The settings of an update."""
 
-    Attributes:
-        dataset: kapture folder of the new capture.
-        map_ref: the map: id, id@version, or a folder.
-        maps_dir: folder of maps.
-        poses: a name of ``POSES``: ``tie``: of the dataset, in a frame of its own; ``given``: of
-            the dataset, in the map's frame; ``localize``: those that the map gives each photo.
-        method: a name of ``METHODS``; None for the one that made the map.
-        capture: what comes before the names of the photos, to tell captures apart.
-        metric: whether a unit of the dataset's poses is a metre.
-        depth_scale: metres per unit of 16-bit PNG depth.
-        depth_sensor: the depth sensor to use, when several go with a photo.
-        features_dir: where ready-made features lie, when not in the dataset.
-        pixel_origin: what the dataset's principal points and ready-made keypoints count from.
-        weights_dir: folder with network weights.
-        inference: how networks are computed.
-        workers: processes that work on photos and pairs.
-    """
-
-    dataset: Path
-    map_ref: str
-    maps_dir: Path
-    poses: str = POSES[0]
-    method: str | None = None
-    capture: str | None = None
-    metric: bool = True
-    depth_scale: float = DepthSettings().depth_scale
-    depth_sensor: str | None = None
-    features_dir: Path | None = None
-    pixel_origin: PixelOrigin = PixelOrigin.CORNER
-    weights_dir: Path | None = None
-    inference: Inference = Inference.AUTO
-    workers: int = 1
+    map_ref: MapArgument
+    dataset: DatasetArgument
+    maps_dir: MapsDirOption = Path("maps")
+    poses: Annotated[
+        str,
+        typer.Option(
+            help="tie: the dataset's poses are in a frame of their own; find where it lies in the "
+            "map. given: they are in the map's frame. localize: use the pose at which the map "
+            "localizes each photo."
+        ),
+    ] = POSES[0]
+    method: Annotated[
+        str | None,
+        typer.Option(
+            help=f"Source of new landmarks: {' or '.join(METHODS)}. Default: the map's method."
+        ),
+    ] = None
+    capture: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Put NAME/ before the names of the photos, if captures use the same names.",
+        ),
+    ] = None
+    metric: Annotated[
+        bool,
+        typer.Option(
+            "--metric/--not-metric",
+            help="Whether the dataset's poses are in metres. If not, the tie finds the scale, and "
+            "depth must have the same unit.",
+        ),
+    ] = True
+    features_dir: FeaturesDirOption = None
+    pixel_origin: PixelOriginOption = PixelOrigin.CORNER
+    weights_dir: WeightsDirOption = None
+    inference: InferenceOption = Inference.AUTO
+    workers: WorkersOption = 1
+    depth_sensor: DepthSensorOption = None
+    depth_scale: DepthScaleOption = DepthSettings().depth_scale
 
 
 def check_settings(settings: UpdateSettings) -> None:
-    """Refuse what would otherwise fail after long work.
+    """Refuse settings that would fail after long work.
 
     Raises:
-        InvalidInput: ``update.poses``, ``update.method``, ``update.capture``.
+        InvalidInput: ``update.poses``, ``update.method``, ``update.capture``,
+            ``update.depth_scale``.
     """
     for option, value, known in (
         ("poses", settings.poses, POSES),
@@ -82,7 +104,7 @@ def check_settings(settings: UpdateSettings) -> None:
             expected="up to 64 letters, digits, '.', '_', '-', beginning with a letter or digit",
             got=settings.capture,
         )
-    if not (settings.depth_scale > 0 and settings.depth_scale < float("inf")):
+    if not 0 < settings.depth_scale < math.inf:
         raise InvalidInput(
             "update.depth_scale",
             "not usable",
@@ -93,7 +115,7 @@ def check_settings(settings: UpdateSettings) -> None:
 
 
 def method_for(settings: UpdateSettings, opened: Map) -> str:
-    """Return how landmarks are made: as asked, else as those of the map.
+    """Return the chosen method, or else the map's.
 
     Raises:
         InvalidInput: ``update.unit`` when depth has no unit in the map.
@@ -113,7 +135,7 @@ def method_for(settings: UpdateSettings, opened: Map) -> str:
 
 
 def refuse_strange_settings(opened: Map) -> None:
-    """Refuse a map whose settings, which may be of any software, are not what an update reads.
+    """Refuse a map whose recorded settings, which any software may have written, are unusable.
 
     Raises:
         Conflict: ``update.settings``.
@@ -123,7 +145,7 @@ def refuse_strange_settings(opened: Map) -> None:
     is_length = (
         isinstance(voxel_size, int | float)
         and not isinstance(voxel_size, bool)
-        and 0 < voxel_size < float("inf")
+        and 0 < voxel_size < math.inf
     )
     for name, known, expected in (
         ("updates", isinstance(settings.get("updates", []), list), "a list of updates"),
@@ -140,7 +162,7 @@ def refuse_strange_settings(opened: Map) -> None:
 
 
 def refuse_few(count: int) -> None:
-    """Refuse to match fewer photos with each other than two.
+    """Refuse fewer than two photos, which cannot be matched with each other.
 
     Raises:
         InvalidInput: ``update.photos_few``.

@@ -28,12 +28,12 @@ PAIRINGS: Mapping[str, Pairing] = {
     "sequence": pair_by_sequence,
     "exhaustive": pair_exhaustively,
 }
-# Those that go by where the photos were taken.
+# Pairings that need poses.
 POSED_PAIRINGS = frozenset({"distance", "frustum"})
 
 
 def pair_photos(scene: Scene, names: Sequence[str], settings: PairSettings) -> Pairs:
-    """Run one or several pairings and return all pairs that any of them found.
+    """Run one or several pairings, and unite their pairs.
 
     Scores of different pairings cannot be compared. With one pairing, they are its own; with
     several, the score of a pair is the number of pairings that found it.

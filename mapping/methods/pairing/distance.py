@@ -3,14 +3,14 @@
 For two cameras at a distance d (between their centres) and an angle a (of the rotation between
 them), the score is ``2 - (d / max_distance + a / max_angle)``, from 2 for equal poses down to 0
 (Humenberger et al. 2020, turned so that more is better). Pairs beyond either limit are rejected.
-It knows nothing of what the cameras see: a wall between two of them does not part them.
+Occlusion is unknown: two cameras may pair through a wall.
 
 The search is exact. The sum in the score is at least the Euclidean distance between two cameras
 when each is the point ``(centre / max_distance, rotation matrix / (sqrt(2) max_angle))`` in twelve
 dimensions, because the Frobenius distance of two rotations is ``2 sqrt(2) sin(a / 2) <=
 sqrt(2) a``. A k-d tree over these points gives each photo some nearest ones; when its k-th best
-pair is better than the farthest of them could be, none beyond can matter. The few photos where
-that is not so, such as those of a camera that stood still, are compared with all.
+pair is better than the farthest of them could be, no photo beyond can matter. The few other photos,
+such as those of a camera that stood still, are compared with all.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mapping.methods.pairing.settings import PairSettings
 
 # Pairs scored at a time: some 100 MiB with all that is computed of them.
 _BLOCK_SIZE = 2**20
-# Neighbours asked of the tree per pair wanted. In six dimensions, a sum of two lengths below s
+# Neighbours to search per pair. In six dimensions, a sum of two lengths below s
 # takes about 1/8 of the volume of the ball of radius s; hence somewhat more than 8.
 _NEIGHBOURS_PER_PAIR = 12
 # No accepted pair is farther apart in the tree than sqrt(2); rounding must lose none.
@@ -39,9 +39,9 @@ _SEARCH_RADIUS = 1.5
 def pair_by_distance(scene: Scene, settings: PairSettings) -> Pairs:
     """Pair every photo with the ``top_k`` nearest in position and rotation.
 
-    Photos without a pose get no pair. Two photos from the very same place, which differ by a
-    rotation only, pair with a high score all the same; their matches are lost, since without a
-    baseline given poses confirm none (``visloc.matching.verification.epipolar_errors``).
+    Photos without a pose get no pair. Two photos from the same place, which differ by a rotation
+    only, still pair with a high score; their matches are lost, since given poses confirm none
+    without a baseline (``visloc.matching.verification.epipolar_errors``).
 
     Raises:
         InvalidInput: ``pairs.no_poses``.

@@ -19,7 +19,7 @@ _HEADER = "# query_image, map_image, score"
 def write_pairs(path: Path, scene: Scene, pairs: Pairs) -> None:
     """Write pairs for ``read_pairs`` and for kapture's own tools; a file there is replaced.
 
-    Numbers are written so that they come back as they were.
+    Numbers are written exactly.
     """
     lines = [_HEADER]
     lines += [
@@ -33,8 +33,8 @@ def write_pairs(path: Path, scene: Scene, pairs: Pairs) -> None:
 def read_pairs(path: Path, scene: Scene) -> Pairs:
     """Read lines ``name, name`` or ``name, name, score``; a pair without a score has score 1.
 
-    A pair that is given again, in either order, counts once with its best score. Comments
-    and blank lines are passed over.
+    A repeated pair, in either order, counts once with its best score. Comments and blank lines are
+    ignored.
 
     Raises:
         DatasetError: with file and line; ``kapture.unreadable``, ``kapture.encoding``,

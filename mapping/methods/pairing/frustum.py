@@ -1,14 +1,14 @@
 """Photos whose viewing frusta overlap, seen from similar sides.
 
 The reference published no definition of its frustum overlap; this is ours. A camera may see any
-point that projects into its image at a depth (along its axis) from ``near`` to ``far``. How deep
-the scene lies is not known, so that all orders of magnitude count the same: depths are weighted
-by their logarithm. A point that A may see counts as shared with B when
+point that projects into its image at a depth (along its axis) from ``near`` to ``far``. The depth
+of the scene is unknown, so all orders of magnitude count the same: depths are weighted by their
+logarithm. A point that A may see counts as shared with B if
 
 1. it projects into B's image,
 2. its depth in B is from ``near`` to ``far``,
 3. the rays to it from both centres differ by less than 60 degrees, because local features do not
-   match beyond. Two cameras that face each other across the same place so share nothing.
+   match beyond. Two cameras that face each other across a place thus share nothing.
 
 For a pixel of A with the ray r = (x, y, 1), the point at depth z is z Q + t in B's frame, with
 Q = R r and ``B_from_A = (R, t)``. Each side of B's image, both depths of B and the angle ask for
@@ -24,12 +24,12 @@ from 0 to 1. Pairs that score less than 0.1 are rejected.
 Approximations:
     - Pixels are turned into rays with the full camera model; B's image, to project into, is the
       rectangle at depth 1 that bounds the rays of its grid and of the middles of its edges.
-    - Walls are not known: cameras in adjacent rooms may pair.
-    - Of each photo, only the nearest ``max(300, 15 top_k)`` others are scored, and those whose
-      nearest it is among; near in position over sqrt(near far) and viewing direction. Photos with
-      fewer others in reach are ranked exactly. Of the true 20 best of a photo, this finds more than
-      99 % among 10 000 random photos in a room, and 96 % in a square of 60 x 60 m; what it finds
-      instead of the others scores nearly the same (99.8 % of the sum).
+    - Walls are unknown: cameras in adjacent rooms may pair.
+    - Each photo is scored only with its nearest ``max(300, 15 top_k)`` others, and with photos
+      that have it among theirs; near in position over sqrt(near far) and viewing direction. Photos
+      with fewer others in reach are ranked exactly. Of the true 20 best of a photo, this finds more
+      than 99 % among 10 000 random photos in a room, and 96 % in a square of 60 x 60 m; the
+      substitutes score nearly the same (99.8 % of the sum).
 """
 
 from __future__ import annotations
@@ -60,10 +60,9 @@ _MAX_SLOPE = 1e3  # of a ray; 89.94 degrees off the axis
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Views:
-    """What each photo may see; arrays along the photos of ``posed``.
+    """The views of photos; arrays along the photos of ``posed``.
 
     Attributes:
-        posed: positions and rotations.
         camera_of: (p,) index into the arrays below.
         rays: (c, g, 3) at depth 1, of a grid of pixels.
         bounds: (c, 2, 2) least and greatest (x, y) at depth 1.

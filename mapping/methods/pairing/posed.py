@@ -14,7 +14,7 @@ from visloc.errors import InvalidInput
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedPhotos:
-    """Those of a scene that a pairing by pose can use.
+    """The photos of a scene that a pairing by pose can use.
 
     Attributes:
         rows: (p,) int64 rows of the scene, ascending.
@@ -28,7 +28,7 @@ class PosedPhotos:
 
 
 def posed_photos(scene: Scene, pairing: str, *, with_camera: bool = False) -> PosedPhotos:
-    """Gather the photos with a pose and, if asked for, with intrinsics.
+    """Collect the photos with a pose and, on request, with intrinsics.
 
     Raises:
         InvalidInput: ``pairs.no_poses`` or ``pairs.no_cameras`` when fewer than two are left.
@@ -64,7 +64,7 @@ def nearest(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Find the nearest points of a tree: distances and rows, (b, count) each, nearest first.
 
-    Where fewer lie within the limit, the distance is infinite and the row no row of the tree.
+    If fewer lie within the limit, distances are infinite and rows are not rows of the tree.
     """
     distances, rows = tree.query(points, k=count, distance_upper_bound=within)
     return np.asarray(distances), np.asarray(rows, dtype=np.int64)

@@ -22,7 +22,7 @@ def pair_by_retrieval(scene: Scene, settings: PairSettings) -> Pairs:
 
     The score is the cosine similarity with one global descriptor, and its generalized harmonic
     mean (``visloc.retrieval.fusion.gharm``) with several. Every photo gets its pairs, however low
-    their scores are: what similarity means a shared view differs between descriptors.
+    their scores: the similarity that indicates a shared view differs between descriptors.
 
     Raises:
         InvalidInput: ``pairs.no_global_descriptors``, or ``pairs.global_descriptor`` for one with

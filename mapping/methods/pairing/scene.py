@@ -1,4 +1,4 @@
-"""What a pairing may look at, and what it returns."""
+"""The input and the output of a pairing."""
 
 from __future__ import annotations
 
@@ -13,16 +13,14 @@ from visloc.geometry import Camera, Pose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """The photos to pair, with all that a pairing may use.
+    """The photos to pair, with all data for pairings.
 
     Attributes:
         names: of n photos; unique.
         sensors: id of each photo's camera.
         timestamps: (n,) int64, in the dataset's unit.
-        cameras: intrinsics; None where unknown.
-        cam_from_world: poses; None where unknown.
-        global_descriptors: (n, D) float32 unit rows by name; empty when no pairing needs them.
-        tracks: (M, 2) int64 rows: 3D point, photo; who sees what in a known reconstruction.
+        global_descriptors: (n, D) float32 unit rows by name; empty if no pairing needs them.
+        tracks: (M, 2) int64 rows: 3D point, photo; the observations of a known reconstruction.
     """
 
     names: tuple[str, ...]

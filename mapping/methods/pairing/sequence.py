@@ -14,10 +14,10 @@ def pair_by_sequence(scene: Scene, settings: PairSettings) -> Pairs:
     """Pair every photo with the ``top_k`` nearest in its camera's sequence.
 
     The photos of a camera are sorted by time, those of one time by row. The (j + 1)-th next one,
-    j from 0, scores ``1 - (j + 1) / top_k``. A photo in the middle so gets half of its pairs on
-    either side, one at an end all of them on one side. Only the order counts, not the time that
-    passed, because the unit of timestamps is not known here: a break in the sequence is
-    bridged, which costs some matching and no accuracy. Different cameras are not paired.
+    j from 0, scores ``1 - (j + 1) / top_k``. A photo in the middle thus gets half of its pairs on
+    either side, one at an end all of them on one side. Only the order counts, not the elapsed time,
+    because the unit of timestamps is unknown here. Breaks in the sequence are therefore bridged,
+    which costs some matching and no accuracy. Different cameras are not paired.
 
     Raises:
         InvalidInput: ``pairs.no_sequence`` when no camera took two photos.

@@ -1,58 +1,51 @@
-"""What a user may choose about pairings."""
+"""The settings of pairings."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
 
+import typer
+
+from mapping.options import SFM_PANEL
 from visloc.errors import InvalidInput
+
+_option = partial(typer.Option, rich_help_panel=SFM_PANEL)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairSettings:
-    """Limits of the pairings, checked when made.
-
-    Attributes:
-        top_k: best pairs kept of every photo, by each pairing.
-        max_distance: between camera centres, in the unit of the world; ``distance`` only.
-        max_angle_deg: between camera rotations; ``distance`` only.
-        near: depth where views begin, in the unit of the world; ``frustum`` only.
-        far: depth where views end; ``frustum`` only.
+    """Limits of the pairings, checked when made. Lengths are in the unit of the world.
 
     Raises:
         InvalidInput: ``pairs.top_k``, ``pairs.max_distance``, ``pairs.max_angle``, ``pairs.near``
             or ``pairs.far``, with the option of the command line as field.
     """
 
-    top_k: int = 20
-    max_distance: float = 25.0
-    max_angle_deg: float = 45.0
-    near: float = 0.5
-    far: float = 50.0
+    top_k: Annotated[int, _option(min=1, help="Best pairs of a photo that each pairing keeps.")] = (
+        20
+    )
+    max_distance: Annotated[
+        float, _option(help="distance: largest distance between camera centres, metres.")
+    ] = 25.0
+    max_angle_deg: Annotated[
+        float,
+        _option("--max-angle", help="distance: largest angle between orientations, degrees."),
+    ] = 45.0
+    near: Annotated[float, _option(help="frustum: depth where views begin, metres.")] = 0.5
+    far: Annotated[float, _option(help="frustum: depth where views end, metres.")] = 50.0
 
     def __post_init__(self) -> None:
+        length = "a positive number, in the unit of the poses"
         _check("top_k", self.top_k >= 1, "at least 1", self.top_k)
-        _check(
-            "max_distance",
-            0 < self.max_distance < math.inf,
-            "a positive number, in the unit of the poses",
-            self.max_distance,
-        )
-        _check(
-            "max_angle",
-            0 < self.max_angle_deg <= 180,
-            "more than 0 and at most 180 degrees",
-            self.max_angle_deg,
-        )
-        _check(
-            "near",
-            0 < self.near < math.inf,
-            "a positive number, in the unit of the poses",
-            self.near,
-        )
-        _check(
-            "far", self.near < self.far < math.inf, f"a number above --near {self.near}", self.far
-        )
+        _check("max_distance", 0 < self.max_distance < math.inf, length, self.max_distance)
+        angle = self.max_angle_deg
+        _check("max_angle", 0 < angle <= 180, "more than 0 and at most 180 degrees", angle)
+        _check("near", 0 < self.near < math.inf, length, self.near)
+        above = f"a number above --near {self.near}"
+        _check("far", self.near < self.far < math.inf, above, self.far)
 
 
 def _check(name: str, good: bool, expected: str, got: float) -> None:

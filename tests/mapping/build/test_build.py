@@ -18,7 +18,9 @@ from threadpoolctl import ThreadpoolController, threadpool_limits
 
 import mapping.build.build
 import mapping.build.publishing
-from mapping.build.build import BuildSettings, build_map
+from mapping.build.build import build_map
+from mapping.build.networks import Networks
+from mapping.build.settings import BuildSettings
 from mapping.build.stages import exclusive
 from mapping.cluster.workers import Workers
 from mapping.methods.rgbd import DepthSettings
@@ -429,8 +431,8 @@ def test_a_build_on_a_cluster_computes_as_suits_the_machine_that_begins_it(
 ) -> None:
     asked: list[Inference] = []
 
-    def note_source(*_: object, inference: Inference, **__: object) -> None:
-        asked.append(inference)
+    def note_source(*_: object, networks: Networks, **__: object) -> None:
+        asked.append(networks.inference)
         raise Stopped
 
     monkeypatch.setattr(mapping.build.build, "open_executor", lambda *_: Workers(1))

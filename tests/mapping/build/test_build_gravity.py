@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mapping.methods.pairing import PairSettings
-from mapping.methods.sfm import SfmSettings
+from mapping.methods.sfm_settings import SfmSettings
 from mapping.sample import ANCHOR_ALTITUDE_M, ANCHOR_LATITUDE_DEG, ANCHOR_LONGITUDE_DEG
 from visloc.archive import Map
 from visloc.errors import InvalidInput
@@ -16,7 +16,7 @@ from visloc.geodesy import geodetic_from_enu
 from visloc.kapture import GnssRecord, read_dataset
 
 Build = Callable[..., Map]
-ESTIMATE = SfmSettings(pairing=PairSettings(top_k=4), estimate_poses=True)
+ESTIMATE = SfmSettings(pairing=PairSettings(top_k=4), poses="estimate")
 ANCHOR = np.array([ANCHOR_LATITUDE_DEG, ANCHOR_LONGITUDE_DEG, ANCHOR_ALTITUDE_M])
 
 

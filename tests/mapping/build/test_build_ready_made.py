@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mapping.maps.updating import UpdateSettings, update_map
-from mapping.methods.sfm import SfmSettings
+from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import Map, MapStore, verify_map
 from visloc.errors import DatasetError, InvalidInput, VislocError
 from visloc.evaluation import pose_error
@@ -341,7 +341,7 @@ def test_a_capture_of_features_alone_joins_a_map_of_such(
         own = tuple(image for image in images if (image.timestamp // 1000 % 2 == 1) == odd)
         rewrite(tmp_path / name, images=own)
     before = build_walk(tmp_path / "first", tmp_path / "maps", **KINDS)
-    settings = UpdateSettings(tmp_path / "second", "walk", tmp_path / "maps")
+    settings = UpdateSettings("walk", tmp_path / "second", tmp_path / "maps")
     after = verify_map(update_map(settings, lambda *_: None).folder)
 
     assert (len(before.images), len(after.images)) == (8, 16)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapping.maps.cameras import cameras_of
 from mapping.methods.pairing import PAIRINGS, PairSettings
-from mapping.methods.sfm import SfmSettings
+from mapping.methods.sfm_settings import SfmSettings
 from mapping.sample import ANCHOR_ALTITUDE_M, ANCHOR_LATITUDE_DEG, ANCHOR_LONGITUDE_DEG
 from visloc.archive import Map, MapStore
 from visloc.errors import DatasetError, InvalidInput, VislocError
@@ -141,7 +141,7 @@ def test_a_focal_length_far_from_the_known_one_stays_as_known_and_is_told(
 
 
 ANCHOR = np.array([ANCHOR_LATITUDE_DEG, ANCHOR_LONGITUDE_DEG, ANCHOR_ALTITUDE_M])
-ESTIMATE = SfmSettings(pairing=PairSettings(top_k=4), estimate_poses=True)
+ESTIMATE = SfmSettings(pairing=PairSettings(top_k=4), poses="estimate")
 
 
 def centers_of(dataset: Path) -> dict[str, NDArray[np.float64]]:
@@ -350,8 +350,8 @@ def test_pairs_that_make_no_map_leave_the_one_before(
         ({"sfm": SfmSettings(pairs=("distance", "distance"))}, "--pairs: a name is given twice"),
         ({"sfm": SfmSettings(refine=("rigs",))}, "--refine.*poses, points, intrinsics.*got rigs"),
         ({"sfm": SfmSettings(mapper="config3")}, "--mapper.*config1, config2.*got config3"),
-        ({"sfm": SfmSettings(estimate_poses=True, refine=("poses",))}, "--refine"),
-        ({"sfm": SfmSettings(estimate_poses=True), "method": "rgbd"}, "--poses.*--method sfm"),
+        ({"sfm": SfmSettings(poses="estimate", refine=("poses",))}, "--refine"),
+        ({"sfm": SfmSettings(poses="estimate"), "method": "rgbd"}, "--poses.*--method sfm"),
     ],
 )
 def test_a_wrong_setting_names_its_option(

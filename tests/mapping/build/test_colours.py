@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
@@ -11,9 +12,13 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from mapping.build.build import BuildSettings, build_map
+from mapping.build.build import build_map
 from mapping.build.colours import landmark_colours
+from mapping.build.context import BuildContext
+from mapping.build.local_features import ExtractedFeatures
+from mapping.build.networks import Networks
 from mapping.build.photos import MappingPhoto
+from mapping.build.settings import BuildSettings
 from mapping.build.stages import WorkFolder
 from mapping.cli.main import app
 from mapping.cluster.workers import Workers
@@ -23,9 +28,14 @@ from visloc.errors import DatasetError
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import FileRecord, read_dataset
+from visloc.types import Inference
 
 Build = Callable[..., Map]
 RED, GREEN, BLUE, GREY = (250, 10, 20), (0, 200, 100), (30, 40, 255), (77, 77, 77)
+
+
+NO_NETWORKS = Networks(None, Inference.AUTO)
+NO_FEATURES = cast("ExtractedFeatures", None)  # colours are those of photos
 
 
 def quiet(*_: object) -> None:
@@ -172,7 +182,10 @@ def colours_of(
     tmp_path: Path, photos: list[MappingPhoto], landmarks: Landmarks
 ) -> NDArray[np.uint8]:
     with Workers(1) as workers:
-        return landmark_colours(WorkFolder(tmp_path / "work"), photos, landmarks, workers, quiet)
+        context = BuildContext(
+            WorkFolder(tmp_path / "work"), NO_FEATURES, NO_NETWORKS, workers, quiet
+        )
+        return landmark_colours(context, photos, landmarks)
 
 
 def test_the_pixel_is_the_one_that_the_keypoint_lies_in(tmp_path: Path) -> None:

@@ -13,14 +13,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
-from mapping.build.features import (
-    ExtractedFeatures,
-    _DescribeTask,
-    describe_photos,
-    describe_with_model,
-    open_descriptor,
-    open_extractor,
-)
+from mapping.build.context import BuildContext
+from mapping.build.global_features import DescribeTask, describe_photos, describe_with_model
+from mapping.build.local_features import ExtractedFeatures
+from mapping.build.networks import Networks, open_descriptor
 from mapping.build.photos import MappingPhoto, collect_photos
 from mapping.build.stages import WorkFolder
 from mapping.cluster.workers import Workers
@@ -80,12 +76,12 @@ def work(tmp_path: Path) -> WorkFolder:
 
 
 def sift(work: WorkFolder, max_keypoints: int = 100) -> ExtractedFeatures:
-    extractor = open_extractor("sift", None, Inference.TORCH)
+    networks = Networks(None, Inference.TORCH)
+    extractor = networks.extractor("sift")
     return ExtractedFeatures(
         work,
         "sift",
-        None,
-        Inference.TORCH,
+        networks,
         max_keypoints,
         extractor.fingerprint,
         extractor.descriptor_dim,
@@ -101,16 +97,14 @@ def describe(
 ) -> tuple[GlobalFeatures, list[str]]:
     stages: list[str] = []
     with Workers(1) as workers:
-        found = describe_photos(
+        context = BuildContext(
             work,
-            photos,
             features or sift(work),
-            name,
-            WEIGHTS,
-            Inference.TORCH,
+            Networks(WEIGHTS, Inference.TORCH),
             workers,
             lambda stage, *_: stages.append(stage),
         )
+        found = describe_photos(context, photos, name)
     return found, stages
 
 
@@ -183,17 +177,8 @@ def test_photos_of_later_are_described_by_the_model_of_the_map(
     def described(some: list[MappingPhoto]) -> NDArray[np.float32]:
         local = sift(work, rgbd_walk.manifest.local_features.max_keypoints)
         with Workers(1) as workers:
-            return describe_with_model(
-                rgbd_walk,
-                work,
-                some,
-                local,
-                "localvlad",
-                None,
-                Inference.TORCH,
-                workers,
-                lambda *_: None,
-            )
+            context = BuildContext(work, local, local.networks, workers, lambda *_: None)
+            return describe_with_model(context, rgbd_walk, some, "localvlad")
 
     found = described(photos)
     assert_array_equal(described(photos[3:4]), found[3:4])
@@ -217,7 +202,9 @@ def test_a_machine_that_computes_in_another_way_is_refused(
 def test_a_machine_that_describes_in_another_way_is_refused(
     work: WorkFolder, photos: list[MappingPhoto]
 ) -> None:
-    task = _DescribeTask.of(work, sift(work), "localvlad", None, Inference.TORCH)
+    local = sift(work)
+    context = BuildContext(work, local, local.networks, Workers(1), lambda *_: None)
+    task = DescribeTask.of(context, "localvlad")
     with pytest.raises(Unavailable) as caught:
         replace(task, computed_with="torch 2.13.0 on H200").find_words(photos[0])
     assert caught.value.code == "build.other_computing"

@@ -4,14 +4,19 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
 import pytest
 
-from mapping.build.build import BuildSettings, build_map
+from mapping.build.build import build_map
+from mapping.build.context import BuildContext
+from mapping.build.local_features import ExtractedFeatures
+from mapping.build.networks import Networks
 from mapping.build.photos import MappingPhoto
 from mapping.build.previews import keep_photos
+from mapping.build.settings import BuildSettings
 from mapping.build.stages import WorkFolder
 from mapping.cluster.workers import Workers
 from visloc.archive import Map, MapStore, open_map, verify_map
@@ -19,6 +24,10 @@ from visloc.errors import MapCorrupt
 from visloc.geometry import Camera
 from visloc.images import read_photo, read_photo_file
 from visloc.kapture import FileRecord
+from visloc.types import Inference
+
+NO_NETWORKS = Networks(None, Inference.AUTO)
+NO_FEATURES = cast("ExtractedFeatures", None)  # pictures need none
 
 
 def quiet(*_: object) -> None:
@@ -65,7 +74,10 @@ def test_photos_become_at_most_640_pixels_and_lose_their_exif(tmp_path: Path) ->
     folder = tmp_path / "map"
 
     with Workers(1) as workers:
-        keep_photos(WorkFolder(tmp_path / "work"), folder, photos, workers, quiet)
+        context = BuildContext(
+            WorkFolder(tmp_path / "work"), NO_FEATURES, NO_NETWORKS, workers, quiet
+        )
+        keep_photos(context, folder, photos)
 
     kept = [path.read_bytes() for path in sorted((folder / "photos").iterdir())]
     first = read_photo(kept[0]).rgb

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from benchmarks.retrieval import shared_landmarks
-from mapping.build.build import BuildSettings, build_map
-from mapping.methods.sfm import SfmSettings
+from mapping.build.build import build_map
+from mapping.build.settings import BuildSettings
+from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import open_map
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, PixelOrigin, Pose
 from visloc.kapture import open_features, open_local_features, read_dataset, read_local
 from visloc.localization.localizer import Localizer
-from visloc.retrieval.fusion import LateFusion
 from visloc.types import Fusion, Localized, LocalizeOptions, QueryFeatures
 
 APGEM = "kapture:AP-GeM-LM18"
@@ -32,7 +32,7 @@ def localizer(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Lo
         method="sfm",
         local_features="kapture:r2d2_500",
         global_features=(APGEM, "localvlad"),
-        fusion=LateFusion(Fusion.MEAN),
+        fusion=Fusion.MEAN,
         features_dir=gallery,
         pixel_origin=PixelOrigin.CENTER,
         sfm=SfmSettings(pairs=("distance",)),

@@ -12,8 +12,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mapping.build.build import BuildSettings, build_map
+from mapping.build.build import build_map
 from mapping.build.photos import read_in_frame
+from mapping.build.settings import BuildSettings
 from mapping.maps.export_features import export_features
 from mapping.maps.updating import UpdateSettings, update_map
 from tests.turning import (
@@ -167,7 +168,7 @@ def test_a_turned_capture_joins_a_map_of_upright_photos(
     built_maps: Path, turned_sample: Path, orientations: Mapping[str, int], tmp_path: Path
 ) -> None:
     maps = Path(shutil.copytree(built_maps, tmp_path / "maps"))
-    settings = UpdateSettings(turned_sample, map_ref="room", maps_dir=maps, capture="again")
+    settings = UpdateSettings("room", turned_sample, maps, capture="again")
     done = update_map(settings, quiet)
     opened = MapStore(maps).open("room")
 

@@ -8,7 +8,8 @@ import pytest
 from rich.console import Console
 
 from mapping.cli import progress
-from mapping.cli.progress import StageProgress, one_step
+from mapping.cli.progress import StageProgress
+from mapping.progress import one_step
 
 
 @pytest.fixture

@@ -8,7 +8,8 @@ import fsspec
 import numpy as np
 import pytest
 
-from mapping.build.build import BuildSettings, build_map
+from mapping.build.build import build_map
+from mapping.build.settings import BuildSettings
 from mapping.build.stages import WorkFolder, key_of
 from mapping.cluster.storage import is_remote, open_store, opened_dataset, place_of
 from visloc.archive import Map, open_map

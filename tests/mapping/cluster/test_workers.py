@@ -180,7 +180,7 @@ def test_killed_with_its_workers_the_same_command_resumes_and_makes_the_same_map
     for trouble in (
         "progress:local features:5",
         "progress:matches:4",
-        "call:mapping.methods.sfm:triangulate",
+        "call:mapping.methods.model_stage:triangulate",
     ):
         killed = run_build(trouble)
         assert killed.returncode == -signal.SIGKILL, (trouble, killed.stderr)

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from mapping.build.build import BuildSettings, build_map
+from mapping.build.build import build_map
 from mapping.build.publishing import publish_edited
+from mapping.build.settings import BuildSettings
 from mapping.build.stages import exclusive
 from mapping.cli.main import app
 from mapping.maps.editing import content_of, moved, selected

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapping.build.build import BuildSettings, build_map
+from mapping.build.build import build_map
 from mapping.build.publishing import publish_edited
+from mapping.build.settings import BuildSettings
 from mapping.cli import main as cli
 from mapping.frames.set_poses import poses_on_earth, read_poses
 from mapping.maps.editing import content_of, moved

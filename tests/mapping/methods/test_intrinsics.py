@@ -11,16 +11,11 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
-from mapping.methods import triangulation
+from mapping.methods.colmap_scene import colmap_database
 from mapping.methods.intrinsics import CameraOrigin, Doubt, is_plausible, notes_on, origin_of
 from mapping.methods.matching import Matches
-from mapping.methods.triangulation import (
-    MAPPER_CONFIGS,
-    SfmPhoto,
-    SparseModel,
-    reconstruct,
-    triangulate,
-)
+from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
+from mapping.methods.triangulation import reconstruct, solve_with_priors, triangulate
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Sensor
@@ -265,7 +260,7 @@ def test_cameras_that_come_in_doubt_one_after_another_are_solved_so_often(tmp_pa
         photos += taken_here
         shown += shown_here
     asked: list[set[str]] = []
-    with triangulation._database(photos, {}, matched(shown), tmp_path) as (_, scene):
+    with colmap_database(photos, {}, matched(shown), tmp_path) as (_, scene):
 
         def solve(doubts: dict[str, Doubt]) -> pycolmap.Reconstruction:
             asked.append(set(doubts))
@@ -282,7 +277,7 @@ def test_cameras_that_come_in_doubt_one_after_another_are_solved_so_often(tmp_pa
                 model.camera(scene.camera_ids[sensor]).params = NONSENSE.params
             return model
 
-        _, doubts = triangulation._believed(solve, scene, photos, set(scene.cameras), poses=True)
+        _, doubts = solve_with_priors(solve, scene, photos, set(scene.cameras), poses=True)
     with_prior = {"0", "1", "2", "3", "4", "5"}
     assert [len(doubted) for doubted in asked] == [0, 1, 2, 6, 7, 8]
     assert asked[3] == with_prior

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mapping.build.context import BuildContext
 from mapping.build.landmarks import View
+from mapping.build.networks import Networks
 from mapping.build.photos import MappingPhoto
 from mapping.build.stages import WorkFolder
 from mapping.cluster.workers import Workers
@@ -14,7 +16,7 @@ from mapping.methods.matching import Verification, fits_poses, match_pairs
 from visloc.geometry import Camera, Pose
 from visloc.kapture import FileRecord
 from visloc.pose.colmap import project
-from visloc.types import Fingerprint, LocalFeatures
+from visloc.types import Fingerprint, Inference, LocalFeatures
 
 CAMERA = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
 POINTS = np.random.default_rng(0).uniform([-2, -1.5, 4], [2, 1.5, 8], (60, 3))
@@ -26,6 +28,7 @@ class TrueFeatures:
 
     fingerprint = Fingerprint("true", 1, {})
     descriptor_dim = 60
+    computed_with = None
     max_keypoints = 60
 
     def key(self, photo: MappingPhoto) -> str:
@@ -33,6 +36,9 @@ class TrueFeatures:
 
     def prepare(self, photo: MappingPhoto) -> None:
         pass
+
+    def turn(self, _photo: MappingPhoto) -> int:
+        return 1
 
     def read(self, photo: MappingPhoto) -> LocalFeatures:
         pose = pose_of(photo.record.timestamp)
@@ -54,15 +60,10 @@ def make_photo(number: int) -> MappingPhoto:
 
 def matched(root: Path, pairs: NDArray[np.int64], **changes: object) -> list[tuple[int, int, int]]:
     values = {"max_error_px": 4.0, "min_matches": 15, "poses_known": True} | changes
-    found, _ = match_pairs(
-        WorkFolder(root),
-        [make_photo(number) for number in range(3)],
-        TrueFeatures(),
-        pairs,
-        Verification(**values),  # type: ignore[arg-type]
-        Workers(1),
-        lambda *_: None,
-    )
+    networks = Networks(None, Inference.TORCH)
+    context = BuildContext(WorkFolder(root), TrueFeatures(), networks, Workers(1), lambda *_: None)
+    photos = [make_photo(number) for number in range(3)]
+    found, _ = match_pairs(context, photos, pairs, Verification(**values))  # type: ignore[arg-type]
     return [(pair.first, pair.second, len(pair.rows)) for pair in found]
 
 

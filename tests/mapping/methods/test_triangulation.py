@@ -12,13 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from mapping.frames.anchor import Alignment, align_positions
 from mapping.methods.matching import Matches
-from mapping.methods.triangulation import (
-    MAPPER_CONFIGS,
-    SfmPhoto,
-    SparseModel,
-    reconstruct,
-    triangulate,
-)
+from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
+from mapping.methods.triangulation import reconstruct, triangulate
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose

@@ -90,7 +90,7 @@ def quiet(_stage: str, _done: int, _total: int) -> None:
 
 def update(dataset: Path, maps_dir: Path, **changes: object) -> Updated:
     values: dict[str, object] = {"map_ref": "walk"} | changes
-    return update_map(UpdateSettings(dataset, maps_dir=maps_dir, **values), quiet)  # type: ignore[arg-type]
+    return update_map(UpdateSettings(dataset=dataset, maps_dir=maps_dir, **values), quiet)  # type: ignore[arg-type]
 
 
 def errors_of_poses(opened: Map, walk: Path, first: int = 0) -> NDArray[np.float64]:
@@ -359,7 +359,7 @@ def test_strange_settings_of_the_map_are_refused_before_the_work(
     told: list[str] = []
     with pytest.raises(Conflict) as caught:
         update_map(
-            UpdateSettings(captures / "second", "strange", maps_dir),
+            UpdateSettings("strange", captures / "second", maps_dir),
             lambda stage, _done, _total: told.append(stage),
         )
     assert caught.value.code == "update.settings"
@@ -466,7 +466,7 @@ def test_stopped_before_the_end_it_finds_its_work_again_and_makes_the_same_map(
         found = (maps_dir / ".work" / "walk").glob("*/*.npz")
         return {path: path.stat().st_mtime_ns for path in found}
 
-    settings = UpdateSettings(captures / "second", "walk", maps_dir)
+    settings = UpdateSettings("walk", captures / "second", maps_dir)
     for _ in range(2):
         with pytest.raises(Stopped):
             update_map(settings, stop)
@@ -503,7 +503,7 @@ def test_another_version_that_came_into_use_is_not_lost(captures: Path, maps_dir
             store.set_current("walk", old)
 
     with pytest.raises(Conflict) as caught:
-        update_map(UpdateSettings(captures / "second", "walk", maps_dir), switch)
+        update_map(UpdateSettings("walk", captures / "second", maps_dir), switch)
     assert caught.value.code == "map.outdated"
     assert store.versions("walk") == sorted([old, new])
 

@@ -1,0 +1,66 @@
+"""Feature extractors and global descriptors, opened once in every process."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from visloc.errors import Unavailable
+from visloc.features import (
+    GlobalDescriptor,
+    LocalFeatureExtractor,
+    make_global_descriptor,
+    make_local_features,
+)
+from visloc.types import Inference
+
+
+@dataclass(frozen=True, slots=True)
+class Networks:
+    """The folder of weights, and the way to run networks."""
+
+    weights_dir: Path | None
+    inference: Inference
+
+    def extractor(self, name: str) -> LocalFeatureExtractor:
+        """Return this process's extractor.
+
+        Raises:
+            WeightsError, InvalidInput: what ``make_local_features`` raises.
+        """
+        return open_extractor(name, self)
+
+    def descriptor(self, name: str) -> GlobalDescriptor:
+        """Return this process's global descriptor; raises what ``extractor`` raises."""
+        return open_descriptor(name, self)
+
+
+@cache
+def open_extractor(name: str, networks: Networks) -> LocalFeatureExtractor:
+    """Make an extractor once per process, for one thread, as executors need it."""
+    return make_local_features(name, networks.weights_dir, networks.inference, threads=1)
+
+
+@cache
+def open_descriptor(name: str, networks: Networks) -> GlobalDescriptor:
+    """Make a global descriptor once per process, for one thread."""
+    return make_global_descriptor(name, networks.weights_dir, networks.inference, threads=1)
+
+
+def refuse_other_computing(name: str, expected: str | None, here: str | None) -> None:
+    """Refuse a machine whose results would differ from those of the machine that builds.
+
+    Raises:
+        Unavailable: ``build.other_computing``.
+    """
+    if here != expected:
+        raise Unavailable(
+            "build.other_computing",
+            f"a machine of the cluster computes {name} in another way than the one that builds; "
+            "their results would be mixed in one map. Choose a way that all have, or machines "
+            "that are alike",
+            field="--inference",
+            expected=expected,
+            got=here,
+        )

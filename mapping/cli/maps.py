@@ -1,0 +1,232 @@
+"""Commands about a map: ``anchor``, ``export``, ``pack``, ``inspect`` and ``verify``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mapping.cli.display import ERR, print_georeference, print_map, say, say_notes, summary_of
+from mapping.cli.progress import StageProgress
+from mapping.cli.sets import print_set, set_summary, verify_tiles
+from mapping.cluster.storage import is_map_folder, map_folder
+from mapping.frames.georeference import (
+    Georeference,
+    correspondences_from_fixes,
+    georeference,
+    given_place,
+    publish_anchored,
+    read_correspondences,
+)
+from mapping.maps.export import EXPORTERS, export_map
+from mapping.maps.packing import write_packed
+from mapping.methods.imported_points import read_imported_points
+from mapping.options import Gravity, MapArgument, MapsDirOption, WeightsDirOption
+from mapping.progress import one_step
+from visloc.archive import Map, SetManifest, open_map, open_set, verify_map, verify_set
+from visloc.archive.checks import read_any_manifest
+from visloc.errors import InvalidInput
+from visloc.features import make_global_descriptor, make_local_features
+from visloc.features.local.readymade import is_ready_made
+from visloc.kapture import read_dataset
+from visloc.localization.localizer import Localizer
+
+
+@dataclass(frozen=True, slots=True)
+class AnchorSettings:
+    """The options of ``mapping anchor``."""
+
+    map_ref: MapArgument
+    dataset: Annotated[
+        Path | None,
+        typer.Option(
+            "--dataset",
+            help="kapture folder with GNSS fixes (records_gnss.txt) of the map's photos.",
+        ),
+    ] = None
+    correspondences: Annotated[
+        Path | None,
+        typer.Option(
+            help="Or a CSV file of points (x,y,z,latitude,longitude,altitude) or of photos "
+            "(image,latitude,longitude,altitude). Its first line names the columns."
+        ),
+    ] = None
+    latitude: Annotated[
+        float | None,
+        typer.Option(
+            help="Or the place itself: degrees (WGS84) of the world's (0, 0, 0).", min=-90, max=90
+        ),
+    ] = None
+    longitude: Annotated[
+        float | None, typer.Option(help="With --latitude: degrees.", min=-180, max=180)
+    ] = None
+    altitude: Annotated[
+        float | None,
+        typer.Option(help="With --latitude: metres above the ellipsoid, not above sea level."),
+    ] = None
+    yaw: Annotated[
+        float | None,
+        typer.Option(
+            help="With --latitude: direction of the world's x axis on the ground, degrees. 0: "
+            "east, 90: north."
+        ),
+    ] = None
+    accuracy: Annotated[
+        float | None,
+        typer.Option(
+            help="With --latitude: RMS error of the place, metres. Default: unknown, and /geopose "
+            "says so.",
+            min=0,
+        ),
+    ] = None
+    scale: Annotated[
+        float | None,
+        typer.Option(help="With --latitude, for a map that is not metric: metres per unit."),
+    ] = None
+    gravity: Annotated[
+        Gravity,
+        typer.Option(
+            metavar="X,Y,Z",
+            help="With --latitude, for a map without known gravity: vector that points down in "
+            "its frame.",
+        ),
+    ] = None
+
+    def located(self, opened: Map) -> Georeference:
+        """Return where the map lies on Earth.
+
+        Raises:
+            InvalidInput: ``anchor.source`` unless the options give the place in one way.
+            VislocError: what reading and fitting raise.
+        """
+        place = (self.latitude, self.longitude, self.altitude, self.yaw)
+        has_place = any(value is not None for value in place)
+        details = any(one is not None for one in (self.accuracy, self.scale, self.gravity))
+        ways = (self.dataset is not None, self.correspondences is not None, has_place)
+        if sum(ways) != 1 or (has_place and None in place) or (details and not has_place):
+            raise InvalidInput(
+                "anchor.source",
+                "say in one way where the map lies",
+                expected="--dataset; or --correspondences; or all of --latitude, --longitude, "
+                "--altitude, --yaw, and where needed --accuracy, --scale and --gravity",
+            )
+        if self.dataset is not None:
+            fixes = correspondences_from_fixes(opened, read_dataset(self.dataset))
+            return georeference(opened, fixes)
+        if self.correspondences is not None:
+            return georeference(opened, read_correspondences(opened, self.correspondences))
+        latitude, longitude, altitude, yaw = (value for value in place if value is not None)
+        return given_place(
+            opened,
+            (latitude, longitude, altitude),
+            yaw,
+            accuracy=self.accuracy,
+            scale=self.scale,
+            gravity=self.gravity,
+        )
+
+
+def anchor(
+    settings: AnchorSettings,
+    maps_dir: MapsDirOption = Path("maps"),
+    force: Annotated[
+        bool, typer.Option("--force", help="Publish a new version of a map that is anchored.")
+    ] = False,
+) -> None:
+    """Tie a map to the Earth, so that answers have GeoPoses; publish it as a new version.
+
+    Poses of photos and landmarks in the map's frame do not change.
+    """
+    opened = open_map(map_folder(settings.map_ref, maps_dir))
+    found = settings.located(opened)
+    print_georeference(found)
+    folder = publish_anchored(opened, found, maps_dir, force=force)
+    say(f"map {open_map(folder).ref}")
+
+
+def export(
+    map_ref: MapArgument,
+    output: Annotated[
+        Path, typer.Option("--output", help="File or folder to write; it must not exist.")
+    ],
+    format_name: Annotated[
+        str, typer.Option("--format", help=f"One of {', '.join(EXPORTERS)}.")
+    ] = "colmap",
+    maps_dir: MapsDirOption = Path("maps"),
+) -> None:
+    """Write a map for other tools: a COLMAP model, a kapture dataset, or a PLY point cloud."""
+    opened = open_map(map_folder(map_ref, maps_dir))
+    with _step("export"):
+        notes = export_map(opened, output, format_name)
+    say(f"{format_name}: {output}")
+    say_notes(notes)
+
+
+def pack(
+    map_ref: MapArgument,
+    output: Annotated[Path, typer.Option("--output", help="File to write, such as room.zip.")],
+    maps_dir: MapsDirOption = Path("maps"),
+) -> None:
+    """Pack a map into one file, for localize maps push. Every byte is checked first."""
+    folder = map_folder(map_ref, maps_dir)
+    with _step("pack"):
+        manifest = write_packed(folder, output)
+    size = output.stat().st_size / 2**20
+    say(f"{manifest.id}@{manifest.version}: {output}, {size:.1f} MiB")
+
+
+def inspect(
+    map_ref: MapArgument,
+    maps_dir: MapsDirOption = Path("maps"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+) -> None:
+    """Show the contents of a map or a set."""
+    folder = map_folder(map_ref, maps_dir)
+    if isinstance(read_any_manifest(folder), SetManifest):
+        tiles = open_set(folder)
+        summary, show = set_summary(tiles), partial(print_set, tiles)
+    else:
+        opened = open_map(folder)
+        summary, show = summary_of(opened), partial(print_map, opened)
+    if as_json:
+        sys.stdout.write(json.dumps(summary, indent=2) + "\n")
+    else:
+        show()
+
+
+def verify(
+    map_ref: MapArgument,
+    maps_dir: MapsDirOption = Path("maps"),
+    weights_dir: WeightsDirOption = None,
+) -> None:
+    """Check every byte of a map (checksums, ranges), and that its features equal ours.
+
+    For a set, its own files are checked; its tiles are maps of their own.
+    """
+    folder = map_folder(map_ref, maps_dir)
+    if isinstance(read_any_manifest(folder), SetManifest):
+        verify_tiles(verify_set(folder), None if is_map_folder(map_ref) else maps_dir)
+        return
+    with _step("verify", if_stopped="nothing was changed"):
+        opened = verify_map(folder)
+        read_imported_points(opened)  # raises when they are damaged
+    say(f"{opened.ref}: {len(opened.manifest.files)} files, every byte as published")
+    name = opened.manifest.local_features.fingerprint.name
+    extractor = None if is_ready_made(name) else make_local_features(name, weights_dir)
+    make_descriptor = partial(make_global_descriptor, weights_dir=weights_dir)
+    Localizer(opened, extractor, make_descriptor)  # raises when they differ
+    names = (name, *(record.fingerprint.name for record in opened.manifest.global_features))
+    say(f"{', '.join(names)}: the same features as here")
+
+
+@contextmanager
+def _step(stage: str, if_stopped: str = "nothing was written") -> Iterator[None]:
+    with StageProgress(ERR, if_stopped=if_stopped) as progress, one_step(progress, stage):
+        yield

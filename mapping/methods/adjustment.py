@@ -1,0 +1,133 @@
+"""Bundle adjustment, and how well it determines focal lengths."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
+import pycolmap
+from numpy.typing import NDArray
+
+from mapping.frames.anchor import align_poses
+from mapping.methods.colmap_calls import interruptible, quiet
+from mapping.methods.colmap_scene import ColmapScene
+from mapping.methods.intrinsics import STEP
+from mapping.methods.sparse_model import SfmPhoto
+from visloc.pose.colmap import pose_from_colmap
+
+REFINABLE = ("poses", "points", "intrinsics")
+# Scale of the robust loss.
+_LOSS_SCALE_PX = 1.0
+
+
+def refine_model(
+    model: pycolmap.Reconstruction,
+    photos: Sequence[SfmPhoto],
+    scene: ColmapScene,
+    refine: Sequence[str],
+    held: Collection[str],
+) -> None:
+    """Adjust points, and also the poses and intrinsics that ``refine`` names.
+
+    Refined poses are aligned to the given ones again. Intrinsics of the sensors ``held`` stay.
+    """
+    poses = "poses" in refine
+    options = _options(poses=poses, intrinsics="intrinsics" in refine)
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = _LOSS_SCALE_PX
+    with quiet():
+        _adjust(model, options, {scene.camera_ids[sensor] for sensor in held}, poses=poses)
+        if poses:
+            given = [photo.cam_from_world for photo in photos if photo.cam_from_world is not None]
+            moved = [
+                pose_from_colmap(model.image(image.image_id).cam_from_world())
+                for image in scene.images
+            ]
+            back = align_poses(moved, given)
+            if scene.on_rigs:  # they fix the scale
+                back = replace(back, scale=1.0)
+            model.transform(
+                pycolmap.Sim3d(back.scale, pycolmap.Rotation3d(back.rotation), back.translation)
+            )
+
+
+def error_rises(
+    model: pycolmap.Reconstruction, camera_ids: Collection[int], *, poses: bool
+) -> dict[int, float]:
+    """Return by camera how reprojection errors rise as focal lengths change and all else adapts.
+
+    All cameras change at once, by ``STEP``: in a scene that determines none of them, each would
+    still be determined by the others.
+
+    Returns:
+        Pixels: the root of the rise of the mean squared error.
+    """
+    before, after = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
+    others = set(model.cameras) - set(camera_ids)
+    with quiet():
+        for copy, step in ((before, 0.0), (after, STEP)):
+            for camera_id in camera_ids:
+                camera = copy.camera(camera_id)
+                for index in camera.focal_length_idxs():
+                    camera.params[index] *= 1 + step
+            options = _options(poses=poses, intrinsics=True)
+            options.refine_focal_length = False
+            _adjust(copy, options, others, poses=poses)
+    errors = _squared_errors(before), _squared_errors(after)
+    return {
+        camera_id: math.sqrt(max(errors[1].get(camera_id, 0.0) - errors[0].get(camera_id, 0.0), 0))
+        for camera_id in camera_ids
+    }
+
+
+def _squared_errors(model: pycolmap.Reconstruction) -> dict[int, float]:
+    """Return by camera the mean squared reprojection error in its photos."""
+    sums: dict[int, NDArray[np.float64]] = {}
+    for image_id in model.reg_image_ids():
+        image = model.image(image_id)
+        seen = image.get_observation_points2D()
+        if not seen:
+            continue
+        points = np.array([model.point3D(point.point3D_id).xyz for point in seen])
+        pixels = np.array([point.xy for point in seen])
+        projected = np.asarray(
+            model.camera(image.camera_id).img_from_cam(image.cam_from_world() * points)
+        )
+        squared = np.sum((projected - pixels) ** 2, axis=1)
+        squared = squared[np.isfinite(squared)]
+        total = sums.setdefault(image.camera_id, np.zeros(2))
+        total += squared.sum(), len(squared)
+    return {camera_id: total / count for camera_id, (total, count) in sums.items() if count}
+
+
+def _options(*, poses: bool, intrinsics: bool) -> pycolmap.BundleAdjustmentOptions:
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_rig_from_world = poses
+    options.refine_sensor_from_rig = False
+    options.refine_focal_length = options.refine_extra_params = intrinsics
+    options.ceres.solver_options.num_threads = 1  # like the mapper
+    return options
+
+
+def _adjust(
+    model: pycolmap.Reconstruction,
+    options: pycolmap.BundleAdjustmentOptions,
+    constant: Collection[int],
+    *,
+    poses: bool,
+) -> None:
+    """Adjust a model, except the intrinsics of the cameras ``constant``."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    for camera_id in constant:
+        config.set_constant_cam_intrinsics(camera_id)
+    if poses:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # pycolmap.bundle_adjustment prints to stderr regardless of options.
+    adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
+    interruptible(lambda token: adjuster.solve())  # noqa: ARG005  it cannot be cancelled

@@ -1,0 +1,163 @@
+"""The stage of a build that makes a sparse model of matches; a worker does it as a whole."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from mapping.build.context import BuildContext
+from mapping.build.landmarks import Observations, View
+from mapping.build.local_features import LocalFeaturesSource
+from mapping.build.photos import MappingPhoto
+from mapping.build.stages import Item, WorkFolder, key_of
+from mapping.methods.colmap_scene import Rigs
+from mapping.methods.intrinsics import Doubt
+from mapping.methods.matching import Matches, camera_values, pose_values
+from mapping.methods.sfm_settings import SfmSettings
+from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
+from mapping.methods.triangulation import reconstruct, triangulate
+from mapping.progress import ItemProgress
+from visloc.geometry import Camera, Pose
+
+# Raised when the code of the stage changes what comes out.
+_REVISION = 3
+
+
+def make_model(
+    context: BuildContext,
+    photos: Sequence[MappingPhoto],
+    rigs: Rigs,
+    matches: Sequence[Matches],
+    matches_key: str,
+    settings: SfmSettings,
+) -> SparseModel:
+    """Triangulate the matches, or find poses with them, as the settings say.
+
+    ``matches_key`` stands for the matches in the key of the model.
+
+    Raises:
+        InvalidInput: ``sfm.*``.
+    """
+    # A map to pair by is not needed any more, and is not sent to a worker.
+    sent = replace(settings, covisible_in=None)
+    task = _ModelTask(context.work, tuple(photos), context.features, rigs, matches, sent)
+    key = _model_key(matches_key, photos, rigs, settings)
+    stage = "incremental mapping" if settings.estimate_poses else "triangulation"
+    context.workers.run_one(task.make, key, partial(context.progress, stage))
+    return _from_item(context.work.read(key), photos)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _ModelTask:
+    """A worker's part, for the whole map."""
+
+    work: WorkFolder
+    photos: tuple[MappingPhoto, ...]
+    features: LocalFeaturesSource
+    rigs: Rigs
+    matches: Sequence[Matches]
+    settings: SfmSettings
+
+    def make(self, key: str, progress: ItemProgress) -> None:
+        def compute() -> Item:
+            given = [self._given(photo) for photo in self.photos]
+            config, refine = MAPPER_CONFIGS[self.settings.mapper], self.settings.refine
+            inputs = given, self.rigs, self.matches, config, refine, self.work.scratch
+            if self.settings.estimate_poses:
+                return _to_item(reconstruct(*inputs, progress))
+            return _to_item(triangulate(*inputs))
+
+        total = len(self.photos) if self.settings.estimate_poses else 1
+        progress(0, total)
+        self.work.get(key, compute)
+        progress(total, total)
+
+    def _given(self, photo: MappingPhoto) -> SfmPhoto:
+        return SfmPhoto(
+            name=photo.name,
+            sensor=photo.record.sensor_id,
+            timestamp=photo.record.timestamp,
+            camera=photo.camera,
+            camera_known=photo.camera_known,
+            cam_from_world=None if self.settings.estimate_poses else photo.pose,
+            keypoints=self.features.read(photo).keypoints,
+        )
+
+
+def _model_key(
+    matches_key: str,
+    photos: Sequence[MappingPhoto],
+    rigs: Rigs,
+    settings: SfmSettings,
+) -> str:
+    return key_of(
+        "sparse_model",
+        _REVISION,
+        matches=matches_key,
+        config=asdict(MAPPER_CONFIGS[settings.mapper]),
+        refine=sorted(settings.refine),
+        estimate_poses=settings.estimate_poses,
+        photos=[
+            [
+                photo.record.sensor_id,
+                photo.record.timestamp,
+                *camera_values(photo.camera),
+                photo.camera_known,
+                *(() if settings.estimate_poses else pose_values(photo.pose)),
+            ]
+            for photo in photos
+        ],
+        rigs={
+            rig: {sensor: pose_values(pose) for sensor, pose in members.items()}
+            for rig, members in rigs.items()
+        },
+    )
+
+
+def _to_item(model: SparseModel) -> Item:
+    placed = [row for row, view in enumerate(model.views) if view is not None]
+    views = [view for view in model.views if view is not None]
+    poses = [[*v.cam_from_world.rotation.ravel(), *v.cam_from_world.translation] for v in views]
+    counts = [len(view.camera.params) for view in views]
+    return {
+        "placed": np.array(placed, dtype=np.int64),
+        "poses": np.array(poses).reshape(-1, 12),
+        "models": np.array([view.camera.model for view in views], dtype=np.str_),
+        "param_offsets": np.cumsum([0, *counts]),
+        "params": np.array([value for view in views for value in view.camera.params]),
+        "points": model.points,
+        "angles_deg": model.angles_deg,
+        "on_rigs": np.array(model.on_rigs),
+        "doubt_sensors": np.array(list(model.doubts), dtype=np.str_),
+        "doubt_reasons": np.array([doubt.reason for doubt in model.doubts.values()], dtype=np.str_),
+        "doubt_px": np.array([doubt.focal_length_px for doubt in model.doubts.values()]),
+        **{f"observed_{name}": array for name, array in asdict(model.observations).items()},
+    }
+
+
+def _from_item(item: Item, photos: Sequence[MappingPhoto]) -> SparseModel:
+    views: list[View | None] = [None] * len(photos)
+    offsets = item["param_offsets"]
+    for order, row in enumerate(item["placed"].tolist()):
+        known = photos[row].camera
+        params = tuple(item["params"][offsets[order] : offsets[order + 1]].tolist())
+        camera = Camera(str(item["models"][order]), known.width, known.height, params)
+        numbers = item["poses"][order]
+        views[row] = View(camera, Pose(numbers[:9].reshape(3, 3), numbers[9:]))
+    observations = Observations(
+        *(item[f"observed_{name}"] for name in ("points", "views", "rows", "pixels"))
+    )
+    doubts = zip(
+        *(item[f"doubt_{name}"].tolist() for name in ("sensors", "reasons", "px")), strict=True
+    )
+    return SparseModel(
+        tuple(views),
+        item["points"],
+        observations,
+        item["angles_deg"],
+        bool(item["on_rigs"]),
+        {sensor: Doubt(reason, focal) for sensor, reason, focal in doubts},
+    )
