@@ -29,11 +29,11 @@ from scipy.stats import spearmanr
 
 from mapping.build.build import build_map
 from mapping.build.settings import BuildSettings
-from mapping.build.stages import WorkFolder
 from mapping.cluster.workers import Workers
 from mapping.report.held_out import hold_out
 from mapping.report.model import CoverageModel, Within, learn, tolerance_of
 from mapping.report.viewpoints import Viewpoints
+from mapping.stages.work_folder import WorkFolder
 from samples.render import render_depth, render_photo
 from samples.scene import ROOM_SIZE_M, Scene, make_room
 from visloc.archive import Map, MapStore

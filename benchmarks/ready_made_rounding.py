@@ -26,10 +26,10 @@ import mapping.methods.matching
 from clients.evaluation.queries import read_queries
 from clients.evaluation.readers import FeatureReader
 from mapping.build.build import build_map
-from mapping.build.local_features import ReadyMadeFeatures
-from mapping.build.photos import MappingPhoto
 from mapping.build.settings import BuildSettings
 from mapping.methods.sfm_settings import SfmSettings
+from mapping.stages.local_features import ReadyMadeFeatures
+from mapping.stages.photos import MappingPhoto
 from visloc.archive import Map, open_map
 from visloc.evaluation import pose_error
 from visloc.geometry import PixelOrigin

@@ -9,7 +9,7 @@ shared. A landmark is shared when, under the query's true pose,
 
 - it projects into the query's image, from in front;
 - the rays to it from both camera centres differ by at most 60 degrees, beyond which local features
-  do not match (as in ``mapping.methods.pairing.frustum``);
+  do not match (as in ``mapping.pairing.frustum``);
 - neither centre is more than twice as far from it as the other: scale changes beyond are matched
   by luck;
 - nothing is seen to hide it: fewer than 3 landmarks of the map that project into the same cell of

@@ -9,22 +9,8 @@ from functools import partial
 from pathlib import Path
 
 from mapping.build.checks import check_settings, refuse_early
-from mapping.build.colours import landmark_colours
 from mapping.build.content import build_content
-from mapping.build.context import BuildContext
-from mapping.build.global_features import describe_photos, read_global_features
-from mapping.build.landmarks import MadeLandmarks
-from mapping.build.local_features import (
-    ExtractedFeatures,
-    ReadyMadeFeatures,
-    local_features_source,
-)
-from mapping.build.networks import Networks
-from mapping.build.photos import MappingPhoto, collect_photos
-from mapping.build.previews import keep_photos
-from mapping.build.publishing import PAIRS, publish_content
 from mapping.build.settings import BuildSettings
-from mapping.build.stages import WorkFolder, exclusive
 from mapping.cluster.executors import Executor, open_executor
 from mapping.cluster.stage_timings import Costs, wrote
 from mapping.cluster.storage import (
@@ -36,10 +22,24 @@ from mapping.cluster.storage import (
 )
 from mapping.cluster.workers import one_thread_here
 from mapping.methods.known_model import landmarks_from_reconstruction
-from mapping.methods.pairing import write_pairs
 from mapping.methods.rgbd import landmarks_from_depth
 from mapping.methods.sfm import landmarks_from_matches
+from mapping.pairing import write_pairs
 from mapping.progress import Progress, one_step
+from mapping.stages.colours import landmark_colours
+from mapping.stages.context import BuildContext
+from mapping.stages.global_features import describe_photos, read_global_features
+from mapping.stages.landmarks import MadeLandmarks
+from mapping.stages.local_features import (
+    ExtractedFeatures,
+    ReadyMadeFeatures,
+    local_features_source,
+)
+from mapping.stages.networks import Networks
+from mapping.stages.photos import MappingPhoto, collect_photos
+from mapping.stages.previews import keep_photos
+from mapping.stages.publishing import PAIRS, publish_content
+from mapping.stages.work_folder import WorkFolder, exclusive
 from visloc.archive import GlobalFeatures, MapContent, MapStore
 from visloc.errors import Conflict, Unavailable
 from visloc.features.backends.choice import choose_inference

@@ -6,19 +6,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from mapping.build.networks import Networks
-from mapping.build.photos import MappingPhoto
 from mapping.build.settings import METHODS, BuildSettings
 from mapping.cluster.executors import EXECUTORS
 from mapping.cluster.storage import is_remote, lies_in, work_place
 from mapping.frames.anchor import MAX_DIRECTION_ERROR_DEG, known_positions
 from mapping.methods.adjustment import REFINABLE
 from mapping.methods.known_model import refuse_without_points
-from mapping.methods.pairing import PAIRINGS
 from mapping.methods.rgbd import refuse_without_depth
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import POSES
 from mapping.methods.sparse_model import MAPPER_CONFIGS
+from mapping.pairing import PAIRINGS
+from mapping.stages.networks import Networks
+from mapping.stages.photos import MappingPhoto
 from visloc.errors import InvalidInput
 from visloc.features.local.readymade import is_ready_made
 from visloc.kapture import Dataset

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.landmarks import MadeLandmarks
-from mapping.build.local_features import LocalFeaturesSource
-from mapping.build.photos import MappingPhoto
 from mapping.build.settings import BuildSettings
 from mapping.methods.sfm import known_rigs
 from mapping.options import Vector
+from mapping.stages.landmarks import MadeLandmarks
+from mapping.stages.local_features import LocalFeaturesSource
+from mapping.stages.photos import MappingPhoto
 from visloc.archive import (
     Anchor,
     FingerprintRecord,

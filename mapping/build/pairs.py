@@ -10,14 +10,14 @@ from typing import Annotated
 import typer
 
 from mapping.build.checks import check_names
-from mapping.build.global_features import read_global_features
-from mapping.build.outputs import refuse_existing
-from mapping.build.photos import collect_photos
-from mapping.methods.pairing import PAIRINGS, POSED_PAIRINGS, PairSettings, write_pairs
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import PairsOption, SfmSettings
 from mapping.options import DatasetArgument, FeaturesDirOption, Names, PixelOriginOption
+from mapping.pairing import PAIRINGS, POSED_PAIRINGS, PairSettings, write_pairs
 from mapping.progress import Progress, one_step
+from mapping.stages.global_features import read_global_features
+from mapping.stages.outputs import refuse_existing
+from mapping.stages.photos import collect_photos
 from visloc.archive import Map
 from visloc.geometry import PixelOrigin
 from visloc.kapture import read_dataset

@@ -27,9 +27,9 @@ from mapping.frames.georeference import (
 )
 from mapping.maps.export import EXPORTERS, export_map
 from mapping.maps.packing import write_packed
-from mapping.methods.imported_points import read_imported_points
 from mapping.options import Gravity, MapArgument, MapsDirOption, WeightsDirOption
 from mapping.progress import one_step
+from mapping.stages.imported_points import read_imported_points
 from visloc.archive import Map, SetManifest, open_map, open_set, verify_map, verify_set
 from visloc.archive.checks import read_any_manifest
 from visloc.errors import InvalidInput

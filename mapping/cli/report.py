@@ -17,7 +17,6 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from mapping.build.stages import WorkFolder, exclusive
 from mapping.cli.display import ERR, OUT, say
 from mapping.cli.progress import StageProgress
 from mapping.cluster.storage import is_map_folder, map_folder
@@ -27,6 +26,7 @@ from mapping.progress import Progress
 from mapping.report import make_report_data
 from mapping.report.data import UP_IS_A_GUESS, decimals_of
 from mapping.report.html import report_page
+from mapping.stages.work_folder import WorkFolder, exclusive
 from visloc.archive import Map, open_map
 from visloc.drawing.detail_levels import detail_order
 from visloc.drawing.point_bytes import packed_points

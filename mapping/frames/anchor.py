@@ -28,7 +28,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from mapping.build.photos import MappingPhoto
+from mapping.stages.photos import MappingPhoto
 from visloc.archive import Anchor, Geodetic
 from visloc.errors import DatasetError
 from visloc.geodesy import enu_from_geodetic

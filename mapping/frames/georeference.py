@@ -15,8 +15,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.publishing import new_version
-from mapping.build.stages import exclusive
 from mapping.frames.anchor import (
     EPSG_GEODETIC,
     GNSS_ERROR_M,
@@ -25,6 +23,8 @@ from mapping.frames.anchor import (
     align_positions,
     coordinate_system,
 )
+from mapping.stages.publishing import new_version
+from mapping.stages.work_folder import exclusive
 from visloc.archive import Anchor, Geodetic, Map, MapStore, down_of, write_anchored
 from visloc.archive.version_rules import outdated
 from visloc.errors import Conflict, DatasetError, InvalidInput

@@ -13,11 +13,11 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 
-from mapping.build.outputs import refuse_existing
-from mapping.build.stages import exclusive
 from mapping.importers.dataset import write_imported
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.progress import Progress, one_step
+from mapping.stages.outputs import refuse_existing
+from mapping.stages.work_folder import exclusive
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mapping.build.outputs import complete_output
 from mapping.importers.left_out import list_path, notes_on, write_list
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.reading.photo_names import is_stored_turned, photo_size
+from mapping.stages.outputs import complete_output
 from visloc.errors import DatasetError
 from visloc.kapture import (
     Dataset,

@@ -20,7 +20,7 @@ from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.reading.json_fields import JsonValue, read_json
 from mapping.importers.reading.photo_names import photo_names, photo_size
 from mapping.importers.reading.tracks import rotation_from_matrix
-from mapping.methods.depth import DEFAULT_DEPTH_SCALE
+from mapping.stages.depth import DEFAULT_DEPTH_SCALE
 from visloc.errors import DatasetError, InvalidInput
 from visloc.geometry import MAX_IMAGE_SIDE, Camera, Pose
 from visloc.kapture import Sensor

@@ -33,7 +33,7 @@ def content_of(opened: Map) -> MapContent:
 
     Large arrays stay mapped from its files, but for keypoints, which become float32: the files must
     stay as long as the content is used. What lies beside the arrays
-    (``mapping.build.publishing.photo_files``, pairs, imported points) is not part of it.
+    (``mapping.stages.publishing.photo_files``, pairs, imported points) is not part of it.
     """
     manifest = opened.manifest
     local, scale = manifest.local_features, manifest.local_features.descriptor_scale

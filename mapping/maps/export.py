@@ -12,9 +12,9 @@ import PIL.Image  # noqa: F401  Pillow saves PNGs only when it was imported befo
 import pycolmap
 from numpy.typing import NDArray
 
-from mapping.build.landmarks import Observations, View, reprojection_errors
-from mapping.build.outputs import complete_output
-from mapping.methods.imported_points import ImportedPoints, read_imported_points
+from mapping.stages.imported_points import ImportedPoints, read_imported_points
+from mapping.stages.landmarks import Observations, View, reprojection_errors
+from mapping.stages.outputs import complete_output
 from visloc.archive import ImageRecord, Map
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose

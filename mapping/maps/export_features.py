@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.photos import read_in_frame
+from mapping.stages.photos import read_in_frame
 from visloc.archive import FingerprintRecord, Map
 from visloc.errors import Conflict
 from visloc.features import (
@@ -19,6 +19,7 @@ from visloc.features import (
     make_global_descriptor,
     make_local_features,
 )
+from visloc.features.photo import extract_features
 from visloc.kapture import (
     Dataset,
     FileRecord,
@@ -27,7 +28,6 @@ from visloc.kapture import (
     write_global_features,
     write_local_features,
 )
-from visloc.photo_features import extract_features
 from visloc.types import Inference, ReadAs
 
 

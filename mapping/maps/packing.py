@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mapping.build.outputs import complete_output, refuse_existing
+from mapping.stages.outputs import complete_output, refuse_existing
 from visloc.archive import verify_any
 from visloc.archive.packed import pack_map
 from visloc.archive.set_rules import AnyManifest

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.publishing import new_version
 from mapping.maps.editing import moved_anchor
 from mapping.progress import one_step
+from mapping.stages.publishing import new_version
 from visloc.archive import (
     Anchor,
     FingerprintRecord,

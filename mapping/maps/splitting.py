@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.publishing import new_version, photo_files
 from mapping.maps.editing import content_of, selected
 from mapping.maps.sets import Progress, publish_set, refuse_map_of_this_name, same_content
+from mapping.stages.publishing import new_version, photo_files
 from visloc.archive import Map, MapContent, MapStore, write_map
 from visloc.archive.anchoring import link_or_copy
 from visloc.archive.checks import read_any_manifest

@@ -11,11 +11,11 @@ import numpy as np
 import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
 
-from mapping.build.landmarks import Observations, View, rows_by_value
 from mapping.methods.colmap_calls import quiet
 from mapping.methods.intrinsics import Doubt
 from mapping.methods.matching import Matches
 from mapping.methods.sparse_model import SfmPhoto, SparseModel
+from mapping.stages.landmarks import Observations, View, rows_by_value
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import colmap_camera, pose_from_colmap

@@ -17,7 +17,7 @@ import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
 from pydantic import BaseModel, ConfigDict
 
-from mapping.build.photos import some
+from mapping.stages.photos import some
 from visloc.errors import InvalidInput
 from visloc.kapture import Sensor
 

@@ -14,19 +14,19 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.context import BuildContext
-from mapping.build.landmarks import (
+from mapping.methods.sfm import landmarks_from_matches
+from mapping.methods.sfm_settings import SfmSettings
+from mapping.stages.context import BuildContext
+from mapping.stages.imported_points import ImportedPoints
+from mapping.stages.landmarks import (
     MadeLandmarks,
     Observations,
     View,
     assemble_landmarks,
     triangulation_angles,
 )
-from mapping.build.local_features import ReadyMadeFeatures
-from mapping.build.photos import MappingPhoto
-from mapping.methods.imported_points import ImportedPoints
-from mapping.methods.sfm import landmarks_from_matches
-from mapping.methods.sfm_settings import SfmSettings
+from mapping.stages.local_features import ReadyMadeFeatures
+from mapping.stages.photos import MappingPhoto
 from visloc.archive import Anchor
 from visloc.errors import DatasetError
 from visloc.geometry import PixelOrigin

@@ -14,11 +14,11 @@ import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
 from numpy.typing import NDArray
 
-from mapping.build.context import BuildContext
-from mapping.build.landmarks import View
-from mapping.build.local_features import LocalFeaturesSource
-from mapping.build.photos import MappingPhoto
-from mapping.build.stages import Item, WorkFolder, key_of
+from mapping.stages.context import BuildContext
+from mapping.stages.landmarks import View
+from mapping.stages.local_features import LocalFeaturesSource
+from mapping.stages.photos import MappingPhoto
+from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc.geometry import Camera, Pose
 from visloc.matching.correspondences import mutual_nearest_neighbours
 from visloc.matching.products import round_descriptors

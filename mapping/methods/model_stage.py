@@ -8,11 +8,6 @@ from functools import partial
 
 import numpy as np
 
-from mapping.build.context import BuildContext
-from mapping.build.landmarks import Observations, View
-from mapping.build.local_features import LocalFeaturesSource
-from mapping.build.photos import MappingPhoto
-from mapping.build.stages import Item, WorkFolder, key_of
 from mapping.methods.colmap_scene import Rigs
 from mapping.methods.intrinsics import Doubt
 from mapping.methods.matching import Matches, camera_values, pose_values
@@ -20,6 +15,11 @@ from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
 from mapping.methods.triangulation import reconstruct, triangulate
 from mapping.progress import ItemProgress
+from mapping.stages.context import BuildContext
+from mapping.stages.landmarks import Observations, View
+from mapping.stages.local_features import LocalFeaturesSource
+from mapping.stages.photos import MappingPhoto
+from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc.geometry import Camera, Pose
 
 # Raised when the code of the stage changes what comes out.

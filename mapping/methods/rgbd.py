@@ -15,15 +15,15 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from mapping.build.context import BuildContext
-from mapping.build.landmarks import MadeLandmarks, Observations, View, assemble_landmarks
-from mapping.build.local_features import LocalFeaturesSource
-from mapping.build.photos import MappingPhoto
-from mapping.build.stages import Item, WorkFolder, key_of
-from mapping.methods.depth import depth_at, photo_depth
 from mapping.methods.matching import camera_values, pose_values
 from mapping.options import RGBD_PANEL, DepthScaleOption
 from mapping.progress import one_step
+from mapping.stages.context import BuildContext
+from mapping.stages.depth import depth_at, photo_depth
+from mapping.stages.landmarks import MadeLandmarks, Observations, View, assemble_landmarks
+from mapping.stages.local_features import LocalFeaturesSource
+from mapping.stages.photos import MappingPhoto
+from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc.archive import Anchor, Landmarks
 from visloc.errors import DatasetError, InvalidInput
 from visloc.geometry import Similarity

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.photos import MappingPhoto
-from mapping.methods.pairing import Pairs, Scene, pair_photos, read_pairs
 from mapping.methods.sfm_settings import SfmSettings
+from mapping.pairing import Pairs, Scene, pair_photos, read_pairs
+from mapping.stages.photos import MappingPhoto
 from visloc.archive import GlobalFeatures, Map
 from visloc.errors import DatasetError, InvalidInput
 from visloc.kapture import Dataset, read_reconstruction

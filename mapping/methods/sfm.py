@@ -12,9 +12,6 @@ from dataclasses import replace
 import numpy as np
 from pydantic import JsonValue
 
-from mapping.build.context import BuildContext
-from mapping.build.landmarks import MadeLandmarks, View, assemble_landmarks
-from mapping.build.photos import MappingPhoto, some
 from mapping.frames.anchor import align_positions, known_positions
 from mapping.methods.intrinsics import (
     CAMERAS,
@@ -29,6 +26,9 @@ from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SparseModel
 from mapping.progress import one_step
+from mapping.stages.context import BuildContext
+from mapping.stages.landmarks import MadeLandmarks, View, assemble_landmarks
+from mapping.stages.photos import MappingPhoto, some
 from visloc.archive import Anchor, GlobalFeatures
 from visloc.geometry import Pose, Similarity
 from visloc.kapture import Dataset

@@ -12,9 +12,9 @@ import typer
 from pydantic import JsonValue
 
 from mapping.methods.adjustment import REFINABLE
-from mapping.methods.pairing import PAIRINGS, PairSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS
 from mapping.options import SFM_PANEL, Names
+from mapping.pairing import PAIRINGS, PairSettings
 from visloc.archive import Map, sha256_of
 
 POSES = ("given", "estimate")

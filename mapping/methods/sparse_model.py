@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.landmarks import Observations, View, reprojection_errors, triangulation_angles
 from mapping.methods.intrinsics import Doubt
+from mapping.stages.landmarks import Observations, View, reprojection_errors, triangulation_angles
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 

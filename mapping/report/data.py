@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mapping.build.stages import WorkFolder
 from mapping.cluster.workers import Workers
-from mapping.maps.cameras import camera_lines
+from mapping.report.cameras import camera_lines
 from mapping.report.grid import Grid, Plan, forecast_grid, make_grid
 from mapping.report.held_out import HeldOut, hold_out
 from mapping.report.model import Forecast, Learned, Within, learn, tolerance_of
 from mapping.report.statistics import statistics_of
 from mapping.report.viewpoints import Viewpoints
 from mapping.report.weak_spots import WeakSpot, find_weak_spots
+from mapping.stages.work_folder import WorkFolder
 from visloc import __version__
 from visloc.archive import Map
 from visloc.geometry import Camera

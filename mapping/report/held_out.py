@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.stages import Item, WorkFolder, key_of
 from mapping.cluster.workers import Workers
-from mapping.maps.stored_queries import match_stored, solve_stored
+from mapping.frames.stored_queries import match_stored, solve_stored
 from mapping.report.viewpoints import Viewpoints
+from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc import __version__
 from visloc.archive import Map, open_map
 from visloc.evaluation import pose_error

@@ -12,7 +12,6 @@ Numbers are little-endian; section numbers are of PKWARE's APPNOTE.TXT 6.3.
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import stat
 import struct
@@ -26,6 +25,7 @@ from visloc.archive.backends.base import MANIFEST
 from visloc.archive.backends.folder import storage_errors
 from visloc.archive.checks import MAX_MANIFEST_BYTES, check_files, read_any_manifest
 from visloc.archive.npz import zip_errors
+from visloc.archive.schema import FILE_NAME
 from visloc.archive.set_rules import AnyManifest
 from visloc.archive.sets import SET_CODES
 from visloc.errors import InvalidInput, TooLarge
@@ -35,8 +35,6 @@ _MAX_DIRECTORY_BYTES = 16 * 2**20
 # Of a map's manifest, which lists the files and tells how the map was made. That of a set, which
 # lists its tiles too, may be as large as any.
 _MAX_MAP_MANIFEST_BYTES, _MAX_MANIFEST_BYTES_PER_FILE = 2**20, 512
-# Names that files of a map have: on every system a path below the map, and nothing else.
-FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}(/[A-Za-z0-9][A-Za-z0-9._-]{0,127}){0,3}")
 _BLOCK_BYTES = 2**20
 _EARLIEST = (1980, 1, 1, 0, 0, 0)
 

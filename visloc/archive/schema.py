@@ -25,6 +25,8 @@ FORMAT = "visloc-map"
 FORMAT_MAJOR, FORMAT_MINOR = 2, 2
 
 ID_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+# Names of a map's files: a path below the map on every operating system.
+FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}(/[A-Za-z0-9][A-Za-z0-9._-]{0,127}){0,3}")
 
 # A photo that a map keeps: pixels of its longer side, and bytes.
 MAX_PHOTO_SIDE = 640

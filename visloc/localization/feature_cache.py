@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.features import LocalFeatureExtractor
+from visloc.features.photo import extract_features
 from visloc.images import Photo
-from visloc.photo_features import extract_features
 from visloc.types import Extraction, LocalFeatures, LocalizeOptions, ReadAs
 
 # Keypoints of a query that are used, strongest first. ACCURATE uses as many as the mapping images.

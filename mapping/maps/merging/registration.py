@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pydantic import JsonValue
 
 from mapping.frames.alignment import MIN_PHOTOS, NoTie, Seen, Tie, tie
+from mapping.frames.stored_queries import match_stored, solve_stored
 from mapping.maps.merging.describing import describe_together
-from mapping.maps.stored_queries import match_stored, solve_stored
 from visloc.archive import GlobalFeatures, Map
 from visloc.errors import Conflict
 from visloc.geometry import Pose

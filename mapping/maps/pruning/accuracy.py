@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.photos import read_in_frame
+from mapping.frames.stored_queries import match_stored, solve_stored
 from mapping.maps.pruning.choosing import Kept
-from mapping.maps.stored_queries import match_stored, solve_stored
 from mapping.report.held_out import left_out_sets, vanishing
 from mapping.report.viewpoints import Viewpoints
+from mapping.stages.photos import read_in_frame
 from visloc.archive import Map
 from visloc.errors import InvalidInput
 from visloc.evaluation import Threshold, median_errors_localized, pose_error

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mapping.build.publishing import PAIRS
-from mapping.methods.imported_points import FILE_NAME as IMPORTED_POINTS
+from mapping.stages.imported_points import FILE_NAME as IMPORTED_POINTS
+from mapping.stages.publishing import PAIRS
 from visloc.archive import Map
 from visloc.archive.checks import json_text
 from visloc.archive.schema import photo_file

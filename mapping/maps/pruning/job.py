@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
-from mapping.build.publishing import link_photos, photo_files, write_content
-from mapping.build.stages import exclusive
 from mapping.maps.editing import content_of, selected
 from mapping.maps.pruning.accuracy import Accuracy, of_held_out_photos
 from mapping.maps.pruning.choosing import LEFT_OUT, Kept, choose, least, num_landmarks, size_with
+from mapping.stages.publishing import link_photos, photo_files, write_content
+from mapping.stages.work_folder import exclusive
 from visloc.archive import Map, MapContent, MapStore, open_map
 from visloc.archive.version_rules import outdated
 from visloc.errors import Conflict, InvalidInput

@@ -9,18 +9,18 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.context import BuildContext
-from mapping.build.global_features import describe_with_model, read_global_features
-from mapping.build.local_features import (
+from mapping.maps.updating.localizing import Placed
+from mapping.maps.updating.settings import UpdateSettings
+from mapping.stages.context import BuildContext
+from mapping.stages.global_features import describe_with_model, read_global_features
+from mapping.stages.local_features import (
     LocalFeaturesSource,
     ReadyMadeFeatures,
     local_features_source,
 )
-from mapping.build.networks import Networks
-from mapping.build.photos import MappingPhoto, collect_photos, some
-from mapping.build.stages import WorkFolder
-from mapping.maps.updating.localizing import Placed
-from mapping.maps.updating.settings import UpdateSettings
+from mapping.stages.networks import Networks
+from mapping.stages.photos import MappingPhoto, collect_photos, some
+from mapping.stages.work_folder import WorkFolder
 from visloc.archive import Map
 from visloc.archive.schema import photo_file
 from visloc.errors import Conflict, DatasetError

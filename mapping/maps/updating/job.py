@@ -10,14 +10,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.colours import landmark_colours
-from mapping.build.context import BuildContext
-from mapping.build.landmarks import MadeLandmarks
-from mapping.build.networks import Networks
-from mapping.build.photos import MappingPhoto, some
-from mapping.build.previews import keep_photos
-from mapping.build.publishing import photo_files, publish_edited
-from mapping.build.stages import WorkFolder, exclusive
 from mapping.cluster.storage import map_folder, work_place
 from mapping.cluster.workers import Workers
 from mapping.maps.editing import content_of, joined
@@ -54,6 +46,14 @@ from mapping.methods.rgbd import (
 from mapping.methods.sfm import landmarks_from_matches
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.progress import Progress, one_step
+from mapping.stages.colours import landmark_colours
+from mapping.stages.context import BuildContext
+from mapping.stages.landmarks import MadeLandmarks
+from mapping.stages.networks import Networks
+from mapping.stages.photos import MappingPhoto, some
+from mapping.stages.previews import keep_photos
+from mapping.stages.publishing import photo_files, publish_edited
+from mapping.stages.work_folder import WorkFolder, exclusive
 from visloc.archive import Map, MapContent, MapStore, open_map
 from visloc.archive.schema import photo_file
 from visloc.archive.version_rules import outdated

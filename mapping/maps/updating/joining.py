@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.build.content import photo_content
-from mapping.build.landmarks import MadeLandmarks
-from mapping.build.local_features import LocalFeaturesSource
 from mapping.maps.updating.capture import Capture
+from mapping.stages.landmarks import MadeLandmarks
+from mapping.stages.local_features import LocalFeaturesSource
 from visloc.archive import Landmarks, MapContent
 from visloc.geometry import Pose
 from visloc.kapture import Dataset

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.context import BuildContext
-from mapping.build.local_features import LocalFeaturesSource
-from mapping.build.networks import Networks
-from mapping.build.photos import MappingPhoto
-from mapping.build.stages import Item, WorkFolder, key_of
 from mapping.methods.matching import camera_values
+from mapping.stages.context import BuildContext
+from mapping.stages.local_features import LocalFeaturesSource
+from mapping.stages.networks import Networks
+from mapping.stages.photos import MappingPhoto
+from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc import __version__
 from visloc.archive import Map, open_map
 from visloc.geometry import Pose

@@ -11,7 +11,6 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.build.photos import MappingPhoto
 from mapping.frames.alignment import (
     MAX_DEPTH_OFF,
     NoTie,
@@ -24,6 +23,7 @@ from mapping.frames.alignment import (
     too_few,
 )
 from mapping.maps.updating.localizing import Placed
+from mapping.stages.photos import MappingPhoto
 from visloc.archive import Map
 from visloc.errors import Conflict
 from visloc.evaluation import pose_error

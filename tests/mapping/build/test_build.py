@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 import mapping.build.build
-import mapping.build.publishing
+import mapping.stages.publishing
 from mapping.build.build import build_map
-from mapping.build.networks import Networks
 from mapping.build.settings import BuildSettings
-from mapping.build.stages import exclusive
 from mapping.cluster.workers import Workers
 from mapping.methods.rgbd import DepthSettings
+from mapping.stages.networks import Networks
+from mapping.stages.work_folder import exclusive
 from visloc.archive import Map, MapStore, verify_map, write_map
 from visloc.errors import (
     Conflict,
@@ -452,7 +452,7 @@ def test_a_full_disk_is_named_and_the_same_build_resumes(
 
     before = MapStore(maps_dir).open("room")
     with monkeypatch.context() as full:
-        full.setattr(mapping.build.publishing, "write_map", write_on_full_disk)
+        full.setattr(mapping.stages.publishing, "write_map", write_on_full_disk)
         with pytest.raises(Unavailable, match=r"No space left on device.*resumes") as caught:
             build(sample / "mapping", maps_dir)
     assert caught.value.code == "storage.failed"

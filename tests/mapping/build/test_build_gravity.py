@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapping.methods.pairing import PairSettings
 from mapping.methods.sfm_settings import SfmSettings
+from mapping.pairing import PairSettings
 from mapping.sample import ANCHOR_ALTITUDE_M, ANCHOR_LATITUDE_DEG, ANCHOR_LONGITUDE_DEG
 from visloc.archive import Map
 from visloc.errors import InvalidInput

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mapping.build.build import build_map
-from mapping.build.photos import read_in_frame
 from mapping.build.settings import BuildSettings
 from mapping.maps.export_features import export_features
 from mapping.maps.updating import UpdateSettings, update_map
+from mapping.stages.photos import read_in_frame
 from tests.turning import (
     png,
     store_dataset_turned,
@@ -30,11 +30,11 @@ from visloc.archive import Map, MapStore
 from visloc.errors import DatasetError
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
+from visloc.features.photo import extract_features
 from visloc.geometry import Camera, PixelOrigin, Pose
 from visloc.images import read_photo, read_photo_file, turn_of
 from visloc.kapture import open_local_features, read_dataset, read_local
 from visloc.localization.localizer import Localizer
-from visloc.photo_features import extract_features
 from visloc.types import Inference, Localized, LocalizeOptions, ReadAs
 
 SIZE = (256, 192)

@@ -17,10 +17,10 @@ from mapping.cli.from_settings import from_settings
 from mapping.cli.maps import AnchorSettings
 from mapping.cluster.workers import DEFAULT_WORKERS
 from mapping.maps.updating import UpdateSettings
-from mapping.methods.pairing import PairSettings
 from mapping.methods.rgbd import DepthSettings
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.options import Names, OnCommandLine
+from mapping.pairing import PairSettings
 from visloc.geometry import PixelOrigin
 from visloc.types import Fusion, Inference
 

@@ -19,7 +19,7 @@ import pytest
 from rich.console import ConsoleDimensions
 
 from mapping.cli import main as cli
-from mapping.methods.pairing import PAIRINGS
+from mapping.pairing import PAIRINGS
 from visloc.archive import MapStore, open_map
 from visloc.kapture import read_dataset, write_dataset
 

@@ -10,8 +10,8 @@ import pytest
 
 from mapping.build.build import build_map
 from mapping.build.settings import BuildSettings
-from mapping.build.stages import WorkFolder, key_of
 from mapping.cluster.storage import is_remote, open_store, opened_dataset, place_of
+from mapping.stages.work_folder import WorkFolder, key_of
 from visloc.archive import Map, open_map
 from visloc.errors import DatasetError, InvalidInput, Unavailable
 from visloc.kapture import read_dataset

@@ -8,7 +8,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mapping.build.photos import MappingPhoto
 from mapping.frames.anchor import (
     Alignment,
     align_poses,
@@ -16,6 +15,7 @@ from mapping.frames.anchor import (
     known_positions,
     scale_doubt,
 )
+from mapping.stages.photos import MappingPhoto
 from visloc.errors import DatasetError
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose, Similarity

@@ -12,7 +12,7 @@ from PIL import Image
 
 from mapping.importers import import_dataset
 from mapping.importers.nerfstudio import read
-from mapping.methods.depth import DepthMatcher, photo_depth, read_depth
+from mapping.stages.depth import DepthMatcher, photo_depth, read_depth
 from visloc.errors import DatasetError, VislocError
 from visloc.geometry import Camera
 from visloc.kapture import read_dataset

@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from mapping.build.build import build_map
-from mapping.build.publishing import publish_edited
 from mapping.build.settings import BuildSettings
-from mapping.build.stages import exclusive
 from mapping.cli.main import app
 from mapping.maps.editing import content_of, moved, selected
 from mapping.maps.merging import join_as_set, merge_maps
 from mapping.sample import write_sample
+from mapping.stages.publishing import publish_edited
+from mapping.stages.work_folder import exclusive
 from visloc.archive import Anchor, Geodetic, Map, MapStore, SetOutline
 from visloc.errors import Conflict, InvalidInput
 from visloc.geometry import Pose, Similarity, rotation_angle

@@ -15,7 +15,6 @@ import pytest
 from numpy.typing import NDArray
 
 from mapping.build.build import build_map
-from mapping.build.publishing import publish_edited
 from mapping.build.settings import BuildSettings
 from mapping.cli import main as cli
 from mapping.frames.set_poses import poses_on_earth, read_poses
@@ -23,6 +22,7 @@ from mapping.maps.editing import content_of, moved
 from mapping.maps.sets import publish_set
 from mapping.maps.splitting import cut, split_map
 from mapping.sample import write_sample
+from mapping.stages.publishing import publish_edited
 from visloc.archive import Anchor, Geodetic, Map, MapStore, SetOutline
 from visloc.archive.places import enu_of
 from visloc.errors import Conflict, InvalidInput

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mapping.maps.export import export_map
-from mapping.methods.imported_points import read_imported_points
+from mapping.stages.imported_points import read_imported_points
 from visloc.archive import Map
 from visloc.errors import DatasetError, MapCorrupt
 from visloc.kapture import read_reconstruction

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapping.build.context import BuildContext
-from mapping.build.landmarks import View
-from mapping.build.networks import Networks
-from mapping.build.photos import MappingPhoto
-from mapping.build.stages import WorkFolder
 from mapping.cluster.workers import Workers
 from mapping.methods.matching import Verification, fits_poses, match_pairs
+from mapping.stages.context import BuildContext
+from mapping.stages.landmarks import View
+from mapping.stages.networks import Networks
+from mapping.stages.photos import MappingPhoto
+from mapping.stages.work_folder import WorkFolder
 from visloc.geometry import Camera, Pose
 from visloc.kapture import FileRecord
 from visloc.pose.colmap import project

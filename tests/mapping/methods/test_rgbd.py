@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapping.build.photos import MappingPhoto
-from mapping.methods.depth import DepthMatch
 from mapping.methods.rgbd import LiftedKeypoints, lift_keypoints, merge_landmarks
+from mapping.stages.depth import DepthMatch
+from mapping.stages.photos import MappingPhoto
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Dataset, FileRecord

@@ -3,7 +3,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mapping.build.stages import WorkFolder
 from mapping.cluster.workers import Workers
 from mapping.report.chance import Outlook, fit_chance, fit_precision, outlook_of
 from mapping.report.held_out import HeldOut, hold_out
@@ -11,6 +10,7 @@ from mapping.report.model import Within, learn, tolerance_of
 from mapping.report.rematch import Rematch, count, fit_rematch
 from mapping.report.sight import Sight
 from mapping.report.viewpoints import Viewpoints
+from mapping.stages.work_folder import WorkFolder
 from visloc.geometry import Camera
 from visloc.types import LocalizeOptions
 

@@ -5,7 +5,6 @@ import itertools
 import numpy as np
 import pytest
 
-from mapping.build.stages import WorkFolder
 from mapping.cluster.workers import Workers
 from mapping.report import held_out
 from mapping.report.held_out import (
@@ -16,6 +15,7 @@ from mapping.report.held_out import (
     vanishing,
 )
 from mapping.report.viewpoints import Viewpoints
+from mapping.stages.work_folder import WorkFolder
 from visloc.types import LocalizeOptions
 
 

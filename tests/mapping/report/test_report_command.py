@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from mapping.build.stages import exclusive
 from mapping.cli import main as cli
 from mapping.cli import report as command
 from mapping.cli.report import MAX_POINTS, summary_of_report
+from mapping.stages.work_folder import exclusive
 from visloc.archive import MapStore
 from visloc.errors import Unavailable
 

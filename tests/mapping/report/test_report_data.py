@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from mapping.build.stages import WorkFolder
 from mapping.cluster.workers import Workers
 from mapping.report import make_report_data
 from mapping.report.data import calibration_of, decimals_of, rank_correlation_of
@@ -14,6 +13,7 @@ from mapping.report.held_out import HeldOut
 from mapping.report.model import Within
 from mapping.report.statistics import statistics_of
 from mapping.report.viewpoints import Viewpoints
+from mapping.stages.work_folder import WorkFolder
 from visloc.archive import MapStore
 from visloc.geometry import Pose
 

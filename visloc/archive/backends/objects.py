@@ -26,8 +26,8 @@ from visloc.archive.checks import (
     parse_any_manifest,
     read_any_manifest,
 )
-from visloc.archive.packed import FILE_NAME
 from visloc.archive.reader import MapOutline
+from visloc.archive.schema import FILE_NAME
 from visloc.archive.set_rules import AnyManifest
 from visloc.archive.set_schema import SetManifest
 from visloc.archive.sets import SetOutline, read_any_outline, verify_any

@@ -1,0 +1,61 @@
+"""Photos that look alike: by global descriptors, fused as in localization."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.pairing.ranking import Candidates, best_of_rows, unite
+from mapping.pairing.scene import Pairs, Scene
+from mapping.pairing.settings import PairSettings
+from visloc.errors import InvalidInput
+from visloc.retrieval.fusion import equal_weights, gharm
+
+# Similarities held at a time, per descriptor: 32 MiB in float64.
+_BLOCK_SIZE = 2**22
+
+
+def pair_by_retrieval(scene: Scene, settings: PairSettings) -> Pairs:
+    """Pair every photo with the ``top_k`` that look most like it.
+
+    The score is the cosine similarity with one global descriptor, and its generalized harmonic
+    mean (``visloc.retrieval.fusion.gharm``) with several. Every photo gets its pairs, however low
+    their scores: the similarity that indicates a shared view differs between descriptors.
+
+    Raises:
+        InvalidInput: ``pairs.no_global_descriptors``, or ``pairs.global_descriptor`` for one with
+            numbers that are not finite.
+    """
+    if not scene.global_descriptors:
+        raise InvalidInput(
+            "pairs.no_global_descriptors",
+            "the pairing retrieval needs global descriptors; choose one or more with "
+            "--global-features, or use another pairing",
+            field="--pairs",
+            expected="global descriptors of the photos",
+        )
+    for name, rows in scene.global_descriptors.items():
+        unusable = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+        if len(unusable):
+            raise InvalidInput(
+                "pairs.global_descriptor",
+                f"the global descriptor {name} of this photo is not usable; extract it again",
+                field=scene.names[unusable[0]],
+                expected="finite numbers",
+            )
+    return unite(_ranked_blocks(list(scene.global_descriptors.values()), settings.top_k))
+
+
+def _ranked_blocks(tables: list[NDArray[np.float32]], top_k: int) -> Iterator[Candidates]:
+    num_photos = len(tables[0])
+    step = max(1, _BLOCK_SIZE // max(num_photos, 1))
+    for start in range(0, num_photos, step):
+        photos = np.arange(start, min(start + step, num_photos))
+        cosines = np.stack([(rows[photos] @ rows.T).ravel() for rows in tables])
+        # Unit vectors in float32 can give 1 + 1e-7.
+        cosines = np.clip(cosines.astype(np.float64), -1.0, 1.0)
+        scores = gharm(cosines, equal_weights(len(tables))).reshape(len(photos), -1)
+        scores[np.arange(len(photos)), photos] = -np.inf  # a photo is no pair with itself
+        yield best_of_rows(photos, scores, top_k)

@@ -1,0 +1,36 @@
+"""The shared inputs of all stages of a job."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
+
+from mapping.cluster.executors import Executor
+from mapping.progress import Progress
+from mapping.stages.local_features import LocalFeaturesSource
+from mapping.stages.networks import Networks
+from mapping.stages.work_folder import WorkFolder
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class BuildContext:
+    """The shared inputs of all stages of a build or an update."""
+
+    work: WorkFolder
+    features: LocalFeaturesSource
+    networks: Networks
+    workers: Executor
+    progress: Progress
+
+    def run(self, stage: str, task: Callable[[T], object], items: Sequence[T]) -> None:
+        """Do a task for every item, as one stage.
+
+        Raises:
+            Unavailable: ``build.worker_died``.
+            Exception: what the task raised first.
+        """
+        self.workers.run(task, items, partial(self.progress, stage))

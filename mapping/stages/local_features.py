@@ -1,0 +1,229 @@
+"""Local features of the mapping photos: extracted here, or read from the dataset."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from mapping.stages.networks import Networks, refuse_other_computing
+from mapping.stages.photos import MappingPhoto
+from mapping.stages.work_folder import Item, WorkFolder, key_of
+from visloc.archive import FingerprintRecord
+from visloc.errors import DatasetError, InvalidInput
+from visloc.features.local.readymade import (
+    MAX_READY_MADE_KEYPOINTS,
+    is_ready_made,
+    ready_made_fingerprint,
+    ready_made_type,
+    to_local_features,
+)
+from visloc.features.photo import extract_features
+from visloc.geometry import PixelOrigin
+from visloc.images import turn_of
+from visloc.kapture import FeatureSet, open_local_features, read_local
+from visloc.types import Fingerprint, LocalFeatures
+
+# Raised when the code of the stage changes what comes out.
+_REVISION = 2
+# Name of an array beside those of the local features of a photo.
+_TURN = "turn"
+
+
+@dataclass(frozen=True, slots=True)
+class ExtractedFeatures:
+    """Local features extracted from the photos, and kept in the work folder.
+
+    The extractor's properties are stored here, so that a worker that only reads features need not
+    load a network.
+
+    Attributes:
+        name: of the extractor, in ``visloc.features.LOCAL_FEATURES``.
+        max_keypoints: strongest ones kept per photo.
+    """
+
+    work: WorkFolder
+    name: str
+    networks: Networks
+    max_keypoints: int
+    fingerprint: Fingerprint
+    descriptor_dim: int
+    computed_with: str
+
+    def key(self, photo: MappingPhoto) -> str:
+        return key_of(
+            "local_features",
+            _REVISION,
+            photo=photo.sha256,
+            size=[photo.camera.width, photo.camera.height],
+            fingerprint=FingerprintRecord.of(self.fingerprint).model_dump(),
+            computed_with=self.computed_with,
+            max_keypoints=self.max_keypoints,
+        )
+
+    def prepare(self, photo: MappingPhoto) -> None:
+        if not self.work.has(self.key(photo)):
+            self.read(photo)
+
+    def read(self, photo: MappingPhoto) -> LocalFeatures:
+        """Return the features of a photo; extract them if necessary.
+
+        Raises:
+            VislocError: what ``MappingPhoto.read`` raises.
+        """
+        item = self._get(photo)
+        return LocalFeatures(**{name: item[name] for name in item if name != _TURN})
+
+    def turn(self, photo: MappingPhoto) -> int:
+        """EXIF orientation by which the photo was turned before extraction."""
+        return int(self._get(photo)[_TURN])
+
+    def _get(self, photo: MappingPhoto) -> Item:
+        return self.work.get(self.key(photo), partial(self._extract, photo))
+
+    def _extract(self, photo: MappingPhoto) -> Item:
+        extractor = self.networks.extractor(self.name)
+        refuse_other_computing(self.name, self.computed_with, extractor.computed_with)
+        pixels = photo.read()
+        local, _ = extract_features(pixels, extractor, max_keypoints=self.max_keypoints)
+        return asdict(local) | {_TURN: np.array(turn_of(pixels.exif_orientation))}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReadyMadeFeatures:
+    """Local features that come with the dataset, read where they lie.
+
+    Attributes:
+        origin: of the keypoints' coordinates.
+    """
+
+    keypoints: FeatureSet
+    descriptors: FeatureSet
+    origin: PixelOrigin
+    _keys: dict[str, str] = field(default_factory=dict, repr=False)
+
+    @property
+    def fingerprint(self) -> Fingerprint:
+        return ready_made_fingerprint(self.descriptors)
+
+    @property
+    def descriptor_dim(self) -> int:
+        return self.descriptors.dsize
+
+    @property
+    def computed_with(self) -> None:
+        """Unknown, unlike for extracted features."""
+
+    @property
+    def max_keypoints(self) -> int:
+        """Most keypoints that a photo may have; all of them are taken."""
+        return MAX_READY_MADE_KEYPOINTS
+
+    def has(self, image_path: str) -> bool:
+        return self.keypoints.has(image_path) and self.descriptors.has(image_path)
+
+    def key(self, photo: MappingPhoto) -> str:
+        """Hash of a photo's features."""
+        if photo.name not in self._keys:
+            digest = hashlib.sha256()
+            for array in asdict(self.read(photo)).values():
+                digest.update(array.tobytes())
+            self._keys[photo.name] = f"ready_made/{digest.hexdigest()[:32]}"
+        return self._keys[photo.name]
+
+    def prepare(self, photo: MappingPhoto) -> None:
+        """Check the features of a photo."""
+        self.read(photo)
+
+    def read(self, photo: MappingPhoto) -> LocalFeatures:
+        """Return the features of a photo.
+
+        Raises:
+            DatasetError: with the file that is wrong.
+        """
+        count = self.descriptors.count(photo.name)
+        if count > MAX_READY_MADE_KEYPOINTS:
+            raise DatasetError(
+                "features.too_many",
+                "the photo has too many keypoints",
+                field=self.descriptors.label(photo.name),
+                expected=f"at most {MAX_READY_MADE_KEYPOINTS}",
+                got=count,
+            )
+        size = (photo.camera.width, photo.camera.height)
+        rows = read_local(self.keypoints, self.descriptors, photo.name, size, self.origin)
+        with errors_in(self.descriptors, photo):
+            return to_local_features(*rows)
+
+    def turn(self, _photo: MappingPhoto) -> int:
+        """Unknown; the photo is assumed to be as stored."""
+        return 1
+
+
+LocalFeaturesSource = ExtractedFeatures | ReadyMadeFeatures
+"""Source of the local features of mapping photos; it is sent to workers.
+
+``key`` identifies a photo's features in the keys of results that depend on them. ``prepare`` makes
+reading them quick.
+"""
+
+
+def local_features_source(
+    work: WorkFolder,
+    dataset: Path,
+    name: str,
+    *,
+    networks: Networks,
+    max_keypoints: int,
+    features_dir: Path | None,
+    pixel_origin: PixelOrigin,
+) -> LocalFeaturesSource:
+    """Return the source of local features that a name stands for.
+
+    Args:
+        dataset: kapture folder.
+        name: an extractor, or ``kapture:TYPE`` for features that come with the dataset.
+        max_keypoints: strongest ones kept per photo; of ready-made features all are taken.
+        features_dir: folder of ready-made features, if not the dataset.
+        pixel_origin: of the coordinates of ready-made keypoints.
+
+    Raises:
+        WeightsError, InvalidInput, DatasetError: what opening them raises.
+    """
+    if is_ready_made(name):
+        keypoints, descriptors = open_local_features(dataset, ready_made_type(name), features_dir)
+        return ReadyMadeFeatures(keypoints, descriptors, pixel_origin)
+    extractor = networks.extractor(name)
+    return ExtractedFeatures(
+        work,
+        name,
+        networks,
+        max_keypoints,
+        extractor.fingerprint,
+        extractor.descriptor_dim,
+        extractor.computed_with,
+    )
+
+
+@contextmanager
+def errors_in(features: FeatureSet, photo: MappingPhoto) -> Iterator[None]:
+    """Name the file in errors about its rows.
+
+    Raises:
+        DatasetError: for ``InvalidInput``, with its code.
+    """
+    try:
+        yield
+    except InvalidInput as error:
+        raise DatasetError(
+            error.code,
+            error.message,
+            field=features.label(photo.name),
+            expected=error.expected,
+            got=error.got,
+        ) from error
