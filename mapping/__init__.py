@@ -1,1 +1,1 @@
-"""The offline job: ``mapping build | inspect | verify | export-features | sample``."""
+"""The offline job: builds maps and edits them, with the ``mapping`` command."""
