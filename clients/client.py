@@ -103,7 +103,7 @@ class AsyncClient:
         self.server = server
         self._transport: _Transport
         if connection.is_grpc:
-            # Imported here, because gRPC and protobuf take a third of the time of ``import clients``.
+            # Imported here, because gRPC takes a third of the time of ``import clients``.
             from clients.transport.grpc import GrpcTransport
 
             self._transport = GrpcTransport(connection)
