@@ -24,6 +24,7 @@ from visloc.errors import (
     Unavailable,
     VislocError,
     WeightsError,
+    refuse,
 )
 
 STATUSES: Mapping[type[VislocError], tuple[HTTPStatus, grpc.StatusCode]] = {
@@ -63,14 +64,12 @@ def statuses_of(error: VislocError) -> tuple[HTTPStatus, grpc.StatusCode]:
 
 def internal_error() -> VislocError:
     """Return what a caller is told when something broke that should not have."""
-    return VislocError(
-        "server.internal", "the server made a mistake; its log has the request id and the cause"
-    )
+    return refuse("server.internal")
 
 
-def stopping_error() -> Unavailable:
+def stopping_error() -> VislocError:
     """Return what a caller is told whose request the end of the server cuts off."""
-    return Unavailable("server.stopping", "the server is being stopped; ask another, or later")
+    return refuse("server.stopping")
 
 
 def request_id(given: str | None) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import Geodetic
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
 from visloc.priors import NO_PRIORS, Priors
 from visloc.sequences.filling import Odometry, TimeUnit
@@ -249,9 +249,8 @@ def check_order(before: int, timestamp: int) -> None:
         InvalidInput: ``sequence.timestamps``.
     """
     if timestamp <= before:
-        raise InvalidInput(
+        raise refuse(
             "sequence.timestamps",
-            "instants come in the order of time, each once",
             field="timestamp",
             expected=f"more than {before}, that of the instant before",
             got=timestamp,

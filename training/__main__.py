@@ -22,7 +22,7 @@ from training.plots import draw
 from training.run import Trainer, resume, train
 from training.settings import PRESETS, Settings
 from training.validation import Score, features_of, validate, validation_pairs
-from visloc.errors import Conflict, InvalidInput, VislocError
+from visloc.errors import VislocError, refuse
 from visloc.features import make_local_features
 
 DATA = Path(".training")
@@ -128,9 +128,7 @@ def _rooms(options: argparse.Namespace) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     if (options.folder / FILE_NAME).exists():
-        raise Conflict(
-            "training.exists", "there is a run in it; use resume", field=str(options.folder)
-        )
+        raise refuse("training.exists", field=str(options.folder))
     changed = {
         each.name: getattr(options, each.name)
         for each in dataclasses.fields(Settings)
@@ -154,7 +152,7 @@ def _trainer(settings: Settings, options: argparse.Namespace) -> Trainer:
         torch.set_num_threads(options.threads)
     device = torch.device(options.device)
     if device.type == "cuda" and not torch.cuda.is_available():
-        raise InvalidInput("training.device", "there is no CUDA GPU", field="device", got="cuda")
+        raise refuse("training.device", field="device", got="cuda")
     pack = read_pack(options.photos, device)
     described = {
         "photos_sha256": pack.sha256,

@@ -12,7 +12,7 @@ from torch import Tensor
 from training.checkpoint import State
 from training.files import write_tensors
 from training.network import ARCHITECTURES
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.features.backends.convolution import fold_batch_norm
 from visloc.features.networks.r2d2.model import Convolution, FoldedNetwork, pack_folded
 
@@ -62,9 +62,8 @@ def export(state: State, output: Path) -> int:
     for each in folded.convolutions:
         largest = float(np.abs(each.weight).max())
         if not largest < _LARGEST_HALF:
-            raise InvalidInput(
+            raise refuse(
                 "training.range",
-                "a weight does not fit 16 bits: was the network trained?",
                 field=each.name,
                 expected=f"less than {_LARGEST_HALF}",
                 got=largest,

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import InvalidInput, VislocError
+from visloc.errors import VislocError, refuse
 from visloc.geometry import Camera, Pose
 from visloc.sequences.filling import PoseSource
 
@@ -177,17 +177,17 @@ def check_fusion_weights(weights: Mapping[str, float], code: str, field: str | N
     field = code if field is None else field
     for name, weight in weights.items():
         if not 1e-6 <= weight <= 1e6:  # NaN fails too
-            raise InvalidInput(
+            raise refuse(
                 code,
-                "not a weight; leave a descriptor away that shall not count",
+                "the weight is out of range; leave a descriptor out to ignore it",
                 field=f"{field}.{name}",
                 expected="0.000001 to 1000000",
                 got=weight,
             )
     if not weights:
-        raise InvalidInput(
+        raise refuse(
             code,
-            "no weights",
+            "there are no weights",
             field=field,
             expected="a weight for one global descriptor or more",
             got="{}",
@@ -258,12 +258,8 @@ class LocalizeOptions:
 
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:
-            raise InvalidInput(
-                "options.preset",
-                "unknown preset",
-                field="options.preset",
-                expected=f"one of {', '.join(PRESETS)}",
-                got=self.preset,
+            raise refuse(
+                "options.preset", field="options.preset", expected=PRESETS, got=self.preset
             )
         for name, low, high in (
             ("top_k", 1, 1000),
@@ -274,9 +270,8 @@ class LocalizeOptions:
         ):
             value = getattr(self, name)
             if value is not None and not low <= value <= high:  # NaN fails too
-                raise InvalidInput(
+                raise refuse(
                     f"options.{name}",
-                    "out of range",
                     field=f"options.{name}",
                     expected=f"{low} to {high}",
                     got=value,

@@ -18,7 +18,7 @@ from clients.transport.retry import RESEND_PAUSE_S, may_resend
 from clients.transport.uploads import OnProgress, Upload, pieces, pieces_async
 from clients.wire.requests import CheckReady, JsonObject
 from clients.wire.rig_requests import AnyRequest, SentInstant, SequenceStart
-from visloc.errors import Conflict, Unavailable, VislocError
+from visloc.errors import Unavailable, VislocError, refuse
 
 _CONNECT_TIMEOUT_S = 10.0
 _LIMITS = httpx.Limits(
@@ -214,9 +214,8 @@ def _refuse_published(upload: Upload, described: httpx.Response) -> None:
         Conflict: ``map.version_exists``.
     """
     if described.status_code == 200:
-        raise Conflict(
+        raise refuse(
             "map.version_exists",
-            "the version exists already; versions never change",
             field="version",
             expected="a version that is not there",
             got=f"{upload.map_id}@{upload.version}",

@@ -11,7 +11,7 @@ from typing import Any, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import InvalidInput
+from visloc.errors import InvalidInput, VislocError, refuse
 from visloc.geometry import Pose
 from visloc.priors import (
     GravityPrior,
@@ -40,12 +40,7 @@ def priors_as_json(priors: Priors) -> dict[str, Any]:
         given["position"] = {"position": position.tolist(), "radius": radius}
     if priors.height is not None:
         if priors.height.down is not None:
-            raise InvalidInput(
-                "priors.height",
-                "heights are measured along what the map, or the gravity prior, knows of down",
-                field="priors.height",
-                expected="no down",
-            )
+            raise refuse("priors.height", field="priors.height")
         given["height"] = {"min": priors.height.min, "max": priors.height.max}
     if priors.pose is not None:
         given["pose"] = {
@@ -82,13 +77,7 @@ def priors_from_text(text: str) -> Priors:
     try:
         raw = json.loads(text if text.lstrip().startswith("{") else Path(text).read_bytes())
     except (OSError, ValueError) as error:
-        raise InvalidInput(
-            "priors.unreadable",
-            "neither JSON nor a file that holds it",
-            field="priors",
-            expected='such as {"height": {"min": 0, "max": 3}}',
-            got=f"{text[:80]} ({error})",
-        ) from error
+        raise refuse("priors.unreadable", field="priors", got=f"{text[:80]} ({error})") from error
     return priors_from_json(raw)
 
 
@@ -138,9 +127,7 @@ def checked_covariance(given: object, field: str) -> NDArray[np.float64]:
     try:
         check_covariance(covariance, field)
     except InvalidInput as error:
-        raise InvalidInput(
-            error.code, error.message, field=error.field, expected=error.expected, got=got
-        ) from None
+        raise refuse(error.code, field=error.field, expected=error.expected, got=got) from None
     return covariance
 
 
@@ -151,9 +138,9 @@ def _pose_prior(raw: Mapping[str, Any]) -> PosePrior:
     )
     rotation_wxyz = _numbers(f"{where}.rotation_wxyz", transform)
     if not abs(math.hypot(*rotation_wxyz) - 1.0) <= _MAX_LENGTH_ERROR:
-        raise InvalidInput(
+        raise refuse(
             "pose.rotation",
-            "not a rotation: its quaternion has not length 1",
+            "the quaternion of the rotation does not have length 1",
             field=f"priors.{where}.rotation_wxyz",
             expected="a unit quaternion w, x, y, z",
             got=rotation_wxyz.tolist(),
@@ -179,21 +166,17 @@ def _tiles(names: object) -> tuple[str, ...]:
 def _given(where: str, raw: object, fields: tuple[str, ...]) -> dict[str, Any]:
     """Return the fields of an object that are not null."""
     if not isinstance(raw, dict):
-        raise InvalidInput(
-            "request.invalid",  # as the server says it
-            "not an object",
+        raise refuse(
+            "request.invalid",
+            "the value is not an object",
             field=where,
             expected=f"an object with {', '.join(fields)}",
             got=raw,
         )
     for name in raw:
         if name not in fields:
-            raise InvalidInput(
-                "request.unknown_field",  # as the server says it
-                "unknown field",
-                field=f"{where}.{name}",
-                expected=f"one of {', '.join(fields)}",
-                got=name,
+            raise refuse(
+                "request.unknown_field", field=f"{where}.{name}", expected=fields, got=name
             )
     return {name: value for name, value in raw.items() if value is not None}
 
@@ -217,11 +200,7 @@ def _is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, float) or (type(value) is int and abs(value) < 2**1000)
 
 
-def _unusable(path: str, expected: str, got: object) -> InvalidInput:
-    return InvalidInput(
-        f"priors.{path.partition('.')[0]}",
-        "not usable",
-        field=f"priors.{path}",
-        expected=expected,
-        got=got,
+def _unusable(path: str, expected: str, got: object) -> VislocError:
+    return refuse(
+        f"priors.{path.partition('.')[0]}", field=f"priors.{path}", expected=expected, got=got
     )

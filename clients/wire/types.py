@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clients.wire.geopose import GeoPose, GeoPoseYpr
-from visloc.errors import InvalidInput
+from visloc.errors import VislocError, refuse
 from visloc.geometry import Camera, Pose, Similarity
 
 OptionValue = int | float | str | Mapping[str, float]
@@ -107,13 +107,7 @@ class LocalizeOptions:
         for text in texts:
             name, equals, value = text.partition("=")
             if not equals:
-                raise InvalidInput(
-                    "options.syntax",
-                    "not an option",
-                    field="option",
-                    expected="NAME=VALUE such as top_k=10",
-                    got=text,
-                )
+                raise refuse("options.syntax", field="option", got=text)
             _check_option_name(name)
             try:
                 values[name] = _PARSERS[_OPTION_KINDS[name]](value)
@@ -311,9 +305,8 @@ class Near:
         for each in fields(self):
             value = getattr(self, each.name)
             if not _can_be_sent(value, float):
-                raise InvalidInput(
+                raise refuse(
                     f"near.{each.name}",
-                    "not usable",
                     field=f"near.{each.name}",
                     expected=_EXPECTED[float],
                     got=value,
@@ -507,12 +500,8 @@ class ServerInfo:
 
 def _check_option_name(name: str) -> None:
     if name not in _OPTION_KINDS:
-        raise InvalidInput(
-            "request.unknown_field",  # as the server says it
-            "unknown field",
-            field=f"options.{name}",
-            expected=f"one of {', '.join(_OPTION_KINDS)}",
-            got=name,
+        raise refuse(
+            "request.unknown_field", field=f"options.{name}", expected=_OPTION_KINDS, got=name
         )
 
 
@@ -552,10 +541,10 @@ def _can_be_sent(value: object, kind: type) -> bool:
     return isinstance(value, str) and value.isprintable()
 
 
-def _not_usable(name: str, value: object) -> InvalidInput:
-    return InvalidInput(
+def _not_usable(name: str, value: object) -> VislocError:
+    return refuse(
         f"options.{name}",
-        "not usable",
+        "the value of the option is not valid",
         field=f"options.{name}",
         expected=_EXPECTED[_OPTION_KINDS[name]],
         got=value,

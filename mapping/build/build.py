@@ -65,7 +65,7 @@ from visloc.archive import (
     MapStore,
     pose_row,
 )
-from visloc.errors import Conflict, InvalidInput, Unavailable
+from visloc.errors import refuse
 from visloc.features import DEFAULT_GLOBAL_FEATURES, DEFAULT_LOCAL_FEATURES
 from visloc.features.backends.choice import choose_inference
 from visloc.features.local.readymade import is_ready_made, ready_made_type
@@ -173,10 +173,12 @@ def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None =
     versions = store.versions(settings.map_id)
     # Versions of which none is current are what a build left that was killed while it published.
     if versions and settings.map_id in store.ids() and not settings.force:
-        raise Conflict(
+        raise refuse(
             "map.exists",
-            f"map {settings.map_id!r} exists (version {versions[-1]}); "
-            "--force publishes a new version and keeps the old one",
+            (
+                f"map {settings.map_id!r} exists (version {versions[-1]}); --force publishes "
+                "a new version and keeps the old one"
+            ),
             field="--map",
         )
     if not is_ready_made(settings.local_features):  # raises when it cannot
@@ -201,11 +203,10 @@ def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None =
             work.remove()
             shutil.rmtree(scratch, ignore_errors=True)
     except storage_errors() as error:
-        raise Unavailable(
+        raise refuse(
             "storage.failed",
-            f"reading or writing failed: {getattr(error, 'strerror', None) or error}; "
-            "finished work is kept, the same command resumes",
             field=str(getattr(error, "filename", None) or work.root),
+            why=getattr(error, "strerror", None) or error,
         ) from error
     return folder
 
@@ -267,13 +268,7 @@ def _read_global(
 def _check(settings: BuildSettings) -> None:
     """Refuse what would otherwise fail after hours, or give a useless map."""
     if settings.method not in METHODS:
-        raise InvalidInput(
-            "build.method",
-            "unknown method",
-            field="--method",
-            expected=f"one of {', '.join(METHODS)}",
-            got=settings.method,
-        )
+        raise refuse("build.method", field="--method", expected=METHODS, got=settings.method)
     _check_names("--executor", (settings.executor,), EXECUTORS)
     if settings.work_dir is not None:
         _refuse_mixed_places(settings, settings.work_dir)
@@ -281,29 +276,16 @@ def _check(settings: BuildSettings) -> None:
         settings.method == "model"
         or any(is_ready_made(n) for n in (settings.local_features, *settings.global_features))
     ):
-        raise InvalidInput(
-            "build.dataset",
-            "features and points that a dataset brings along are not read from a URL",
-            field="dataset",
-            expected="a folder, for --method model and kapture:TYPE",
-            got=str(settings.dataset),
-        )
+        raise refuse("build.dataset", field="dataset", got=str(settings.dataset))
     names = settings.global_features
     if not names or "" in names or len(set(names)) < len(names):
-        raise InvalidInput(
-            "build.global_features",
-            "not a set of global features",
-            field="--global-features",
-            expected="one or more names, each once",
-            got=",".join(names),
-        )
+        raise refuse("build.global_features", field="--global-features", got=",".join(names))
     if settings.fusion.weights is not None:
         check_fusion_weights(settings.fusion.weights, "build.fusion_weights", "--fusion-weights")
         unknown = [name for name in settings.fusion.weights if name not in names]
         if unknown:
-            raise InvalidInput(
+            raise refuse(
                 "build.fusion_weights",
-                "weights of global features that the map will not have",
                 field="--fusion-weights",
                 expected=f"of {', '.join(names)}",
                 got=",".join(unknown),
@@ -313,9 +295,12 @@ def _check(settings: BuildSettings) -> None:
             continue
         descriptor = open_descriptor(name, settings.weights_dir, settings.inference)
         if descriptor.needs_image and is_ready_made(settings.local_features):
-            raise InvalidInput(
+            raise refuse(
                 "build.global_features",
-                f"{name} is made of the photo, which is not there when features are sent instead",
+                (
+                    f"{name} is computed from the photo, which is missing when features are sent "
+                    "instead"
+                ),
                 field="--global-features",
                 expected="kapture:TYPE, or localvlad, with ready-made local features",
                 got=name,
@@ -323,21 +308,13 @@ def _check(settings: BuildSettings) -> None:
     for name in ("voxel_size", "depth_scale"):
         value = getattr(settings.depth, name)
         if not (math.isfinite(value) and value > 0):
-            raise InvalidInput(
-                f"build.{name}",
-                "not usable",
-                field=f"--{name.replace('_', '-')}",
-                expected="metres, more than 0",
-                got=value,
-            )
+            raise refuse(f"build.{name}", field=f"--{name.replace('_', '-')}", got=value)
     if settings.gravity is not None:
         length = math.hypot(*settings.gravity)
         if not (math.isfinite(length) and length >= _MIN_LENGTH):
-            raise InvalidInput(
+            raise refuse(
                 "build.gravity",
-                "not a direction",
                 field="--gravity",
-                expected="three finite numbers that are not all 0, such as 0,0,-1",
                 got=",".join(f"{value:g}" for value in settings.gravity),
             )
     sfm = settings.sfm
@@ -345,21 +322,11 @@ def _check(settings: BuildSettings) -> None:
     _check_names("--refine", sfm.refine, REFINABLE)
     _check_names("--mapper", (sfm.mapper,), tuple(MAPPER_CONFIGS))
     if sfm.estimate_poses and settings.method != "sfm":
-        raise InvalidInput(
-            "build.poses",
-            "poses are estimated from matches",
-            field="--poses",
-            expected="given, or --method sfm",
-            got=f"estimate with --method {settings.method}",
+        raise refuse(
+            "build.poses", field="--poses", got=f"estimate with --method {settings.method}"
         )
     if sfm.estimate_poses and not set(sfm.refine) <= {"intrinsics"}:
-        raise InvalidInput(
-            "build.refine",
-            "estimated poses and points are refined anyway",
-            field="--refine",
-            expected="nothing, or intrinsics, with --poses estimate",
-            got=",".join(sfm.refine),
-        )
+        raise refuse("build.refine", field="--refine", got=",".join(sfm.refine))
 
 
 def _refuse_mixed_places(settings: BuildSettings, work_dir: Path) -> None:
@@ -374,10 +341,12 @@ def _refuse_mixed_places(settings: BuildSettings, work_dir: Path) -> None:
         ("--cache-dir", settings.cache_dir),
     ):
         if lies_in(root, place) or lies_in(place, root):
-            raise InvalidInput(
+            raise refuse(
                 "build.work_dir",
-                f"finished work would be kept in {root}, which is in {option} or holds it, and is "
-                "removed when the map is published",
+                (
+                    f"finished work would be kept in {root}, which overlaps {option}, and "
+                    "publishing the map removes it"
+                ),
                 field="--work-dir",
                 expected=f"a folder apart from {option}, or without the option",
                 got=str(work_dir),
@@ -387,9 +356,9 @@ def _refuse_mixed_places(settings: BuildSettings, work_dir: Path) -> None:
 def _check_names(option: str, names: Sequence[str], known: Sequence[str]) -> None:
     unknown = [name for name in names if name not in known]
     if unknown or len(set(names)) < len(names):
-        raise InvalidInput(
+        raise refuse(
             f"build.{option[2:]}",
-            "unknown name" if unknown else "a name is given twice",
+            "a name is unknown" if unknown else "a name is given twice",
             field=option,
             expected=f"of {', '.join(known)}, each once",
             got=",".join(names),
@@ -496,10 +465,12 @@ def _refuse_gravity_that_is_not_down(settings: BuildSettings) -> None:
     x, y, z = settings.gravity
     angle_deg = math.degrees(math.atan2(math.hypot(x, y), -z))
     if angle_deg > MAX_DIRECTION_ERROR_DEG:
-        raise InvalidInput(
+        raise refuse(
             "build.gravity",
-            "the map is anchored to GNSS fixes, its axes point east, north and up, and this is "
-            "not down there; leave the option out",
+            (
+                "the map is anchored to GNSS fixes, its axes point east, north and up, and "
+                "this is not down; leave the option out"
+            ),
             field="--gravity",
             expected=f"0,0,-1 to within {MAX_DIRECTION_ERROR_DEG:g} degrees",
             got=f"{x:g},{y:g},{z:g}, {angle_deg:.1f} degrees off",

@@ -18,7 +18,7 @@ from mapping.build.stages import Item, WorkFolder, key_of
 from mapping.cli.progress import one_step
 from mapping.cluster.executors import Executor
 from visloc.archive import FingerprintRecord, GlobalFeatures, Map
-from visloc.errors import DatasetError, InvalidInput, Unavailable
+from visloc.errors import DatasetError, InvalidInput, refuse
 from visloc.features import (
     GlobalDescriptor,
     LocalFeatureExtractor,
@@ -223,12 +223,13 @@ class ReadyMadeFeatures:
         """
         count = self.descriptors.count(photo.name)
         if count > MAX_READY_MADE_KEYPOINTS:
-            raise DatasetError(
+            raise refuse(
                 "features.too_many",
                 "the photo has too many keypoints",
                 field=self.descriptors.label(photo.name),
                 expected=f"at most {MAX_READY_MADE_KEYPOINTS}",
                 got=count,
+                kind=DatasetError,
             )
         size = (photo.camera.width, photo.camera.height)
         rows = read_local(self.keypoints, self.descriptors, photo.name, size, self.origin)
@@ -420,13 +421,7 @@ def _errors_in(features: FeatureSet, photo: MappingPhoto) -> Iterator[None]:
     try:
         yield
     except InvalidInput as error:
-        raise DatasetError(
-            error.code,
-            error.message,
-            field=features.label(photo.name),
-            expected=error.expected,
-            got=error.got,
-        ) from error
+        raise error.about(features.label(photo.name), DatasetError) from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -525,14 +520,8 @@ def _upright_pixels(photo: MappingPhoto) -> NDArray[np.uint8]:
 def _refuse_other_computing(name: str, expected: str | None, here: str | None) -> None:
     """Refuse what would not be what the command itself computes, whose name all items have."""
     if here != expected:
-        raise Unavailable(
-            "build.other_computing",
-            f"a machine of the cluster computes {name} in another way than the one that builds; "
-            "their results would be mixed in one map. Choose a way that all have, or machines "
-            "that are alike",
-            field="--inference",
-            expected=expected,
-            got=here,
+        raise refuse(
+            "build.other_computing", field="--inference", expected=expected, got=here, name=name
         )
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mapping.methods.depth import DepthMatch, DepthMatcher
 from visloc.archive import sha256_of
-from visloc.errors import DatasetError
+from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo, read_photo_file, upright
 from visloc.kapture import Dataset, FileRecord
@@ -78,9 +78,8 @@ def read_in_frame(path: Path, size: tuple[int, int], sensor_id: str) -> Photo:
         return photo
     if photo.is_on_its_side and stored[::-1] == size:
         return replace(photo, rgb=upright(photo.rgb, photo.exif_orientation), exif_orientation=1)
-    raise DatasetError(
+    raise refuse(
         "dataset.photo_size",
-        "the photo is not of the size of its camera",
         field=str(path),
         expected=f"{size[0]} x {size[1]} as sensors.txt has it for {sensor_id}",
         got=f"{stored[0]} x {stored[1]}",
@@ -158,7 +157,7 @@ def collect_photos(
             *(["ready-made features"] if has_features is not None else []),
             *(["a camera of a known model", "a pose"] if posed else []),
         ]
-        raise DatasetError(
+        raise refuse(
             "dataset.no_photos",
             "no photo of the dataset can be used" + "".join(f"; {note}" for note in notes),
             field=str(dataset.root / "sensors" / "records_camera.txt"),
@@ -180,6 +179,4 @@ def _checksum(dataset: Dataset, record: FileRecord) -> str:
     try:
         return sha256_of(path) if dataset.files is None else dataset.files.identity(record.path)
     except OSError as error:
-        raise DatasetError(
-            "dataset.unreadable", f"cannot be read: {error.strerror}", field=str(path)
-        ) from error
+        raise refuse("dataset.unreadable", field=str(path), got=error.strerror) from error

@@ -85,7 +85,7 @@ from mapping.methods.triangulation import MAPPER_CONFIGS, REFINABLE
 from mapping.sample import write_sample
 from visloc.archive import SetManifest, open_map, open_set, verify_map, verify_set
 from visloc.archive.checks import read_any_manifest
-from visloc.errors import InvalidInput, VislocError
+from visloc.errors import VislocError, refuse
 from visloc.features import (
     DEFAULT_LOCAL_FEATURES,
     make_global_descriptor,
@@ -253,8 +253,12 @@ def build(
     complete.
     """
     if poses not in ("given", "estimate"):
-        raise InvalidInput(
-            "build.poses", "unknown", field="--poses", expected="given or estimate", got=poses
+        raise refuse(
+            "build.poses",
+            "the value is unknown",
+            field="--poses",
+            expected="given or estimate",
+            got=poses,
         )
     maps = place_of(maps_dir, "--maps-dir")
     settings = BuildSettings(
@@ -434,9 +438,7 @@ def import_command(
     choices make a dataset first, and build from it.
     """
     if (map_id is None) == (output is None):
-        raise InvalidInput(
-            "import.target", "say what to make", field="--map", expected="either --map or --output"
-        )
+        raise refuse("import.target", field="--map")
     if output is not None:
         with StageProgress(_err, if_stopped="nothing was written") as progress:
             summary = import_dataset(format_name, path, output, photos, progress)
@@ -544,12 +546,7 @@ def anchor(
     ways = (dataset is not None, correspondences is not None, any(v is not None for v in said))
     details = any(one is not None for one in (accuracy, scale, gravity))
     if sum(ways) != 1 or (ways[2] and None in said) or (details and not ways[2]):
-        raise InvalidInput(
-            "anchor.source",
-            "say in one way where the map lies",
-            expected="--dataset; or --correspondences; or all of --latitude, --longitude, "
-            "--altitude, --yaw, and where needed --accuracy, --scale and --gravity",
-        )
+        raise refuse("anchor.source")
     opened = open_map(map_folder(map_ref, maps_dir))
     if dataset is not None:
         found = georeference(opened, correspondences_from_fixes(opened, read_dataset(dataset)))
@@ -760,9 +757,9 @@ def _parse_weights(text: str) -> dict[str, float]:
     except ValueError:
         weights = {}
     if not weights or len(weights) < len(items) or "" in weights:
-        raise InvalidInput(
+        raise refuse(
             "build.fusion_weights",
-            "not weights of global features",
+            "these are not weights of global features",
             field="--fusion-weights",
             expected="NAME=WEIGHT,... such as densevlad=1,localvlad=2, each name once",
             got=text,
@@ -774,9 +771,9 @@ def _parse_vector(option: str, text: str) -> tuple[float, float, float]:
     try:
         x, y, z = (float(number) for number in text.split(","))
     except ValueError:
-        raise InvalidInput(
+        raise refuse(
             f"build.{option[2:]}",
-            "not a vector",
+            "this is not a vector",
             field=option,
             expected="X,Y,Z such as 0,0,-1",
             got=text,
@@ -787,9 +784,7 @@ def _parse_vector(option: str, text: str) -> tuple[float, float, float]:
 def _parse_size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
     if not (width.isdecimal() and height.isdecimal()):
-        raise InvalidInput(
-            "sample.size", "not a size", field="--size", expected="WxH such as 640x480", got=text
-        )
+        raise refuse("sample.size", field="--size", got=text)
     return int(width), int(height)
 
 

@@ -16,7 +16,7 @@ from mapping.cli.progress import StageProgress
 from mapping.maps.pruning.accuracy import BINS, Accuracy, lost, of_queries
 from mapping.maps.pruning.job import Pruned, prune_map
 from visloc.archive import Map, MapStore
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.features import make_global_descriptor, make_local_features
 
 # More than this part of the queries, and than two of them, is more than noise.
@@ -52,12 +52,7 @@ def prune(
     Prints the accuracy before and after. The version before stays.
     """
     if (max_bytes is None) == (max_landmarks is None):
-        raise InvalidInput(
-            "prune.goal",
-            "say how small",
-            field="--max-bytes",
-            expected="either --max-bytes or --max-landmarks",
-        )
+        raise refuse("prune.goal", field="--max-bytes")
     store = MapStore(maps_dir)
     opened = store.open(map_id)
     with StageProgress(_err, if_stopped="nothing was published") as progress:
@@ -98,13 +93,7 @@ def parse_size(text: str, whole: int) -> int:
         number, unit = float(found[1]), found[2].upper()
         size = number / 100 * whole if unit == "%" else number * _UNITS[unit]
     if size < 1:
-        raise InvalidInput(
-            "prune.max_bytes",
-            "not a size",
-            field="--max-bytes",
-            expected="such as 200MB, 1.5GB, 50% or 1000000",
-            got=text,
-        )
+        raise refuse("prune.max_bytes", field="--max-bytes", got=text)
     return int(size)
 
 

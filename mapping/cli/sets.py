@@ -19,7 +19,7 @@ from mapping.maps.splitting import split_map
 from visloc.archive import MapSet, MapStore, open_set
 from visloc.archive.checks import read_any_manifest
 from visloc.archive.set_rules import refuse_missing_tiles
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.sets.coarse import check_descriptor
 
 _out = Console()
@@ -169,13 +169,17 @@ def _length(option: str, text: str, metric: bool) -> float:
     """
     match = re.fullmatch(r"([0-9]*\.?[0-9]+)(m?)", text.strip())
     if match is None or (match[2] and not metric):
-        raise InvalidInput(
+        raise refuse(
             f"split.{option[2:]}",
-            "not a length" if match is None else "the map is not metric: nobody knows its metres",
-            field=option,
-            expected="a number such as 25 for units of the map, or 25m of a metric one"
+            "the length is not valid"
             if match is None
-            else "a number of the map's own units, such as 25",
+            else "the map is not metric, so lengths in metres have no meaning",
+            field=option,
+            expected=(
+                "a number such as 25 for units of the map, or 25m of a metric one"
+                if match is None
+                else "a number of the map's own units, such as 25"
+            ),
             got=text,
         )
     return float(match[1])

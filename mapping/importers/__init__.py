@@ -20,7 +20,7 @@ from mapping.cluster.stage_timings import Progress
 from mapping.importers.dataset import write_imported
 from mapping.importers.model import ImportedImage, ImportedModel
 from visloc.archive import MapStore
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 
 __all__ = [
     "IMPORTERS",
@@ -124,21 +124,9 @@ def read_model(
         DatasetError: with the file, and the line or image, that is wrong.
     """
     if name not in IMPORTERS:
-        raise InvalidInput(
-            "import.unknown_format",
-            "no such format",
-            field="FORMAT",
-            expected=f"one of {', '.join(IMPORTERS)}",
-            got=name,
-        )
+        raise refuse("import.unknown_format", field="FORMAT", expected=IMPORTERS, got=name)
     if photos is not None and not photos.is_dir():
-        raise InvalidInput(
-            "import.photos",
-            "not a folder",
-            field="--photos",
-            expected="the folder that the names of photos are relative to",
-            got=str(photos),
-        )
+        raise refuse("import.photos", field="--photos", got=str(photos))
     module, function = IMPORTERS[name]
     read: Callable[..., ImportedModel] = getattr(import_module(module), function)
     if name == "images":  # the only one that decodes photos, which takes long

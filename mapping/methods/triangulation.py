@@ -29,7 +29,7 @@ from mapping.build.landmarks import (
 from mapping.frames.anchor import align_poses
 from mapping.methods.intrinsics import STEP, Doubt, doubt_of, is_plausible, no_lens
 from mapping.methods.matching import Matches
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import colmap_camera, pose_from_colmap
 
@@ -236,10 +236,11 @@ def reconstruct(
                 return max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()))
             if left_out:
                 raise no_lens({sensor: doubts[sensor] for sensor in left_out}, _names(photos))
-            raise InvalidInput(
+            raise refuse(
                 "sfm.no_model",
-                "no two photos could be placed relative to each other"
-                + (" with their focal length as it was known" if doubts else ""),
+                "no two photos could be placed relative to each other with their known focal length"
+                if doubts
+                else None,
                 field="dataset",
                 expected="photos that overlap; see --pairs and --mapper",
                 got=f"{len(photos)} photos, {len(matches)} pairs with verified matches",
@@ -512,11 +513,9 @@ def _database(
 ) -> Iterator[tuple[Path, _Scene]]:
     """A temporary COLMAP database with everything in it."""
     if not matches:
-        raise InvalidInput(
+        raise refuse(
             "sfm.no_matches",
-            "too few matches to triangulate anything",
             field="dataset",
-            expected="pairs of photos that show the same; see --pairs and --mapper",
             got=f"{len(photos)} photos, none of their pairs with enough verified matches",
         )
     work.mkdir(parents=True, exist_ok=True)
@@ -655,12 +654,13 @@ def _checked(model: SparseModel, config: MapperConfig) -> SparseModel:
     lengths = np.bincount(observations.points, minlength=len(model.points))
     good = (lengths >= config.min_track_length) & (angles >= config.min_angle_deg)
     if not good.any():
-        raise InvalidInput(
+        raise refuse(
             "sfm.no_points",
-            "too few matches to triangulate anything",
             field="dataset",
-            expected=f"points seen by {config.min_track_length} photos and more, from directions "
-            f"{config.min_angle_deg} degrees apart; see --pairs and --mapper",
+            expected=(
+                f"points seen by {config.min_track_length} photos and more, from directions "
+                f"{config.min_angle_deg} degrees apart; see --pairs and --mapper"
+            ),
             got=f"{len(model.points)} points, none of them good enough",
         )
     number = np.cumsum(good) - 1

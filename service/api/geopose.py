@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field
 from service.api.message import IncomingMessage, converted
 from service.values import Near as NearCore
 from visloc.archive import Geodetic
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Pose
 from visloc.geopose import geopose_of
 
@@ -38,13 +38,14 @@ class Near(IncomingMessage):
             value = getattr(self, name)
             # NaN fails too.
             if not low <= value <= high or (name == "radius" and value == 0):
-                raise InvalidInput(
+                raise refuse(
                     f"near.{name}",
-                    "not a place on Earth",
                     field=f"near.{name}",
-                    expected=f"more than 0, at most {high:.0f} metres"
-                    if name == "radius"
-                    else f"{low:g} to {high:g} degrees",
+                    expected=(
+                        f"more than 0, at most {high:.0f} metres"
+                        if name == "radius"
+                        else f"{low:g} to {high:g} degrees"
+                    ),
                     got=value,
                 )
         return NearCore(self.latitude, self.longitude, self.radius)
@@ -68,13 +69,7 @@ def near_from_text(text: str) -> Near:
     try:
         latitude, longitude, radius = (float(number) for number in text.split(","))
     except ValueError:
-        raise InvalidInput(
-            "near.syntax",
-            "not a place",
-            field="near",
-            expected="latitude,longitude,radius in degrees and metres, such as 48.27,2.7,100",
-            got=text,
-        ) from None
+        raise refuse("near.syntax", field="near", got=text) from None
     return Near(latitude=latitude, longitude=longitude, radius=radius)
 
 

@@ -10,7 +10,7 @@ from pydantic import Field
 
 import visloc.types
 from service.api.message import IncomingMessage, converted
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 
 # More global descriptors than any map has, and longer names.
 _MAX_WEIGHTS = 16
@@ -21,18 +21,18 @@ def _check_names(value: object) -> object:
     """Refuse too many or too long names before any weight is looked at."""
     if isinstance(value, Mapping):
         if len(value) > _MAX_WEIGHTS:
-            raise InvalidInput(
+            raise refuse(
                 "options.fusion_weights",
-                "too many weights",
+                "there are too many weights",
                 field="fusion_weights",
                 expected=f"at most {_MAX_WEIGHTS}",
                 got=len(value),
             )
         for name in value:
             if not isinstance(name, str) or not 0 < len(name) <= _MAX_NAME:
-                raise InvalidInput(
+                raise refuse(
                     "options.fusion_weights",
-                    "not the name of a global descriptor",
+                    "this is not the name of a global descriptor",
                     field="fusion_weights",
                     expected=f"a text of 1 to {_MAX_NAME} characters",
                     got=f"{len(name)} characters" if isinstance(name, str) else type(name).__name__,
@@ -130,23 +130,17 @@ class LocalizeOptions(IncomingMessage):
 
 
 _WORDS: Mapping[str, tuple[type[StrEnum], str]] = {
-    "read_as": (visloc.types.ReadAs, "unknown orientation to read in"),
-    "extraction": (visloc.types.Extraction, "unknown effort"),
-    "fusion": (visloc.types.Fusion, "unknown way of fusing"),
-    "matcher": (visloc.types.Matcher, "unknown way of matching"),
-    "solver": (visloc.types.Solver, "unknown solver"),
+    "read_as": (visloc.types.ReadAs, "the orientation is unknown"),
+    "extraction": (visloc.types.Extraction, "the extraction is unknown"),
+    "fusion": (visloc.types.Fusion, "the fusion is unknown"),
+    "matcher": (visloc.types.Matcher, "the matcher is unknown"),
+    "solver": (visloc.types.Solver, "the solver is unknown"),
 }
 
 
 def _known_word(words: type[StrEnum], given: str, name: str, message: str) -> StrEnum:
     if given not in list(words):
-        raise InvalidInput(
-            f"options.{name}",
-            message,
-            field=f"options.{name}",
-            expected=f"one of {', '.join(words)}",
-            got=given,
-        )
+        raise refuse(f"options.{name}", message, field=f"options.{name}", expected=words, got=given)
     return words(given)
 
 

@@ -24,7 +24,7 @@ from service.workers.process import MapFolder
 from visloc.archive import SetOutline, read_any_outline
 from visloc.archive.set_rules import refuse_if_tile
 from visloc.archive.store import version_in_use
-from visloc.errors import MapCorrupt, NotFound, Unavailable, VislocError
+from visloc.errors import MapCorrupt, NotFound, Unavailable, VislocError, refuse
 
 logger = logging.getLogger(__name__)
 
@@ -254,7 +254,7 @@ class Catalog:
     async def _hold(self, ref: str) -> MapFolder:
         """Return ``id@version``, which stays until it is given back."""
         if ref in self._leaving:
-            raise NotFound("map.version", "the version is being deleted", field="map", got=ref)
+            raise refuse("map.version", "the version is being deleted", field="map", got=ref)
         self._users[ref] += 1
         try:
             return await self._at_hand(ref)
@@ -413,5 +413,5 @@ class Catalog:
         task.add_done_callback(self._background.discard)
 
 
-def _gone_meanwhile(map_id: str) -> NotFound:
-    return NotFound("map.unknown", "the map was deleted a moment ago", field="map", got=map_id)
+def _gone_meanwhile(map_id: str) -> VislocError:
+    return refuse("map.unknown", "the map was deleted a moment ago", field="map", got=map_id)

@@ -39,10 +39,8 @@ from service.workers.judging import judged
 from service.workers.pool import Workers
 from service.workers.process import MapFolder, WorkerSettings
 from visloc.errors import (
-    InvalidInput,
-    Overloaded,
-    Unavailable,
     VislocError,
+    refuse,
 )
 from visloc.priors import NO_PRIORS
 
@@ -209,7 +207,7 @@ class Engine:
         """
         self._check_ready()
         if self._photos >= self._max_photos:
-            raise Overloaded("server.busy", "too many photos are waiting; try again shortly")
+            raise refuse("server.busy", "too many photos are waiting; try again shortly")
 
     @contextmanager
     def admit_batch(self) -> Iterator[None]:
@@ -221,7 +219,9 @@ class Engine:
         """
         self._check_ready()
         if self._batches >= self._max_batches:
-            raise Overloaded("server.busy", "too many rigs and sequences; try again shortly")
+            raise refuse(
+                "server.busy", "too many rigs and sequences are waiting; try again shortly"
+            )
         self._batches += 1
         try:
             yield
@@ -239,7 +239,7 @@ class Engine:
             VislocError: what the store raises.
         """
         if not job.images:
-            raise InvalidInput("rig.empty", "there is no image", field="images")
+            raise refuse("rig.empty", "there is no image", field="images")
         async with self._catalog.using(job.maps, self.workers) as maps:
             sets, alone = parted(maps, job.priors)
             found = [self._sets.localize_rig(job, of) for of in sets]
@@ -267,9 +267,8 @@ class Engine:
         async with self._catalog.using(start.maps, self.workers) as maps:
             sets, alone = parted(maps, start.priors)
             if sets and len(maps) > 1:
-                raise InvalidInput(
+                raise refuse(
                     "sequence.set",
-                    "a sequence is localized in one set of maps, or in maps",
                     field="maps",
                     expected=f"one set, such as {sets[0].ref}, or no set",
                     got=", ".join(of.ref for of in maps),
@@ -396,7 +395,7 @@ class Engine:
         if self._draining:
             raise stopping_error()
         if not self._started:
-            raise Unavailable("server.starting", "the maps are being loaded; try again shortly")
+            raise refuse("server.starting")
 
 
 def _in_turn(instants: AsyncIterator[Instant] | Sequence[Instant]) -> AsyncIterator[Instant]:

@@ -12,7 +12,7 @@ from service.values import Near
 from service.workers.process import MapFolder
 from visloc.archive import MapOutline, SetOutline
 from visloc.archive.set_schema import MAX_TILES
-from visloc.errors import InvalidInput, MapCorrupt, NotFound, VislocError
+from visloc.errors import MapCorrupt, NotFound, VislocError, refuse
 from visloc.sets.choosing import tiles_near
 
 logger = logging.getLogger(__name__)
@@ -116,15 +116,13 @@ class Listing:
                 if _reaches(self.describe(map_id).outline, near):
                     found.append(map_id)
         if not found:
-            raise NotFound(
+            raise refuse(
                 "map.none_near",
-                "no map that is tied to the Earth reaches into this circle",
                 field="near",
-                expected="a place that a map covers: GET /maps?near=latitude,longitude,radius",
                 got=f"{near.latitude:g}, {near.longitude:g}, {near.radius:g} m",
             )
         if len(found) > MAX_MAPS:
-            raise InvalidInput(
+            raise refuse(
                 "request.map",
                 "too many maps reach into this circle",
                 field="near.radius",

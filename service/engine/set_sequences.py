@@ -39,7 +39,7 @@ from service.workers import process as worker
 from service.workers.pool import Workers
 from service.workers.process import MapFolder, Seen
 from visloc.archive import SetOutline
-from visloc.errors import InvalidInput, NotFound, Unavailable, VislocError
+from visloc.errors import InvalidInput, NotFound, Unavailable, VislocError, refuse
 from visloc.pose.centre import moved_pose
 from visloc.priors import Priors
 from visloc.sequences.filling import guess_time_unit
@@ -144,7 +144,7 @@ class SetSequence:
                         yield answer
                 index += 1
             if index == 0:
-                raise InvalidInput("sequence.empty", "there is no instant", field="instants")
+                raise refuse("sequence.empty", field="instants")
         except VislocError:
             # What is wrong with one instant does not take the answers of those before it along.
             for answer in await self._finish():

@@ -45,6 +45,7 @@ from visloc.errors import (
     NotFound,
     Unavailable,
     VislocError,
+    refuse,
 )
 from visloc.priors import Priors
 from visloc.sets.choosing import (
@@ -248,14 +249,10 @@ class SetSearch:
         return await together(of(row) for row in rows)
 
 
-def tile_unavailable(tile: TileRecord, error: VislocError) -> Unavailable:
+def tile_unavailable(tile: TileRecord, error: VislocError) -> VislocError:
     """``set.tile_unavailable``."""
-    return Unavailable(
-        "set.tile_unavailable",
-        f"a tile of the set that may show this cannot be opened: {error.message}",
-        field="map",
-        expected=tile.ref,
-        got=error.code,
+    return refuse(
+        "set.tile_unavailable", field="map", expected=tile.ref, got=error.code, why=error.message
     )
 
 
@@ -308,7 +305,7 @@ def check_no_tiles(maps: Sequence[MapFolder], priors: Priors) -> None:
         InvalidInput: ``priors.maps``.
     """
     if priors.maps is not None:
-        raise InvalidInput(
+        raise refuse(
             "priors.maps",
             "only a set of maps has tiles",
             field="priors.maps",

@@ -54,7 +54,7 @@ from service.telemetry.metrics import ServiceState
 from service.telemetry.metrics_port import metrics_response
 from service.telemetry.observer import Observer, route_of
 from service.values import Instant, InstantLocalization, SequenceStart
-from visloc.errors import InvalidInput, NotFound, Overloaded, VislocError
+from visloc.errors import InvalidInput, NotFound, VislocError, refuse
 
 logger = logging.getLogger(__name__)
 
@@ -284,19 +284,12 @@ class RequestEnvelope:
         await response(scope, receive, send)
 
 
-def _busy() -> Overloaded:
-    return Overloaded(
-        "server.busy", "requests are being served on all connections; try again shortly"
-    )
+def _busy() -> VislocError:
+    return refuse("server.busy", "all connections are busy; try again shortly")
 
 
-def _ambiguous() -> InvalidInput:
-    return InvalidInput(
-        "request.framing",
-        "the request says in two ways where its body ends",
-        field="Transfer-Encoding",
-        expected="Content-Length or Transfer-Encoding, not both",
-    )
+def _ambiguous() -> VislocError:
+    return refuse("request.framing", field="Transfer-Encoding")
 
 
 async def _next_of(answers: AsyncGenerator[InstantLocalization]) -> InstantLocalization:
@@ -362,8 +355,9 @@ async def _on_http_exception(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     status = HTTPStatus(error.status_code)
     kind = NotFound if status == HTTPStatus.NOT_FOUND else InvalidInput
-    code = "http." + status.phrase.lower().replace(" ", "_").replace("-", "_")
-    refused = kind(code, status.phrase, got=f"{request.method} {request.url.path}")
+    name = status.phrase.lower().replace(" ", "_").replace("-", "_")
+    asked = f"{request.method} {request.url.path}"
+    refused = refuse(f"http.{name}", status.phrase, got=asked, kind=kind)
     response = _refused(request, refused, status)
     response.headers.update(error.headers or {})
     return response

@@ -24,7 +24,7 @@ from service.api.message import MAX_INSTANT_VALUES
 from service.http.slow_clients import arrivals_of
 from service.settings import REQUEST_OVERHEAD_BYTES, ServiceSettings
 from service.values import Instant, LocalizeJob, RigJob, SequenceStart
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 
 _CHUNK_BYTES = 64 * 1024
 # The parts of the form of one photo that are files, and how curl sends them.
@@ -168,9 +168,8 @@ def checked_media_type(request: Request, kinds: Collection[str]) -> str:
     """
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type not in kinds:
-        raise InvalidInput(
+        raise refuse(
             "request.content_type",
-            "this kind of body is not read here",
             field="Content-Type",
             expected=" or ".join(kinds),
             got=media_type or "none",
@@ -203,9 +202,9 @@ async def _read_batch(
         )
         if form.texts.keys() != {"request"}:
             name = next(iter(form.texts), None)
-            raise InvalidInput(
+            raise refuse(
                 "request.missing_field" if name is None else "request.unknown_field",
-                "the form needs the request as a text",
+                "the form needs the request as a text part",
                 field="request" if name is None else name[:100],
                 expected="a text, as of curl -F 'request=<request.json'",
                 got="a file" if name is None and "request" in form.files else name,
@@ -265,7 +264,7 @@ def _parse_form(
         try:
             for name, value in parsed.multi_items():
                 if name in form.texts or name in form.files:
-                    raise InvalidInput("request.duplicate_field", "given twice", field=name[:100])
+                    raise refuse("request.duplicate_field", field=name[:100])
                 if isinstance(value, UploadFile):
                     form.files[name] = await value.read()
                 else:
@@ -277,7 +276,7 @@ def _parse_form(
     try:
         return asyncio.run(parse())
     except MultiPartException as error:
-        raise InvalidInput("request.malformed", error.message, expected=expected) from None
+        raise refuse("request.malformed", error.message, expected=expected) from None
 
 
 def _check_kinds(form: _Form) -> None:
@@ -287,16 +286,16 @@ def _check_kinds(form: _Form) -> None:
         InvalidInput: ``request.invalid``.
     """
     for name in form.texts.keys() & _FILES.keys():
-        raise InvalidInput(
+        raise refuse(
             "request.invalid",
-            "the wrong kind of form part",
+            "the form has the wrong kind of part here",
             field=name,
             expected=f"a file, as of curl -F {name}=@{_FILES[name]}",
         )
     for name in form.files.keys() & (LocalizeRequest.model_fields.keys() - _FILES.keys()):
-        raise InvalidInput(
+        raise refuse(
             "request.invalid",
-            "the wrong kind of form part",
+            "the form has the wrong kind of part here",
             field=name,
             expected="a text, without a file name",
         )

@@ -16,7 +16,7 @@ from service.http.openapi.app import problems
 from service.http.responses import json_response
 from service.http.slow_clients import arrivals_of
 from service.settings import ServiceSettings
-from visloc.errors import TooLarge
+from visloc.errors import refuse
 
 _PACKED = ("application/zip", "application/octet-stream")
 _PACKED_BODY: dict[str, Any] = {
@@ -118,7 +118,7 @@ def add_map_routes(app: FastAPI, engine: Engine, settings: ServiceSettings) -> N
 def _check_declared_size(request: Request, settings: ServiceSettings) -> None:
     declared = request.headers.get("content-length", "")
     if declared.isdecimal() and int(declared[:20]) > settings.max_upload_bytes:
-        raise TooLarge(
+        raise refuse(
             "request.too_large",
             "the packed map has too many bytes",
             expected=f"at most {settings.max_upload_bytes} bytes",

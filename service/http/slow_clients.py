@@ -17,7 +17,7 @@ from service.grpc.calls import Handler, behaviour_of, handler_like
 from service.grpc.connections import GrpcConnections
 from service.grpc.envelope import Context, Envelope
 from service.http.acceptor import Connection, OpenConnections
-from visloc.errors import InvalidInput, Overloaded, TimedOut, TooLarge
+from visloc.errors import InvalidInput, TimedOut, VislocError, refuse
 
 # Calls whose only message may be large.
 _LARGE_MESSAGES = ("Localize", "LocalizeRig")
@@ -139,7 +139,7 @@ class Arrivals:
                     if len(body) + len(chunk) > limit:
                         raise _too_large(limit, "more")
                     if self._held + len(chunk) > self._max_bytes:
-                        raise Overloaded(
+                        raise refuse(
                             "server.busy", "too many bytes are arriving; try again shortly"
                         )
                     self._held += len(chunk)
@@ -249,28 +249,22 @@ async def _timely(messages: AsyncIterator[Any], patience_s: float) -> AsyncGener
         if message is None:
             return
         if isinstance(message, _Unreadable):
-            raise InvalidInput(
+            raise refuse(
                 "request.malformed",
-                "the message is not what the method takes",
+                "the message does not fit the method",
                 expected="a protobuf message as in localization.proto",
                 got=message.reason,
             )
         yield message
 
 
-def _too_large(limit: int, got: str) -> TooLarge:
-    return TooLarge(
-        "request.too_large",
-        "the request has too many bytes",
-        expected=f"at most {limit} bytes",
-        got=got,
-    )
+def _too_large(limit: int, got: str) -> VislocError:
+    return refuse("request.too_large", expected=f"at most {limit} bytes", got=got)
 
 
-def _too_slow(seconds: float, got: str) -> TimedOut:
-    return TimedOut(
+def _too_slow(seconds: float, got: str) -> VislocError:
+    return refuse(
         "request.too_slow",
-        "the request does not arrive",
         expected=f"all within {seconds:g} s, and a second more for every 100 kB",
         got=got,
     )

@@ -25,7 +25,7 @@ from fcntl import LOCK_EX, flock
 from pathlib import Path
 from typing import Any
 
-from visloc.errors import InvalidInput
+from visloc.errors import VislocError, refuse
 
 FORMAT = 1
 MAX_FILE_BYTES = 8 * 2**20
@@ -125,20 +125,14 @@ def read_keys(path: Path) -> tuple[Key, ...]:
             mode = os.fstat(file.fileno()).st_mode
             content = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
-        raise InvalidInput(
+        raise refuse(
             "keys.file",
             "the file of API keys cannot be read; `python -m service.keys init` makes one",
             field=str(path),
             got=error.strerror,
         ) from None
     if mode & (stat.S_IWGRP | stat.S_IWOTH):
-        raise InvalidInput(
-            "keys.permissions",
-            "others may write the file of API keys, and so let themselves in; chmod go-w",
-            field=str(path),
-            expected="a mode such as 600",
-            got=f"{stat.S_IMODE(mode):o}",
-        )
+        raise refuse("keys.permissions", field=str(path), got=f"{stat.S_IMODE(mode):o}")
     if len(content) > MAX_FILE_BYTES:
         raise _malformed(path, f"at most {MAX_FILE_BYTES} bytes", "more")
     try:
@@ -247,23 +241,16 @@ def check_key(key: Key, field: str) -> None:
         InvalidInput: ``keys.name``, ``keys.scopes``, ``keys.limit``.
     """
     if not _NAME.fullmatch(key.name):
-        raise InvalidInput("keys.name", "not a name", field=field, expected=NAME_RULE, got=key.name)
+        raise refuse("keys.name", field=field, expected=NAME_RULE, got=key.name)
     if not key.scopes:
-        raise InvalidInput(
-            "keys.scopes",
-            "a key without a scope is good for nothing",
-            field=field,
-            expected=f"some of {', '.join(Scope)}",
-        )
+        raise refuse("keys.scopes", field=field, expected=f"some of {', '.join(Scope)}")
     is_rate = key.rate is None or (_is_number(key.rate) and 0 < key.rate <= 1e6)
     counts = (key.burst, key.concurrency)
     are_counts = all(n is None or (type(n) is int and 1 <= n <= 10**6) for n in counts)
     if not is_rate or not are_counts or (key.rate is None) != (key.burst is None):
-        raise InvalidInput(
+        raise refuse(
             "keys.limit",
-            "a limit that cannot be used",
             field=field,
-            expected="rate above 0 with burst, concurrency from 1, each to a million",
             got=f"rate {key.rate}, burst {key.burst}, concurrency {key.concurrency}",
         )
 
@@ -272,7 +259,5 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _malformed(field: object, expected: str, got: str) -> InvalidInput:
-    return InvalidInput(
-        "keys.file", "not a file of API keys", field=str(field), expected=expected, got=got
-    )
+def _malformed(field: object, expected: str, got: str) -> VislocError:
+    return refuse("keys.file", field=str(field), expected=expected, got=got)

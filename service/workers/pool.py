@@ -26,7 +26,7 @@ from typing import Any, ParamSpec, TypeVar
 from service.errors import stopping_error
 from service.workers import process as worker
 from service.workers.process import Loaded, MapFolder, WorkerSettings
-from visloc.errors import TimedOut, Unavailable, VislocError
+from visloc.errors import VislocError, refuse
 
 logger = logging.getLogger(__name__)
 
@@ -323,7 +323,7 @@ class _Worker:
                 await asyncio.wait({future})
                 with suppress(BrokenProcessPool):
                     future.result()
-                raise TimedOut(
+                raise refuse(
                     "server.deadline",
                     "the request took too long; ask for less, or raise request_timeout_s",
                     expected=f"at most {limit_s:g} s",
@@ -341,8 +341,5 @@ class _Worker:
                 os.kill(self.pid, signal.SIGKILL)
 
 
-def _died() -> Unavailable:
-    return Unavailable(
-        "server.worker_died",
-        "the process that worked on the request died, and is being replaced; try again",
-    )
+def _died() -> VislocError:
+    return refuse("server.worker_died")

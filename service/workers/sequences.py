@@ -9,7 +9,7 @@ from service.api.message import inside
 from service.values import Instant, InstantLocalization, SequenceStart, check_order
 from service.workers.instants import Target, check_images, check_options, check_priors
 from service.workers.judging import judged
-from visloc.errors import InvalidInput, TooLarge
+from visloc.errors import refuse
 from visloc.localization.solving import SeenImage, Solved
 from visloc.priors import Priors
 from visloc.sequences.filling import TimeUnit, guess_time_unit
@@ -57,9 +57,8 @@ class SequenceRun:
             TooLarge: ``sequence.too_many_instants``, ``rig.too_many_images``.
         """
         if index >= self._max_instants:
-            raise TooLarge(
+            raise refuse(
                 "sequence.too_many_instants",
-                "too many instants in one sequence; send it in parts",
                 field="instants",
                 expected=f"at most {self._max_instants}",
             )
@@ -123,7 +122,7 @@ class SequenceRun:
             InvalidInput: ``sequence.empty`` when there was no instant.
         """
         if not self._solvers:
-            raise InvalidInput("sequence.empty", "there is no instant", field="instants")
+            raise refuse("sequence.empty", field="instants")
         for held, solver in zip(self._held, self._solvers, strict=True):
             held += solver.finish()
         # Motion may place instants that no image localizes; in several maps, it tells nothing.
@@ -197,10 +196,10 @@ def _is_metric(target: Target) -> bool:
 def _guessed_unit(timestamp: int) -> TimeUnit:
     unit = guess_time_unit([timestamp])
     if unit is None:
-        raise InvalidInput(
+        raise refuse(
             "sequence.time_unit",
-            "the unit of the timestamps cannot be told by their size",
+            "the size of the timestamps does not reveal their unit",
             field="time_unit",
-            expected=f"one of {', '.join(TimeUnit)}",
+            expected=TimeUnit,
         )
     return unit

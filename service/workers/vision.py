@@ -54,7 +54,7 @@ from service.workers.tiles import Read, TileChooser, read_query, summed, written
 from visloc.archive.places import anchor_rms
 from visloc.archive.store import open_published, open_published_set
 from visloc.drawing.matches_picture import draw_overlay
-from visloc.errors import Conflict, InvalidInput, MapCorrupt, VislocError
+from visloc.errors import Conflict, InvalidInput, VislocError, refuse
 from visloc.features import (
     GlobalDescriptor,
     LocalFeatureExtractor,
@@ -150,13 +150,7 @@ class Vision:
             try:
                 opened = self._opened_set(of) if of.is_set else self._opened_map(of)
             except InvalidInput as error:  # features that are not here: not the caller's mistake
-                raise Conflict(
-                    error.code,
-                    error.message,
-                    field=error.field,
-                    expected=error.expected,
-                    got=error.got,
-                ) from error
+                raise error.about(error.field, Conflict) from error
             opened.warm_up()
         logger.info("map %s loaded in %.1f s", of.ref, perf_counter() - start)
         return opened
@@ -399,9 +393,4 @@ def _damage_named(ref: str) -> Iterator[None]:
         raise
     except (Exception, SystemExit) as error:
         logger.exception("map %s cannot be used", ref)
-        raise MapCorrupt(
-            "map.unusable",
-            "the map cannot be used; rebuild it, or see the server's log for the cause",
-            field=ref,
-            got=type(error).__name__,
-        ) from error
+        raise refuse("map.unusable", field=ref, got=type(error).__name__) from error

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ValidationError
 from visloc.archive.npz import read_npy_header, read_npz
 from visloc.archive.schema import FORMAT_MAJOR, FORMAT_MINOR, Manifest
 from visloc.archive.set_schema import SET_FORMAT, SET_MAJOR, SET_MINOR, SetManifest
-from visloc.errors import InvalidInput, MapCorrupt
+from visloc.errors import VislocError, refuse
 
 RecordType = TypeVar("RecordType", bound=BaseModel)
 
@@ -92,9 +92,8 @@ def read_any_manifest(folder: Path) -> Manifest | SetManifest:
     newest = (SET_MAJOR, SET_MINOR) if of_set else (FORMAT_MAJOR, FORMAT_MINOR)
     major = version.partition(".")[0]
     if major.isascii() and major.isdigit() and len(major) < 9 and int(major) > newest[0]:
-        raise MapCorrupt(
+        raise refuse(
             "map.format_version",
-            "the map was written by a newer visloc; upgrade visloc or rebuild the map",
             field=str(path),
             expected=f"format {newest[0]}.x or older (this program writes {newest[0]}.{newest[1]})",
             got=version,
@@ -104,16 +103,10 @@ def read_any_manifest(folder: Path) -> Manifest | SetManifest:
     return _parse(Manifest, text, path, "map.manifest")
 
 
-def is_set(ref: str, manifest: SetManifest) -> InvalidInput:
+def is_set(ref: str, manifest: SetManifest) -> VislocError:
     """``map.is_set``."""
     some = ", ".join(tile.ref for tile in manifest.tiles[:3])
-    return InvalidInput(
-        "map.is_set",
-        "this is a set of maps, not a map; name one of its tiles",
-        field="map",
-        expected=f"a map, such as {some}",
-        got=ref,
-    )
+    return refuse("map.is_set", field="map", expected=f"a map, such as {some}", got=ref)
 
 
 def check_files(folder: Path, manifest: Manifest | SetManifest) -> None:
@@ -125,24 +118,18 @@ def check_files(folder: Path, manifest: Manifest | SetManifest) -> None:
     for name, entry in manifest.files.items():
         parts = PurePosixPath(name).parts
         if not parts or ".." in parts or name.startswith("/") or "\\" in name or "\0" in name:
-            raise MapCorrupt(
-                "map.file_name",
-                "a file name leads out of the map",
-                field=str(folder / "manifest.json"),
-                got=name,
-            )
+            raise refuse("map.file_name", field=str(folder / "manifest.json"), got=name)
         path = folder / name
         try:
             status = path.lstat()
         except (OSError, ValueError):  # ValueError: lone surrogates
             status = None
         if status is None or not stat.S_ISREG(status.st_mode):
-            raise MapCorrupt("map.file_missing", "a file of the map is missing", field=str(path))
+            raise refuse("map.file_missing", field=str(path))
         size = status.st_size
         if size != entry.size:
-            raise MapCorrupt(
+            raise refuse(
                 "map.file_size",
-                "a file of the map has another size than when it was published",
                 field=str(path),
                 expected=f"{entry.size} bytes",
                 got=f"{size} bytes",
@@ -158,9 +145,8 @@ def check_checksums(folder: Path, manifest: Manifest | SetManifest) -> None:
     for name, entry in manifest.files.items():
         digest = sha256_of(folder / name)
         if digest != entry.sha256:
-            raise MapCorrupt(
+            raise refuse(
                 "map.checksum",
-                "a file of the map was altered after it was published; restore or rebuild it",
                 field=str(folder / name),
                 expected=f"sha256 {entry.sha256}",
                 got=digest,
@@ -173,11 +159,7 @@ def check_checksums(folder: Path, manifest: Manifest | SetManifest) -> None:
         or manifest_hash(fields) != manifest.manifest_hash
         or content_hash(fields) != manifest.content_hash
     ):
-        raise MapCorrupt(
-            "map.manifest_hash",
-            "the manifest was altered after it was published; restore or rebuild the map",
-            field=str(path),
-        )
+        raise refuse("map.manifest_hash", field=str(path))
 
 
 def read_record(folder: Path, name: str, record: type[RecordType]) -> RecordType:
@@ -275,9 +257,9 @@ def read_model(folder: Path, name: str) -> dict[str, NDArray[np.float32]]:
     try:
         model = read_npz(path)
     except (ValueError, OSError) as error:
-        raise MapCorrupt(
+        raise refuse(
             "map.array",
-            "not a model file",
+            "the file does not hold a model",
             field=str(path),
             expected="an .npz without compression",
             got=str(error),
@@ -286,9 +268,9 @@ def read_model(folder: Path, name: str) -> dict[str, NDArray[np.float32]]:
         model[key] = _widened(model[key], model.pop(key + SCALES))
     for key, array in model.items():
         if array.dtype != np.float32 or not np.isfinite(array).all():
-            raise MapCorrupt(
+            raise refuse(
                 "map.array",
-                f"array {key!r} of a model is not usable",
+                f"array {key!r} of a model is not valid",
                 field=str(path),
                 expected="finite float32, or int8 with finite float32 scales of its columns",
                 got=str(array.dtype),
@@ -315,14 +297,14 @@ def _array_header(
             offset = file.tell()
             size = file.seek(0, os.SEEK_END)
     except (ValueError, OSError) as error:
-        raise MapCorrupt("map.array", "not a NumPy array file", field=str(path)) from error
+        raise refuse("map.array", "the file is not a NumPy array", field=str(path)) from error
     expected = np.dtype(dtype if before is None or found != np.dtype(before) else before)
     whole = size == offset + math.prod(shape) * expected.itemsize
     # Before any memory is taken: a header can say anything.
     if found != expected or found_shape != shape or not whole:
-        raise MapCorrupt(
+        raise refuse(
             "map.array",
-            "an array of the map is not what the manifest says",
+            "an array of the map does not match the manifest; restore or rebuild the map",
             field=str(path),
             expected=f"{expected} of shape {shape}, in a file as long as that",
             got=f"{found} of shape {found_shape}, in {size} bytes",
@@ -330,11 +312,9 @@ def _array_header(
     return expected, offset, "F" if fortran else "C"
 
 
-def _cut_short(path: Path) -> MapCorrupt:
-    return MapCorrupt(
-        "map.array",
-        "an array of the map could not be read to its end; restore or rebuild the map",
-        field=str(path),
+def _cut_short(path: Path) -> VislocError:
+    return refuse(
+        "map.array", "an array of the map is cut short; restore or rebuild the map", field=str(path)
     )
 
 
@@ -342,20 +322,20 @@ def _read_text(path: Path, limit: int, code: str) -> str:
     try:
         status = path.lstat()
         if not stat.S_ISREG(status.st_mode):  # to open a pipe is to wait for its other end
-            raise MapCorrupt(code, "not a file", field=str(path), expected="a plain file")
+            raise refuse(code, "this is not a plain file", field=str(path), expected="a plain file")
         if status.st_size > limit:
-            raise MapCorrupt(
+            raise refuse(
                 code, "the file is too large", field=str(path), expected=f"at most {limit} bytes"
             )
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise MapCorrupt(code, "the file is missing", field=str(path)) from None
+        raise refuse(code, "the file is missing", field=str(path)) from None
     except OSError as error:
-        raise MapCorrupt(
+        raise refuse(
             code, "the file cannot be read", field=str(path), got=error.strerror
         ) from error
     except UnicodeDecodeError as error:
-        raise MapCorrupt(code, "the file is not UTF-8 text", field=str(path)) from error
+        raise refuse(code, "the file is not UTF-8 text", field=str(path)) from error
 
 
 def _parse(record: type[RecordType], text: str, path: Path, code: str) -> RecordType:
@@ -364,7 +344,7 @@ def _parse(record: type[RecordType], text: str, path: Path, code: str) -> Record
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise MapCorrupt(
+        raise refuse(
             code, f"{where or 'the file'}: {first['msg']}", field=str(path), got=first["input"]
         ) from error
 

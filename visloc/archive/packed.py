@@ -24,7 +24,7 @@ from visloc.archive.checks import check_files, read_any_manifest
 from visloc.archive.set_rules import AnyManifest
 from visloc.archive.sets import SET_CODES
 from visloc.archive.store import storage_errors
-from visloc.errors import InvalidInput, TooLarge
+from visloc.errors import VislocError, refuse
 
 MANIFEST = "manifest.json"
 
@@ -137,22 +137,24 @@ def _read_entries(source: BinaryIO, max_bytes: int) -> dict[str, _Entry]:
         raise _bad_format("bytes that belong to no entry")
     total = sum(entry.size for entry in entries.values())
     if total > max_bytes:
-        raise TooLarge(
+        raise refuse(
             "packed.too_large",
-            "the map is too large",
             field="map",
             expected=f"at most {max_bytes} bytes",
             got=f"{total} bytes",
         )
     if MANIFEST not in entries:
-        raise InvalidInput(
-            "packed.files", "not a packed map", field="map", expected=f"an entry {MANIFEST}"
+        raise refuse(
+            "packed.files",
+            "the file is not a packed map: it has no manifest",
+            field="map",
+            expected=f"an entry {MANIFEST}",
         )
     limit = _MAX_MANIFEST_BYTES + _MAX_MANIFEST_BYTES_PER_FILE * len(entries)
     if SET_CODES in entries:
         limit = _MAX_SET_MANIFEST_BYTES
     if entries[MANIFEST].size > limit:
-        raise TooLarge(
+        raise refuse(
             "packed.too_large",
             "the manifest is too large",
             field=MANIFEST,
@@ -189,7 +191,7 @@ def _read_end(source: BinaryIO) -> tuple[int, int, int]:
     if start + length != stop:
         raise _bad_format("the list of its entries is not where it should be")
     if count > MAX_ENTRIES or length > _MAX_DIRECTORY_BYTES:
-        raise TooLarge(
+        raise refuse(
             "packed.too_large",
             "the archive has too many entries",
             field="map",
@@ -285,16 +287,18 @@ def _check_listed(entries: dict[str, _Entry], manifest: AnyManifest) -> None:
     del files[MANIFEST]
     listed = {name: entry.size for name, entry in manifest.files.items()}
     for name in sorted(files.keys() ^ listed.keys()):
-        raise InvalidInput(
+        raise refuse(
             "packed.files",
-            "is not in the archive" if name in listed else "is not listed in the manifest",
+            "the archive does not have this file of the manifest"
+            if name in listed
+            else "the manifest does not list this file",
             field=name,
         )
     for name, size in files.items():
         if size != listed[name]:
-            raise InvalidInput(
+            raise refuse(
                 "packed.files",
-                "has another size than the manifest says",
+                "the file does not have the size in the manifest",
                 field=name,
                 expected=f"{listed[name]} bytes",
                 got=f"{size} bytes",
@@ -329,15 +333,9 @@ def _read(source: BinaryIO, start: int, length: int) -> bytes:
     return data
 
 
-def _bad_format(why: str) -> InvalidInput:
-    return InvalidInput(
-        "packed.format",
-        "not a packed map",
-        field="map",
-        expected="a file as `mapping pack` writes it",
-        got=why,
-    )
+def _bad_format(why: str) -> VislocError:
+    return refuse("packed.format", field="map", got=why)
 
 
-def _bad_entry(name: str, why: str) -> InvalidInput:
-    return InvalidInput("packed.entry", f"an entry {why}", field="map", got=name)
+def _bad_entry(name: str, why: str) -> VislocError:
+    return refuse("packed.entry", field="map", got=name, why=why)

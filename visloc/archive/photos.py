@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from visloc.archive.checks import map_array, read_record
 from visloc.archive.reader import MapOutline
 from visloc.archive.schema import ImageRecord, ImagesFile
-from visloc.errors import MapCorrupt
+from visloc.errors import refuse
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,11 +38,7 @@ def read_photos(folder: Path, outline: MapOutline) -> MappingPhotos:
     images = read_record(folder, "images.json", ImagesFile).images
     num = outline.manifest.counts.images
     if len(images) != num or any(image.camera not in outline.cameras for image in images):
-        raise MapCorrupt(
-            "map.images",
-            "the photos do not fit the manifest or the cameras",
-            field=str(folder / "images.json"),
-        )
+        raise refuse("map.images", field=str(folder / "images.json"))
     poses = map_array(folder, "image_poses.npy", "<f8", (num, 7), load=True)
     conjugate = np.where(poses[:, :1] < 0, -1.0, 1.0) * poses[:, :4] * (1.0, -1.0, -1.0, -1.0)
     return MappingPhotos(images, -_rotated(conjugate, poses[:, 4:]), conjugate)

@@ -29,7 +29,7 @@ from visloc.archive.schema import (
     Manifest,
     photo_file,
 )
-from visloc.errors import InvalidInput, MapCorrupt
+from visloc.errors import InvalidInput, refuse
 from visloc.geometry import Camera, Pose
 from visloc.retrieval.fusion import LateFusion
 from visloc.retrieval.rows import GlobalRows
@@ -174,7 +174,7 @@ def outline_of(folder: Path, manifest: Manifest) -> MapOutline:
             },
         )
     except InvalidInput as error:
-        raise MapCorrupt("map.cameras", str(error), field=str(folder / "cameras.json")) from error
+        raise refuse("map.cameras", str(error), field=str(folder / "cameras.json")) from error
 
 
 def open_map(folder: Path) -> Map:
@@ -195,9 +195,8 @@ def open_map(folder: Path) -> Map:
         for record in manifest.global_features
     }
     if len(set(files.values())) != len(manifest.global_features):
-        raise MapCorrupt(
+        raise refuse(
             "map.manifest",
-            "two global descriptors of one name",
             field=str(folder / "manifest.json"),
             got=", ".join(record.fingerprint.name for record in manifest.global_features),
         )
@@ -206,18 +205,16 @@ def open_map(folder: Path) -> Map:
         described += [name for name, _, _ in _beside_rows(record, n)]
     for name in (*_ARRAYS, *described):
         if name not in manifest.files:
-            raise MapCorrupt(
-                "map.file_missing", "a file that every such map has is not listed", field=name
+            raise refuse(
+                "map.file_missing",
+                "the manifest does not list a file that every such map has",
+                field=name,
             )
     _check_photos(folder, manifest)
     images = read_record(folder, "images.json", ImagesFile).images
     outline = outline_of(folder, manifest)
     if len(images) != n or any(image.camera not in outline.cameras for image in images):
-        raise MapCorrupt(
-            "map.images",
-            "the photos do not fit the manifest or the cameras",
-            field=str(folder / "images.json"),
-        )
+        raise refuse("map.images", field=str(folder / "images.json"))
     return Map(
         path=folder,
         manifest=manifest,
@@ -285,9 +282,7 @@ def verify_map(folder: Path) -> Map:
             fine[f"index/{stem}.members.npy"] = _are_good(rows.clusters, counts.images)
     for name, good in fine.items():
         if not good:
-            raise MapCorrupt(
-                "map.range", "numbers are out of their range", field=str(folder / name)
-            )
+            raise refuse("map.range", field=str(folder / name))
     return opened
 
 
@@ -342,9 +337,8 @@ def _check_photos(folder: Path, manifest: Manifest) -> None:
     files = [manifest.files.get(photo_file(row)) for row in range(manifest.counts.images)]
     kept = [file for file in files if file is not None]
     if kept and (len(kept) < len(files) or max(file.size for file in kept) > MAX_PHOTO_BYTES):
-        raise MapCorrupt(
+        raise refuse(
             "map.photos",
-            "the map keeps some of its photos only, or large ones",
             field=str(folder / "photos"),
             expected=f"{len(files)} files of at most {MAX_PHOTO_BYTES} bytes, or none",
             got=f"{len(kept)} files, the largest of {max(file.size for file in kept)} bytes",

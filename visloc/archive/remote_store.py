@@ -58,9 +58,9 @@ from visloc.errors import (
     Conflict,
     MapCorrupt,
     NotFound,
-    StorageFull,
     Unavailable,
     VislocError,
+    refuse,
 )
 
 logger = logging.getLogger(__name__)
@@ -158,12 +158,7 @@ class RemoteMapStore:
         if known.current is None:
             raise none_in_use(map_id, known.versions)
         if not ID_PATTERN.fullmatch(known.current):
-            raise MapCorrupt(
-                "map.current",
-                "does not name a version",
-                field=f"{self.url}/{map_id}/{CURRENT}",
-                got=known.current,
-            )
+            raise refuse("map.current", field=f"{self.url}/{map_id}/{CURRENT}", got=known.current)
         return known.current
 
     def at_hand(self, ref: str) -> Path | None:
@@ -452,19 +447,11 @@ class RemoteMapStore:
         if not versions:
             raise self._unknown_map(map_id)
         if version not in versions:
-            raise NotFound(
-                "map.version",
-                f"map {map_id!r} has no such version",
-                field="map",
-                expected=f"one of: {', '.join(versions)}",
-                got=version,
-            )
+            raise refuse("map.version", field="map", expected=versions, got=version, map_id=map_id)
 
-    def _unknown_map(self, map_id: str) -> NotFound:
+    def _unknown_map(self, map_id: str) -> VislocError:
         known = ", ".join(self.ids()) or "none"
-        return NotFound(
-            "map.unknown", "no such map", field="map", expected=f"one of: {known}", got=map_id
-        )
+        return refuse("map.unknown", field="map", expected=f"one of: {known}", got=map_id)
 
     # Manifests
 
@@ -596,7 +583,7 @@ class RemoteMapStore:
                         raise self._damaged(map_id, version, MANIFEST, "is too large")
                     self._fs.get_file(f"{place}/{MANIFEST}", str(target / MANIFEST))
                 except (FileNotFoundError, KeyError):
-                    raise NotFound(
+                    raise refuse(
                         "map.version", "the version was removed", field="map", got=version
                     ) from None
             manifest = read_any_manifest(target)
@@ -614,9 +601,9 @@ class RemoteMapStore:
     def _make_room(self, size: int) -> None:
         """Delete the least recently used copies until a map of ``size`` bytes fits."""
         if size > self._max_bytes:
-            raise StorageFull(
+            raise refuse(
                 "maps.storage_full",
-                "the map is larger than the room for copies (max_cache_bytes)",
+                "the map is larger than the space for copies (max_cache_bytes)",
                 field=str(self._copies.root),
                 expected=f"at least {size} bytes",
                 got=f"{self._max_bytes} bytes",
@@ -634,8 +621,8 @@ class RemoteMapStore:
                 self._copies.remove(folder.parent.name, folder.name)
             used -= freed
 
-    def _damaged(self, map_id: str, version: str, name: str, why: str) -> MapCorrupt:
-        return MapCorrupt(
+    def _damaged(self, map_id: str, version: str, name: str, why: str) -> VislocError:
+        return refuse(
             "map.file_size",
             f"a file of the map in the storage {why}",
             field=f"{self.url}/{map_id}/{version}/{name}",
@@ -689,13 +676,8 @@ class RemoteMapStore:
             raise self._away(type(error).__name__) from None  # its text may tell secrets
         self._away_until = NEVER
 
-    def _away(self, why: str) -> Unavailable:
-        return Unavailable(
-            "maps.storage_away",
-            "the storage of the maps does not answer; try again in a few seconds",
-            field=self.url,
-            got=why,
-        )
+    def _away(self, why: str) -> VislocError:
+        return refuse("maps.storage_away", field=self.url, got=why)
 
 
 def _options_for(url: str) -> dict[str, Any]:

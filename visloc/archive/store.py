@@ -38,12 +38,10 @@ from visloc.archive.sets import (
     verify_any,
 )
 from visloc.errors import (
-    Conflict,
-    Forbidden,
-    InvalidInput,
     MapCorrupt,
     NotFound,
-    StorageFull,
+    VislocError,
+    refuse,
 )
 
 CURRENT = "current"
@@ -88,13 +86,17 @@ class MapStore:
             if versions:
                 raise none_in_use(map_id, versions) from None
             known = ", ".join(self.ids()) or "none"
-            raise NotFound(
-                "map.unknown", "no such map", field="map", expected=f"one of: {known}", got=map_id
+            raise refuse(
+                "map.unknown", field="map", expected=f"one of: {known}", got=map_id
             ) from None
         except (OSError, UnicodeDecodeError) as error:
-            raise MapCorrupt("map.current", "cannot be read", field=str(path)) from error
+            raise refuse(
+                "map.current",
+                "the file that names the version in use cannot be read",
+                field=str(path),
+            ) from error
         if not ID_PATTERN.fullmatch(version):
-            raise MapCorrupt("map.current", "does not name a version", field=str(path), got=version)
+            raise refuse("map.current", field=str(path), got=version)
         return version
 
     def folder(self, ref: str) -> Path:
@@ -111,12 +113,12 @@ class MapStore:
         if not folder.is_dir():
             if not self.versions(map_id):
                 self.current_version(map_id)  # raises: no such map
-            raise NotFound(
+            raise refuse(
                 "map.version",
-                f"map {map_id!r} has no such version",
                 field="map",
                 expected=f"one of: {', '.join(self.versions(map_id)) or 'none'}",
                 got=version,
+                map_id=map_id,
             )
         return folder
 
@@ -408,9 +410,8 @@ def read_published_outline(folder: Path) -> MapOutline | SetOutline:
 def refuse_renamed(manifest: AnyManifest, folder: Path, map_id: str, version: str) -> None:
     """Raise MapCorrupt ``map.renamed`` unless a manifest is of this name."""
     if (manifest.id, manifest.version) != (map_id, version):
-        raise MapCorrupt(
+        raise refuse(
             "map.renamed",
-            "the map's folder was copied or renamed; build the map under its new id",
             field=str(folder),
             expected=f"{manifest.id}/{manifest.version}",
             got=f"{map_id}/{version}",
@@ -420,9 +421,9 @@ def refuse_renamed(manifest: AnyManifest, folder: Path, map_id: str, version: st
 def checked_name(name: str, what: str) -> str:
     """Return an id of a map or version; InvalidInput ``map.id`` for what cannot be one."""
     if not ID_PATTERN.fullmatch(name):
-        raise InvalidInput(
+        raise refuse(
             "map.id",
-            f"not a {what} name",
+            f"this is not a valid name of a {what}",
             field="map",
             expected="up to 64 letters, digits, '.', '_', '-', beginning with a letter or digit",
             got=name,
@@ -430,43 +431,30 @@ def checked_name(name: str, what: str) -> str:
     return name
 
 
-def version_exists(map_id: str, version: str) -> Conflict:
+def version_exists(map_id: str, version: str) -> VislocError:
     """``map.version_exists``."""
-    return Conflict(
-        "map.version_exists",
-        "the version exists already; versions never change, publish under another name",
-        field="map",
-        got=f"{map_id}@{version}",
-    )
+    return refuse("map.version_exists", field="map", got=f"{map_id}@{version}")
 
 
-def none_in_use(map_id: str, versions: Sequence[str]) -> NotFound:
+def none_in_use(map_id: str, versions: Sequence[str]) -> VislocError:
     """``map.none_in_use``."""
-    return NotFound(
+    return refuse(
         "map.none_in_use",
-        "no version of the map is in use; put one into use, or name one",
         field="map",
-        expected=f"one of: {', '.join(f'{map_id}@{version}' for version in versions)}",
+        expected=(f"{map_id}@{version}" for version in versions),
         got=map_id,
     )
 
 
-def version_in_use(map_id: str, version: str, others: Sequence[str]) -> Conflict:
+def version_in_use(map_id: str, version: str, others: Sequence[str]) -> VislocError:
     """``map.version_in_use``."""
-    return Conflict(
-        "map.version_in_use",
-        "the version is in use; make another one current first",
-        field="map",
-        expected=f"one of: {', '.join(others)}",
-        got=f"{map_id}@{version}",
-    )
+    return refuse("map.version_in_use", field="map", expected=others, got=f"{map_id}@{version}")
 
 
-def outdated(map_id: str, based_on: str, current: str | None) -> Conflict:
+def outdated(map_id: str, based_on: str, current: str | None) -> VislocError:
     """``map.outdated``."""
-    return Conflict(
+    return refuse(
         "map.outdated",
-        "another version of the map came into use meanwhile; run the same command again on it",
         field="map",
         expected=f"{map_id}@{based_on}",
         got="no version" if current is None else f"{map_id}@{current}",
@@ -485,18 +473,9 @@ def storage_errors(place: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in FULL:
-            raise StorageFull(
-                "maps.storage_full",
-                "no room on the disk; remove maps or versions that are not needed",
-                field=str(place),
-            ) from error
+            raise refuse("maps.storage_full", field=str(place)) from error
         if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
-            raise Forbidden(
-                "maps.read_only",
-                "the folder of maps may not be written to by this program",
-                field=str(place),
-                got=error.strerror,
-            ) from error
+            raise refuse("maps.read_only", field=str(place), got=error.strerror) from error
         raise
 
 

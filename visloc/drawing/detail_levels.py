@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from visloc.archive.checks import array_rows, is_finite, map_array
 from visloc.archive.schema import Manifest
-from visloc.errors import MapCorrupt
+from visloc.errors import refuse
 
 MAGIC = b"VLPT"
 FORMAT = 1
@@ -59,9 +59,7 @@ def read_landmarks(folder: Path, manifest: Manifest) -> NDArray[np.float32]:
     """
     landmarks = map_array(folder, _LANDMARKS, "<f4", (manifest.counts.landmarks, 3), load=True)
     if not is_finite(landmarks):
-        raise MapCorrupt(
-            "map.range", "numbers are out of their range", field=str(folder / _LANDMARKS)
-        )
+        raise refuse("map.range", field=str(folder / _LANDMARKS))
     return landmarks
 
 

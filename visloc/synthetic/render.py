@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
 from visloc.synthetic.scene import Rectangle, Scene
 from visloc.synthetic.textures import Image
@@ -108,9 +108,9 @@ def _cast(
 ) -> _Hits:
     """Send rays x rays rays through each pixel and keep the nearest hits."""
     if camera.model != "PINHOLE":
-        raise InvalidInput(
+        raise refuse(
             "camera.model",
-            "the renderer knows one camera model",
+            "the renderer supports one camera model only",
             field="camera.model",
             expected="PINHOLE",
             got=camera.model,

@@ -26,7 +26,7 @@ from mapping.maps.updating.localizing import Placed
 from mapping.maps.updating.settings import UpdateSettings
 from visloc.archive import Map
 from visloc.archive.schema import photo_file
-from visloc.errors import Conflict, DatasetError
+from visloc.errors import refuse
 from visloc.features.local.readymade import is_ready_made, ready_made_type
 from visloc.kapture import Dataset, open_features
 from visloc.localization.fingerprints import check_fingerprint
@@ -92,12 +92,7 @@ def collect_capture(
         )
     photos = [photo for photo in photos if photo.camera_known]
     if not photos:
-        raise DatasetError(
-            "dataset.no_photos",
-            "no photo of the dataset has a camera of a known model",
-            field=str(dataset.root / "sensors" / "sensors.txt"),
-            expected="a model with its parameters",
-        )
+        raise refuse("dataset.no_photos", field=str(dataset.root / "sensors" / "sensors.txt"))
     names = [
         photo.name if settings.capture is None else f"{settings.capture}/{photo.name}"
         for photo in photos
@@ -105,14 +100,7 @@ def collect_capture(
     known = {image.name for image in opened.images}
     both = [name for name in names if name in known]
     if both:
-        raise Conflict(
-            "update.photos",
-            "the map has photos of these names; if these are others, name the capture: "
-            "--capture NAME puts NAME/ before the names of its photos",
-            field="--capture",
-            expected="names that the map does not have",
-            got=f"{len(both)}: {some(both)}",
-        )
+        raise refuse("update.photos", field="--capture", got=f"{len(both)}: {some(both)}")
     return Capture(photos, names, {}), [*dataset.notes, *notes]
 
 

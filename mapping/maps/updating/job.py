@@ -56,7 +56,7 @@ from mapping.methods.sfm import SfmSettings, landmarks_from_matches
 from visloc.archive import Map, MapContent, MapStore, open_map
 from visloc.archive.schema import photo_file
 from visloc.archive.store import outdated
-from visloc.errors import Unavailable
+from visloc.errors import refuse
 from visloc.evaluation import pose_error
 from visloc.geometry import Similarity
 from visloc.kapture import Dataset, read_dataset
@@ -155,11 +155,8 @@ def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
             progress("archive", 1, 1)
             shutil.rmtree(work_root, ignore_errors=True)
     except OSError as error:
-        raise Unavailable(
-            "storage.failed",
-            f"reading or writing failed: {error.strerror or error}; "
-            "finished work is kept, the same command resumes",
-            field=str(error.filename or work_root),
+        raise refuse(
+            "storage.failed", field=str(error.filename or work_root), why=error.strerror or error
         ) from error
     return Updated(folder, record, notes)
 

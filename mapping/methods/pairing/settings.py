@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,10 +57,6 @@ class PairSettings:
 
 def _check(name: str, good: bool, expected: str, got: float) -> None:
     if not good:  # comparisons with NaN are false
-        raise InvalidInput(
-            f"pairs.{name}",
-            "not usable for pairing",
-            field=f"--{name.replace('_', '-')}",
-            expected=expected,
-            got=got,
+        raise refuse(
+            f"pairs.{name}", field=f"--{name.replace('_', '-')}", expected=expected, got=got
         )

@@ -30,7 +30,7 @@ from service.settings import ServiceSettings
 from service.telemetry.observer import Observer
 from service.values import InstantLocalization, Localization, LocalizeJob, RigJob
 from visloc.archive import Geodetic
-from visloc.errors import InvalidInput, NotFound
+from visloc.errors import InvalidInput, VislocError, refuse
 from visloc.geometry import Pose
 from visloc.geopose import accuracy_of
 from visloc.types import Localized
@@ -117,9 +117,8 @@ def answer_kind(accept: list[str]) -> str:
             kind = f"{kind}; version={version}"
         best, best_quality = kind, quality
     if best is None:
-        raise InvalidInput(
+        raise refuse(
             "geopose.accept",
-            "such an answer is not given here",
             field="Accept",
             expected=f"{OSCP}; version=1.0 or 2.0, {OGC}, {JSON}, or nothing",
             got=", ".join(accept),
@@ -163,10 +162,7 @@ async def _answer(
     geopose, _ = geoposes_to_words(found.cam_from_world, found.geodetic, ypr=False)
     if geopose is None or found.geodetic is None:
         # Found by its anchor, and replaced by a version without one in that moment.
-        raise NotFound(
-            "geopose.not_anchored",
-            f"map {found.map_ref} localizes the photo and is not anchored to the Earth",
-        )
+        raise refuse("geopose.not_anchored", ref=found.map_ref)
     # Of a place that was simply given, nobody knows how exact it is.
     anchor = (await engine.map(found.map_ref)).outline.manifest.world.anchor
     accuracy = accuracy_of(
@@ -208,5 +204,5 @@ def _of_rig(found: InstantLocalization) -> _Found:
     return _Found(cam_from_world, covariance, found.geodetic, ref)
 
 
-def _not_localized(stage: str, reason: str, message: str) -> NotFound:
-    return NotFound("geopose.not_localized", message, got=f"{stage}: {reason}")
+def _not_localized(stage: str, reason: str, message: str) -> VislocError:
+    return refuse("geopose.not_localized", message, got=f"{stage}: {reason}")

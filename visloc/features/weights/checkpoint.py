@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load
 
-from visloc.errors import WeightsError
+from visloc.errors import refuse
 from visloc.features.weights.pickled_pca import PickledPca, stand_in
 
 MAX_FILE_BYTES = 256 * 2**20
@@ -133,25 +133,14 @@ def read_checkpoint(path: Path, max_bytes: int = MAX_FILE_BYTES) -> Checkpoint:
         with path.open("rb") as file:
             data = file.read(max_bytes + 1)
     except OSError as error:
-        raise WeightsError(
-            "weights.unreadable", "cannot be read", field=str(path), got=error.strerror
-        ) from error
+        raise refuse("weights.unreadable", field=str(path), got=error.strerror) from error
     if len(data) > max_bytes:
-        raise WeightsError(
-            "weights.too_large",
-            "too large for weights",
-            field=str(path),
-            expected=f"at most {max_bytes} bytes",
-        )
+        raise refuse("weights.too_large", field=str(path), expected=f"at most {max_bytes} bytes")
     try:
         content, tensors = _read(data)
     except _MALFORMED as error:
-        raise WeightsError(
-            "weights.format",
-            "not a whole file of plain tensors",
-            field=str(path),
-            expected="safetensors, or a state dict saved by torch.save",
-            got=f"{type(error).__name__}: {error}",
+        raise refuse(
+            "weights.format", field=str(path), got=f"{type(error).__name__}: {error}"
         ) from error
     return Checkpoint(path, hashlib.sha256(data).hexdigest(), tensors, _pca_of(content))
 
