@@ -197,6 +197,7 @@ def open_map(folder: Path) -> Map:
     if len(set(files.values())) != len(manifest.global_features):
         raise refuse(
             "map.manifest",
+            "two global descriptors have the same name",
             field=str(folder / "manifest.json"),
             got=", ".join(record.fingerprint.name for record in manifest.global_features),
         )

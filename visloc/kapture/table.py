@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from visloc.errors import InvalidInput, VislocError, refuse
+from visloc.errors import DatasetError, InvalidInput, VislocError, refuse
 
 _VERSION = re.compile(r"#\s*kapture format:\s*(\d{1,4})\.(\d{1,4})", re.ASCII)
 _INTEGER = re.compile(r"[+-]?\d{1,19}", re.ASCII)
@@ -70,7 +70,7 @@ class Table:
     def error(self, code: str, message: str | None = None, **parts: Any) -> VislocError:
         """Return an error about the current row; the arguments are those of ``refuse``."""
         where = f"{self.relative}:{self.line}" if self.line else self.relative
-        return refuse(code, message, field=where, **parts)
+        return refuse(code, message, field=where, kind=DatasetError, **parts)
 
     @contextmanager
     def errors_at_row(self) -> Iterator[None]:

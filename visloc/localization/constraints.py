@@ -107,6 +107,7 @@ class Constraints:
             name = "gravity" if gravity is not None else "height"
             raise refuse(
                 f"priors.{name}",
+                "the down direction of this map is unknown",
                 field=f"priors.{name}",
                 expected="a map that was built with --gravity, or priors.gravity with its world",
             )

@@ -218,7 +218,7 @@ def test_a_distortion_that_folds_the_photo_makes_the_camera_unknown(folder: Path
         (4, "a.jpg 500 1 0 0 0 nan 0 0 0 0", "not a usable number"),
         (4, "a.jpg 500 1 0 0 0 1e300 0 0 0 0", "not a usable number"),
         (4, "b.jpg 500 1 0 0 0 0 0 0 0 0", "two photos have the name"),
-        (4, "a\udcff.jpg 500 1 0 0 0 0 0 0 0 0", "not a usable name"),
+        (4, "a\udcff.jpg 500 1 0 0 0 0 0 0 0 0", "not a valid name"),
         (9, "0 0 1 10 20 30", "wrong number of fields"),
         (9, "0 0 1 10 20 30 2 0 0 1 2", "wrong number of fields"),
         (9, "0 0 1 10 20 30 99999999999999999 0 0 1 2", "not a usable number"),

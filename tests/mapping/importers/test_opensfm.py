@@ -464,5 +464,5 @@ def test_cut_off_features_are_refused(featured: Path, cut: int) -> None:
 def test_tracks_of_other_features_are_refused(featured: Path, feature: int, x: float) -> None:
     row = f"a.jpg\t17\t{feature}\t{x}\t0.2\t0.01\t1\t2\t3"
 
-    with pytest.raises(DatasetError, match=r"not those that .* was made of"):
+    with pytest.raises(DatasetError, match=r"the tracks in .* were made from other features"):
         read(write(featured, tracks=TRACKS + row))

@@ -137,6 +137,6 @@ def test_a_plugin_speaks_for_itself_about_its_weights(install: Install) -> None:
 
 def test_a_plugin_whose_features_have_another_name_is_refused(install: Install) -> None:
     install("mesh", "grid_features:load")
-    with pytest.raises(InvalidInput, match="has another name") as caught:
+    with pytest.raises(InvalidInput, match="makes features of another name") as caught:
         make_local_features("mesh")
     assert (caught.value.code, caught.value.got) == ("features.plugin", "grid")
