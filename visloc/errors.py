@@ -168,7 +168,7 @@ def refuse(
     if expected is None:
         expected = entry.expected
     elif not isinstance(expected, str):
-        expected = f"one of {', '.join(expected)}"
+        expected = f"one of {', '.join(expected) or 'none'}"
     text = entry.sentence.format(**values) if message is None else message
     return (kind or entry.kinds[0])(code, text, field=field, expected=expected, got=got)
 

@@ -18,7 +18,7 @@ from clients.transport.retry import RESEND_PAUSE_S, may_resend
 from clients.transport.uploads import OnProgress, Upload, pieces, pieces_async
 from clients.wire.requests import CheckReady, JsonObject
 from clients.wire.rig_requests import AnyRequest, SentInstant, SequenceStart
-from visloc.errors import Unavailable, VislocError, refuse
+from visloc.errors import VislocError, refuse
 
 _CONNECT_TIMEOUT_S = 10.0
 _LIMITS = httpx.Limits(
@@ -283,7 +283,7 @@ def _refusal(status: int, message: str, problem: Mapping[str, object]) -> Visloc
     return errors.received(parts, fallback, message)
 
 
-def _failure(server: str, timeout_s: float, error: httpx.HTTPError) -> Unavailable:
+def _failure(server: str, timeout_s: float, error: httpx.HTTPError) -> VislocError:
     if isinstance(error, httpx.TimeoutException) and not isinstance(error, httpx.ConnectTimeout):
         return errors.timed_out(server, timeout_s)
     return errors.unreachable(server, str(error) or type(error).__name__)

@@ -451,7 +451,7 @@ class RemoteMapStore:
 
     def _unknown_map(self, map_id: str) -> VislocError:
         known = ", ".join(self.ids()) or "none"
-        return refuse("map.unknown", field="map", expected=f"one of: {known}", got=map_id)
+        return refuse("map.unknown", field="map", expected=f"one of {known}", got=map_id)
 
     # Manifests
 

@@ -87,7 +87,7 @@ class MapStore:
                 raise none_in_use(map_id, versions) from None
             known = ", ".join(self.ids()) or "none"
             raise refuse(
-                "map.unknown", field="map", expected=f"one of: {known}", got=map_id
+                "map.unknown", field="map", expected=f"one of {known}", got=map_id
             ) from None
         except (OSError, UnicodeDecodeError) as error:
             raise refuse(
@@ -116,7 +116,7 @@ class MapStore:
             raise refuse(
                 "map.version",
                 field="map",
-                expected=f"one of: {', '.join(self.versions(map_id)) or 'none'}",
+                expected=self.versions(map_id),
                 got=version,
                 map_id=map_id,
             )

@@ -148,7 +148,7 @@ def test_verify_tells_that_the_features_of_a_map_are_others(
         (("build", "nowhere", "--map", "room"), "[map.exists] --map: map 'room' exists"),
         (
             ("build", "nowhere", "--map", "new", "--local-features", "surf"),
-            "[features.unknown] local_features: unknown feature; if a package brings it",
+            "[features.unknown] local_features: the features are unknown; if a package provides",
         ),
         (
             ("build", "nowhere", "--map", "new", "--local-features", "r2d2"),
@@ -164,9 +164,18 @@ def test_verify_tells_that_the_features_of_a_map_are_others(
         (("build", "x", "--map", "new", "--max-angle", "270"), "[pairs.max_angle] --max-angle"),
         (("build", "x", "--map", "new", "--near", "9", "--far", "2"), "[pairs.far] --far"),
         (("build", "x", "--map", "new", "--covisible-in", "y"), "[map.unknown]"),
-        (("build", "x", "--map", "new", "--gravity", "down"), "[build.gravity] --gravity: not a"),
-        (("build", "x", "--map", "new", "--gravity", "0,0"), "[build.gravity] --gravity: not a"),
-        (("build", "x", "--map", "new", "--gravity", "0,0,0"), "[build.gravity] --gravity: not a"),
+        (
+            ("build", "x", "--map", "new", "--gravity", "down"),
+            "[build.gravity] --gravity: this is not a",
+        ),
+        (
+            ("build", "x", "--map", "new", "--gravity", "0,0"),
+            "[build.gravity] --gravity: this is not a",
+        ),
+        (
+            ("build", "x", "--map", "new", "--gravity", "0,0,0"),
+            "[build.gravity] --gravity: this is not a",
+        ),
         (("build", "x", "--map", "new", "--gravity", "0,nan,1"), "[build.gravity] --gravity"),
         (("calibrate-rig", "nowhere"), "[kapture.no_dataset] sensors/sensors.txt: nowhere"),
         (("import", "colmap", "x"), "[import.target] --map: say whether to make"),
@@ -193,7 +202,7 @@ def test_an_error_is_one_line_with_its_code(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--size", "640"), "[sample.size] --size: not a size (expected WxH"),
+        (("--size", "640"), "[sample.size] --size: the size is not valid (expected WxH"),
         (("--size", "8x8"), "[sample.size] --size: photos of this size cannot be made"),
         (("--images", "1"), "[sample.images] --images"),
         (("--seed", "-1"), "[sample.seed] --seed"),

@@ -213,7 +213,7 @@ def test_photos_of_a_camera_that_no_lens_has_are_refused_by_name(tmp_path: Path)
         solved(around_an_object(), None, tmp_path, NONSENSE, radius=230)
     assert caught.value.code == "sfm.camera"
     assert caught.value.field == "cam/0.jpg, cam/1.jpg, cam/2.jpg, ..."
-    assert "plausible for any lens" in caught.value.message
+    assert "not plausible for any lens" in caught.value.message
     assert "import photos with --output first" in str(caught.value.expected)
 
 
@@ -256,7 +256,7 @@ def test_the_same_photos_give_the_same_bits(tmp_path: Path) -> None:
 
 def test_cameras_that_come_in_doubt_one_after_another_are_solved_so_often(tmp_path: Path) -> None:
     # Six cameras with a prior, two without. Each model has photos of one of them that is not in
-    # doubt yet, and determines nothing; of those without a prior it makes what plausible for any lens.
+    # doubt yet, and determines nothing; of those without a prior it makes what no lens has.
     points, poses = around_an_object()
     photos, shown = [], []
     for number, pose in enumerate(poses):

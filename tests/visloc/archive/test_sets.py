@@ -161,7 +161,7 @@ def test_a_tile_of_other_content_is_not_that_tile(
     elsewhere = MapStore(tmp_path / "elsewhere")
     elsewhere.publish(incoming("hall", "hall", "v1", notes=["another"]), "hall", "v1")
 
-    with pytest.raises(Conflict, match="another one") as caught:
+    with pytest.raises(Conflict, match="another tile") as caught:
         elsewhere.publish(incoming("house", "house", "v2"), "house", "v2")
     assert caught.value.code == "set.tile"
 
