@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from visloc import errors
-from visloc.errors import TimedOut, Unavailable, VislocError
+from visloc.errors import VislocError, refuse
 
 # By the name that the server sends.
 _KINDS = {
@@ -54,38 +54,24 @@ def received(parts: Mapping[str, object], fallback: Fallback, message: str) -> V
     )
 
 
-def unreachable(server: str, why: str) -> Unavailable:
+def unreachable(server: str, why: str) -> VislocError:
     """Make the exception for a server that refuses or drops the connection."""
     if "CERTIFICATE_VERIFY_FAILED" in why:
-        return Unavailable(
+        return refuse(
             "server.unreachable",
-            "the server's certificate is not trusted; name the authority that signed it: --ca, ca=",
+            "the certificate of the server is not trusted; name the authority that "
+            "signed it with --ca or ca=",
             field=server,
             got=why,
         )
-    return Unavailable(
-        "server.unreachable",
-        "the server cannot be reached; check that it runs, and its address and port",
-        field=server,
-        got=why or None,
-    )
+    return refuse("server.unreachable", field=server, got=why or None)
 
 
-def timed_out(server: str, timeout_s: float) -> TimedOut:
+def timed_out(server: str, timeout_s: float) -> VislocError:
     """Make the exception for an answer that did not come in time."""
-    return TimedOut(
-        "server.timeout",
-        "no answer in time; the server may be busy, or allow it more time",
-        field=server,
-        expected=f"an answer within {timeout_s:g} s",
-    )
+    return refuse("server.timeout", field=server, expected=f"an answer within {timeout_s:g} s")
 
 
-def not_understood(server: str, got: object) -> Unavailable:
+def not_understood(server: str, got: object) -> VislocError:
     """Make the exception for an answer that is not one of a localization service."""
-    return Unavailable(
-        "server.answer",
-        "this is not the answer of a localization service of this version; check the address",
-        field=server,
-        got=got,
-    )
+    return refuse("server.answer", field=server, got=got)

@@ -17,7 +17,7 @@ import typer
 
 from mapping.cluster.storage import place_of
 from mapping.cluster.workers import DEFAULT_WORKERS
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.features import global_feature_names, local_feature_names
 from visloc.geometry import PixelOrigin
 from visloc.types import Inference
@@ -57,13 +57,7 @@ def gravity_in(text: str) -> Vector:
     try:
         x, y, z = (float(number) for number in text.split(","))
     except ValueError:
-        raise InvalidInput(
-            "build.gravity",
-            "not a vector",
-            field="--gravity",
-            expected="X,Y,Z such as 0,0,-1",
-            got=text,
-        ) from None
+        raise refuse("build.gravity", field="--gravity", got=text) from None
     return x, y, z
 
 

@@ -27,7 +27,7 @@ from samples.trajectories import (
     query_trajectory,
     stereo_rig,
 )
-from visloc.errors import Conflict, InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Pose
 from visloc.kapture import Dataset, FileRecord, GnssRecord, Sensor, write_dataset
 
@@ -119,37 +119,20 @@ class _Run:
 
 def _check(root: Path, images: int, seed: int, size: tuple[int, int]) -> None:
     if not 2 <= images <= _MAX_IMAGES:
-        raise InvalidInput(
-            "sample.images",
-            "cannot make a sample of so many photos",
-            field="--images",
-            expected=f"2 to {_MAX_IMAGES}",
-            got=images,
-        )
+        raise refuse("sample.images", field="--images", expected=f"2 to {_MAX_IMAGES}", got=images)
     if not 0 <= seed < 2**31:
-        raise InvalidInput(
-            "sample.seed",
-            "not a seed",
-            field="--seed",
-            expected=f"0 to {2**31 - 1}",
-            got=seed,
-        )
+        raise refuse("sample.seed", field="--seed", expected=f"0 to {2**31 - 1}", got=seed)
     width, height = size
     if not (_SMALLEST[0] <= width <= _LARGEST and _SMALLEST[1] <= height <= _LARGEST):
-        raise InvalidInput(
+        raise refuse(
             "sample.size",
-            "cannot make photos of this size",
+            "photos of this size cannot be made",
             field="--size",
             expected=f"{_SMALLEST[0]}x{_SMALLEST[1]} to {_LARGEST}x{_LARGEST} pixels",
             got=f"{width}x{height}",
         )
     if root.exists() and not (root.is_dir() and not any(root.iterdir())):
-        raise Conflict(
-            "sample.exists",
-            "there is something already; name another folder or remove it",
-            field=str(root),
-            expected="a folder that is absent or empty",
-        )
+        raise refuse("sample.exists", field=str(root))
 
 
 def _runs(num_mapping: int, num_queries: int) -> tuple[_Run, _Run]:

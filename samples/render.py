@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from samples.scene import Rectangle, Scene
 from samples.textures import Image
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
 
 _NEAR_M = 0.01
@@ -108,9 +108,9 @@ def _cast(
 ) -> _Hits:
     """Send rays x rays rays through each pixel and keep the nearest hits."""
     if camera.model != "PINHOLE":
-        raise InvalidInput(
+        raise refuse(
             "camera.model",
-            "the renderer knows one camera model",
+            "the renderer supports one camera model only",
             field="camera.model",
             expected="PINHOLE",
             got=camera.model,

@@ -22,6 +22,7 @@ from visloc.errors import (
     Unavailable,
     VislocError,
     WeightsError,
+    refuse,
 )
 
 STATUSES: Mapping[type[VislocError], tuple[HTTPStatus, grpc.StatusCode]] = {
@@ -59,21 +60,18 @@ def statuses_of(error: VislocError) -> tuple[HTTPStatus, grpc.StatusCode]:
 
 def internal_error() -> VislocError:
     """Return the error for a bug of the server."""
-    return VislocError(
-        "server.internal", "the server made a mistake; its log has the request id and the cause"
-    )
+    return refuse("server.internal")
 
 
-def stopping_error() -> Unavailable:
+def stopping_error() -> VislocError:
     """Return the error for a request that the end of the server interrupts."""
-    return Unavailable("server.stopping", "the server is being stopped; ask another, or later")
+    return refuse("server.stopping")
 
 
-def too_slow(grace_s: float, got: str) -> TimedOut:
+def too_slow(grace_s: float, got: str) -> VislocError:
     """Return the error of a request whose body or next message does not arrive in time."""
-    return TimedOut(
+    return refuse(
         "request.too_slow",
-        "the request does not arrive",
         expected=f"all within {grace_s:g} s, and a second more for every 100 kB",
         got=got,
     )

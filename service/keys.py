@@ -18,7 +18,7 @@ from service.security.key_file import (
     read_keys,
     usual_burst,
 )
-from visloc.errors import Conflict, NotFound, VislocError
+from visloc.errors import VislocError, refuse
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -46,7 +46,7 @@ def _add(given: argparse.Namespace) -> None:
     key, token = new_key(given.name, scopes, **limits)
     with edited_keys(given.file) as keys:
         if any(key.name in (other.name, other.id) or key.id == other.id for other in keys):
-            raise Conflict("keys.exists", "there is a key of this name", field="name", got=key.name)
+            raise refuse("keys.exists", field="name", got=key.name)
         keys.append(key)
     _tell(key, token)
 
@@ -76,7 +76,7 @@ def _place(keys: Sequence[Key], key: str) -> int:
     for place, candidate in enumerate(keys):
         if key in (candidate.id, candidate.name):
             return place
-    raise NotFound("keys.unknown", "no such key", field="key", expected="an id or a name", got=key)
+    raise refuse("keys.unknown", field="key", got=key)
 
 
 def _tell(key: Key, token: str) -> None:

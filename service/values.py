@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import Geodetic, MapOutline, SetOutline
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Camera
 from visloc.priors import NO_PRIORS, Priors
 from visloc.sequences.filling import Odometry, TimeUnit
@@ -188,9 +188,8 @@ def check_order(before: int, timestamp: int) -> None:
         InvalidInput: ``sequence.timestamps``.
     """
     if timestamp <= before:
-        raise InvalidInput(
+        raise refuse(
             "sequence.timestamps",
-            "instants come in the order of time, each once",
             field="timestamp",
             expected=f"more than {before}, that of the instant before",
             got=timestamp,

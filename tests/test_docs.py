@@ -12,7 +12,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
-from http import HTTPStatus
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -39,20 +38,18 @@ from service.api import (
 )
 from service.errors import STATUSES
 from service.settings import CONFIG_VARIABLE, PREFIX, ServiceSettings, read_settings
-from tests import docs_check
+from tests import docs_check, error_docs
 from tests.docs_check import commands_of
 from visloc.archive import MapStore
-from visloc.errors import InvalidInput
+from visloc.errors import InvalidInput, catalogue
 from visloc.geometry import Camera, Pose
 from visloc.pose.centre import position_covariance
-from visloc.priors import Priors
 from visloc.types import (
     PRESETS,
     Extraction,
     Fusion,
     LocalizeOptions,
     Matcher,
-    Near,
     ReadAs,
     Reason,
     Solver,
@@ -407,88 +404,22 @@ def test_every_relative_link_leads_somewhere(page: Path) -> None:
 
 # docs/api.md and the code
 
-CODE = re.compile(
-    r"(access|request|image|camera|options|maps?|near|packed|page|features|weights|server|pose"
-    r"|geopose|debug|rig|sequence|set|upload)"
-    r"\.[a-z0-9_]+"
-)
-# Modules that take part in an answer, and the codes of theirs that no client meets.
-ANSWERING = (
-    *("service/**/*.py", "visloc/*.py", "visloc/archive/*.py", "visloc/features/**/*.py"),
-    *(f"visloc/{room}/*.py" for room in ("drawing", "localization", "sequences", "sets")),
-    "visloc_api/words/*.py",
-    *(
-        "clients/wire/requests.py",
-        "clients/transport/connection.py",
-        "clients/errors.py",
-        "clients/wire/types.py",
-    ),
-    "clients/transport/uploads.py",
-)
-NOT_MET = {
-    "image.missing",  # reading a file, in process
-    *("features.metric", "features.descriptor"),  # of files
-    "pose.device_from_world",  # a field
-    "map.outdated",  # of commands that edit a map
-}
+
+@pytest.mark.parametrize("page", error_docs.pages(), ids=lambda page: page.name)
+def test_the_tables_of_error_codes_are_those_of_the_catalogue(page: Path) -> None:
+    text = page.read_text()
+
+    assert error_docs.with_tables(text) == text, "run make docs-errors"
+    codes = error_docs.codes_wanted(text)
+    assert len(codes) == len(set(codes))
 
 
-def codes_in(node: ast.AST, pattern: re.Pattern[str] = CODE) -> Iterator[str]:
-    """The codes among the strings of a module; ``field=`` names fields, which look the same."""
-    if isinstance(node, ast.keyword) and node.arg == "field":
-        return
-    if (
-        isinstance(node, ast.Constant)
-        and isinstance(node.value, str)
-        and pattern.fullmatch(node.value)
-    ):
-        yield node.value
-    for child in ast.iter_child_nodes(node):
-        yield from codes_in(child, pattern)
+def test_the_page_of_the_api_lists_every_code_that_its_callers_meet() -> None:
+    listed = set(error_docs.codes_wanted(API.read_text()))
 
-
-def test_the_codes_listed_are_those_that_a_client_may_meet() -> None:
-    in_source = {
-        code
-        for pattern in ANSWERING
-        for path in ROOT.glob(pattern)
-        if "openapi" not in path.parts  # examples
-        for code in codes_in(ast.parse(path.read_text()))
+    assert listed == {
+        code for code, entry in catalogue().items() if entry.section in ("api", "clients")
     }
-    of_options = {f"options.{name}" for name in LocalizeOptions.__slots__}
-    of_priors = {f"priors.{name}" for name in Priors.__slots__}
-    of_near = {f"near.{name}" for name in Near.__slots__}
-    of_http = {f"http.{status.name.lower()}" for status in HTTPStatus}
-    listed = [code for row in table("codes") for code in words(row[0])]
-
-    assert len(listed) == len(set(listed))
-    assert set(listed) - of_http == (in_source | of_options | of_priors | of_near) - NOT_MET
-
-
-def test_the_codes_of_commands_that_change_maps_are_listed() -> None:
-    pattern = re.compile(r"(set|split|merge|prune|update)\.[a-z_]+")
-    in_source = {
-        code
-        for sources in (
-            *("mapping/maps/*.py", "mapping/maps/*/*.py"),
-            *("mapping/frames/set_poses.py", "mapping/cli/*.py"),
-            "visloc/archive/set_rules.py",
-        )
-        for path in ROOT.glob(sources)
-        for code in codes_in(ast.parse(path.read_text()), pattern)
-    }
-    listed = [
-        code
-        for page in ("map-sets.md", "living-maps.md")
-        for row in (ROOT / "docs" / page).read_text().partition("\n## Errors\n")[2].splitlines()
-        if row.startswith("|")
-        for code in words(row.split("|")[1])
-        if pattern.fullmatch(code)
-    ]
-
-    assert len(listed) == len(set(listed))
-    by_option = {"update.poses", "update.method"}  # put together with the name of the option
-    assert set(listed) == in_source | by_option
 
 
 def test_the_errors_have_the_statuses_that_are_listed() -> None:

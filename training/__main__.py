@@ -23,7 +23,7 @@ from training.ranges import paint_pictures, record_ranges
 from training.run import Trainer, resume, train
 from training.settings import PRESETS, Settings
 from training.validation import Score, features_of, validate, validation_pairs
-from visloc.errors import Conflict, InvalidInput, VislocError
+from visloc.errors import VislocError, refuse
 from visloc.features import make_local_features
 from visloc.features.backends.calibration import PICTURES, RECORDED
 
@@ -136,9 +136,7 @@ def _rooms(options: argparse.Namespace) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     if (options.folder / FILE_NAME).exists():
-        raise Conflict(
-            "training.exists", "there is a run in it; use resume", field=str(options.folder)
-        )
+        raise refuse("training.exists", field=str(options.folder))
     changed = {
         each.name: getattr(options, each.name)
         for each in dataclasses.fields(Settings)
@@ -162,7 +160,7 @@ def _trainer(settings: Settings, options: argparse.Namespace) -> Trainer:
         torch.set_num_threads(options.threads)
     device = torch.device(options.device)
     if device.type == "cuda" and not torch.cuda.is_available():
-        raise InvalidInput("training.device", "there is no CUDA GPU", field="device", got="cuda")
+        raise refuse("training.device", field="device", got="cuda")
     pack = read_pack(options.photos, device)
     described = {
         "photos_sha256": pack.sha256,

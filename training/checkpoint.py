@@ -13,7 +13,7 @@ import torch
 
 from training.files import write_whole
 from training.settings import Settings
-from visloc.errors import InvalidInput, NotFound
+from visloc.errors import NotFound, refuse
 
 FILE_NAME = "checkpoint.pt"
 _VERSION = 1
@@ -66,7 +66,7 @@ def load_state(path: Path, device: torch.device) -> State:
         InvalidInput: ``training.checkpoint`` if it is no checkpoint of this version.
     """
     if not path.is_file():
-        raise NotFound("training.checkpoint", "no such checkpoint", field=str(path))
+        raise refuse("training.checkpoint", field=str(path), kind=NotFound)
     try:
         content = torch.load(path, map_location=device, weights_only=True)
         _check_version(content["version"])
@@ -86,9 +86,9 @@ def load_state(path: Path, device: torch.device) -> State:
         TypeError,
         ValueError,
     ) as e:
-        raise InvalidInput(
+        raise refuse(
             "training.checkpoint",
-            "not a checkpoint of this training code",
+            "this is not a checkpoint of this training code",
             field=str(path),
             expected=f"version {_VERSION}",
             got=f"{type(e).__name__}: {e}",

@@ -10,7 +10,7 @@ import torch
 from training.checkpoint import State
 from training.files import write_tensors
 from training.network import ARCHITECTURES, TrainableR2D2
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.features.networks.r2d2.model import pack
 
 LICENCE = "BSD-3-Clause"
@@ -29,9 +29,8 @@ def export(state: State, output: Path) -> int:
     for number, convolution in enumerate(network.convolutions()):
         largest = float(convolution.weight.abs().max())
         if not largest < _LARGEST_HALF:
-            raise InvalidInput(
+            raise refuse(
                 "training.range",
-                "a weight does not fit 16 bits: was the network trained?",
                 field=f"convolutions.{number}",
                 expected=f"less than {_LARGEST_HALF}",
                 got=largest,

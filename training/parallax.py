@@ -20,7 +20,7 @@ from samples.scene import make_room
 from samples.trajectories import mapping_trajectory
 from training.files import write_tensors
 from training.homographies import rotation_about
-from visloc.errors import InvalidInput, NotFound
+from visloc.errors import NotFound, refuse
 from visloc.geometry import Camera, Pose
 
 WIDTH_PX, HEIGHT_PX = 480, 360
@@ -191,11 +191,7 @@ def read_rooms(path: Path, device: torch.device) -> tuple[Place, ...]:
         InvalidInput: ``training.rooms`` if it is another kind of file.
     """
     if not path.is_file():
-        raise NotFound(
-            "training.rooms",
-            "no such rooms; make them with: python -m training rooms",
-            field=str(path),
-        )
+        raise refuse("training.rooms", field=str(path), kind=NotFound)
     try:
         packed = load(path.read_bytes())
         names = sorted(name.removesuffix(".image") for name in packed if name.endswith(".image"))
@@ -203,7 +199,9 @@ def read_rooms(path: Path, device: torch.device) -> tuple[Place, ...]:
         for name in names:
             places.setdefault(name.rpartition("-")[0], []).append(_view(packed, name, device))
     except (SafetensorError, ValueError, KeyError, cv2.error) as error:
-        raise InvalidInput("training.rooms", f"no rooms: {error}", field=str(path)) from error
+        raise refuse(
+            "training.rooms", f"the rooms cannot be read: {error}", field=str(path)
+        ) from error
     return tuple(tuple(views) for views in places.values())
 
 

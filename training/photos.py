@@ -20,7 +20,7 @@ from safetensors.numpy import load
 from torch import Tensor
 
 from training.files import read_about, write_tensors
-from visloc.errors import InvalidInput, NotFound
+from visloc.errors import NotFound, refuse
 from visloc.images import read_photo
 
 VALIDATION = "validation"
@@ -78,7 +78,7 @@ def pack_photos(source: Path, output: Path, *, research: bool, validation: bool)
         arrays[name] = np.frombuffer(path.read_bytes(), np.uint8)
         licences[name] = _licences(path.parent / "SOURCES.tsv").get(path.name, "not stated")
     if not arrays:
-        raise NotFound("training.photos", "no photos", field=str(source), expected="*/*.jpg")
+        raise refuse("training.photos", field=str(source))
     write_tensors(output, arrays, {"licences": licences})
     return len(arrays)
 
@@ -96,20 +96,16 @@ def read_pack(path: Path, device: torch.device) -> Pack:
         InvalidInput: ``training.pack`` if it is no pack.
     """
     if not path.is_file():
-        raise NotFound(
-            "training.pack",
-            "no such pack of photos; make one with: python -m training pack",
-            field=str(path),
-        )
+        raise refuse("training.pack", field=str(path), kind=NotFound)
     data = path.read_bytes()
     try:
         packed = load(data)
         told = read_about(path)["licences"]
         licences = Counter(str(told[name]) for name in packed)
     except (SafetensorError, LookupError, TypeError, ValueError) as error:
-        raise InvalidInput(
+        raise refuse(
             "training.pack",
-            "no pack of photos of this version; make one with: python -m training pack",
+            "this is not a pack of photos of this version; make one with: python -m training pack",
             field=str(path),
             got=f"{type(error).__name__}: {error}",
         ) from error

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from training.run import LOG_NAME, VALIDATION_NAME
 from training.validation import THRESHOLDS_PX
-from visloc.errors import NotFound
+from visloc.errors import refuse
 
 _SMOOTH_SHARE = 0.02  # of the steps: single batches differ more than the network changes
 _PARTS = ("total", "peakiness", "reliability", "similarity")
@@ -30,7 +30,7 @@ def draw(folder: Path, beside: Path | None = None) -> list[Path]:
     """
     lines = _lines(folder / LOG_NAME)
     if not lines:
-        raise NotFound("training.log", "no steps to draw", field=str(folder / LOG_NAME))
+        raise refuse("training.log", field=str(folder / LOG_NAME))
     written = [_draw_losses(lines, folder / "loss.png")]
     scores = _lines(folder / VALIDATION_NAME)
     if scores:

@@ -22,7 +22,7 @@ from training.pairs import Pairs, Sources, make_pairs
 from training.sampler import sample
 from training.settings import Settings
 from training.validation import Score
-from visloc.errors import InvalidInput, VislocError
+from visloc.errors import VislocError, refuse
 
 LOG_NAME = "log.jsonl"
 VALIDATION_NAME = "validation.jsonl"
@@ -106,9 +106,8 @@ class Trainer:
         """
         different = self.settings.difference_to(state.settings)
         if different is not None:
-            raise InvalidInput(
+            raise refuse(
                 "training.settings",
-                "the checkpoint is of a run with other settings",
                 field=different,
                 expected=str(getattr(state.settings, different)),
                 got=getattr(self.settings, different),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 
 _BLOCK_PX = 8
 
@@ -69,12 +69,8 @@ class Settings:
             ("parallax_share", 0 <= self.parallax_share <= 1, "0 to 1"),
         ):
             if not is_right:
-                raise InvalidInput(
-                    "training.setting",
-                    "a setting that cannot be used",
-                    field=name,
-                    expected=expected,
-                    got=getattr(self, name),
+                raise refuse(
+                    "training.setting", field=name, expected=expected, got=getattr(self, name)
                 )
 
     @property

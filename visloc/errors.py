@@ -16,12 +16,17 @@
        +- StorageFull    ... because there is no room on its disk
 
 A photo that cannot be localized is not an error: it is an answer (``visloc.types.NotLocalized``).
+
+``error_codes.toml`` lists the codes with kind and sentence; ``refuse`` makes an error of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 
 
 class VislocError(Exception):
@@ -59,6 +64,12 @@ class VislocError(Exception):
             if value is not None
         ]
         return f"{text} ({', '.join(details)})" if details else text
+
+    def about(self, field: str | None, kind: type[VislocError] | None = None) -> VislocError:
+        """Return the same error about another field, and of another kind where one is given."""
+        return (kind or type(self))(
+            self.code, self.message, field=field, expected=self.expected, got=self.got
+        )
 
 
 class InvalidInput(VislocError):
@@ -113,6 +124,80 @@ class StorageFull(Unavailable):
     """There is no room on the server's disk."""
 
 
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """What the catalogue says about a code, or about a family of codes such as ``options.*``.
+
+    Attributes:
+        section: who raises it, for the docs.
+        kinds: the first is raised unless the place names another one of them.
+        sentence: has a ``{name}`` for each value that ``refuse`` takes.
+        note: more that the docs tell.
+        names: of a family, what stands for the ``*``.
+    """
+
+    section: str
+    kinds: tuple[type[VislocError], ...]
+    sentence: str
+    expected: str | None = None
+    note: str | None = None
+    names: str | None = None
+
+
+def refuse(
+    code: str,
+    message: str | None = None,
+    *,
+    field: str | None = None,
+    expected: str | Iterable[str] | None = None,
+    got: object = None,
+    kind: type[VislocError] | None = None,
+    **values: object,
+) -> VislocError:
+    """Return the error of a code, to be raised.
+
+    Args:
+        code: one of the catalogue, or of a family in it.
+        message: instead of the catalogue's sentence, where the place knows more.
+        field: the field, option or file that is wrong.
+        expected: what would have been right, or the words to choose from; else the catalogue's.
+        got: what came instead.
+        kind: instead of the code's first kind.
+        values: what the sentence names in braces.
+    """
+    entry = _entry(code)
+    if expected is None:
+        expected = entry.expected
+    elif not isinstance(expected, str):
+        expected = f"one of {', '.join(expected) or 'none'}"
+    text = entry.sentence.format(**values) if message is None else message
+    return (kind or entry.kinds[0])(code, text, field=field, expected=expected, got=got)
+
+
+@functools.cache
+def catalogue() -> Mapping[str, Entry]:
+    """Return the entries of ``error_codes.toml`` by code, in the order of the file."""
+    import tomllib  # only a process that meets an error needs it
+
+    text = Path(__file__).with_name("error_codes.toml").read_text(encoding="utf-8")
+    return {
+        f"{group}.{name}": _parsed(section, **parts)
+        for section, groups in tomllib.loads(text).items()
+        for group, names in groups.items()
+        for name, parts in names.items()
+    }
+
+
+def _entry(code: str) -> Entry:
+    known = catalogue()
+    return known[code] if code in known else known[f"{code.partition('.')[0]}.*"]
+
+
+def _parsed(section: str, *, kind: str | list[str], sentence: str, **rest: str) -> Entry:
+    kinds = [kind] if isinstance(kind, str) else kind
+    return Entry(section, tuple(globals()[name] for name in kinds), sentence, **rest)
+
+
 def _short(value: object, limit: int = 200) -> str:
     text = value if isinstance(value, str) else repr(value)
     return text if len(text) <= limit else text[: limit - 3] + "..."
@@ -130,6 +215,4 @@ def inside(place: str) -> Iterator[None]:
 def placed(error: VislocError, place: str) -> VislocError:
     """Return the error of a field within a larger message."""
     field = ".".join(part for part in (place, error.field) if part)
-    return type(error)(
-        error.code, error.message, field=field or None, expected=error.expected, got=error.got
-    )
+    return error.about(field or None)

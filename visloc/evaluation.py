@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Pose, rotation_angle
 
 
@@ -31,9 +31,8 @@ class Threshold:
     def __post_init__(self) -> None:
         # Written so that NaN fails too.
         if not (self.max_position_error_m >= 0 and self.max_orientation_error_deg >= 0):
-            raise InvalidInput(
+            raise refuse(
                 "evaluation.threshold",
-                "not a threshold",
                 field="threshold",
                 expected="metres and degrees, neither negative",
                 got=f"{self.max_position_error_m} m, {self.max_orientation_error_deg} degrees",
@@ -122,9 +121,8 @@ def percentile(values: Sequence[float], percent: float) -> float:
 
 def _check_count(errors: Sequence[tuple[float, float]], num_queries: int) -> None:
     if not 0 < num_queries >= len(errors):
-        raise InvalidInput(
+        raise refuse(
             "evaluation.num_queries",
-            "wrong number of queries",
             field="num_queries",
             expected=f"at least one, and not fewer than the {len(errors)} localized",
             got=num_queries,

@@ -15,7 +15,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 
 # COLMAP's camera models that kapture knows, with their parameters in COLMAP's order.
 CAMERA_MODELS: Mapping[str, tuple[str, ...]] = {
@@ -89,17 +89,10 @@ class Pose:
         t = np.asarray(translation, dtype=np.float64)
         norm = math.hypot(*q) if q.shape == (4,) else math.nan  # no overflow on the way
         if not (math.isfinite(norm) and norm >= 1e-6):
-            raise InvalidInput(
-                "pose.rotation",
-                "not a rotation",
-                field="rotation",
-                expected="a quaternion w, x, y, z of four finite numbers, not all zero",
-                got=rotation_wxyz,
-            )
+            raise refuse("pose.rotation", field="rotation", got=rotation_wxyz)
         if t.shape != (3,) or not np.isfinite(t).all():
-            raise InvalidInput(
+            raise refuse(
                 "pose.translation",
-                "not a translation",
                 field="translation",
                 expected="three finite numbers",
                 got=translation,
@@ -214,38 +207,33 @@ class Camera:
     def __post_init__(self) -> None:
         names = CAMERA_MODELS.get(self.model)
         if names is None:
-            raise InvalidInput(
-                "camera.model",
-                "unknown camera model",
-                field="camera.model",
-                expected=f"one of {', '.join(CAMERA_MODELS)}",
-                got=self.model,
+            raise refuse(
+                "camera.model", field="camera.model", expected=CAMERA_MODELS, got=self.model
             )
         if not (0 < self.width <= MAX_IMAGE_SIDE and 0 < self.height <= MAX_IMAGE_SIDE):
-            raise InvalidInput(
+            raise refuse(
                 "camera.size",
-                "the image size of the camera is not usable",
                 field="camera.width" if not 0 < self.width <= MAX_IMAGE_SIDE else "camera.height",
                 expected=f"1 to {MAX_IMAGE_SIDE} pixels",
                 got=f"{self.width} x {self.height}",
             )
         if len(self.params) != len(names):
-            raise InvalidInput(
+            raise refuse(
                 "camera.param_count",
-                f"wrong number of parameters for {self.model}",
                 field="camera.params",
                 expected=f"{len(names)}: {', '.join(names)}",
                 got=len(self.params),
+                model=self.model,
             )
         for name, value in zip(names, self.params, strict=True):
             positive = name in ("f", "fx", "fy")
             if not math.isfinite(value) or (positive and value <= 0):
-                raise InvalidInput(
+                raise refuse(
                     "camera.param_value",
-                    f"{name} is not usable",
                     field="camera.params",
                     expected=f"{name} to be a {'positive ' if positive else ''}finite number",
                     got=value,
+                    name=name,
                 )
 
     @staticmethod
@@ -260,13 +248,7 @@ class Camera:
             width, height = (_whole(field) for field in rest[:2])
             params = tuple(float(field) for field in rest[2:])
         except ValueError:
-            raise InvalidInput(
-                "camera.syntax",
-                "not a camera",
-                field="camera",
-                expected="MODEL,width,height,params... such as PINHOLE,640,480,525,525,320,240",
-                got=text,
-            ) from None
+            raise refuse("camera.syntax", field="camera", got=text) from None
         return Camera(model, width, height, params)
 
     @property

@@ -27,7 +27,7 @@ from PIL.PngImagePlugin import PngImageFile
 from PIL.TiffImagePlugin import BITSPERSAMPLE, SAMPLEFORMAT, TiffImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
-from visloc.errors import InvalidInput, NotFound, TooLarge
+from visloc.errors import VislocError, refuse
 from visloc.file_kinds import HEAD_BYTES, file_kind
 
 FORMATS = "JPEG, PNG, WebP, TIFF or BMP"
@@ -135,11 +135,9 @@ def read_photo_file(path: Path, limits: ImageLimits = _DEFAULT_LIMITS) -> Photo:
         with path.open("rb") as file:
             data = file.read(limits.max_bytes + 1)
     except FileNotFoundError:
-        raise NotFound("image.missing", "this photo does not exist", field=str(path)) from None
+        raise refuse("image.missing", field=str(path)) from None
     except OSError as error:
-        raise InvalidInput(
-            "image.unreadable", "this photo cannot be read", field=str(path), got=error.strerror
-        ) from error
+        raise refuse("image.unreadable", field=str(path), got=error.strerror) from error
     return _read(data, limits, field=str(path))
 
 
@@ -193,13 +191,10 @@ def _turn(exif_orientation: int) -> tuple[bool, bool, bool]:
 
 def _read(data: bytes, limits: ImageLimits, field: str) -> Photo:
     if not data:
-        raise InvalidInput(
-            "image.empty", "the photo has no bytes", field=field, expected=FORMATS, got="0 bytes"
-        )
+        raise refuse("image.empty", field=field, expected=FORMATS, got="0 bytes")
     if len(data) > limits.max_bytes:
-        raise TooLarge(
+        raise refuse(
             "image.too_large",
-            "the photo has too many bytes",
             field=field,
             expected=f"at most {limits.max_bytes} bytes",
             got=f"{len(data)} bytes" if field == "image" else "more",
@@ -219,9 +214,8 @@ def _read(data: bytes, limits: ImageLimits, field: str) -> Photo:
         )
     rgb = _decode(_only_pixels(data) if isinstance(header, PngImageFile) else data)
     if rgb is None or rgb.shape != (height, width, 3):
-        raise InvalidInput(
+        raise refuse(
             "image.undecodable",
-            "the photo is damaged or cut off",
             field=field,
             expected=f"{width} x {height} pixels of {header.format}",
             got="pixels that cannot be decoded",
@@ -235,24 +229,17 @@ def _read(data: bytes, limits: ImageLimits, field: str) -> Photo:
     return Photo(rgb, orientation, focal_length_px)
 
 
-def _too_many_pixels(field: str, limits: ImageLimits, got: str) -> TooLarge:
-    return TooLarge(
+def _too_many_pixels(field: str, limits: ImageLimits, got: str) -> VislocError:
+    return refuse(
         "image.too_many_pixels",
-        "the photo has too many pixels",
         field=field,
         expected=f"at most {limits.max_pixels} pixels",
         got=got,
     )
 
 
-def _too_complex(field: str, expected: str, got: str) -> TooLarge:
-    return TooLarge(
-        "image.too_complex",
-        "the photo takes too much work to decode; save it again as an ordinary JPEG or PNG",
-        field=field,
-        expected=expected,
-        got=got,
-    )
+def _too_complex(field: str, expected: str, got: str) -> VislocError:
+    return refuse("image.too_complex", field=field, expected=expected, got=got)
 
 
 def _count_passes(data: bytes, field: str) -> int:
@@ -310,9 +297,9 @@ def _open_header(data: bytes, field: str) -> ImageFile:
     # variable, and warns or raises before ours can be compared.
     kind = file_kind(data[:HEAD_BYTES])
     if kind is None or not kind.is_read:
-        raise InvalidInput(
+        raise refuse(
             "image.format",
-            "not an image that is read here" if kind is None else kind.refusal,
+            "the server does not read this image format" if kind is None else kind.refusal,
             field=field,
             expected=FORMATS,
             got=f"bytes that begin with {data[:12].hex(' ')}" if kind is None else kind.name,
@@ -320,9 +307,9 @@ def _open_header(data: bytes, field: str) -> ImageFile:
     try:
         header = _READERS[kind.name](io.BytesIO(data))
     except _MALFORMED as error:
-        raise InvalidInput(
+        raise refuse(
             "image.undecodable",
-            "the photo's header is damaged or cut off",
+            "the header of the photo is damaged or cut off",
             field=field,
             expected=FORMATS,
             got=str(error) or type(error).__name__,
@@ -342,9 +329,9 @@ def _check_tiff(header: TiffImageFile, field: str) -> None:
         problem = f"{bits} bits per sample, sample format {kinds}"
     else:
         return
-    raise InvalidInput(
+    raise refuse(
         "image.format",
-        "this kind of TIFF is not read here; save it as PNG",
+        "the server does not read this kind of TIFF; save it as PNG",
         field=field,
         expected="grey, palette or colour with up to 16 bits per sample, without transparency",
         got=problem,

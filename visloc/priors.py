@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import InvalidInput
+from visloc.errors import VislocError, refuse
 from visloc.geometry import Pose
 
 # A gravity prior of a larger spread says too little to search by.
@@ -168,9 +168,8 @@ def check_covariance(covariance: NDArray[np.float64], field: str) -> None:
             and bool(np.linalg.eigvalsh(unitless)[0] > _LEAST_EIGENVALUE)
         )
     if not fine:
-        raise InvalidInput(
+        raise refuse(
             "pose.covariance",
-            "not the covariance of a pose",
             field=field,
             expected="6 x 6 finite numbers, symmetric and positive definite: rotation (rad), then "
             f"translation; none beyond {_MOST:g}",
@@ -189,10 +188,9 @@ def _unit_vector(part: str, vector: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(vector / norm)
 
 
-def _unusable(prior: str, part: str | None, expected: str, got: object) -> InvalidInput:
-    return InvalidInput(
+def _unusable(prior: str, part: str | None, expected: str, got: object) -> VislocError:
+    return refuse(
         f"priors.{prior}",
-        "not usable",
         field=f"priors.{prior}" if part is None else f"priors.{prior}.{part}",
         expected=expected,
         got=str(got)[:100],

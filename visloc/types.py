@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import InvalidInput, VislocError
+from visloc.errors import VislocError, refuse
 from visloc.geometry import Camera, Pose
 
 
@@ -124,9 +124,8 @@ class Near:
             is_number = isinstance(value, int | float) and not isinstance(value, bool)
             # NaN fails too.
             if not is_number or not low <= value <= high or (name == "radius" and value == 0):
-                raise InvalidInput(
+                raise refuse(
                     f"near.{name}",
-                    "not a place on Earth",
                     field=f"near.{name}",
                     expected=f"more than 0, at most {high:.0f} metres"
                     if name == "radius"
@@ -241,17 +240,17 @@ def check_fusion_weights(weights: Mapping[str, float], code: str, field: str | N
     field = code if field is None else field
     for name, weight in weights.items():
         if not 1e-6 <= weight <= 1e6:  # NaN fails too
-            raise InvalidInput(
+            raise refuse(
                 code,
-                "not a weight; leave a descriptor away that shall not count",
+                "the weight is out of range; leave a descriptor out to ignore it",
                 field=f"{field}.{name}",
                 expected="0.000001 to 1000000",
                 got=weight,
             )
     if not weights:
-        raise InvalidInput(
+        raise refuse(
             code,
-            "no weights",
+            "there are no weights",
             field=field,
             expected="a weight for one global descriptor or more",
             got="{}",
@@ -370,12 +369,8 @@ class LocalizeOptions:
 
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:
-            raise InvalidInput(
-                "options.preset",
-                "unknown preset",
-                field="options.preset",
-                expected=f"one of {', '.join(PRESETS)}",
-                got=self.preset,
+            raise refuse(
+                "options.preset", field="options.preset", expected=PRESETS, got=self.preset
             )
         for option in fields(self):
             value = getattr(self, option.name)
@@ -383,9 +378,8 @@ class LocalizeOptions:
                 continue
             low, high = option.metadata["range"]
             if not low <= value <= high:  # NaN fails too
-                raise InvalidInput(
+                raise refuse(
                     f"options.{option.name}",
-                    "out of range",
                     field=f"options.{option.name}",
                     expected=f"{low} to {high}",
                     got=value,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from visloc.errors import Unavailable
+from visloc.errors import Unavailable, refuse
 
 _BUILT = Path(__file__).parent / "built"
 
@@ -34,11 +34,14 @@ def report_parts() -> tuple[str, str]:
 def _built(part: str, first: str) -> Path:
     folder = _BUILT / part
     if not (folder / first).is_file():
-        raise Unavailable(
+        raise refuse(
             "page.not_built",
-            "the page's files are not here: they are made from web/ by Node.js 20.19 or newer; "
-            "wheels and images carry them",
+            (
+                "the files of the page are missing: Node.js 20.19 or newer builds them from "
+                "web/; wheels and images include them"
+            ),
             field=str(folder),
             expected="what `make install` builds where npm is present",
+            kind=Unavailable,
         )
     return folder

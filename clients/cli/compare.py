@@ -34,7 +34,7 @@ from clients.evaluation.compare import (
 )
 from clients.evaluation.readers import Reader, takes_features
 from clients.evaluation.results import check_can_be_written, write_whole
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc_api.words.maps import MapInfo
 
 _out = Console()
@@ -148,13 +148,7 @@ def _make_folder(output: Path) -> None:
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InvalidInput(
-            "output.folder",
-            "cannot be made; choose another folder",
-            field="output",
-            expected="a folder, or a path where one can be made",
-            got=f"{output}: {error.strerror}",
-        ) from error
+        raise refuse("output.folder", field="output", got=f"{output}: {error.strerror}") from error
 
 
 def _drawing() -> Callable[[Mapping[str, Any]], bytes]:
@@ -164,11 +158,7 @@ def _drawing() -> Callable[[Mapping[str, Any]], bytes]:
         InvalidInput: ``compare.matplotlib``.
     """
     if importlib.util.find_spec("matplotlib") is None:
-        raise InvalidInput(
-            "compare.matplotlib",
-            "the picture is drawn by matplotlib, which is not installed",
-            expected="pip install 'visloc[compare]'",
-        )
+        raise refuse("compare.matplotlib")
     from clients.cli.compare_plot import draw_comparison
 
     return draw_comparison

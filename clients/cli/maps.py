@@ -21,7 +21,7 @@ from clients.cli.maps_display import print_map, print_maps
 from clients.cli.options import Connection, spread
 from clients.cli.progress import EXIT_STOPPED
 from clients.wire.requests import checked_version
-from visloc.errors import InvalidInput, VislocError
+from visloc.errors import VislocError, refuse
 from visloc.types import Near
 
 maps_app = typer.Typer(
@@ -133,8 +133,12 @@ def _bar() -> Progress:
 def _names(version: str) -> tuple[str, str]:
     map_id, at, name = version.partition("@")
     if not at:
-        raise InvalidInput(
-            "map.id", "not a version of a map", field="map", expected="ID@VERSION", got=version
+        raise refuse(
+            "map.id",
+            "this does not name a version of a map",
+            field="map",
+            expected="ID@VERSION",
+            got=version,
         )
     return checked_version(map_id, name)
 
@@ -143,11 +147,5 @@ def _near(text: str) -> Near:
     try:
         latitude, longitude, radius = (float(number) for number in text.split(","))
     except ValueError:
-        raise InvalidInput(
-            "near.syntax",  # as the server says it
-            "not a place",
-            field="near",
-            expected="latitude,longitude,radius in degrees and metres, such as 48.27,2.7,100",
-            got=text,
-        ) from None
+        raise refuse("near.syntax", field="near", got=text) from None
     return Near(latitude, longitude, radius)

@@ -22,7 +22,7 @@ from clients.evaluation.results import (
 )
 from clients.evaluation.run import InstantOutcome, Outcome, localize_all
 from clients.wire.types import LocalizeOptions
-from visloc.errors import Conflict
+from visloc.errors import refuse
 from visloc.geometry import PixelOrigin
 from visloc.sequences.filling import TracedPose
 
@@ -176,10 +176,8 @@ def _check_same_run(path: Path, described: dict[str, Any]) -> None:
     known = found if isinstance(found, dict) else {}
     names = dict.fromkeys((*described, *known))
     differing = [name for name in names if known.get(name) != described.get(name)]
-    raise Conflict(
+    raise refuse(
         "batch.other_run",
-        "the folder holds results of another run; give another folder, what that run was given, "
-        "or --restart to remove its results",
         field=str(path),
         expected=", ".join(f"{name} {described.get(name)}" for name in differing),
         got=", ".join(f"{name} {known.get(name, 'unknown')}" for name in differing),

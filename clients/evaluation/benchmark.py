@@ -15,7 +15,7 @@ from clients.evaluation.modes import Mode
 from clients.evaluation.queries import Query
 from clients.evaluation.run import InstantOutcome, Outcome
 from clients.wire.answers import ServerInfo
-from visloc.errors import InvalidInput
+from visloc.errors import InvalidInput, refuse
 from visloc.evaluation import (
     Threshold,
     median_errors_localized,
@@ -81,9 +81,8 @@ def parse_threshold(text: str) -> Threshold:
             return Threshold(position_m, orientation_deg)
     except (ValueError, InvalidInput):
         pass
-    raise InvalidInput(
+    raise refuse(
         "evaluation.threshold",
-        "not a threshold",
         field="threshold",
         expected="METRES/DEGREES, neither negative, such as 0.25/2",
         got=text,

@@ -16,7 +16,7 @@ from clients.evaluation.readers import Reader
 from clients.evaluation.run import Outcome, QueryClient
 from clients.wire.answers import ServerInfo
 from clients.wire.types import LocalizeOptions
-from visloc.errors import Forbidden, InvalidInput, Unauthenticated, Unavailable, VislocError
+from visloc.errors import Forbidden, Unauthenticated, Unavailable, VislocError, refuse
 from visloc.evaluation import Threshold
 from visloc_api.words.maps import MapInfo
 from visloc_api.words.options import CHOICES
@@ -97,13 +97,7 @@ def parse_values(text: str | None) -> tuple[str, ...]:
         return ()
     values = tuple(value.strip() for value in text.split(","))
     if not all(values) or len(set(values)) < len(values):
-        raise InvalidInput(
-            "compare.values",
-            "not a list of values",
-            field="values",
-            expected="different words with commas between",
-            got=text,
-        )
+        raise refuse("compare.values", field="values", got=text)
     return values
 
 
@@ -125,23 +119,23 @@ def make_variants(
     if axis is Axis.LOCAL_FEATURES:
         return _variants_of_maps(values, maps, fixed)
     if len(maps) > 1:
-        raise InvalidInput(
+        raise refuse(
             "compare.maps",
-            f"several maps are for --axis {Axis.LOCAL_FEATURES} only",
             field="map",
-            expected="one map",
             got=", ".join(info.ref for info in maps),
+            axis=Axis.LOCAL_FEATURES,
         )
     (info,) = maps
     name = axis.option
     assert name is not None
     if name in fixed.given():
-        raise InvalidInput(
+        raise refuse(
             "compare.option",
-            f"--axis {axis} varies {name}, so it cannot be given",
             field="option",
             expected=f"--values, and no --option {name}=...",
             got=fixed.given()[name],
+            axis=axis,
+            name=name,
         )
     if axis is Axis.GLOBAL_FEATURES:
         known = info.global_features
@@ -292,7 +286,7 @@ def _variants_of_maps(
     values: Sequence[str], maps: Sequence[MapInfo], fixed: LocalizeOptions
 ) -> list[Variant]:
     if values:
-        raise InvalidInput(
+        raise refuse(
             "compare.values",
             f"the values of --axis {Axis.LOCAL_FEATURES} are the maps",
             field="values",
@@ -301,9 +295,7 @@ def _variants_of_maps(
         )
     refs = [info.ref for info in maps]
     if len(set(refs)) < len(refs):
-        raise InvalidInput(
-            "compare.maps", "a map is named twice", field="map", expected="different maps"
-        )
+        raise refuse("compare.maps", "a map is named twice", field="map", expected="different maps")
     kinds = [info.local_features for info in maps]
     return [
         Variant(
@@ -320,9 +312,9 @@ def _check_words(words: Sequence[str], known: Sequence[str]) -> None:
     """Refuse now what the server would refuse after everything else was measured."""
     for word in words:
         if word not in known:
-            raise InvalidInput(
+            raise refuse(
                 "compare.values",
-                "unknown value of the axis",
+                "the axis does not have this value",
                 field="values",
                 expected=f"of {', '.join(known)}",
                 got=word,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from clients.evaluation.queries import Query, QuerySet
 from clients.wire.rigs import Rig
-from visloc.errors import DatasetError, NotFound
+from visloc.errors import VislocError, refuse
 from visloc.geometry import Pose
 from visloc.types import RigSensor
 from visloc_api.words.maps import MapInfo
@@ -52,12 +52,9 @@ def instants_of_dataset(queries: QuerySet, *, or_else: str = "") -> list[QueryIn
             continue
         cam_from_rig = queries.rigs[rig_id][sensor_id]
         if cam_from_rig is None:
-            raise DatasetError(
+            raise refuse(
                 "queries.rig_transform",
-                "it is not known where this camera sits in its rig",
                 field=str(queries.source / "sensors" / "rigs.txt"),
-                expected="qw, qx, qy, qz, tx, ty, tz of every camera that took photos; "
-                "'mapping calibrate-rig' estimates them",
                 got=f"{rig_id}, {sensor_id}",
             )
         sensors.setdefault(rig_id, {})[sensor_id] = RigSensor(cam_from_rig)
@@ -75,12 +72,12 @@ def instants_of_map_rig(queries: QuerySet, info: MapInfo, rig_id: str) -> list[Q
     """
     rigs = {rig.id: rig.sensors for rig in info.rigs}
     if rig_id not in rigs:
-        raise NotFound(
+        raise refuse(
             "rig.unknown",
-            f"map {info.ref} has no such rig",
             field="rig",
             expected=f"one of {', '.join(rigs)}" if rigs else "a map that knows rigs",
             got=rig_id,
+            ref=info.ref,
         )
     taken_by = {q.sensor_id for q in queries.photos if q.sensor_id is not None}
     rig_of = {sensor_id: rig_id if sensor_id in rigs[rig_id] else None for sensor_id in taken_by}
@@ -98,12 +95,11 @@ def _rig_of(queries: QuerySet, sensor_id: str) -> str | None:
     outermost = max(carriers, key=lambda rig_id: len(queries.rigs[rig_id]))
     others = [rig_id for rig_id in carriers if rig_id != outermost]
     if not all(queries.rigs[o].keys() < queries.rigs[outermost].keys() for o in others):
-        raise DatasetError(
+        raise refuse(
             "queries.rig_ambiguous",
-            f"several rigs carry the camera {sensor_id}",
             field=str(queries.source / "sensors" / "rigs.txt"),
-            expected="one rig for each camera that took photos",
             got=", ".join(carriers),
+            sensor_id=sensor_id,
         )
     return outermost
 
@@ -126,10 +122,9 @@ def _alone(photos: Iterable[Query]) -> Rig:
     return {query.sensor: RigSensor(Pose.identity()) for query in photos}
 
 
-def _no_rigs(queries: QuerySet, expected: str) -> DatasetError:
-    return DatasetError(
+def _no_rigs(queries: QuerySet, expected: str) -> VislocError:
+    return refuse(
         "queries.no_rigs",
-        "no photo was taken by a rig",
         field=str(queries.source),
         expected=expected,
         got=f"{len(queries.photos)} photos of cameras on their own",

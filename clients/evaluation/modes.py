@@ -8,7 +8,7 @@ from enum import StrEnum
 
 from clients.evaluation.instants import QueryInstant, instants_of_dataset, instants_of_map_rig
 from clients.evaluation.queries import Query, QuerySet
-from visloc.errors import DatasetError, InvalidInput
+from visloc.errors import refuse
 from visloc.sequences.filling import TimeUnit, TracedPose, fill_rig, fill_sequence, guess_time_unit
 from visloc_api.words.maps import MapInfo
 
@@ -87,12 +87,8 @@ def parse_modes(texts: Iterable[str]) -> list[Mode]:
         try:
             modes.append(Mode(word))
         except ValueError:
-            raise InvalidInput(
-                "mode.unknown",
-                "no such mode",
-                field="mode",
-                expected=f"one of {', '.join(Mode)}, all",
-                got=word,
+            raise refuse(
+                "mode.unknown", field="mode", expected=f"one of {', '.join(Mode)}, all", got=word
             ) from None
     return list(dict.fromkeys(modes)) or [Mode.SINGLE]
 
@@ -164,18 +160,11 @@ def _fill_sequence(
 def _time_unit(queries: QuerySet, given: TimeUnit | None) -> TimeUnit:
     timestamps = [query.timestamp for query in queries.photos if query.timestamp is not None]
     if len(timestamps) < len(queries.photos):
-        raise DatasetError(
-            "queries.no_timestamps",
-            "it is not known when the photos were taken",
-            field=str(queries.source),
-            expected="a kapture folder",
-            got="a list of photos",
-        )
+        raise refuse("queries.no_timestamps", field=str(queries.source), got="a list of photos")
     unit = given or guess_time_unit(timestamps)
     if unit is None:
-        raise DatasetError(
+        raise refuse(
             "queries.time_unit",
-            "the unit of the timestamps cannot be told by their size",
             field=str(queries.source / "sensors" / "records_camera.txt"),
             expected=f"--time-unit {', '.join(TimeUnit)}",
             got=f"timestamps from {min(timestamps)} to {max(timestamps)}",

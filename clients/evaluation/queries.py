@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from visloc.errors import DatasetError, InvalidInput
+from visloc.errors import DatasetError, InvalidInput, refuse
 from visloc.geometry import Camera, PixelOrigin, Pose
 from visloc.kapture import read_dataset
 from visloc.kapture.text import relative_path
@@ -72,16 +72,10 @@ def read_queries(source: Path, origin: PixelOrigin = PixelOrigin.CORNER) -> Quer
     elif source.is_file():
         queries = QuerySet(source, tuple(_read_list(source, origin)), {})
     else:
-        raise DatasetError(
-            "queries.missing",
-            "no such file or folder",
-            field=str(source),
-            expected="a kapture folder, or a text file that lists photos",
-        )
+        raise refuse("queries.missing", field=str(source))
     if not queries.photos:
-        raise DatasetError(
+        raise refuse(
             "queries.empty",
-            "there is no photo in it",
             field=str(source),
             expected="photos in sensors/records_camera.txt" if source.is_dir() else "a line each",
         )
@@ -108,13 +102,7 @@ def _read_list(path: Path, origin: PixelOrigin) -> list[Query]:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(
-            "list.unreadable",
-            "the list cannot be read",
-            field=str(path),
-            expected="a text file in UTF-8 with one photo per line",
-            got=str(error),
-        ) from error
+        raise refuse("list.unreadable", field=str(path), got=str(error)) from error
     queries: dict[str, Query] = {}
     for number, line in enumerate(lines, start=1):
         fields = line.split()
@@ -123,9 +111,7 @@ def _read_list(path: Path, origin: PixelOrigin) -> list[Query]:
         where = f"{path}:{number}"
         name = _parse_name(where, fields[0])
         if name in queries:
-            raise DatasetError(
-                "list.duplicate", "listed twice", field=where, expected="every name once", got=name
-            )
+            raise refuse("list.duplicate", field=where, got=name)
         camera = _parse_camera(where, fields[1:])
         if camera is not None:
             camera = camera.with_pixels_from(origin)
@@ -137,13 +123,7 @@ def _parse_name(where: str, text: str) -> str:
     try:
         return relative_path(text)
     except ValueError:
-        raise DatasetError(
-            "list.path",
-            "the path cannot be used",
-            field=where,
-            expected="a path relative to the folder of the list, that stays inside it",
-            got=text,
-        ) from None
+        raise refuse("list.path", field=where, got=text) from None
 
 
 def _parse_camera(where: str, fields: Sequence[str]) -> Camera | None:
@@ -152,16 +132,15 @@ def _parse_camera(where: str, fields: Sequence[str]) -> Camera | None:
     if fields[0] == _UNKNOWN_CAMERA:
         if len(fields) == 3 and all(field.isdecimal() for field in fields[1:]):
             return None
-        raise DatasetError(
+        raise refuse(
             "camera.param_count",
-            f"wrong parameters for {_UNKNOWN_CAMERA}",
             field=where,
             expected="2: width, height",
             got=" ".join(fields[1:]),
+            kind=DatasetError,
+            model=_UNKNOWN_CAMERA,
         )
     try:
         return Camera.from_text(" ".join(fields))
     except InvalidInput as error:
-        raise DatasetError(
-            error.code, error.message, field=where, expected=error.expected, got=error.got
-        ) from None
+        raise error.about(where, DatasetError) from None

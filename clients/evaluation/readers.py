@@ -11,7 +11,7 @@ import numpy as np
 from clients.evaluation.queries import Query
 from clients.wire.features import Features
 from clients.wire.requests import read_image
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import PixelOrigin
 from visloc.kapture import (
     READY_MADE_PREFIX,
@@ -51,9 +51,8 @@ class FeatureReader:
             DatasetError: ``kapture.*``, with the file that is missing or wrong.
         """
         if query.camera is None:
-            raise InvalidInput(
+            raise refuse(
                 "camera.required",
-                "features cannot be localized without the camera that they were seen with",
                 field=query.name,
                 expected="its model, size and parameters in sensors.txt",
             )
@@ -98,20 +97,20 @@ def choose_reader(
     ready_made = [name for name in info.global_features if name.startswith(READY_MADE_PREFIX)]
     if not takes_features(info):
         if features_dir is not None:
-            raise InvalidInput(
+            raise refuse(
                 "queries.features_dir",
-                f"map {info.ref} takes photos; ready-made features are of no use to it",
                 field="features_dir",
                 expected=f"a map with features {READY_MADE_PREFIX}TYPE",
                 got=", ".join((info.local_features, *info.global_features)),
+                ref=info.ref,
             )
         return lambda query: read_image(query.path)
     if not source.is_dir():
-        raise InvalidInput(
+        raise refuse(
             "queries.no_features",
-            f"map {info.ref} takes features, and a list of photos has none",
             field=str(source),
             expected=f"a kapture folder with {', '.join((info.local_features, *ready_made))}",
+            ref=info.ref,
         )
     kind = info.local_features
     keypoints, descriptors = open_local_features(

@@ -14,7 +14,7 @@ from urllib.parse import quote
 from clients.evaluation.filling import pose_as_json
 from clients.evaluation.run import Outcome
 from clients.wire.answers import parse_pose
-from visloc.errors import DatasetError, InvalidInput
+from visloc.errors import InvalidInput, refuse
 from visloc.sequences.filling import TracedPose
 from visloc.types import PoseSource
 from visloc_api.words.answers import PoseEstimate
@@ -107,12 +107,7 @@ def read_results(path: Path) -> Iterator[StoredResult]:
             try:
                 parsed = _parse_line(line)
             except (KeyError, TypeError, ValueError, InvalidInput) as error:
-                raise DatasetError(
-                    "results.line",
-                    "not a result; begin again with --restart, or remove the line",
-                    field=f"{path}:{number}",
-                    got=str(error),
-                ) from error
+                raise refuse("results.line", field=f"{path}:{number}", got=str(error)) from error
             yield StoredResult(*parsed, offset, len(line))
             offset += len(line)
 
@@ -169,9 +164,9 @@ def check_can_be_written(paths: Sequence[Path]) -> None:
     """
     for path in paths:
         if path.is_dir() or not os.access(path.parent, os.W_OK):
-            raise InvalidInput(
+            raise refuse(
                 "output.folder",
-                "cannot be written",
+                "the file cannot be written",
                 field=str(path),
                 expected="a file in an existing folder that is not write-protected",
             )

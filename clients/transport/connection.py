@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from clients.wire.requests import checked_server
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 
 _KEY = re.compile(r"[\x21-\x7e]{1,512}")
 
@@ -48,20 +48,9 @@ def checked_connection(
     """
     connection = Connection(checked_server(server), timeout_s, api_key, _authorities(ca))
     if api_key is not None and not _KEY.fullmatch(api_key):
-        raise InvalidInput(  # without the key
-            "server.api_key",
-            "not an API key",
-            field="api_key",
-            expected="visible ASCII characters without spaces, as `python -m service.keys` prints",
-        )
+        raise refuse("server.api_key", field="api_key")
     if ca is not None and not connection.is_encrypted:
-        raise InvalidInput(
-            "server.ca",
-            "a certificate authority is of no use without TLS",
-            field="ca",
-            expected="https://host:port or grpcs://host:port",
-            got=server,
-        )
+        raise refuse("server.ca", field="ca", got=server)
     return connection
 
 
@@ -72,9 +61,9 @@ def _authorities(ca: str | Path | None) -> str | None:
         text = Path(ca).read_text(encoding="ascii")
         ssl.create_default_context(cadata=text)
     except (OSError, ValueError) as error:  # SSLError is an OSError
-        raise InvalidInput(
+        raise refuse(
             "server.ca",
-            "no certificates can be read from it",
+            "the file holds no certificates",
             field=str(ca),
             expected="a PEM file",
             got=str(error),

@@ -17,7 +17,7 @@ from clients.transport.retry import RESEND_PAUSE_S, may_resend
 from clients.transport.uploads import OnProgress, Upload, pieces_async
 from clients.wire.requests import CheckReady, JsonObject
 from clients.wire.rig_requests import AnyRequest, SentInstant, SequenceStart
-from visloc.errors import Conflict, Unavailable, VislocError
+from visloc.errors import VislocError, refuse
 from visloc_api.words.wire import NDJSON
 
 _CONNECT_TIMEOUT_S = 10.0
@@ -110,7 +110,7 @@ class HttpTransport:
         except httpx.HTTPError as error:
             return error
 
-    def _failure(self, error: httpx.HTTPError) -> Unavailable:
+    def _failure(self, error: httpx.HTTPError) -> VislocError:
         if isinstance(error, httpx.TimeoutException) and not isinstance(
             error, httpx.ConnectTimeout
         ):
@@ -157,9 +157,8 @@ def _refuse_published(upload: Upload, described: httpx.Response) -> None:
         Conflict: ``map.version_exists``.
     """
     if described.status_code == 200:
-        raise Conflict(
+        raise refuse(
             "map.version_exists",
-            "the version exists already; versions never change",
             field="version",
             expected="a version that is not there",
             got=f"{upload.map_id}@{upload.version}",

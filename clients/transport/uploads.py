@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from clients.wire.requests import checked_version
-from visloc.errors import InvalidInput
+from visloc.errors import VislocError, refuse
 
 # Called with the number of bytes that were sent since the last call.
 OnProgress = Callable[[int], None]
@@ -54,11 +54,8 @@ def upload_request(path: Path, map_id: str | None, version: str | None) -> Uploa
             known_id, known_version = _read_names(path)
             map_id, version = map_id or known_id, version or known_version
     except OSError as error:
-        raise InvalidInput(
-            "packed.unreadable",
-            "the packed map cannot be read",
-            field=str(path),
-            got=error.strerror or str(error),
+        raise refuse(
+            "packed.unreadable", field=str(path), got=error.strerror or str(error)
         ) from error
     return Upload(path, *checked_version(map_id, version), size)
 
@@ -74,9 +71,8 @@ def pieces(upload: Upload, on_progress: OnProgress) -> Generator[bytes]:
         while left:
             piece = file.read(min(left, _PIECE_BYTES))
             if not piece:
-                raise InvalidInput(
+                raise refuse(
                     "packed.changed",
-                    "the packed map became shorter while it was sent",
                     field=str(upload.path),
                     expected=f"{upload.size_bytes} bytes",
                     got=f"{upload.size_bytes - left} bytes",
@@ -112,11 +108,5 @@ def _read_names(path: Path) -> tuple[str, str]:
     return names
 
 
-def _not_packed(path: Path, got: str) -> InvalidInput:
-    return InvalidInput(
-        "packed.manifest",
-        "not a packed map",
-        field=str(path),
-        expected="a file that mapping pack wrote",
-        got=got,
-    )
+def _not_packed(path: Path, got: str) -> VislocError:
+    return refuse("packed.manifest", field=str(path), got=got)

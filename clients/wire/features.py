@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from visloc.errors import InvalidInput
+from visloc.errors import VislocError, refuse
 from visloc_api.words.wire import ARRAY_DTYPES
 
 
@@ -78,9 +78,8 @@ def _array(part: str, values: ArrayLike, name: str | None = None) -> NDArray[Any
     array = np.asarray(values)
     dtype = "float32" if array.dtype == np.float64 else array.dtype.name
     if dtype not in ARRAY_DTYPES:
-        raise InvalidInput(
+        raise refuse(
             "features.dtype",
-            "an array of these cannot be sent",
             field=_field(part, name),
             expected=f"one of {', '.join(ARRAY_DTYPES)}, float64",
             got=array.dtype.name,
@@ -95,10 +94,10 @@ def _array_as_json(array: NDArray[Any]) -> dict[str, Any]:
 
 def _wrong_shape(
     part: str, expected: str, array: NDArray[Any], name: str | None = None
-) -> InvalidInput:
-    return InvalidInput(
+) -> VislocError:
+    return refuse(
         f"features.{part}",
-        "not the shape of such an array",
+        "the array does not have the right shape",
         field=_field(part, name),
         expected=expected,
         got=str(array.shape),

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import visloc_api.words.priors
-from visloc.errors import InvalidInput
+from visloc.errors import InvalidInput, VislocError, refuse
 from visloc.geometry import Pose
 from visloc.priors import Priors, check_covariance
 from visloc_api.words.geometry import Transform
@@ -35,13 +35,7 @@ def priors_from_text(text: str) -> Priors:
     try:
         raw = json.loads(text if text.lstrip().startswith("{") else Path(text).read_bytes())
     except (OSError, ValueError) as error:
-        raise InvalidInput(
-            "priors.unreadable",
-            "neither JSON nor a file that holds it",
-            field="priors",
-            expected='such as {"height": {"min": 0, "max": 3}}',
-            got=f"{text[:80]} ({error})",
-        ) from error
+        raise refuse("priors.unreadable", field="priors", got=f"{text[:80]} ({error})") from error
     return priors_from_json(raw)
 
 
@@ -58,7 +52,7 @@ def priors_from_json(raw: object) -> Priors:
         raise _named_by_prior(error) from None
 
 
-def _named_by_prior(error: InvalidInput) -> InvalidInput:
+def _named_by_prior(error: InvalidInput) -> VislocError:
     """Give a wrong value the code of its prior; the server names the kind of mistake."""
     field = (error.field or "").partition("[")[0]
     prior, _, part = field.removeprefix("priors.").partition(".")
@@ -67,7 +61,7 @@ def _named_by_prior(error: InvalidInput) -> InvalidInput:
     ):
         return error
     code = "request.invalid" if part == "device_from_world" else f"priors.{prior}"
-    return InvalidInput(code, "not usable", field=field, expected=error.expected, got=error.got)
+    return refuse(code, field=field, expected=error.expected, got=error.got)
 
 
 def checked_covariance(given: object, field: str) -> NDArray[np.float64]:
@@ -87,7 +81,5 @@ def checked_covariance(given: object, field: str) -> NDArray[np.float64]:
     try:
         check_covariance(covariance, field)
     except InvalidInput as error:
-        raise InvalidInput(
-            error.code, error.message, field=error.field, expected=error.expected, got=got
-        ) from None
+        raise refuse(error.code, field=error.field, expected=error.expected, got=got) from None
     return covariance

@@ -13,7 +13,7 @@ import httpx
 from clients.wire.features import Features, PhotoOrFeatures
 from clients.wire.priors import priors_from_json
 from clients.wire.types import LocalizeOptions
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Camera
 from visloc.priors import NO_PRIORS, Priors
 from visloc.types import Near
@@ -133,13 +133,7 @@ def checked_search(
             ``request.id``.
     """
     if request_id is not None and not REQUEST_ID.fullmatch(request_id):
-        raise InvalidInput(
-            "request.id",
-            "not usable",
-            field="request_id",
-            expected="1 to 128 visible ASCII characters",
-            got=request_id,
-        )
+        raise refuse("request.id", field="request_id", got=request_id)
     if not isinstance(options, LocalizeOptions):
         options = LocalizeOptions.from_mapping(options or {})
     if not isinstance(priors, Priors):
@@ -148,8 +142,8 @@ def checked_search(
         return Search(where, options, priors, request_id, ypr)
     maps = (where,) if isinstance(where, str) else tuple(where)
     if not maps:
-        raise InvalidInput(
-            "request.map", "no map to search", field="map", expected="a map, or several"
+        raise refuse(
+            "request.map", "there is no map to search", field="map", expected="a map, or several"
         )
     return Search(tuple(map(_checked, maps)), options, priors, request_id, ypr)
 
@@ -171,9 +165,9 @@ def checked_version(map_id: str, version: str) -> tuple[str, str]:
     """
     for name, what in ((map_id, "map"), (version, "map version")):
         if not _NAME.fullmatch(name):
-            raise InvalidInput(
+            raise refuse(
                 "map.id",
-                f"not a {what} name",
+                f"this is not a valid name of a {what}",
                 field="map",
                 expected="letters, digits, '.', '_' and '-', beginning with a letter or digit",
                 got=name,
@@ -199,11 +193,8 @@ def read_image(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise InvalidInput(
-            "image.unreadable",
-            "the photo cannot be read",
-            field=str(path),
-            got=error.strerror or str(error),
+        raise refuse(
+            "image.unreadable", field=str(path), got=error.strerror or str(error)
         ) from error
 
 
@@ -215,13 +206,7 @@ def checked_server(server: str) -> str:
     """
     match = _SERVER.fullmatch(server)
     if match is None or not 0 < int(match["port"] or 80) < 65536 or not _is_url(server):
-        raise InvalidInput(
-            "server.url",
-            "not the address of a server",
-            field="server",
-            expected="http://host:port or grpc://host:port; with TLS https:// or grpcs://",
-            got=server,
-        )
+        raise refuse("server.url", field="server", got=server)
     return server
 
 
@@ -234,9 +219,8 @@ def _is_url(text: str) -> bool:
 
 def _checked(map_ref: str) -> str:
     if not _MAP.fullmatch(map_ref):
-        raise InvalidInput(
+        raise refuse(
             "map.id",
-            "not the name of a map",
             field="map",
             expected="id or id@version, of letters, digits, '.', '_' and '-'",
             got=map_ref,

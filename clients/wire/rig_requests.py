@@ -14,7 +14,7 @@ from clients.wire.features import Features
 from clients.wire.priors import checked_covariance, priors_as_json, transform_as_json
 from clients.wire.requests import Request, Search, read_query
 from clients.wire.rigs import Instant, Rig, RigImage
-from visloc.errors import InvalidInput
+from visloc.errors import VislocError, refuse
 from visloc.geometry import Camera, Pose
 from visloc.priors import Priors
 from visloc.sequences.filling import Odometry, TimeUnit, guess_time_unit
@@ -76,9 +76,7 @@ def rig_request(search: Search, rig: Rig, images: Iterable[RigImage]) -> Localiz
             ``image.unreadable``.
     """
     if rig is None:  # from callers without a type checker
-        raise InvalidInput(
-            "request.missing_field", "this field is needed", field="rig", expected=_A_RIG
-        )
+        raise refuse("request.missing_field", field="rig", expected=_A_RIG)
     _check_rig(rig)
     return LocalizeRig(search, rig, _sent_images(images))
 
@@ -96,20 +94,10 @@ def sequence_start(
         _check_rig(rig)
     units = [unit.value for unit in TimeUnit]
     if time_unit is not None and time_unit not in units:
-        raise InvalidInput(
-            "sequence.time_unit",
-            "unknown unit of timestamps",
-            field="time_unit",
-            expected=f"one of {', '.join(units)}",
-            got=time_unit,
-        )
+        raise refuse("sequence.time_unit", field="time_unit", expected=units, got=time_unit)
     if max_gap_s is not None and not (math.isfinite(max_gap_s) and max_gap_s >= 0):
-        raise InvalidInput(
-            "sequence.max_gap",
-            "not a time",
-            field="max_gap_s",
-            expected="seconds, 0 or more",
-            got=max_gap_s,
+        raise refuse(
+            "sequence.max_gap", field="max_gap_s", expected="seconds, 0 or more", got=max_gap_s
         )
     return SequenceStart(search, rig, time_unit, max_gap_s)
 
@@ -145,11 +133,11 @@ def check_time_unit(time_unit: str | None, first_timestamp: int) -> None:
         InvalidInput: ``sequence.time_unit``, as the server raises it.
     """
     if time_unit is None and guess_time_unit([first_timestamp]) is None:
-        raise InvalidInput(
+        raise refuse(
             "sequence.time_unit",
-            "the unit of the timestamps cannot be told by their size",
+            "the size of the timestamps does not reveal their unit",
             field="time_unit",
-            expected=f"one of {', '.join(TimeUnit)}",
+            expected=TimeUnit,
         )
 
 
@@ -229,9 +217,9 @@ def _check_timestamp(timestamp: int, code: str, field: str) -> None:
     else:
         whole = -_MAX_TIMESTAMP <= timestamp < _MAX_TIMESTAMP
     if not whole:
-        raise InvalidInput(
+        raise refuse(
             code,
-            "not a timestamp",
+            "this is not a timestamp",
             field=field,
             expected="a whole number of 64 bits",
             got=timestamp,
@@ -250,31 +238,24 @@ def _check_rig(rig: Rig) -> None:
         _check_rigid(sensor.cam_from_rig, f"{field}.cam_from_rig", "rig.rotation")
 
 
-def _unusable(field: str, expected: str, got: object) -> InvalidInput:
-    return InvalidInput(
-        "request.invalid",  # as the server says it
-        "cannot be used",
-        field=field,
-        expected=expected,
-        got=type(got).__name__,
-    )
+def _unusable(field: str, expected: str, got: object) -> VislocError:
+    return refuse("request.invalid", field=field, expected=expected, got=type(got).__name__)
 
 
 def _check_rigid(pose: Pose, field: str, code: str) -> None:
     # A quaternion is made of it, which would hide the scale.
     scale_error = np.abs(pose.rotation @ pose.rotation.T - np.eye(3)).max()
     if not (scale_error <= _MAX_SCALE_ERROR and np.linalg.det(pose.rotation) > 0):
-        raise InvalidInput(
+        raise refuse(
             code,
-            "not a rotation: scaled, sheared or mirrored",
+            "the rotation is scaled, sheared or mirrored",
             field=field,
             expected="a rotation matrix",
             got=pose.rotation.tolist(),
         )
     if not np.isfinite(pose.translation).all():
-        raise InvalidInput(
+        raise refuse(
             "pose.translation",
-            "not a translation",
             field=field,
             expected="three finite numbers",
             got=pose.translation.tolist(),

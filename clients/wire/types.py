@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from visloc.errors import InvalidInput
+from visloc.errors import VislocError, refuse
 from visloc_api.words.options import KINDS
 
 OptionValue = int | float | str | Mapping[str, float]
@@ -77,13 +77,7 @@ class LocalizeOptions:
         for text in texts:
             name, equals, value = text.partition("=")
             if not equals:
-                raise InvalidInput(
-                    "options.syntax",
-                    "not an option",
-                    field="option",
-                    expected="NAME=VALUE such as top_k=10",
-                    got=text,
-                )
+                raise refuse("options.syntax", field="option", got=text)
             _check_option_name(name)
             try:
                 values[name] = _PARSERS[_OPTION_KINDS[name]](value)
@@ -103,12 +97,8 @@ class LocalizeOptions:
 
 def _check_option_name(name: str) -> None:
     if name not in _OPTION_KINDS:
-        raise InvalidInput(
-            "request.unknown_field",  # as the server says it
-            "unknown field",
-            field=f"options.{name}",
-            expected=f"one of {', '.join(_OPTION_KINDS)}",
-            got=name,
+        raise refuse(
+            "request.unknown_field", field=f"options.{name}", expected=_OPTION_KINDS, got=name
         )
 
 
@@ -148,10 +138,9 @@ def _can_be_sent(value: object, kind: type) -> bool:
     return isinstance(value, str) and value.isprintable()
 
 
-def _not_usable(name: str, value: object) -> InvalidInput:
-    return InvalidInput(
+def _not_usable(name: str, value: object) -> VislocError:
+    return refuse(
         f"options.{name}",
-        "not usable",
         field=f"options.{name}",
         expected=_EXPECTED[_OPTION_KINDS[name]],
         got=value,

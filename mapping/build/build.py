@@ -41,7 +41,7 @@ from mapping.stages.previews import keep_photos
 from mapping.stages.publishing import PAIRS, publish_content
 from mapping.stages.work_folder import WorkFolder, exclusive
 from visloc.archive import GlobalFeatures, MapContent, MapStore
-from visloc.errors import Conflict, Unavailable
+from visloc.errors import refuse
 from visloc.features.backends.choice import choose_inference
 from visloc.features.local.readymade import is_ready_made
 from visloc.kapture import Dataset
@@ -91,11 +91,10 @@ def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None =
             work.remove()
             shutil.rmtree(scratch, ignore_errors=True)
     except storage_errors() as error:
-        raise Unavailable(
+        raise refuse(
             "storage.failed",
-            f"reading or writing failed: {getattr(error, 'strerror', None) or error}; "
-            "finished work is kept, the same command resumes",
             field=str(getattr(error, "filename", None) or work.root),
+            why=getattr(error, "strerror", None) or error,
         ) from error
     return folder
 
@@ -104,10 +103,10 @@ def _refuse_existing_map(settings: BuildSettings, store: MapStore) -> None:
     versions = store.versions(settings.map_id)
     # A build that was killed while it published leaves versions of which none is current.
     if versions and settings.map_id in store.ids() and not settings.force:
-        raise Conflict(
+        raise refuse(
             "map.exists",
-            f"map {settings.map_id!r} exists (version {versions[-1]}); "
-            "--force publishes a new version and keeps the old one",
+            f"map {settings.map_id!r} exists (version {versions[-1]}); --force publishes "
+            "a new version and keeps the old one",
             field="--map",
         )
 

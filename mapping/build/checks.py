@@ -19,7 +19,7 @@ from mapping.methods.sparse_model import MAPPER_CONFIGS
 from mapping.pairing import PAIRINGS
 from mapping.stages.networks import Networks
 from mapping.stages.photos import MappingPhoto
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.features.local.readymade import is_ready_made
 from visloc.kapture import Dataset
 from visloc.types import check_fusion_weights
@@ -36,13 +36,7 @@ def check_settings(settings: BuildSettings) -> None:
         WeightsError: for a network whose weights are missing.
     """
     if settings.method not in METHODS:
-        raise InvalidInput(
-            "build.method",
-            "unknown method",
-            field="--method",
-            expected=f"one of {', '.join(METHODS)}",
-            got=settings.method,
-        )
+        raise refuse("build.method", field="--method", expected=METHODS, got=settings.method)
     check_names("--executor", (settings.executor,), EXECUTORS)
     _refuse_mixed_places(settings)
     _refuse_remote_features(settings)
@@ -59,9 +53,9 @@ def check_names(option: str, names: Sequence[str], known: Sequence[str]) -> None
     """
     unknown = [name for name in names if name not in known]
     if unknown or len(set(names)) < len(names):
-        raise InvalidInput(
+        raise refuse(
             f"build.{option[2:]}",
-            "unknown name" if unknown else "a name is given twice",
+            "a name is unknown" if unknown else "a name is given twice",
             field=option,
             expected=f"of {', '.join(known)}, each once",
             got=",".join(names),
@@ -73,13 +67,7 @@ def _refuse_remote_features(settings: BuildSettings) -> None:
     if is_remote(settings.dataset) and (
         settings.method == "model" or any(is_ready_made(name) for name in names)
     ):
-        raise InvalidInput(
-            "build.dataset",
-            "features and points that a dataset brings along are not read from a URL",
-            field="dataset",
-            expected="a folder, for --method model and kapture:TYPE",
-            got=str(settings.dataset),
-        )
+        raise refuse("build.dataset", field="dataset", got=str(settings.dataset))
 
 
 def _refuse_mixed_places(settings: BuildSettings) -> None:
@@ -93,10 +81,10 @@ def _refuse_mixed_places(settings: BuildSettings) -> None:
         ("--cache-dir", settings.cache_dir),
     ):
         if lies_in(root, place) or lies_in(place, root):
-            raise InvalidInput(
+            raise refuse(
                 "build.work_dir",
-                f"finished work would be kept in {root}, which is in {option} or holds it, and is "
-                "removed when the map is published",
+                f"finished work would be kept in {root}, which overlaps {option}, and "
+                "publishing the map removes it",
                 field="--work-dir",
                 expected=f"a folder apart from {option}, or without the option",
                 got=str(settings.work_dir),
@@ -106,20 +94,13 @@ def _refuse_mixed_places(settings: BuildSettings) -> None:
 def _check_global_features(settings: BuildSettings) -> None:
     names, weights = settings.global_features, settings.fusion_weights
     if not names or "" in names or len(set(names)) < len(names):
-        raise InvalidInput(
-            "build.global_features",
-            "not a set of global features",
-            field="--global-features",
-            expected="one or more names, each once",
-            got=",".join(names),
-        )
+        raise refuse("build.global_features", field="--global-features", got=",".join(names))
     if weights is not None:
         check_fusion_weights(weights, "build.fusion_weights", "--fusion-weights")
         unknown = [name for name in weights if name not in names]
         if unknown:
-            raise InvalidInput(
+            raise refuse(
                 "build.fusion_weights",
-                "weights of global features that the map will not have",
                 field="--fusion-weights",
                 expected=f"of {', '.join(names)}",
                 got=",".join(unknown),
@@ -129,9 +110,10 @@ def _check_global_features(settings: BuildSettings) -> None:
         if is_ready_made(name):
             continue
         if networks.descriptor(name).needs_image and is_ready_made(settings.local_features):
-            raise InvalidInput(
+            raise refuse(
                 "build.global_features",
-                f"{name} is made of the photo, which is not there when features are sent instead",
+                f"{name} is computed from the photo, which is missing when features are sent "
+                "instead",
                 field="--global-features",
                 expected="kapture:TYPE, or localvlad, with ready-made local features",
                 got=name,
@@ -142,21 +124,13 @@ def _check_lengths(settings: BuildSettings) -> None:
     for name in ("voxel_size", "depth_scale"):
         value = getattr(settings.depth, name)
         if not (math.isfinite(value) and value > 0):
-            raise InvalidInput(
-                f"build.{name}",
-                "not usable",
-                field=f"--{name.replace('_', '-')}",
-                expected="metres, more than 0",
-                got=value,
-            )
+            raise refuse(f"build.{name}", field=f"--{name.replace('_', '-')}", got=value)
     if settings.gravity is not None:
         length = math.hypot(*settings.gravity)
         if not (math.isfinite(length) and length >= _MIN_LENGTH):
-            raise InvalidInput(
+            raise refuse(
                 "build.gravity",
-                "not a direction",
                 field="--gravity",
-                expected="three finite numbers that are not all 0, such as 0,0,-1",
                 got=",".join(f"{value:g}" for value in settings.gravity),
             )
 
@@ -164,28 +138,22 @@ def _check_lengths(settings: BuildSettings) -> None:
 def _check_sfm(settings: BuildSettings) -> None:
     sfm = settings.sfm
     if sfm.poses not in POSES:
-        raise InvalidInput(
-            "build.poses", "unknown", field="--poses", expected=" or ".join(POSES), got=sfm.poses
+        raise refuse(
+            "build.poses",
+            "the value is unknown",
+            field="--poses",
+            expected=" or ".join(POSES),
+            got=sfm.poses,
         )
     check_names("--pairs", sfm.pairs, tuple(PAIRINGS))
     check_names("--refine", sfm.refine, REFINABLE)
     check_names("--mapper", (sfm.mapper,), tuple(MAPPER_CONFIGS))
     if sfm.estimate_poses and settings.method != "sfm":
-        raise InvalidInput(
-            "build.poses",
-            "poses are estimated from matches",
-            field="--poses",
-            expected="given, or --method sfm",
-            got=f"estimate with --method {settings.method}",
+        raise refuse(
+            "build.poses", field="--poses", got=f"estimate with --method {settings.method}"
         )
     if sfm.estimate_poses and not set(sfm.refine) <= {"intrinsics"}:
-        raise InvalidInput(
-            "build.refine",
-            "estimated poses and points are refined anyway",
-            field="--refine",
-            expected="nothing, or intrinsics, with --poses estimate",
-            got=",".join(sfm.refine),
-        )
+        raise refuse("build.refine", field="--refine", got=",".join(sfm.refine))
 
 
 def refuse_early(settings: BuildSettings, dataset: Dataset, photos: Sequence[MappingPhoto]) -> None:
@@ -221,10 +189,10 @@ def _refuse_gravity_that_is_not_down(settings: BuildSettings) -> None:
     x, y, z = settings.gravity
     angle_deg = math.degrees(math.atan2(math.hypot(x, y), -z))
     if angle_deg > MAX_DIRECTION_ERROR_DEG:
-        raise InvalidInput(
+        raise refuse(
             "build.gravity",
-            "the map is anchored to GNSS fixes, its axes point east, north and up, and this is "
-            "not down there; leave the option out",
+            "the map is anchored to GNSS fixes, its axes point east, north and up, and "
+            "this is not down; leave the option out",
             field="--gravity",
             expected=f"0,0,-1 to within {MAX_DIRECTION_ERROR_DEG:g} degrees",
             got=f"{x:g},{y:g},{z:g}, {angle_deg:.1f} degrees off",

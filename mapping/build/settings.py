@@ -32,7 +32,7 @@ from mapping.options import (
     WorkersOption,
     names_in,
 )
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.features import DEFAULT_GLOBAL_FEATURES, DEFAULT_LOCAL_FEATURES
 from visloc.geometry import PixelOrigin
 from visloc.retrieval.fusion import LateFusion
@@ -50,9 +50,9 @@ def _weights_in(text: str) -> Mapping[str, float]:
     except ValueError:
         weights = {}
     if not weights or len(weights) < len(items) or "" in weights:
-        raise InvalidInput(
+        raise refuse(
             "build.fusion_weights",
-            "not weights of global features",
+            "these are not weights of global features",
             field="--fusion-weights",
             expected="NAME=WEIGHT,... such as densevlad=1,localvlad=2, each name once",
             got=text,

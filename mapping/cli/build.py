@@ -36,7 +36,7 @@ from mapping.options import (
     WorkersOption,
 )
 from visloc.archive import open_map
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.features import DEFAULT_GLOBAL_FEATURES, DEFAULT_LOCAL_FEATURES
 
 CovisibleInOption = Annotated[
@@ -107,9 +107,7 @@ def import_(settings: ImportSettings) -> None:
     build from it.
     """
     if (settings.map_id is None) == (settings.output is None):
-        raise InvalidInput(
-            "import.target", "say what to make", field="--map", expected="either --map or --output"
-        )
+        raise refuse("import.target", field="--map")
     if settings.output is not None:
         _import_dataset(settings, settings.output)
     if settings.map_id is not None:

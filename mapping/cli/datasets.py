@@ -25,7 +25,7 @@ from mapping.options import (
 )
 from mapping.sample import write_sample
 from visloc.archive import open_map
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.features import DEFAULT_LOCAL_FEATURES
 from visloc.kapture import read_dataset
 from visloc.types import Inference
@@ -137,7 +137,5 @@ def sample(
 def _parse_size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
     if not (width.isdecimal() and height.isdecimal()):
-        raise InvalidInput(
-            "sample.size", "not a size", field="--size", expected="WxH such as 640x480", got=text
-        )
+        raise refuse("sample.size", field="--size", got=text)
     return int(width), int(height)

@@ -32,7 +32,7 @@ from mapping.progress import one_step
 from mapping.stages.imported_points import read_imported_points
 from visloc.archive import Map, SetManifest, open_map, open_set, verify_map, verify_set
 from visloc.archive.checks import read_any_manifest
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.features.local.readymade import is_ready_made
 from visloc.kapture import read_dataset
@@ -111,12 +111,7 @@ class AnchorSettings:
         details = any(one is not None for one in (self.accuracy, self.scale, self.gravity))
         ways = (self.dataset is not None, self.correspondences is not None, has_place)
         if sum(ways) != 1 or (has_place and None in place) or (details and not has_place):
-            raise InvalidInput(
-                "anchor.source",
-                "say in one way where the map lies",
-                expected="--dataset; or --correspondences; or all of --latitude, --longitude, "
-                "--altitude, --yaw, and where needed --accuracy, --scale and --gravity",
-            )
+            raise refuse("anchor.source")
         if self.dataset is not None:
             fixes = correspondences_from_fixes(opened, read_dataset(self.dataset))
             return georeference(opened, fixes)

@@ -16,7 +16,7 @@ from mapping.maps.pruning.accuracy import BINS, Accuracy, lost, of_queries
 from mapping.maps.pruning.job import Pruned, prune_map
 from mapping.options import MapsDirOption, WeightsDirOption
 from visloc.archive import Map, MapStore
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.features import make_global_descriptor, make_local_features
 
 # More lost queries than this share of all, and than this number, are more than noise.
@@ -49,12 +49,7 @@ def prune(
     A new version is published; the old one stays. The accuracy before and after is printed.
     """
     if (max_bytes is None) == (max_landmarks is None):
-        raise InvalidInput(
-            "prune.goal",
-            "say how small",
-            field="--max-bytes",
-            expected="either --max-bytes or --max-landmarks",
-        )
+        raise refuse("prune.goal", field="--max-bytes")
     store = MapStore(maps_dir)
     opened = store.open(map_id)
     with StageProgress(ERR, if_stopped="nothing was published") as progress:
@@ -95,13 +90,7 @@ def parse_size(text: str, whole: int) -> int:
         number, unit = float(found[1]), found[2].upper()
         size = number / 100 * whole if unit == "%" else number * _UNITS[unit]
     if size < 1:
-        raise InvalidInput(
-            "prune.max_bytes",
-            "not a size",
-            field="--max-bytes",
-            expected="such as 200MB, 1.5GB, 50% or 1000000",
-            got=text,
-        )
+        raise refuse("prune.max_bytes", field="--max-bytes", got=text)
     return int(size)
 
 

@@ -30,7 +30,7 @@ from mapping.stages.work_folder import WorkFolder, exclusive
 from visloc.archive import Map, open_map
 from visloc.drawing.detail_levels import detail_order
 from visloc.drawing.point_bytes import packed_points
-from visloc.errors import Conflict
+from visloc.errors import Conflict, VislocError, refuse
 from visloc_web import report_parts
 
 # Landmarks that the file carries: 3.2 MB, and as many as a picture of a screen can tell apart.
@@ -132,18 +132,9 @@ def _work_folder(root: Path) -> Iterator[WorkFolder]:
             held.enter_context(exclusive(root.with_name(f"{root.name}.lock")))
             root.mkdir(exist_ok=True)
         except Conflict as error:
-            raise Conflict(
-                "report.running", "another report of this map is being made", field=str(root)
-            ) from error
+            raise refuse("report.running", field=str(root)) from error
         except OSError as error:
-            raise Conflict(
-                "report.work",
-                "finished work cannot be kept in this folder; give one that can be written",
-                field=str(root.parent),
-                expected="a folder that can be written, of --maps-dir, or of --output for a map "
-                "that is given as a folder",
-                got=error.strerror,
-            ) from error
+            raise refuse("report.work", field=str(root.parent), got=error.strerror) from error
         yield WorkFolder(root)
 
 
@@ -191,7 +182,7 @@ def _begun(target: Path) -> Path:
     unfinished = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:
         if target.is_dir():
-            raise _no_output(target, "this is a folder", "there is a folder of this name")
+            raise _no_output(target, "the path is a folder", "there is a folder of this name")
         target.parent.mkdir(parents=True, exist_ok=True)
         unfinished.touch()
     except OSError as error:
@@ -201,8 +192,8 @@ def _begun(target: Path) -> Path:
     return unfinished
 
 
-def _no_output(target: Path, message: str, why: str) -> Conflict:
-    return Conflict(
+def _no_output(target: Path, message: str, why: str) -> VislocError:
+    return refuse(
         "report.output",
         message,
         field="--output",

@@ -19,7 +19,7 @@ from mapping.options import MapsDirOption
 from visloc.archive import MapSet, MapStore, open_set
 from visloc.archive.checks import read_any_manifest
 from visloc.archive.set_rules import refuse_missing_tiles
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.sets.coarse import check_descriptor
 
 # More lines than anyone reads.
@@ -158,9 +158,11 @@ def _length(option: str, text: str, metric: bool) -> float:
     """
     match = re.fullmatch(r"([0-9]*\.?[0-9]+)(m?)", text.strip())
     if match is None or (match[2] and not metric):
-        raise InvalidInput(
+        raise refuse(
             f"split.{option[2:]}",
-            "not a length" if match is None else "the map is not metric: nobody knows its metres",
+            "the length is not valid"
+            if match is None
+            else "the map is not metric, so lengths in metres have no meaning",
             field=option,
             expected="a number such as 25 for units of the map, or 25m of a metric one"
             if match is None

@@ -10,7 +10,7 @@ from typing import Protocol, TypeVar
 from mapping.cluster.stage_timings import Spent
 from mapping.cluster.workers import Workers
 from mapping.progress import ItemProgress
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 
 T = TypeVar("T")
 
@@ -71,11 +71,5 @@ def open_executor(name: str, workers: int, ray_address: str) -> AbstractContextM
     try:
         from mapping.cluster.ray_pool import RayPool  # ray is optional
     except ImportError as error:
-        raise InvalidInput(
-            "build.no_ray",
-            "Ray is not installed: pip install 'visloc[cluster]'",
-            field="--executor",
-            expected="local, or ray where it is installed",
-            got=str(error),
-        ) from error
+        raise refuse("build.no_ray", field="--executor", got=str(error)) from error
     return RayPool(workers, ray_address)

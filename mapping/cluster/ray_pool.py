@@ -18,7 +18,7 @@ from mapping.cluster.stage_timings import Spent
 from mapping.cluster.workers import ONE_THREAD, do_batch, in_batches
 from mapping.progress import ItemProgress
 from visloc import __version__
-from visloc.errors import Unavailable
+from visloc.errors import refuse
 
 T = TypeVar("T")
 
@@ -59,12 +59,8 @@ class RayPool:
                 **own,
             )
         except (OSError, RuntimeError, ValueError) as error:
-            raise Unavailable(
-                "build.no_cluster",
-                "the Ray cluster cannot be used",
-                field="--ray-address",
-                expected="local, auto, HOST:PORT or ray://HOST:PORT of a running cluster",
-                got=f"{address}: {_reason(error)}",
+            raise refuse(
+                "build.no_cluster", field="--ray-address", got=f"{address}: {_reason(error)}"
             ) from error
         self._count = count
         self._spent = Spent()
@@ -131,12 +127,8 @@ def _reason(error: BaseException) -> str:
 def _do_batch(version: str, task: Callable[[T], object], items: Sequence[T]) -> tuple[int, Spent]:
     """Do a batch; this runs on the cluster."""
     if version != __version__:
-        raise Unavailable(
-            "build.other_version",
-            "a machine of the cluster has another version of visloc",
-            field="--ray-address",
-            expected=version,
-            got=__version__,
+        raise refuse(
+            "build.other_version", field="--ray-address", expected=version, got=__version__
         )
     return do_batch(task, items)
 
@@ -147,11 +139,11 @@ def _result_of(reference: ray.ObjectRef[Any]) -> tuple[int, Spent]:
     except ray.exceptions.RayTaskError as error:
         raise error.cause from None  # as the task raised it
     except ray.exceptions.RayError as error:
-        raise Unavailable(
+        raise refuse(
             "build.worker_died",
-            f"a worker of the cluster ended, {_RETRIES + 1} times in the same batch: it was "
-            "killed, or there was not enough memory; finished work is kept, the same command "
-            "resumes",
+            f"a worker of the cluster ended {_RETRIES + 1} times in the same batch: it "
+            "was killed or ran out of memory; finished work is kept, and the same "
+            "command resumes",
             field="--executor",
             got=type(error).__name__,
         ) from error

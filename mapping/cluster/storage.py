@@ -15,7 +15,7 @@ from pathlib import Path, PurePath
 from typing import Any, cast
 
 from visloc.archive import MapStore, sha256_of
-from visloc.errors import InvalidInput
+from visloc.errors import VislocError, refuse
 from visloc.kapture import Dataset, read_dataset
 
 # kapture's text files are fetched; everything else is read where it lies.
@@ -45,15 +45,8 @@ def place_of(text: str, option: str) -> Path:
     return cast("Path", place)
 
 
-def _bad_url(option: str, got: str) -> InvalidInput:
-    return InvalidInput(
-        "build.url",
-        "the URL cannot be used",
-        field=option,
-        expected="a folder, or a URL such as s3://BUCKET/FOLDER with visloc[cluster] installed; "
-        "credentials come from the environment",
-        got=got,
-    )
+def _bad_url(option: str, got: str) -> VislocError:
+    return refuse("build.url", field=option, got=got)
 
 
 def is_remote(place: Path) -> bool:

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from mapping.cluster.stage_timings import Spent, spent_here
 from mapping.progress import ItemProgress
-from visloc.errors import Unavailable
+from visloc.errors import refuse
 
 T = TypeVar("T")
 
@@ -86,12 +86,7 @@ class Workers:
                 self._spent += spent
                 progress(done, len(items))
         except BrokenProcessPool as error:
-            raise Unavailable(
-                "build.worker_died",
-                "a worker process ended: it was killed, or there was not enough memory; "
-                "finished work is kept, the same command resumes",
-                field="--workers",
-            ) from error
+            raise refuse("build.worker_died", field="--workers") from error
 
     def run_one(
         self, task: Callable[[T, ItemProgress], object], item: T, progress: ItemProgress

@@ -30,7 +30,7 @@ from scipy.special import stdtrit
 
 from mapping.stages.photos import MappingPhoto
 from visloc.archive import Anchor, Geodetic
-from visloc.errors import DatasetError
+from visloc.errors import refuse
 from visloc.geodesy import enu_from_geodetic
 from visloc.geometry import Pose, Similarity
 from visloc.kapture import Dataset
@@ -128,11 +128,11 @@ def coordinate_system(dataset: Dataset, receivers: set[str]) -> str:
     known = (*EPSG_GEODETIC, *_EPSG_UTM)
     for system, receiver in sorted(systems.items()):
         if len(systems) > 1 or system not in known:
-            raise DatasetError(
+            raise refuse(
                 "gnss.epsg",
-                f"the fixes of receiver {receiver!r} are in a coordinate system that is not known"
+                f"the coordinate system of the fixes of receiver {receiver!r} is unknown"
                 if system not in known
-                else "the fixes are in several coordinate systems; convert them to one",
+                else "the GNSS fixes use several coordinate systems; convert them to one",
                 field=str(dataset.root / "sensors" / "sensors.txt"),
                 expected=f"{' or '.join(EPSG_GEODETIC)} (degrees), or WGS84 / UTM in metres, "
                 "EPSG:32601 to 32660 and 32701 to 32760",

@@ -27,7 +27,7 @@ from mapping.stages.publishing import new_version
 from mapping.stages.work_folder import exclusive
 from visloc.archive import Anchor, Geodetic, Map, MapStore, down_of, write_anchored
 from visloc.archive.version_rules import outdated
-from visloc.errors import Conflict, DatasetError, InvalidInput
+from visloc.errors import VislocError, refuse
 from visloc.geodesy import enu_from_geodetic
 from visloc.geometry import Pose, Similarity
 from visloc.kapture import Dataset
@@ -98,18 +98,16 @@ def correspondences_from_fixes(opened: Map, dataset: Dataset) -> Correspondences
         if (time := times.get(image.name, image.timestamp)) in fixes
     ]
     if not found:
-        raise InvalidInput(
+        raise refuse(
             "anchor.fixes",
-            "no photo of the map has a GNSS fix in the dataset",
             field=str(dataset.root),
-            expected="records_gnss.txt with fixes at the timestamps of the map's photos",
             got=f"{len(fixes)} fixes, {len(opened.images)} photos",
         )
     system = coordinate_system(dataset, {fix.sensor_id for _, fix in found})
     if system not in EPSG_GEODETIC:
-        raise DatasetError(
+        raise refuse(
             "gnss.epsg",
-            "a place on Earth needs fixes in degrees",
+            "a place on Earth requires fixes in degrees",
             field=str(dataset.root / "sensors" / "sensors.txt"),
             expected=" or ".join(EPSG_GEODETIC),
             got=system,
@@ -150,9 +148,8 @@ def read_correspondences(opened: Map, path: Path) -> Correspondences:
     by_name = {image.name: row for row, image in enumerate(opened.images)}
     for number, row in rows:
         if row["image"] not in by_name:
-            raise InvalidInput(
+            raise refuse(
                 "anchor.image",
-                "the map has no such photo",
                 field=f"{path}:{number}",
                 expected=f"a name such as {opened.images[0].name}",
                 got=row["image"],
@@ -173,10 +170,7 @@ def georeference(opened: Map, known: Correspondences) -> Georeference:
     local = enu_from_geodetic(known.positions, origin)
     found = align_positions(known.points, local, known.max_error_m)
     if isinstance(found, str):
-        raise InvalidInput(
-            "anchor.undetermined",
-            f"these {len(known.names)} places do not tell where the map lies: {found}",
-        )
+        raise refuse("anchor.undetermined", count=len(known.names), why=found)
     similarity = found.similarity
     if opened.manifest.world.metric:
         similarity = _keep_scale(similarity, known.points[found.agrees], local[found.agrees])
@@ -220,11 +214,11 @@ def given_place(
     _check_positions(np.array([position]), "--latitude, --longitude, --altitude")
     world = opened.manifest.world
     if (scale is None) != world.metric or (scale is not None and not 0 < scale < math.inf):
-        raise InvalidInput(
+        raise refuse(
             "anchor.scale",
-            "a unit of this map is a metre"
+            "the unit of this map is the metre"
             if world.metric
-            else "how long a unit of this map is, is not known",
+            else "the unit of this map has an unknown length in metres",
             field="--scale",
             expected="nothing" if world.metric else "metres per unit, more than 0",
             got="nothing" if scale is None else scale,
@@ -233,14 +227,13 @@ def given_place(
     level = np.array([1.0, 0.0, 0.0]) + down * -down[0]
     length = float(np.linalg.norm(level))
     if not math.isfinite(yaw_deg) or length < _MIN_LEVEL:
-        raise InvalidInput(
+        raise refuse(
             "anchor.yaw",
-            "not a direction"
+            "this is not a valid direction"
             if length >= _MIN_LEVEL
-            else "the world's x axis is nearly upright and has no direction on the ground; "
-            "anchor the map by --correspondences",
+            else "the world's x axis is nearly vertical and has no horizontal direction; "
+            "anchor the map with --correspondences",
             field="--yaw",
-            expected="degrees from east to the x axis, counter-clockwise",
             got=yaw_deg,
         )
     # The world's axes that become east, north and up when yaw is 0, as rows.
@@ -262,12 +255,7 @@ def publish_anchored(opened: Map, found: Georeference, maps_dir: Path, *, force:
             when another version is in use; ``build.running``.
     """
     if opened.geodetic is not None and not force:
-        raise Conflict(
-            "map.anchored",
-            f"map {opened.ref} is anchored already; "
-            "--force publishes a new version and keeps the old one",
-            field="MAP",
-        )
+        raise refuse("map.anchored", field="MAP", ref=opened.ref)
     map_id, based_on = opened.manifest.id, opened.manifest.version
     store = MapStore(maps_dir)
     with (
@@ -305,9 +293,9 @@ def _keep_scale(
     """Return the best rigid fit: its rotation is that of the similarity."""
     # Both the fit and the map may be off by as much.
     if abs(math.log(similarity.scale)) > 2 * MAX_SCALE_ERROR:
-        raise InvalidInput(
+        raise refuse(
             "anchor.scale",
-            "the map says that its unit is a metre, and these places do not",
+            "the unit of the map is the metre, but the places give it another length",
             expected=f"a unit of 1 m to within {2 * MAX_SCALE_ERROR:.0%}, or a map that was built "
             "with --not-metric",
             got=f"a unit of {similarity.scale:.4g} m",
@@ -322,9 +310,9 @@ def _check_down(opened: Map, geodetic: Geodetic) -> None:
         return
     angle_deg = _angle_deg(opened.gravity, down_of(geodetic))
     if angle_deg > MAX_DIRECTION_ERROR_DEG:
-        raise InvalidInput(
+        raise refuse(
             "anchor.gravity",
-            "what points down by these places is not what the map has as down",
+            "the places and the map disagree about the down direction",
             expected=f"the same direction to within {MAX_DIRECTION_ERROR_DEG:g} degrees",
             got=f"{angle_deg:.1f} degrees",
         )
@@ -334,27 +322,23 @@ def _given_down(opened: Map, gravity: tuple[float, float, float] | None) -> NDAr
     known = opened.gravity
     if gravity is None:
         if known is None:
-            raise InvalidInput(
+            raise refuse(
                 "anchor.gravity",
-                "the map does not know what is down",
+                "the down direction of the map is unknown",
                 field="--gravity",
                 expected="X,Y,Z in its world, such as 0,0,-1",
             )
         return known
     length = math.hypot(*gravity)
     if not _MIN_LENGTH <= length < math.inf:
-        raise InvalidInput(
-            "anchor.gravity",
-            "not a direction",
-            field="--gravity",
-            expected="three finite numbers that are not all 0, such as 0,0,-1",
-            got=",".join(f"{value:g}" for value in gravity),
+        raise refuse(
+            "anchor.gravity", field="--gravity", got=",".join(f"{value:g}" for value in gravity)
         )
     down = np.array(gravity) / length
     if known is not None and _angle_deg(known, down) > MAX_DIRECTION_ERROR_DEG:
-        raise InvalidInput(
+        raise refuse(
             "anchor.gravity",
-            "the map knows another down; leave the option out",
+            "the map has another down direction; leave the option out",
             field="--gravity",
             expected=f"{','.join(f'{value:.4g}' for value in known)} to within "
             f"{MAX_DIRECTION_ERROR_DEG:g} degrees",
@@ -373,41 +357,40 @@ def _check_positions(positions: NDArray[np.float64], field: str) -> None:
     fine = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (np.abs(height) <= 100_000)
     if not fine.all():
         wrong = positions[~fine][0]
-        raise InvalidInput(
-            "anchor.position",
-            "not a place on Earth",
-            field=field,
-            expected="latitude -90 to 90 and longitude -180 to 180 degrees, altitude in metres",
-            got=", ".join(f"{value:g}" for value in wrong),
-        )
+        raise refuse("anchor.position", field=field, got=", ".join(f"{value:g}" for value in wrong))
 
 
 def _read_rows(path: Path) -> list[tuple[int, Mapping[str, str | float]]]:
     """Read the lines of a CSV file with their numbers."""
 
-    def refuse(line: int, message: str, expected: str, got: object) -> InvalidInput:
-        return InvalidInput(
-            "anchor.file", message, field=f"{path}:{line}", expected=expected, got=got
-        )
+    def bad(line: int, message: str, expected: str, got: object) -> VislocError:
+        return refuse("anchor.file", message, field=f"{path}:{line}", expected=expected, got=got)
 
     try:
         if path.stat().st_size > _MAX_FILE_BYTES:
-            raise refuse(1, "too large", f"at most {_MAX_FILE_BYTES} bytes", path.stat().st_size)
+            raise bad(
+                1, "the file is too large", f"at most {_MAX_FILE_BYTES} bytes", path.stat().st_size
+            )
         lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise refuse(1, "cannot be read", "a CSV file", str(error)) from None
+        raise bad(1, "the file cannot be read", "a CSV file", str(error)) from None
     header = tuple(name.strip() for name in lines[0]) if lines else ()
     columns: Sequence[str] = _IMAGE_COLUMNS if "image" in header else _POINT_COLUMNS
     if sorted(header) != sorted(columns):
         names = f"{','.join(_POINT_COLUMNS)} or {','.join(_IMAGE_COLUMNS)}"
-        raise refuse(1, "the first line must name the columns", names, ",".join(header))
+        raise bad(1, "the first line must name the columns", names, ",".join(header))
     rows: list[tuple[int, Mapping[str, str | float]]] = []
     for number, line in enumerate(lines[1:], start=2):
         if not line:
             continue
         if len(line) != len(header) or len(rows) >= _MAX_POINTS:
             expected = f"{len(header)} fields, in at most {_MAX_POINTS} lines"
-            raise refuse(number, "not such a line", expected, ",".join(line))
+            raise bad(
+                number,
+                "the line does not have the columns of the first line",
+                expected,
+                ",".join(line),
+            )
         try:
             rows.append(
                 (
@@ -419,9 +402,9 @@ def _read_rows(path: Path) -> list[tuple[int, Mapping[str, str | float]]]:
                 )
             )
         except ValueError as error:
-            raise refuse(number, "not a number", "finite numbers", str(error)) from None
+            raise bad(number, "the field is not a number", "finite numbers", str(error)) from None
     if not rows:
-        raise refuse(1, "there are no lines after the first", "three or more", 0)
+        raise bad(1, "there are no lines after the first", "three or more", 0)
     return rows
 
 

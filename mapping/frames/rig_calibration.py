@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from visloc.errors import Conflict, DatasetError, InvalidInput, TooLarge
+from visloc.errors import VislocError, refuse
 from visloc.geometry import Pose
 from visloc.kapture import Dataset
 from visloc.kapture.writer import write_rigs
@@ -134,21 +134,17 @@ def calibrate_rig(
             ``rig.not_rigid`` for cameras that move against each other.
     """
     if not rig or rig in dataset.sensors:
-        raise InvalidInput(
+        raise refuse(
             "rig.id",
-            "not the id of a rig",
+            "this is not a valid id of a rig",
             field="--rig",
             expected="an id that no sensor has",
             got=rig,
         )
     names = _chosen(dataset, cameras)
     if reference is not None and reference not in names:
-        raise InvalidInput(
-            "rig.reference",
-            "the reference is not one of the cameras",
-            field="--reference",
-            expected=f"one of {_some(names)}",
-            got=reference,
+        raise refuse(
+            "rig.reference", field="--reference", expected=f"one of {_some(names)}", got=reference
         )
     poses, notes = _poses_of(dataset, names)
     shared = _shared_instants(poses)
@@ -177,12 +173,7 @@ def refuse_known_rigs(output: Path) -> None:
         Conflict: ``rig.exists``.
     """
     if output.exists() or output.is_symlink():
-        raise Conflict(
-            "rig.exists",
-            "there is a file already, which stays as it is; name another one with --output",
-            field=str(output),
-            expected="a path that does not exist",
-        )
+        raise refuse("rig.exists", field=str(output))
 
 
 def write_calibration(calibration: RigCalibration, output: Path) -> None:
@@ -202,19 +193,18 @@ def _chosen(dataset: Dataset, cameras: Sequence[str] | None) -> list[str]:
     names = sorted(known if cameras is None else cameras)
     unknown = [name for name in names if name not in known]
     if unknown or len(set(names)) < len(names) or len(names) < 2:
-        raise InvalidInput(
+        raise refuse(
             "rig.cameras",
-            "not cameras of the dataset"
+            "the dataset does not have these cameras"
             if unknown
-            else "a rig has two cameras at least, each named once",
+            else "a rig needs at least two cameras, each named once",
             field="--cameras",
             expected=f"two or more of {_some(known)}" if len(known) > 1 else "two cameras or more",
             got=_some(unknown or names) or "none",
         )
     if len(names) > MAX_CAMERAS:
-        raise TooLarge(
+        raise refuse(
             "rig.too_many_cameras",
-            "too many cameras for one rig; name those that are on it",
             field="--cameras",
             expected=f"at most {MAX_CAMERAS}",
             got=len(names),
@@ -277,17 +267,15 @@ def _links(
 
 def _unconnected(
     dataset: Dataset, names: Sequence[str], shared: NDArray[np.int64], unconnected: Sequence[str]
-) -> DatasetError:
+) -> VislocError:
     connected = [row for row, name in enumerate(names) if name not in unconnected]
     counts = {name: int(shared[names.index(name), connected].max()) for name in unconnected}
-    return DatasetError(
+    return refuse(
         "rig.unconnected",
-        "cameras have photos with poses at too few instants (equal timestamps) at which a camera "
-        f"that is connected with the reference has one too: {_some(unconnected)}; leave them out "
-        "with --cameras, or give their photos poses and the timestamps of the others",
         field=str(dataset.root / "sensors"),
         expected=f"{MIN_INSTANTS} such instants or more",
         got=_some([f"{name}: {count}" for name, count in counts.items()]),
+        names=_some(unconnected),
     )
 
 
@@ -390,16 +378,16 @@ def _refuse_loose(
     turn, shift = relative.rotation_deg.median, relative.position.median
     if turn <= MAX_ROTATION_DEG and shift <= limit < math.inf:
         return
-    raise DatasetError(
+    raise refuse(
         "rig.not_rigid",
-        f"cameras {pair[1]!r} and {pair[0]!r} move against each other, so they are no rig, or "
-        "their timestamps or poses are wrong; leave one out with --cameras",
         field=str(dataset.root / "sensors" / "trajectories.txt"),
-        expected=f"relative poses of {relative.instants} instants that agree within "
+        expected=f"relative poses of {relative.instants} timestamps that agree within "
         f"{MAX_ROTATION_DEG:g} degrees and {limit:.3g} units in the median "
-        f"({MAX_POSITION_SHARE:.0%} of the larger of their distance, {distance:.3g}, and of their "
-        f"way from one instant to the next, {step:.3g})",
+        f"({MAX_POSITION_SHARE:.0%} of their distance, {distance:.3g}, or of their way between "
+        f"timestamps, {step:.3g}, whichever is larger)",
         got=f"{turn:.3g} degrees and {shift:.3g} units",
+        first=pair[1],
+        second=pair[0],
     )
 
 

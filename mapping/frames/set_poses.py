@@ -8,7 +8,7 @@ from pathlib import Path
 from visloc.archive import Geodetic, MapStore
 from visloc.archive.places import origin_of
 from visloc.archive.set_schema import MAX_SCALE, MIN_SCALE
-from visloc.errors import InvalidInput
+from visloc.errors import InvalidInput, refuse
 from visloc.geodesy import ecef_from_geodetic, enu_from_ecef
 from visloc.geometry import Pose, Similarity
 
@@ -30,8 +30,8 @@ def read_poses(path: Path, refs: Sequence[str]) -> list[tuple[str, Similarity]]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInput(
-            "set.poses", "cannot be read", field=str(path), expected="a text file"
+        raise refuse(
+            "set.poses", "the file cannot be read", field=str(path), expected="a text file"
         ) from error
     found: dict[str, Similarity] = {}
     for number, line in enumerate(lines, 1):
@@ -40,9 +40,11 @@ def read_poses(path: Path, refs: Sequence[str]) -> list[tuple[str, Similarity]]:
             continue
         where = f"{path}:{number}"
         if name in found or name not in refs:
-            raise InvalidInput(
+            raise refuse(
                 "set.poses",
-                "the map has two lines" if name in found else "not one of the maps of the set",
+                "the map has two lines"
+                if name in found
+                else "this is not one of the maps of the set",
                 field=where,
                 expected=f"one line for each of {', '.join(refs)}",
                 got=name,
@@ -50,7 +52,7 @@ def read_poses(path: Path, refs: Sequence[str]) -> list[tuple[str, Similarity]]:
         found[name] = _parsed(fields, where)
     absent = [ref for ref in refs if ref not in found]
     if absent:
-        raise InvalidInput(
+        raise refuse(
             "set.poses", "a map has no line", field=str(path), expected=_LINE, got=absent[0]
         )
     return [(ref, found[ref]) for ref in refs]
@@ -89,9 +91,9 @@ def set_from_world(geodetic: Geodetic, origin: Geodetic) -> Similarity:
 def _place(store: MapStore, ref: str) -> Geodetic:
     geodetic = store.outline(ref).geodetic
     if geodetic is None:
-        raise InvalidInput(
+        raise refuse(
             "set.poses",
-            f"{ref} is not tied to the Earth, so that nothing tells where it lies in the set",
+            f"{ref} is not anchored to the Earth, so its place in the set is unknown",
             field="MAP",
             expected="--poses FILE, or maps that `mapping anchor` tied to the Earth",
         )
@@ -105,13 +107,9 @@ def _parsed(fields: Sequence[str], where: str) -> Similarity:
         numbers = []
     scale = numbers[7] if len(numbers) == 8 else 1.0
     if len(numbers) not in (7, 8) or not MIN_SCALE <= scale <= MAX_SCALE:
-        raise InvalidInput(
-            "set.poses", "not a pose", field=where, expected=_LINE, got=" ".join(fields)
-        )
+        raise refuse("set.poses", field=where, expected=_LINE, got=" ".join(fields))
     try:
         pose = Pose.from_quaternion(numbers[:4], numbers[4:7])
     except InvalidInput as error:
-        raise InvalidInput(
-            error.code, error.message, field=where, expected=error.expected, got=error.got
-        ) from error
+        raise error.about(where, InvalidInput) from error
     return Similarity(scale, pose.rotation, pose.translation)

@@ -19,7 +19,7 @@ from mapping.progress import Progress, one_step
 from mapping.stages.outputs import refuse_existing
 from mapping.stages.work_folder import exclusive
 from visloc.archive import MapStore
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 
 __all__ = [
     "IMPORTERS",
@@ -123,21 +123,9 @@ def read_model(
         DatasetError: with the file, and the line or image, that is wrong.
     """
     if name not in IMPORTERS:
-        raise InvalidInput(
-            "import.unknown_format",
-            "no such format",
-            field="FORMAT",
-            expected=f"one of {', '.join(IMPORTERS)}",
-            got=name,
-        )
+        raise refuse("import.unknown_format", field="FORMAT", expected=IMPORTERS, got=name)
     if photos is not None and not photos.is_dir():
-        raise InvalidInput(
-            "import.photos",
-            "not a folder",
-            field="--photos",
-            expected="the folder that the names of photos are relative to",
-            got=str(photos),
-        )
+        raise refuse("import.photos", field="--photos", got=str(photos))
     module, function = IMPORTERS[name]
     read: Callable[..., ImportedModel] = getattr(import_module(module), function)
     if name == "images":  # the only one that decodes photos, which takes long

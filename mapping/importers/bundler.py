@@ -23,7 +23,7 @@ from mapping.importers.reading.centered import kept_measurements, note_on_absent
 from mapping.importers.reading.photo_names import photo_names, photo_size
 from mapping.importers.reading.text_lines import TextLines
 from mapping.importers.reading.tracks import Measurements, rotation_from_matrix
-from visloc.errors import DatasetError, InvalidInput
+from visloc.errors import InvalidInput, refuse
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
@@ -111,9 +111,9 @@ def _bundle_file(path: Path) -> Path:
     found = sorted(path.glob("*.out"))
     named = [file for file in found if file.name == "bundle.out"] or found
     if len(named) != 1:
-        raise DatasetError(
+        raise refuse(
             "import.missing",
-            "not exactly one Bundler file in this folder; name the file",
+            "the folder does not hold exactly one Bundler file; name the file",
             field=str(path),
             expected="bundle.out, or one *.out",
             got=[file.name for file in found],
@@ -133,11 +133,11 @@ def _list_file(path: Path, photos: Path | None) -> Path:
     for candidate in candidates:
         if candidate.is_file():
             return candidate
-    raise DatasetError(
+    raise refuse(
         "import.missing",
         "the list of photos is missing: one name per line, in the order of the cameras",
         field=str(path),
-        expected=f"one of {', '.join(str(candidate) for candidate in candidates)}",
+        expected=(str(candidate) for candidate in candidates),
     )
 
 
@@ -165,14 +165,18 @@ def _read_header(lines: TextLines, num_named: int, list_file: Path) -> int:
     """Check the number of cameras; return the number of points."""
     header = lines.next("# Bundle file v0.3")
     if header != "# Bundle file v0.3":
-        raise lines.error("not a Bundler file", expected="# Bundle file v0.3", got=header)
+        raise lines.error("this is not a Bundler file", expected="# Bundle file v0.3", got=header)
     fields = lines.next("the number of cameras and that of points").split()
     if len(fields) != 2:
-        raise lines.error("wrong number of fields", expected="2: cameras, points", got=len(fields))
+        raise lines.error(
+            "the line has the wrong number of fields",
+            expected="2: cameras, points",
+            got=len(fields),
+        )
     num_cameras, num_points = (lines.to_integer(field, _MAX_COUNT) for field in fields)
     if num_cameras != num_named:
         raise lines.error(
-            f"the list of photos ({list_file}) is not of this file",
+            f"the list of photos ({list_file}) belongs to another file",
             expected=f"{num_named} cameras, one per photo of the list",
             got=num_cameras,
         )
@@ -183,16 +187,16 @@ def _read_camera(lines: TextLines) -> _CameraBlock | None:
     focal, k1, k2 = lines.next_numbers(3, "f k1 k2 of a camera")
     start = lines.number
     if focal < 0:
-        raise lines.error("not a usable focal length", expected="more than 0", got=focal)
+        raise lines.error("the focal length is not valid", expected="more than 0", got=focal)
     matrix = [lines.next_numbers(3, "a row of a rotation") for _ in range(3)]
     translation = np.array(lines.next_numbers(3, "a translation"))
     if focal == 0:
         return None
     rotation = rotation_from_matrix(matrix)
     if rotation is None:
-        raise DatasetError(
+        raise refuse(
             "import.line",
-            "not a rotation",
+            "the matrix is not a rotation",
             field=f"{lines.path}:{start + 1}",
             expected="an orthonormal matrix",
             got=matrix,
@@ -204,7 +208,9 @@ def _read_camera(lines: TextLines) -> _CameraBlock | None:
 def _read_color(lines: TextLines) -> list[int]:
     fields = lines.next("R G B of a point").split()
     if len(fields) != 3:
-        raise lines.error("wrong number of fields", expected="3: R G B", got=len(fields))
+        raise lines.error(
+            "the line has the wrong number of fields", expected="3: R G B", got=len(fields)
+        )
     return [lines.to_integer(field, 255) for field in fields]
 
 
@@ -216,7 +222,9 @@ def _read_view_list(
     count = lines.to_integer(count_field, _MAX_COUNT)
     if len(fields) != 4 * count:
         raise lines.error(
-            "wrong number of fields", expected=f"{1 + 4 * count}: {expected}", got=len(fields) + 1
+            "the line has the wrong number of fields",
+            expected=f"{1 + 4 * count}: {expected}",
+            got=len(fields) + 1,
         )
     return [
         (
@@ -240,7 +248,7 @@ def _sensor(
     try:
         made = Camera("RADIAL", width, height, (focal, width / 2, height / 2, k1, k2))
     except InvalidInput as error:
-        raise DatasetError(
+        raise refuse(
             "import.line", error.message, field=f"{path}:{camera.line}", got=error.got
         ) from error
     return Sensor.with_camera(sensor_id, made)

@@ -18,7 +18,7 @@ from mapping.importers.colmap_checks import check_model, has_model
 from mapping.importers.colmap_database import REFUSALS, Database, DatabaseImage, read_database
 from mapping.importers.largest import ModelSize, largest_model
 from mapping.importers.model import ImportedImage, ImportedModel
-from visloc.errors import DatasetError, InvalidInput, NotFound, VislocError
+from visloc.errors import DatasetError, InvalidInput, NotFound, VislocError, refuse
 from visloc.geometry import CAMERA_MODELS, Camera, Pose
 from visloc.kapture import GnssRecord, Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
@@ -47,12 +47,13 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     places = _places(path, folder)
     database_path = path if path.is_file() else _database_in(places)
     if folder is None and database_path is None:
-        raise NotFound(
+        raise refuse(
             "import.missing",
-            "there is neither a COLMAP model nor a database",
+            "there is neither a COLMAP model nor a COLMAP database",
             field=str(path),
             expected="cameras, images and points3D (.bin or .txt), there, in sparse/0, sparse or "
             "a subfolder; or a database.db",
+            kind=NotFound,
         )
     if photos is None:
         photos = next((p / "images" for p in places if (p / "images").is_dir()), None)
@@ -119,9 +120,9 @@ def _reconstruction(folder: Path) -> pycolmap.Reconstruction:
     try:
         return pycolmap.Reconstruction(folder)
     except REFUSALS as error:
-        raise DatasetError(
+        raise refuse(
             "import.colmap",
-            "not a COLMAP model, or a damaged one",
+            "the COLMAP model is damaged or not a COLMAP model",
             field=str(folder),
             expected="files that belong together",
             got=str(error),
@@ -283,13 +284,7 @@ def _pose(image: pycolmap.Image, folder: Path) -> Pose | None:
     try:
         return Pose.from_quaternion((w, x, y, z), rigid.translation)
     except InvalidInput as error:
-        raise DatasetError(
-            error.code,
-            error.message,
-            field=f"{folder}: image {image.name!r}",
-            expected=error.expected,
-            got=error.got,
-        ) from error
+        raise error.about(f"{folder}: image {image.name!r}", DatasetError) from error
 
 
 def _sensor_id(camera_id: int) -> str:
@@ -300,13 +295,14 @@ def _sensor(camera: pycolmap.Camera, source: Path, image: str | None) -> Sensor:
     where = f"{source}: camera {camera.camera_id}" + ("" if image is None else f" of {image!r}")
     model = camera.model.name
     if model not in CAMERA_MODELS:
-        raise DatasetError(
+        raise refuse(
             "camera.model",
-            "kapture has no such camera model; in COLMAP, undistort the images first, or estimate "
-            "with another model",
+            "kapture does not have this camera model; undistort the images in COLMAP "
+            "first, or estimate with another model",
             field=where,
-            expected=f"one of {', '.join(CAMERA_MODELS)}",
+            expected=CAMERA_MODELS,
             got=model,
+            kind=DatasetError,
         )
     try:
         return Sensor.with_camera(
@@ -314,9 +310,7 @@ def _sensor(camera: pycolmap.Camera, source: Path, image: str | None) -> Sensor:
             Camera(model, camera.width, camera.height, tuple(map(float, camera.params))),
         )
     except InvalidInput as error:
-        raise DatasetError(
-            error.code, error.message, field=where, expected=error.expected, got=error.got
-        ) from error
+        raise error.about(where, DatasetError) from error
 
 
 def _timestamps(frames: Iterable[tuple[str, object]]) -> dict[str, int]:

@@ -14,7 +14,7 @@ import PIL.Image  # noqa: F401  Pillow saves PNGs only when it was imported befo
 import pycolmap
 
 from mapping.importers.reading.text_lines import TextLines
-from visloc.errors import DatasetError
+from visloc.errors import DatasetError, VislocError, refuse
 from visloc.geometry import MAX_IMAGE_SIDE
 
 FILES = ("cameras", "images", "points3D")
@@ -99,8 +99,8 @@ class _Bytes:
         if self._position != len(self._content):
             raise self.damaged(f"{len(self._content) - self._position} bytes too many")
 
-    def damaged(self, got: str) -> DatasetError:
-        return DatasetError(
+    def damaged(self, got: str) -> VislocError:
+        return refuse(
             "import.colmap",
             "the file is damaged",
             field=str(self.path),
@@ -118,9 +118,7 @@ def _check_binary(path: Path) -> None:
                 with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
                     _walk(_Bytes(path, content))
     except OSError as error:
-        raise DatasetError(
-            "import.unreadable", "cannot be read", field=str(path), got=error.strerror
-        ) from error
+        raise refuse("import.unreadable", field=str(path), got=error.strerror) from error
 
 
 def _walk(data: _Bytes) -> None:
@@ -173,22 +171,28 @@ def _check_cameras_text(path: Path) -> set[int]:
         while (line := _next_record(lines)) is not None:
             fields = line.split()
             if len(fields) < 4:
-                raise _bad(lines, "not a camera", "id, model, width, height, parameters", line)
+                raise _bad(
+                    lines,
+                    "the line does not describe a camera",
+                    "id, model, width, height, parameters",
+                    line,
+                )
             if fields[1] not in _NUM_PARAMS:
-                raise DatasetError(
+                raise refuse(
                     "camera.model",
-                    "unknown camera model",
                     field=f"{path}:{lines.number}",
-                    expected=f"one of {', '.join(_NUM_PARAMS)}",
+                    expected=_NUM_PARAMS,
                     got=fields[1],
+                    kind=DatasetError,
                 )
             if len(fields) != 4 + _NUM_PARAMS[fields[1]]:
-                raise DatasetError(
+                raise refuse(
                     "camera.param_count",
-                    f"wrong number of parameters for {fields[1]}",
                     field=f"{path}:{lines.number}",
                     expected=str(_NUM_PARAMS[fields[1]]),
                     got=len(fields) - 4,
+                    kind=DatasetError,
+                    model=fields[1],
                 )
             for side in fields[2:4]:
                 lines.to_integer(side, MAX_IMAGE_SIDE)
@@ -196,7 +200,7 @@ def _check_cameras_text(path: Path) -> set[int]:
                 lines.to_number(number)
             camera = lines.to_integer(fields[0], _MAX_ID)
             if camera in cameras:
-                raise _bad(lines, "two cameras of one id", "every id once", fields[0])
+                raise _bad(lines, "two cameras have the same id", "every id once", fields[0])
             cameras.add(camera)
     return cameras
 
@@ -210,12 +214,15 @@ def _check_images_text(path: Path, cameras: set[int]) -> dict[int, int]:
             fields = line.split(maxsplit=9)
             if len(fields) != 10:
                 raise _bad(
-                    lines, "not an image", "id, qw qx qy qz, tx ty tz, camera, name", fields[:10]
+                    lines,
+                    "the line does not describe an image",
+                    "id, qw qx qy qz, tx ty tz, camera, name",
+                    fields[:10],
                 )
             if len(fields[9].split()) > 1:  # pycolmap would read up to the blank
                 raise _bad(
                     lines,
-                    "a text model cannot hold this name; convert the model to binary",
+                    "a text model cannot store this name; convert the model to binary",
                     "a name without blanks",
                     fields[9],
                 )
@@ -225,12 +232,12 @@ def _check_images_text(path: Path, cameras: set[int]) -> dict[int, int]:
             if lines.to_integer(fields[8], _MAX_ID) not in cameras:
                 raise _bad(
                     lines,
-                    f"image {fields[9]!r} is of a camera that cameras.txt does not have",
+                    f"cameras.txt does not have the camera of image {fields[9]!r}",
                     f"one of {', '.join(map(str, sorted(cameras)[:10]))}",
                     fields[8],
                 )
             if image in images:
-                raise _bad(lines, "two images of one id", "every id once", fields[0])
+                raise _bad(lines, "two images have the same id", "every id once", fields[0])
             if fields[9] in names:
                 raise _twice(f"{path}:{lines.number}", fields[9])
             names.add(fields[9])
@@ -238,7 +245,7 @@ def _check_images_text(path: Path, cameras: set[int]) -> dict[int, int]:
             if len(keypoints) % 3:
                 raise _bad(
                     lines,
-                    "not keypoints",
+                    "the keypoints are not valid",
                     "x, y, point id of each",
                     f"{len(keypoints)} fields",
                 )
@@ -259,7 +266,7 @@ def _check_points_text(path: Path, images: dict[int, int]) -> None:
             if len(fields) < 8 or len(fields) % 2:
                 raise _bad(
                     lines,
-                    "not a point",
+                    "the line does not describe a point",
                     "id, x y z, r g b, error, pairs of image and keypoint",
                     f"{len(fields)} fields",
                 )
@@ -269,7 +276,7 @@ def _check_points_text(path: Path, images: dict[int, int]) -> None:
                 lines.to_integer(channel, 255)
             point = lines.to_integer(fields[0], 2**63)
             if point in points:
-                raise _bad(lines, "two points of one id", "every id once", fields[0])
+                raise _bad(lines, "two points have the same id", "every id once", fields[0])
             points.add(point)
             for index in range(8, len(fields), 2):
                 image = lines.to_integer(fields[index], _MAX_ID)
@@ -277,7 +284,7 @@ def _check_points_text(path: Path, images: dict[int, int]) -> None:
                 if keypoint >= images.get(image, 0):
                     raise _bad(
                         lines,
-                        "the point is seen by a keypoint that images.txt does not have",
+                        "images.txt does not have a keypoint of this point",
                         "an image and the index of one of its keypoints",
                         f"image {image}, keypoint {keypoint}",
                     )
@@ -289,21 +296,11 @@ def _next_record(lines: TextLines) -> str | None:
     return line
 
 
-def _bad(lines: TextLines, message: str, expected: str, got: object) -> DatasetError:
-    return DatasetError(
-        "import.colmap",
-        message,
-        field=f"{lines.path}:{lines.number}",
-        expected=expected,
-        got=got,
+def _bad(lines: TextLines, message: str, expected: str, got: object) -> VislocError:
+    return refuse(
+        "import.colmap", message, field=f"{lines.path}:{lines.number}", expected=expected, got=got
     )
 
 
-def _twice(where: str, name: str) -> DatasetError:
-    return DatasetError(
-        "import.duplicate_image",
-        "two images have the same name",
-        field=where,
-        expected="every name once",
-        got=name,
-    )
+def _twice(where: str, name: str) -> VislocError:
+    return refuse("import.duplicate_image", field=where, got=name)

@@ -14,7 +14,7 @@ import PIL.Image  # noqa: F401  Pillow saves PNGs only when it was imported befo
 import pycolmap
 from numpy.typing import NDArray
 
-from visloc.errors import DatasetError
+from visloc.errors import refuse
 
 # What pycolmap raises on files that it cannot read; seen by damaging them.
 REFUSALS = (ValueError, RuntimeError, IndexError, KeyError, MemoryError, OSError)
@@ -53,12 +53,13 @@ def read_database(path: Path) -> Database:
         with path.open("rb") as file:
             is_database = file.read(len(_SQLITE)) == _SQLITE
     except OSError as error:
-        raise DatasetError(
-            "import.unreadable", "cannot be read", field=str(path), got=error.strerror
-        ) from error
+        raise refuse("import.unreadable", field=str(path), got=error.strerror) from error
     if not is_database:
-        raise DatasetError(
-            "import.colmap", "not a COLMAP database", field=str(path), expected="an SQLite file"
+        raise refuse(
+            "import.colmap",
+            "the file is not a COLMAP database",
+            field=str(path),
+            expected="an SQLite file",
         )
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "database.db"  # pycolmap migrates old databases in place
@@ -73,9 +74,9 @@ def read_database(path: Path) -> Database:
             finally:
                 database.close()
         except REFUSALS as error:
-            raise DatasetError(
+            raise refuse(
                 "import.colmap",
-                "not a COLMAP database, or a damaged one",
+                "the file is not a COLMAP database, or it is damaged",
                 field=str(path),
                 got=str(error),
             ) from error
@@ -94,11 +95,11 @@ def _contents(path: Path, database: pycolmap.Database) -> Database:
     kinds: set[str] = set()
     for image in database.read_all_images():
         if image.camera_id not in cameras:
-            raise DatasetError(
+            raise refuse(
                 "import.colmap",
-                f"image {image.name!r} is of a camera that the database does not have",
+                f"the database does not have the camera of image {image.name!r}",
                 field=str(path),
-                expected=f"one of {', '.join(map(str, sorted(cameras)[:10]))}",
+                expected=map(str, sorted(cameras)[:10]),
                 got=image.camera_id,
             )
         key = image.image_id

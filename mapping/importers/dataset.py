@@ -12,7 +12,7 @@ from mapping.importers.left_out import list_path, notes_on, write_list
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.reading.photo_names import is_stored_turned, photo_size
 from mapping.stages.outputs import complete_output
-from visloc.errors import DatasetError
+from visloc.errors import refuse
 from visloc.kapture import (
     Dataset,
     FileRecord,
@@ -130,7 +130,7 @@ def _reconstruction(model: ImportedModel) -> Reconstruction:
 
 def _check_images(model: ImportedModel) -> None:
     if not model.images:
-        raise DatasetError("import.empty", "there are no photos in it", expected="photos")
+        raise refuse("import.empty", expected="photos")
     for image in model.images:
         _check_path(image.name, image.name)
         _check_sensor(model, image, image.sensor, "camera")
@@ -153,11 +153,8 @@ def _check_images(model: ImportedModel) -> None:
     )
     fixes = [(record.timestamp, record.sensor_id) for record in model.gnss]
     if len(set(fixes)) < len(fixes):
-        raise DatasetError(
-            "import.duplicate_record",
-            "a GNSS receiver has two fixes of the same time",
-            expected="every timestamp once",
-            got=next(fix for fix in fixes if fixes.count(fix) > 1),
+        raise refuse(
+            "import.duplicate_record", got=next(fix for fix in fixes if fixes.count(fix) > 1)
         )
 
 
@@ -167,25 +164,18 @@ def _check_path(path: str, image: str) -> None:
     except ValueError:
         usable = False
     if not usable:
-        raise DatasetError(
-            "import.name",
-            "kapture cannot hold this name; rename the file, and in the model",
-            field=f"image {image!r}",
-            expected="a path below the folder of photos, with forward slashes, without commas, "
-            "control characters, or blanks around it",
-            got=path,
-        )
+        raise refuse("import.name", field=f"image {image!r}", got=path)
 
 
 def _check_sensor(model: ImportedModel, image: ImportedImage, sensor: str, kind: str) -> None:
     found = model.sensors.get(sensor)
     if found is None or found.kind != kind:
-        raise DatasetError(
+        raise refuse(
             "import.sensor",
-            f"the photo is of a {kind} sensor that the model does not have",
             field=f"image {image.name!r}",
-            expected=f"one of {', '.join(s.id for s in model.sensors.values() if s.kind == kind)}",
+            expected=(s.id for s in model.sensors.values() if s.kind == kind),
             got=sensor,
+            what=kind,
         )
 
 
@@ -200,7 +190,7 @@ def _refuse_twice(
     for image in images:
         key = key_of(image)
         if key in seen:
-            raise DatasetError(
+            raise refuse(
                 code,
                 message,
                 field=f"image {image.name!r}",
@@ -212,9 +202,9 @@ def _refuse_twice(
 
 def _check_features(model: ImportedModel) -> None:
     if not is_folder_name(model.keypoints_type):
-        raise DatasetError(
+        raise refuse(
             "import.features",
-            "not the name of a feature type",
+            "this is not a valid name of a feature type",
             expected="a folder name without commas",
             got=model.keypoints_type,
         )
@@ -225,7 +215,7 @@ def _check_features(model: ImportedModel) -> None:
             continue
         where = f"image {image.name!r}"
         if keypoints is None or (descriptors is not None and len(keypoints) != len(descriptors)):
-            raise DatasetError(
+            raise refuse(
                 "import.features",
                 "the numbers of keypoints and descriptors differ",
                 field=where,
@@ -234,9 +224,9 @@ def _check_features(model: ImportedModel) -> None:
                 f"{0 if descriptors is None else len(descriptors)} descriptors",
             )
         if keypoints.ndim != 2 or keypoints.shape[1] < 2 or not np.isfinite(keypoints).all():
-            raise DatasetError(
+            raise refuse(
                 "import.features",
-                "keypoints are not usable",
+                "the keypoints are not valid",
                 field=where,
                 expected="(n, 2 or more) finite numbers",
                 got=f"shape {keypoints.shape}",
@@ -247,9 +237,9 @@ def _check_features(model: ImportedModel) -> None:
             kind = (array.shape[1], array.dtype.name)
             known, first = kinds.setdefault(what, (kind, image.name))
             if kind != known:
-                raise DatasetError(
+                raise refuse(
                     "import.features",
-                    f"{what} are not of one kind",
+                    f"the {what} differ in size or type between photos",
                     field=where,
                     expected=f"{known[0]} {known[1]} each, as of {first!r}",
                     got=f"{kind[0]} {kind[1]}",
@@ -259,7 +249,7 @@ def _check_features(model: ImportedModel) -> None:
 def _check_points(model: ImportedModel) -> None:
     points, colors, observations = model.points, model.colors, model.observations
     if len(colors) not in (0, len(points)):
-        raise DatasetError(
+        raise refuse(
             "import.points",
             "the numbers of points and colours differ",
             expected=f"{len(points)} colours",
@@ -267,9 +257,9 @@ def _check_points(model: ImportedModel) -> None:
         )
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
-        raise DatasetError(
+        raise refuse(
             "import.points",
-            "a point is not at a place",
+            "the coordinates of a point are not finite",
             field=f"point {bad[0]} (counted from 0)",
             expected="finite coordinates",
             got=points[bad[0]].tolist(),
@@ -283,9 +273,8 @@ def _check_points(model: ImportedModel) -> None:
     if outside.any():
         row = observations[np.flatnonzero(outside)[0]].tolist()
         name = model.images[row[1]].name if 0 <= row[1] < len(counts) else "?"
-        raise DatasetError(
+        raise refuse(
             "import.observations",
-            "a point is seen by a keypoint that does not exist",
             field=f"image {name!r}",
             expected=f"points up to {len(points) - 1}, images up to {len(counts) - 1}, keypoints "
             "up to their number, counted from 0",
@@ -307,10 +296,8 @@ def _check_photos(model: ImportedModel) -> list[str]:
     text = ", ".join(missing[:_NAMED]) + (", ..." if len(missing) > _NAMED else "")
     has_features = all(image.descriptors is not None for image in model.images)
     if len(missing) == len(model.images) and not has_features:
-        raise DatasetError(
+        raise refuse(
             "import.photos_missing",
-            "none of the photos is there, and there are no descriptors to use instead; name their "
-            "folder with --photos",
             field="--photos" if model.photos is None else str(model.photos),
             expected=f"{len(model.images)} photos: {text}",
             got="no folder of photos" if model.photos is None else "none of them",
@@ -336,12 +323,11 @@ def _check_sizes(model: ImportedModel) -> None:
     if not wrong:
         return
     path, (width, height), expected, sensor = wrong[0]
-    raise DatasetError(
+    raise refuse(
         "import.photo_size",
-        f"{len(wrong)} of {len(model.images)} photos are not of the size of their camera, this one "
-        "is the first; name the folder of photos of that size with --photos, or scale the cameras "
-        "in the model: size, focal length and principal point",
         field=str(path),
         expected=f"{expected[0]} x {expected[1]} pixels, as its camera {sensor}",
         got=f"{width} x {height} pixels",
+        count=len(wrong),
+        total=len(model.images),
     )

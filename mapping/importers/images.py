@@ -17,7 +17,7 @@ from PIL import ExifTags, Image
 from mapping.importers.left_out import notes_on
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.methods.intrinsics import FROM_EXIF
-from visloc.errors import DatasetError, InvalidInput, NotFound, TooLarge
+from visloc.errors import InvalidInput, NotFound, TooLarge, VislocError, refuse
 from visloc.file_kinds import HEAD_BYTES, FileKind, file_kind
 from visloc.geometry import Camera
 from visloc.images import FORMATS, ImageLimits, read_photo
@@ -99,9 +99,9 @@ def read(
         DatasetError: ``import.empty`` if it holds no readable photo.
     """
     if photos is not None:
-        raise InvalidInput(
+        raise refuse(
             "import.photos",
-            "a folder of photos has no other one beside it",
+            "a folder of photos does not take a second folder of photos",
             field="--photos",
             expected="only PATH",
             got=str(photos),
@@ -109,13 +109,17 @@ def read(
     if path.is_file():
         raise _not_a_folder(path)
     if not path.is_dir():
-        raise NotFound(
-            "import.missing", "no such folder", field=str(path), expected="a folder of photos"
+        raise refuse(
+            "import.missing",
+            "there is no such folder",
+            field=str(path),
+            expected="a folder of photos",
+            kind=NotFound,
         )
     files = _files_in(path)
     found = _read_photos(path, files, progress or (lambda _done, _total: None))
     if not found:
-        raise DatasetError(
+        raise refuse(
             "import.empty",
             "; ".join(["the folder holds no readable photo", *notes_on(files.left_out)]),
             field=str(path),
@@ -168,7 +172,7 @@ def _read_photos(path: Path, files: _Files, progress: Callable[[int, int], None]
     return found
 
 
-def _not_a_folder(file: Path) -> InvalidInput:
+def _not_a_folder(file: Path) -> VislocError:
     kind = _kind_of(file)
     if kind is None:
         advice = "name the folder that it lies in"
@@ -176,12 +180,11 @@ def _not_a_folder(file: Path) -> InvalidInput:
         advice = "a map takes several photos: name the folder that they lie in"
     else:
         advice = kind.refusal
-    return InvalidInput(
+    return refuse(
         "import.folder",
-        f"this is a file; {advice}",
         field=str(file),
-        expected="a folder of photos",
         got="a file" if kind is None else f"a file, {kind.name}",
+        advice=advice,
     )
 
 
@@ -251,13 +254,9 @@ def _read_photo(folder: Path, name: str) -> _Found:
             data = file.read(_LIMITS.max_bytes + 1)
         photo = read_photo(data, _LIMITS)  # decodes, as a build will
     except OSError as error:
-        raise InvalidInput(
-            "image.unreadable", "cannot be read", field=name, got=error.strerror
-        ) from error
+        raise refuse("image.unreadable", field=name, got=error.strerror) from error
     except InvalidInput as error:
-        raise InvalidInput(
-            error.code, error.message, field=name, expected=error.expected, got=error.got
-        ) from error
+        raise error.about(name, InvalidInput) from error
     top, details, gps = _exif(data)
     camera = " ".join(
         _text(top.get(tag)) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)

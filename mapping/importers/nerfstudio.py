@@ -21,7 +21,7 @@ from mapping.importers.reading.json_fields import JsonValue, read_json
 from mapping.importers.reading.photo_names import photo_names, photo_size
 from mapping.importers.reading.tracks import rotation_from_matrix
 from mapping.stages.depth import DEFAULT_DEPTH_SCALE
-from visloc.errors import DatasetError, InvalidInput
+from visloc.errors import DatasetError, InvalidInput, VislocError, refuse
 from visloc.geometry import MAX_IMAGE_SIDE, Camera, Pose
 from visloc.kapture import Sensor
 
@@ -143,7 +143,8 @@ def _pose(value: JsonValue) -> Pose:
     rows = [row.numbers(4) for row in value.elements()]
     if len(rows) not in (3, 4) or rows[3:] not in ([], [[0, 0, 0, 1]]):
         raise value.error(
-            "not a pose", expected="a rotation and a position, camera to world: 3 or 4 rows of 4"
+            "the matrix is not a pose",
+            expected="a rotation and a position, camera to world: 3 or 4 rows of 4",
         )
     matrix = np.array(rows, np.float64)
     rotation = rotation_from_matrix(matrix[:3, :3])
@@ -153,7 +154,7 @@ def _pose(value: JsonValue) -> Pose:
     return Pose(cam_from_world, -cam_from_world @ matrix[:3, 3])
 
 
-def _no_rotation(matrix: NDArray[np.float64], value: JsonValue) -> DatasetError:
+def _no_rotation(matrix: NDArray[np.float64], value: JsonValue) -> VislocError:
     """Say what is wrong with the left three columns of a transform."""
     lengths = np.linalg.norm(matrix, axis=0)
     determinant = float(np.linalg.det(matrix))
@@ -165,7 +166,7 @@ def _no_rotation(matrix: NDArray[np.float64], value: JsonValue) -> DatasetError:
         message = f"the pose is scaled by {scale:.6g}; divide its first three columns by that"
     else:
         message = "the first three columns of the pose are not a rotation"
-    return DatasetError(
+    return refuse(
         "import.json",
         message,
         field=value.where,
@@ -184,7 +185,7 @@ def _camera(top: JsonValue, frame: JsonValue, photo: Path) -> Camera:
 
     size = _size(find("w"), find("h")) or photo_size(photo)
     if size is None:
-        raise frame.error("neither the file nor a photo tells the size", expected="w and h")
+        raise frame.error("neither the file nor a photo gives the image size", expected="w and h")
     width, height = size
     focal = number("fl_x")
     angle = number("camera_angle_x")
@@ -209,15 +210,16 @@ def _camera(top: JsonValue, frame: JsonValue, photo: Path) -> Camera:
     if name == "OPENCV_FISHEYE":
         ours, params = name, (*pinhole, k1, k2, k3, k4)
     elif name not in _PERSPECTIVE:
-        raise DatasetError(
+        raise refuse(
             "camera.model",
-            "kapture has no such camera model",
+            "kapture does not have this camera model",
             field=(model or frame).where,
-            expected=f"one of {', '.join((*_PERSPECTIVE, 'OPENCV_FISHEYE'))}",
+            expected=(*_PERSPECTIVE, "OPENCV_FISHEYE"),
             got=name,
+            kind=DatasetError,
         )
     elif k4:
-        raise frame.error("k4 of a perspective camera cannot be kept", expected="0")
+        raise frame.error("kapture cannot store k4 of a perspective camera", expected="0")
     elif k3:
         ours, params = "FULL_OPENCV", (*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
     elif k1 or k2 or p1 or p2:
@@ -227,9 +229,7 @@ def _camera(top: JsonValue, frame: JsonValue, photo: Path) -> Camera:
     try:
         return Camera(ours, width, height, params)
     except InvalidInput as error:
-        raise DatasetError(
-            error.code, error.message, field=frame.where, expected=error.expected, got=error.got
-        ) from error
+        raise error.about(frame.where, DatasetError) from error
 
 
 def _size(width: JsonValue | None, height: JsonValue | None) -> tuple[int, int] | None:
@@ -239,7 +239,9 @@ def _size(width: JsonValue | None, height: JsonValue | None) -> tuple[int, int] 
     for value in (width, height):
         side = value.number()  # some recorders write 1920.0
         if not (side.is_integer() and 1 <= side <= MAX_IMAGE_SIDE):
-            raise value.error("not a size", expected=f"1 to {MAX_IMAGE_SIDE} whole pixels")
+            raise value.error(
+                "this is not a valid size", expected=f"1 to {MAX_IMAGE_SIDE} whole pixels"
+            )
         sides.append(int(side))
     return sides[0], sides[1]
 

@@ -26,7 +26,7 @@ from mapping.importers.reading.centered import kept_measurements, note_on_absent
 from mapping.importers.reading.photo_names import photo_names, photo_size
 from mapping.importers.reading.text_lines import TextLines
 from mapping.importers.reading.tracks import Measurements, pose_from_center, rotation_from_matrix
-from visloc.errors import DatasetError, InvalidInput
+from visloc.errors import InvalidInput, refuse
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
@@ -89,7 +89,7 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
         while (part := _read_part(lines, has_matrices)) is not None:
             parts.append(part)
     if not parts:
-        raise DatasetError("import.empty", "the file holds no model", field=str(path))
+        raise refuse("import.empty", "the file holds no model", field=str(path))
     sizes = [
         ModelSize(f"model {number}", photos=len(part.cameras), points=len(part.points))
         for number, part in enumerate(parts)
@@ -103,9 +103,9 @@ def _nvm_file(path: Path) -> Path:
         return path
     found = sorted(path.glob("*.nvm"))
     if len(found) != 1:
-        raise DatasetError(
+        raise refuse(
             "import.missing",
-            "not exactly one NVM file in this folder; name the file",
+            "the folder does not hold exactly one NVM file; name the file",
             field=str(path),
             expected="one *.nvm",
             got=[file.name for file in found],
@@ -116,17 +116,17 @@ def _nvm_file(path: Path) -> Path:
 def _read_header(lines: TextLines) -> tuple[_Calibration | None, bool]:
     fields = lines.next("NVM_V3").split()
     if fields[0] not in ("NVM_V3", "NVM_V3_R9T"):
-        raise lines.error("not an NVM file", expected="NVM_V3 or NVM_V3_R9T", got=fields[0])
+        raise lines.error("this is not an NVM file", expected="NVM_V3 or NVM_V3_R9T", got=fields[0])
     if len(fields) == 1:
         return None, fields[0] == "NVM_V3_R9T"
     if fields[1] != "FixedK" or len(fields) < 6:
         raise lines.error(
-            "unknown calibration", expected="FixedK fx cx fy cy", got=" ".join(fields[1:])
+            "the calibration is unknown", expected="FixedK fx cx fy cy", got=" ".join(fields[1:])
         )
     fx, cx, fy, cy = (lines.to_number(field) for field in fields[2:6])
     if min(fx, fy) < _MIN_FOCAL:
         raise lines.error(
-            "not a usable focal length", expected=f"at least {_MIN_FOCAL} px", got=[fx, fy]
+            "the focal length is not valid", expected=f"at least {_MIN_FOCAL} px", got=[fx, fy]
         )
     return _Calibration(fx, cx, fy, cy), fields[0] == "NVM_V3_R9T"
 
@@ -149,24 +149,28 @@ def _read_camera(lines: TextLines, has_matrices: bool) -> _CameraLine:
     name, *fields = lines.next("a camera").rsplit(None, num_numbers)
     if len(fields) != num_numbers:
         raise lines.error(
-            "not a camera", expected=f"a name and {num_numbers} numbers", got=len(fields)
+            "the line does not describe a camera",
+            expected=f"a name and {num_numbers} numbers",
+            got=len(fields),
         )
     focal, *numbers, k, _ = (lines.to_number(field) for field in fields)
     if focal < _MIN_FOCAL:
         raise lines.error(
-            "not a usable focal length", expected=f"at least {_MIN_FOCAL} px", got=focal
+            "the focal length is not valid", expected=f"at least {_MIN_FOCAL} px", got=focal
         )
     if has_matrices:
         rotation = rotation_from_matrix(numbers[:9])
         if rotation is None:
-            raise lines.error("not a rotation", expected="an orthonormal matrix", got=numbers[:9])
+            raise lines.error(
+                "this is not a rotation", expected="an orthonormal matrix", got=numbers[:9]
+            )
         pose = Pose(rotation, np.array(numbers[9:]))
     else:
         try:
             rotation = Pose.from_quaternion(numbers[:4], np.zeros(3)).rotation
         except InvalidInput as error:
             raise lines.error(
-                "not a rotation", expected="a quaternion that is not zero", got=numbers[:4]
+                "this is not a rotation", expected="a quaternion that is not zero", got=numbers[:4]
             ) from error
         pose = pose_from_center(rotation, np.array(numbers[4:]))
     # VisualSFM writes a blank in a name as a double quote; other tools quote the whole name.
@@ -181,7 +185,7 @@ def _read_point(lines: TextLines, point: int, part: _Part) -> None:
     count = lines.to_integer(fields[6], _MAX_COUNT) if len(fields) >= 7 else -1
     if len(fields) != 7 + 4 * count:
         raise lines.error(
-            "wrong number of fields",
+            "the line has the wrong number of fields",
             expected=expected if count < 0 else f"{7 + 4 * count}: {expected}",
             got=len(fields),
         )
@@ -223,7 +227,7 @@ def _model(
         try:
             made = _camera(calibration, line.k, width, height)
         except InvalidInput as error:
-            raise DatasetError(
+            raise refuse(
                 "import.line", error.message, field=f"{path}:{line.line}", got=error.got
             ) from error
         if made is None:

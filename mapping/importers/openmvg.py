@@ -22,7 +22,7 @@ from mapping.importers.reading.json_fields import JsonValue, read_json
 from mapping.importers.reading.photo_names import photo_names
 from mapping.importers.reading.tracks import Measurements, pose_from_center, rotation_from_matrix
 from mapping.importers.regions import PIXELS, with_features
-from visloc.errors import DatasetError, InvalidInput
+from visloc.errors import DatasetError, InvalidInput, refuse
 from visloc.geometry import MAX_IMAGE_SIDE, Camera, Pose
 from visloc.kapture import Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
@@ -66,7 +66,7 @@ def read(path: Path, photos: Path | None = None) -> ImportedModel:
     poses = _read_poses(top["extrinsics"])
     views, notes = _usable(_read_views(top["views"]), left_out)
     if not views:
-        raise DatasetError(
+        raise refuse(
             "import.empty",
             "the file holds no photo that can be used" + "".join(f"; {note}" for note in notes),
             field=str(path),
@@ -125,7 +125,7 @@ def _entries(array: JsonValue) -> dict[int, JsonValue]:
     for element in array.elements():
         key = element["key"].integer(_UNDEFINED)
         if key in entries:
-            raise element["key"].error("occurs twice", expected="different keys")
+            raise element["key"].error("the key occurs twice", expected="different keys")
         entries[key] = element["value"]
     return entries
 
@@ -144,7 +144,7 @@ class _Pointers:
         if number >= _FIRST_USE:
             return self._data.setdefault(number - _FIRST_USE, wrapper["data"])
         if number not in self._data:
-            raise wrapper["id"].error("points to nothing before it")
+            raise wrapper["id"].error("the id refers to nothing before it")
         return self._data[number]
 
     def type_name(self, value: JsonValue) -> str:
@@ -154,7 +154,7 @@ class _Pointers:
             name = value["polymorphic_name"].text()
             return self._types.setdefault(number - _FIRST_USE, name)
         if number not in self._types:
-            raise value["polymorphic_id"].error("a type that was not named before")
+            raise value["polymorphic_id"].error("the type was not named before")
         return self._types[number]
 
 
@@ -198,7 +198,7 @@ def _read_intrinsics(array: JsonValue) -> tuple[dict[int, Camera], dict[str, set
         except DatasetError:
             raise
         except InvalidInput as error:
-            raise DatasetError(
+            raise refuse(
                 "import.json", error.message, field=data.where, expected=error.expected
             ) from error
         if camera is None:
@@ -244,11 +244,13 @@ def _sensor(view: _View, cameras: dict[int, Camera]) -> Sensor:
         return Sensor(sensor_id, "", "camera", params, None)
     camera = cameras.get(view.intrinsic)
     if camera is None:
-        raise view.at["id_intrinsic"].error("no such intrinsics", expected="a key of intrinsics")
+        raise view.at["id_intrinsic"].error(
+            "there are no such intrinsics", expected="a key of intrinsics"
+        )
     if (camera.width, camera.height) != (view.width, view.height):
         raise view.at.error(
-            f"the photo is {view.width} x {view.height}, its camera {camera.width} x "
-            f"{camera.height}",
+            f"the photo has {view.width} x {view.height} pixels and its camera "
+            f"{camera.width} x {camera.height}",
             expected="the same size",
         )
     return Sensor.with_camera(f"camera_{view.intrinsic}", camera)
@@ -261,7 +263,7 @@ def _read_poses(array: JsonValue) -> dict[int, Pose]:
         matrix = [row.numbers(3) for row in rows.elements()]
         rotation = rotation_from_matrix(matrix) if len(matrix) == 3 else None
         if rotation is None:
-            raise rows.error("not a rotation", expected="an orthonormal matrix of 3 rows")
+            raise rows.error("this is not a rotation", expected="an orthonormal matrix of 3 rows")
         poses[key] = pose_from_center(rotation, np.array(value["center"].numbers(3)))
     return poses
 
@@ -276,7 +278,7 @@ def _read_structure(
     for value in _entries(array).values() if array is not None else ():
         for key, seen in _entries(value["observations"]).items():
             if key not in known:
-                raise seen.error(f"seen in view {key}, which is not there")
+                raise seen.error(f"the point is observed in view {key}, which does not exist")
             x, y = seen["x"].numbers(2)
             feature = seen["id_feat"].integer(_UNDEFINED)
             if key in ranks:

@@ -26,7 +26,7 @@ from mapping.importers.reading.json_fields import JsonValue, read_json
 from mapping.importers.reading.photo_names import photo_names
 from mapping.importers.reading.text_lines import TextLines
 from mapping.importers.reading.tracks import Measurements, keypoints_of
-from visloc.errors import DatasetError, InvalidInput
+from visloc.errors import DatasetError, InvalidInput, refuse
 from visloc.geodesy import geodetic_from_enu
 from visloc.geometry import MAX_IMAGE_SIDE, Camera, Pose
 from visloc.kapture import GnssRecord, Sensor
@@ -135,13 +135,13 @@ def _read_shots(
     shots = [_read_shot(name, value) for name, value in model["shots"].fields()]
     for shot in shots:
         if shot.camera not in cameras and shot.camera not in unknown:
-            raise shot.at["camera"].error("no such camera", expected="a key of cameras")
+            raise shot.at["camera"].error("there is no such camera", expected="a key of cameras")
     for camera, kind in unknown.items():
         num = sum(shot.camera == camera for shot in shots)
         notes.append(f"{num} photos of a camera of the kind {kind!r} were left out")
     usable = [shot for shot in shots if shot.camera in cameras]
     if not usable:
-        raise DatasetError(
+        raise refuse(
             "import.empty",
             "no photo of the reconstruction can be used" + "".join(f"; {n}" for n in notes),
             field=str(path),
@@ -161,7 +161,7 @@ def _sensors(cameras: Mapping[str, Camera]) -> dict[str, Sensor]:
 def _largest(top: JsonValue) -> tuple[JsonValue, list[str]]:
     reconstructions = top.elements()
     if not reconstructions:
-        raise DatasetError("import.empty", "the file holds no reconstruction", field=top.where)
+        raise refuse("import.empty", "the file holds no reconstruction", field=top.where)
     sizes = []
     for number, reconstruction in enumerate(reconstructions):
         points = reconstruction.get("points")
@@ -187,7 +187,7 @@ def _read_cameras(cameras: JsonValue) -> tuple[dict[str, Camera], dict[str, str]
         except DatasetError:
             raise
         except InvalidInput as error:
-            raise DatasetError(
+            raise refuse(
                 "import.json", error.message, field=value.where, expected=error.expected
             ) from error
         if camera is None:
@@ -264,7 +264,7 @@ def _read_tracks(
         if line is not None and line.startswith("OPENSFM_TRACKS_VERSION"):
             if line not in _NUM_COLUMNS:
                 raise lines.error(
-                    "an unknown version", expected=f"one of {', '.join(_NUM_COLUMNS)}", got=line
+                    "the version is unknown", expected=f"one of {', '.join(_NUM_COLUMNS)}", got=line
                 )
             num_columns = _NUM_COLUMNS[line]
             line = lines.next_or_none()
@@ -272,7 +272,7 @@ def _read_tracks(
             fields = line.split("\t")
             if len(fields) != num_columns:
                 raise lines.error(
-                    "wrong number of fields, separated by tabs",
+                    "the line has the wrong number of fields, separated by tabs",
                     expected=f"{num_columns}: image, track, feature, x, y, ...",
                     got=len(fields),
                 )
@@ -320,9 +320,9 @@ def _checked_rows(
         inside = numbers < len(found.points)
         off = np.abs(found.points[numbers[inside], :2] - xy[inside]).max(axis=1)
         if not inside.all() or (off > 1e-4).any():  # tracks have six digits
-            raise DatasetError(
+            raise refuse(
                 "import.features",
-                f"the features are not those that {path.name} was made of",
+                f"the tracks in {path.name} were made from other features",
                 field=str(found.path),
                 expected="the tracked features, where the tracks have them",
             )
@@ -342,7 +342,7 @@ def _fixes(
     latitude, longitude = reference["latitude"], reference["longitude"]
     for angle, limit in ((latitude, 90), (longitude, 180)):
         if not -limit <= angle.number() <= limit:
-            raise angle.error("not an angle on the globe", expected=f"-{limit} to {limit} degrees")
+            raise angle.error("the angle is out of range", expected=f"-{limit} to {limit} degrees")
     origin = [latitude.number(), longitude.number(), reference["altitude"].number()]
     positions = np.array([gps for _, gps, _ in located])
     geodetic = geodetic_from_enu(positions, np.array(origin))

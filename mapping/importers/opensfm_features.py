@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.importers.reading.json_fields import LARGEST
-from visloc.errors import DatasetError
+from visloc.errors import VislocError, refuse
 
 _MAX_FEATURES = 1_000_000
 _MAX_DIMENSIONS = 4096
@@ -72,18 +72,21 @@ def _read(path: Path) -> Features:
             points = _array(path, archive, "points")
             descriptors = _array(path, archive, "descriptors")
     except (OSError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
-        raise _error(path, "not a readable archive", None, str(error)) from error
+        raise _error(path, "the archive cannot be read", None, str(error)) from error
     if points.shape[1] != 4 or points.dtype.kind != "f" or not _is_sane(points):
-        raise _error(path, "points are not usable", "(n, 4) finite floats", _kind(points))
+        raise _error(path, "the points are not valid", "(n, 4) finite floats", _kind(points))
     if len(descriptors) != len(points):
         raise _error(
-            path, "not as many descriptors as points", str(len(points)), str(len(descriptors))
+            path,
+            "the numbers of descriptors and points differ",
+            str(len(points)),
+            str(len(descriptors)),
         )
     if descriptors.dtype == np.uint8:
         return Features(path, points.astype(np.float32), descriptors)
     if descriptors.dtype.kind != "f" or not _is_sane(descriptors):
         raise _error(
-            path, "descriptors are not usable", "bytes or finite floats", _kind(descriptors)
+            path, "the descriptors are not valid", "bytes or finite floats", _kind(descriptors)
         )
     return Features(path, points.astype(np.float32), descriptors.astype(np.float32))
 
@@ -114,7 +117,7 @@ def _array(path: Path, archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
         ):
             raise _error(
                 path,
-                f"{name!r} is not usable",
+                f"{name!r} is not valid",
                 f"numbers, up to {_MAX_FEATURES} rows of up to {_MAX_DIMENSIONS}",
                 f"{dtype} {shape}",
             )
@@ -123,7 +126,9 @@ def _array(path: Path, archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
             raise _error(path, f"{name!r} is too large", f"{_MAX_BYTES} bytes", str(size))
         data = file.read(size + 1)
     if len(data) != size:
-        raise _error(path, f"{name!r} is not as long as it says", f"{size} bytes", None)
+        raise _error(
+            path, f"{name!r} does not have the length that it announces", f"{size} bytes", None
+        )
     return np.frombuffer(data, dtype).reshape(shape)
 
 
@@ -135,5 +140,5 @@ def _kind(array: NDArray[Any]) -> str:
     return f"{array.dtype} {array.shape}"
 
 
-def _error(path: Path, message: str, expected: str | None, got: str | None) -> DatasetError:
-    return DatasetError("import.features", message, field=str(path), expected=expected, got=got)
+def _error(path: Path, message: str, expected: str | None, got: str | None) -> VislocError:
+    return refuse("import.features", message, field=str(path), expected=expected, got=got)

@@ -14,7 +14,7 @@ from mapping.importers.model import ImportedImage
 from mapping.importers.reading.json_fields import read_json
 from mapping.importers.reading.text_lines import TextLines
 from mapping.importers.reading.tracks import Measurements, keypoints_of
-from visloc.errors import DatasetError
+from visloc.errors import refuse
 from visloc.geometry import PixelOrigin
 
 PIXELS = PixelOrigin.CENTER  # where OpenMVG counts from
@@ -35,7 +35,7 @@ def read_keypoints(path: Path) -> NDArray[np.float32]:
             fields = line.split()
             if len(fields) != 4:
                 raise lines.error(
-                    "wrong number of fields",
+                    "the line has the wrong number of fields",
                     expected="4: x y scale orientation",
                     got=len(fields),
                 )
@@ -54,14 +54,11 @@ def read_descriptors(path: Path, count: int) -> NDArray[np.uint8]:
         with path.open("rb") as file:
             data = file.read(size + 1)
     except OSError as error:
-        raise DatasetError(
-            "import.unreadable", "cannot be read", field=str(path), got=error.strerror
-        ) from error
+        raise refuse("import.unreadable", field=str(path), got=error.strerror) from error
     announced = int.from_bytes(data[:8], "little")
     if announced != count or len(data) != size:
-        raise DatasetError(
+        raise refuse(
             "import.descriptors",
-            "the descriptors are not those of the features",
             field=str(path),
             expected=f"{count} descriptors of {_DIMENSIONS} bytes: {size} bytes",
             got=f"{announced} announced, "

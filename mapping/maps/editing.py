@@ -21,7 +21,7 @@ from visloc.archive.checks import read_record
 from visloc.archive.npz import read_npz
 from visloc.archive.schema import CamerasFile
 from visloc.archive.writer import PoseRow
-from visloc.errors import Conflict
+from visloc.errors import refuse
 from visloc.geometry import Camera, Pose, Similarity
 
 # Names that an error lists.
@@ -204,12 +204,11 @@ def joined(a: MapContent, b: MapContent, same: NDArray[np.int64] | None = None) 
     names = {image.name for image in a.images}
     both = [image.name for image in b.images if image.name in names]
     if both:
-        raise Conflict(
+        raise refuse(
             "merge.photos",
-            f"{len(both)} photos are in both maps by name",
             field="MAP",
-            expected="photos of different names",
             got=", ".join(both[:_NAMED]) + (", ..." if len(both) > _NAMED else ""),
+            count=len(both),
         )
     cameras, rigs, camera_of = _joined_cameras(a, b)
     return replace(
@@ -232,9 +231,8 @@ def joined(a: MapContent, b: MapContent, same: NDArray[np.int64] | None = None) 
 def refuse_other_features(a: MapContent, b: MapContent) -> None:
     """Raise Conflict ``merge.features`` unless two maps have the same local features."""
     if a.local_fingerprint != b.local_fingerprint:
-        raise Conflict(
+        raise refuse(
             "merge.features",
-            "the maps were built with different local features; build one of them again",
             field="MAP",
             expected=a.local_fingerprint.model_dump_json(),
             got=b.local_fingerprint.model_dump_json(),

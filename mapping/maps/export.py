@@ -16,7 +16,7 @@ from mapping.stages.imported_points import ImportedPoints, read_imported_points
 from mapping.stages.landmarks import Observations, View, reprojection_errors
 from mapping.stages.outputs import complete_output
 from visloc.archive import ImageRecord, Map
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Pose
 from visloc.kapture import (
     READY_MADE_PREFIX,
@@ -62,13 +62,7 @@ def export_map(opened: Map, output: Path, format_name: str) -> tuple[str, ...]:
     """
     export = EXPORTERS.get(format_name)
     if export is None:
-        raise InvalidInput(
-            "export.unknown_format",
-            "no such format",
-            field="--format",
-            expected=f"one of {', '.join(EXPORTERS)}",
-            got=format_name,
-        )
+        raise refuse("export.unknown_format", field="--format", expected=EXPORTERS, got=format_name)
     with complete_output(output, "export.exists") as partial:
         return export(opened, partial)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapping.stages.photos import read_in_frame
 from visloc.archive import FingerprintRecord, Map
-from visloc.errors import Conflict
+from visloc.errors import refuse
 from visloc.features import (
     GlobalDescriptor,
     LocalFeatureExtractor,
@@ -123,7 +123,7 @@ def _refuse_other_features(
     built_with = opened.manifest.local_features
     fingerprint = FingerprintRecord.of(extractor.fingerprint)
     if (built_with.fingerprint, built_with.max_keypoints) != (fingerprint, max_keypoints):
-        raise Conflict(
+        raise refuse(
             "map.features",
             "the map was built with other local features",
             field="--map",
@@ -139,11 +139,7 @@ def _claim(path: Path, settings: Mapping[str, object]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
     elif path.read_text(encoding="utf-8") != text:
-        raise Conflict(
-            "export.other_settings",
-            "the folder holds features made with other settings; name another folder or remove it",
-            field=str(path),
-        )
+        raise refuse("export.other_settings", field=str(path))
 
 
 def _write_records(dataset: Dataset, output: Path) -> None:
@@ -156,9 +152,8 @@ def _write_records(dataset: Dataset, output: Path) -> None:
     if not (output / "sensors" / "sensors.txt").is_file():
         write_dataset(replace(dataset, root=output))
     if records.resolve() != photos or read_dataset(output).images != dataset.images:
-        raise Conflict(
+        raise refuse(
             "export.other_dataset",
-            "the folder holds another dataset; name another folder or remove it",
             field=str(output),
             expected=f"a new folder, or one that was made of {dataset.root}",
         )

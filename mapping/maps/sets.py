@@ -35,7 +35,7 @@ from visloc.archive.set_rules import refuse_other_features
 from visloc.archive.sets import joined_extent
 from visloc.archive.store import open_published
 from visloc.archive.version_rules import checked_name
-from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound
+from visloc.errors import MapCorrupt, NotFound, refuse
 from visloc.geodesy import ecef_from_geodetic, geodetic_from_enu
 from visloc.geometry import Similarity
 from visloc.localization.constraints import MapGeometry
@@ -133,11 +133,11 @@ def publish_set(
 
 def _refuse_number(num_tiles: int) -> None:
     if not num_tiles:
-        raise InvalidInput("set.tiles", "no maps", field="MAP", expected="one or more")
+        raise refuse("set.tiles", "there are no maps", field="MAP", expected="one or more")
     if num_tiles > MAX_TILES:
-        raise InvalidInput(
+        raise refuse(
             "set.tiles",
-            "too many maps",
+            "there are too many maps",
             field="MAP",
             expected=f"at most {MAX_TILES}",
             got=num_tiles,
@@ -152,20 +152,15 @@ def refuse_map_of_this_name(store: MapStore, set_id: str, field: str) -> None:
     """
     with suppress(NotFound, MapCorrupt):
         if not isinstance(read_any_manifest(store.folder(set_id)), SetManifest):
-            raise Conflict(
-                "set.id_is_map",
-                "a map has this id already; give the set another one",
-                field=field,
-                got=set_id,
-            )
+            raise refuse("set.id_is_map", field=field, got=set_id)
 
 
 def _refuse_twice(folders: Sequence[Path]) -> None:
     for folder, count in Counter(folders).items():
         if count > 1:
-            raise InvalidInput(
+            raise refuse(
                 "set.tiles",
-                "a map is named twice; at a second place in the set it would be another map",
+                "a map is named twice; a second place in the set requires another map",
                 field="MAP",
                 expected="each version of a map once",
                 got=f"{folder.parent.name}@{folder.name}",
@@ -260,14 +255,13 @@ def _refuse_other_place(placed: Sequence[_Placed], geodetic: Geodetic) -> None:
         away = float(np.linalg.norm(there - here, axis=1).max())
         size = geodetic.scale * float(np.linalg.norm(np.subtract(box.max, box.min)))
         if away > max(_MAX_PLACE_DIFFERENCE_M, _MAX_PLACE_SHARE * size):
-            raise Conflict(
+            raise refuse(
                 "set.anchor",
-                f"by its own anchor, {one.record.ref} lies elsewhere on Earth than by the set's; "
-                "anchor it anew, or correct its pose",
                 field="MAP",
                 expected=f"at most {_MAX_PLACE_DIFFERENCE_M:g} m, or {_MAX_PLACE_SHARE:.0%} of its "
                 "extent, away",
                 got=f"{away:.4g} m",
+                ref=one.record.ref,
             )
 
 
@@ -278,12 +272,12 @@ def _is_metric(placed: Sequence[_Placed], anchor: Anchor | None) -> bool:
         return geodetic is not None and abs(geodetic.scale - 1) <= _MAX_SCALE_DIFFERENCE
     least, most = min(scales), max(scales)
     if most > least * (1 + _MAX_SCALE_DIFFERENCE):
-        raise Conflict(
+        raise refuse(
             "set.scale",
-            f"metres of {scales[least]} and {scales[most]} are not of one length in the set",
             field="MAP",
-            expected="one scale for all metric maps",
             got=f"{least:g} and {most:g}",
+            first=scales[least],
+            second=scales[most],
         )
     return abs(least - 1) <= _MAX_SCALE_DIFFERENCE
 
@@ -298,11 +292,11 @@ def _down(placed: Sequence[_Placed]) -> NDArray[np.float64] | None:
     for one, down in zip(placed, downs, strict=True):
         angle = math.acos(float(np.clip(down @ mean, -1, 1)))
         if angle > _MAX_DOWN_DIFFERENCE:
-            raise Conflict(
+            raise refuse(
                 "set.gravity",
-                f"{one.record.ref} has another down than the other maps, where it lies in the set",
                 field="MAP",
                 expected=f"at most {math.degrees(_MAX_DOWN_DIFFERENCE):g} degrees from their mean",
                 got=f"{math.degrees(angle):.3g} degrees",
+                ref=one.record.ref,
             )
     return np.asarray(mean)

@@ -19,7 +19,7 @@ from visloc.archive.checks import read_any_manifest
 from visloc.archive.schema import ID_PATTERN, photo_file
 from visloc.archive.store import open_published
 from visloc.archive.version_rules import checked_name
-from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound
+from visloc.errors import MapCorrupt, NotFound, VislocError, refuse
 from visloc.geometry import Similarity
 from visloc.localization.constraints import MapGeometry
 from visloc.priors import MAX_TILES
@@ -79,9 +79,9 @@ def split_map(
     refuse_map_of_this_name(store, set_id, "--set")
     cuts = cut(opened, tile, overlap)
     if len(cuts) > MAX_TILES:
-        raise InvalidInput(
+        raise refuse(
             "split.tile",
-            "too many tiles",
+            "there are too many tiles",
             field="--tile",
             expected=f"a side that makes at most {MAX_TILES} tiles",
             got=f"{len(cuts)} tiles",
@@ -117,13 +117,10 @@ def cut(opened: Map, tile: float, overlap: float) -> tuple[Cut, ...]:
         InvalidInput: ``split.tile``, ``split.overlap``.
     """
     if not (np.isfinite(tile) and tile > 0):
-        raise InvalidInput(
-            "split.tile", "not a length", field="--tile", expected="more than 0", got=tile
-        )
+        raise refuse("split.tile", field="--tile", got=tile)
     if not 0 <= overlap <= tile:
-        raise InvalidInput(
+        raise refuse(
             "split.overlap",
-            "not the width of a margin",
             field="--overlap",
             expected=f"0 to the side of a tile, {tile:g}",
             got=overlap,
@@ -160,8 +157,8 @@ def cut(opened: Map, tile: float, overlap: float) -> tuple[Cut, ...]:
     return tuple(cuts)
 
 
-def _too_small(tile: float) -> InvalidInput:
-    return InvalidInput(
+def _too_small(tile: float) -> VislocError:
+    return refuse(
         "split.tile",
         "the tiles are too small",
         field="--tile",
@@ -226,9 +223,9 @@ def _refuse_other_maps(store: MapStore, map_id: str, set_id: str, cuts: Sequence
     for one in cuts:
         tile_id = _tile_id(set_id, one)
         if not ID_PATTERN.fullmatch(tile_id):
-            raise InvalidInput(
+            raise refuse(
                 "map.id",
-                "with this id of the set, those of its tiles would be no map names",
+                "the id of the set is too long for the ids of its tiles",
                 field="--set",
                 expected="an id short enough for -<i>-<j> to follow, 64 letters in all",
                 got=tile_id,
@@ -236,10 +233,4 @@ def _refuse_other_maps(store: MapStore, map_id: str, set_id: str, cuts: Sequence
         with suppress(NotFound):
             notes = read_any_manifest(store.folder(tile_id)).notes
             if not any(note.startswith(f"{_TILE_OF}{map_id}@") for note in notes):
-                raise Conflict(
-                    "split.map_exists",
-                    f"a map that is no tile of {map_id} has the id of a tile; give the set another "
-                    "id, or remove that map",
-                    field="--set",
-                    got=tile_id,
-                )
+                raise refuse("split.map_exists", field="--set", got=tile_id, map_id=map_id)

@@ -16,7 +16,7 @@ from mapping.methods.intrinsics import Doubt
 from mapping.methods.matching import Matches
 from mapping.methods.sparse_model import SfmPhoto, SparseModel
 from mapping.stages.landmarks import Observations, View, rows_by_value
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import colmap_camera, pose_from_colmap
 
@@ -34,11 +34,9 @@ def colmap_database(
         InvalidInput: ``sfm.no_matches``.
     """
     if not matches:
-        raise InvalidInput(
+        raise refuse(
             "sfm.no_matches",
-            "too few matches to triangulate anything",
             field="dataset",
-            expected="pairs of photos that show the same; see --pairs and --mapper",
             got=f"{len(photos)} photos, none of their pairs with enough verified matches",
         )
     work.mkdir(parents=True, exist_ok=True)

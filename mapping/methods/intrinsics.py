@@ -18,7 +18,7 @@ import pycolmap
 from pydantic import BaseModel, ConfigDict
 
 from mapping.stages.photos import some
-from visloc.errors import InvalidInput
+from visloc.errors import VislocError, refuse
 from visloc.kapture import Sensor
 
 # EXIF rounds, and counts crops and digital stabilization in or not: several per cent are usual,
@@ -249,14 +249,12 @@ def _count(doubted: Mapping[str, CameraOrigin], photos: Sequence[str]) -> str:
     return f"{len(doubted)} camera{'s' * (len(doubted) > 1)} of {len(photos)} photos"
 
 
-def no_lens(doubts: Mapping[str, Doubt], photos: Mapping[str, Sequence[str]]) -> InvalidInput:
+def no_lens(doubts: Mapping[str, Doubt], photos: Mapping[str, Sequence[str]]) -> VislocError:
     """The error ``sfm.camera``: no photo is left whose camera a lens may have."""
     names = [name for camera in doubts for name in photos[camera]]
     focal = [f"{doubt.focal_length_px:.1f} px" for doubt in doubts.values()]
-    return InvalidInput(
+    return refuse(
         "sfm.camera",
-        "the camera that was estimated for these photos is one that no lens has, so no map can "
-        "be made of them",
         field=some(names),
         expected="photos with a focal length in EXIF, more photos that overlap, from more places, "
         f"or a camera {_IN_SENSORS}",

@@ -28,7 +28,7 @@ from mapping.stages.landmarks import (
 from mapping.stages.local_features import ReadyMadeFeatures
 from mapping.stages.photos import MappingPhoto
 from visloc.archive import Anchor
-from visloc.errors import DatasetError
+from visloc.errors import VislocError, refuse
 from visloc.geometry import PixelOrigin
 from visloc.kapture import Dataset, FeatureSet, Reconstruction, open_features, read_reconstruction
 
@@ -116,14 +116,8 @@ def refuse_without_points(dataset: Dataset) -> None:
         raise _no_points(dataset)
 
 
-def _no_points(dataset: Dataset) -> DatasetError:
-    return DatasetError(
-        "model.no_points",
-        "the dataset has no points with observations",
-        field=str(dataset.root / "reconstruction" / "points3d.txt"),
-        expected="points3d.txt and observations.txt, as mapping import writes them; "
-        "without, use --method sfm",
-    )
+def _no_points(dataset: Dataset) -> VislocError:
+    return refuse("model.no_points", field=str(dataset.root / "reconstruction" / "points3d.txt"))
 
 
 def _imported_points(
@@ -173,10 +167,10 @@ def _check_rows(
     beyond = np.flatnonzero(observations[:, 2] >= counts[observations[:, 1]])
     if len(beyond):
         _, photo, row = observations[beyond[0]].tolist()
-        raise DatasetError(
+        raise refuse(
             "kapture.index",
-            f"reconstruction/observations.txt has a keypoint of {photos[photo].name} that is not "
-            "in this file",
+            f"reconstruction/observations.txt has a keypoint of {photos[photo].name} that "
+            "this file does not have",
             field=keypoints.label(photos[photo].name),
             expected=f"less than {counts[photo]}",
             got=str(row),

@@ -25,7 +25,7 @@ from mapping.stages.local_features import LocalFeaturesSource
 from mapping.stages.photos import MappingPhoto
 from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc.archive import Anchor, Landmarks
-from visloc.errors import DatasetError, InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Similarity
 from visloc.kapture import Dataset
 from visloc.pose.colmap import normalized_rays, project
@@ -112,13 +112,7 @@ def refuse_without_depth(dataset: Dataset, photos: Sequence[MappingPhoto]) -> No
         DatasetError: ``dataset.no_depth``.
     """
     if all(photo.depth is None for photo in photos):
-        raise DatasetError(
-            "dataset.no_depth",
-            "no photo has a depth map",
-            field=str(dataset.root / "sensors" / "records_depth.txt"),
-            expected="depth maps with the timestamps of the photos, of a sensor in their rig or "
-            "with poses of its own; see --depth-sensor. Without depth: --method sfm",
-        )
+        raise refuse("dataset.no_depth", field=str(dataset.root / "sensors" / "records_depth.txt"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,12 +199,7 @@ def merge_landmarks(
     rows = np.concatenate(rows_of)
     del rows_of
     if len(points) == 0:
-        raise InvalidInput(
-            "rgbd.no_landmarks",
-            "no keypoint of any photo has a depth",
-            field="dataset",
-            expected="depth maps that go with the photos; see --depth-sensor and --depth-scale",
-        )
+        raise refuse("rgbd.no_landmarks", field="dataset")
     # Voxels are counted from near the photos, to keep precision far from the world's origin.
     origin = np.round(np.mean([photo.pose.center for photo in photos], axis=0))
     points -= origin
@@ -237,9 +226,8 @@ def _voxel_index(points: NDArray[np.float64], voxel_size: float) -> tuple[NDArra
     cells -= cells.min(axis=0)
     size = cells.max(axis=0) + 1.0
     if np.prod(size) >= 2**62:
-        raise InvalidInput(
+        raise refuse(
             "rgbd.voxel_size",
-            "the voxel size is too small for the extent of the map",
             field="--voxel-size",
             expected=f"more for an extent of {', '.join(f'{s:g}' for s in size * voxel_size)}",
             got=voxel_size,

@@ -11,7 +11,7 @@ from mapping.methods.sfm_settings import SfmSettings
 from mapping.pairing import Pairs, Scene, pair_photos, read_pairs
 from mapping.stages.photos import MappingPhoto
 from visloc.archive import GlobalFeatures, Map
-from visloc.errors import DatasetError, InvalidInput
+from visloc.errors import DatasetError, refuse
 from visloc.kapture import Dataset, read_reconstruction
 
 
@@ -27,11 +27,9 @@ def find_pairs(scene: Scene, settings: SfmSettings) -> Pairs:
     else:
         pairs = pair_photos(scene, settings.pairs, settings.pairing)
     if len(pairs) == 0:
-        raise InvalidInput(
+        raise refuse(
             "pairs.none",
-            "no two photos are paired",
             field="--pairs" if settings.pairs_file is None else str(settings.pairs_file),
-            expected="photos that may show the same",
             got=f"{len(scene.names)} photos, no pair",
         )
     return pairs
@@ -70,11 +68,11 @@ def _tracks(dataset: Dataset, names: Sequence[str], covisible_in: Map | None) ->
     else:
         known = read_reconstruction(dataset.root)
         if known is None:
-            raise DatasetError(
+            raise refuse(
                 "pairs.no_tracks",
-                "covisibility needs to know which photos see the same points",
                 field=str(dataset.root / "reconstruction" / "observations.txt"),
                 expected="points3d.txt and observations.txt there, or a map: --covisible-in MAP",
+                kind=DatasetError,
             )
         seen_in = [row_of_name.get(name, -1) for name in known.images]
         images = np.array(seen_in, dtype=np.int64)[known.observations[:, 1]]

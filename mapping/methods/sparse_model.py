@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapping.methods.intrinsics import Doubt
 from mapping.stages.landmarks import Observations, View, reprojection_errors, triangulation_angles
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
 
 
@@ -113,9 +113,8 @@ def without_bad_points(model: SparseModel, config: MapperConfig) -> SparseModel:
     lengths = np.bincount(observations.points, minlength=len(model.points))
     good = (lengths >= config.min_track_length) & (angles >= config.min_angle_deg)
     if not good.any():
-        raise InvalidInput(
+        raise refuse(
             "sfm.no_points",
-            "too few matches to triangulate anything",
             field="dataset",
             expected=f"points seen by {config.min_track_length} photos and more, from directions "
             f"{config.min_angle_deg} degrees apart; see --pairs and --mapper",

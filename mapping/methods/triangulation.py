@@ -24,7 +24,7 @@ from mapping.methods.intrinsics import (
 from mapping.methods.matching import Matches
 from mapping.methods.sparse_model import MapperConfig, SfmPhoto, SparseModel, without_bad_points
 from mapping.progress import ItemProgress
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 
 # After so many models that put cameras in doubt, no camera with a prior is refined any more.
 _MAX_JUDGEMENTS = 3
@@ -107,10 +107,11 @@ def reconstruct(
             if left_out:
                 names = names_by_sensor((photo.sensor, photo.name) for photo in photos)
                 raise no_lens({sensor: doubts[sensor] for sensor in left_out}, names)
-            raise InvalidInput(
+            raise refuse(
                 "sfm.no_model",
-                "no two photos could be placed relative to each other"
-                + (" with their focal length as it was known" if doubts else ""),
+                "no two photos could be placed relative to each other with their known focal length"
+                if doubts
+                else None,
                 field="dataset",
                 expected="photos that overlap; see --pairs and --mapper",
                 got=f"{len(photos)} photos, {len(matches)} pairs with verified matches",

@@ -16,7 +16,7 @@ from mapping.pairing.retrieval import pair_by_retrieval
 from mapping.pairing.scene import Pairs, Scene
 from mapping.pairing.sequence import pair_by_sequence
 from mapping.pairing.settings import PairSettings
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 
 Pairing = Callable[[Scene, PairSettings], Pairs]
 
@@ -50,9 +50,9 @@ def pair_photos(scene: Scene, names: Sequence[str], settings: PairSettings) -> P
     distinct = list(dict.fromkeys(names))
     unknown = [name for name in distinct if name not in PAIRINGS]
     if unknown or not distinct:
-        raise InvalidInput(
+        raise refuse(
             "pairs.unknown",
-            "no such pairing" if unknown else "no pairing is named",
+            "the pairing is unknown" if unknown else "no pairing is named",
             field="--pairs",
             expected=f"one or more of {', '.join(PAIRINGS)}, separated by commas",
             got=", ".join(unknown),

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 from mapping.pairing.ranking import Candidates, best_of_each, unite
 from mapping.pairing.scene import Pairs, Scene
 from mapping.pairing.settings import PairSettings
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 
 _PHOTOS_AT_A_TIME = 512
 
@@ -26,13 +26,7 @@ def pair_by_covisibility(scene: Scene, settings: PairSettings) -> Pairs:
         InvalidInput: ``pairs.no_tracks``.
     """
     if len(scene.tracks) == 0:
-        raise InvalidInput(
-            "pairs.no_tracks",
-            "the pairing covisibility needs a known reconstruction; give a dataset or a map that "
-            "has 3D points and their observations, or use another pairing",
-            field="--pairs",
-            expected="photos that see known 3D points",
-        )
+        raise refuse("pairs.no_tracks", field="--pairs", expected="photos that see known 3D points")
     return unite(_ranked_blocks(scene.tracks, len(scene.names), settings.top_k))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from mapping.pairing.scene import Pairs, Scene
 from mapping.pairing.settings import PairSettings
-from visloc.errors import TooLarge
+from visloc.errors import refuse
 
 # 12.5 million pairs: days of matching.
 MAX_PHOTOS = 5000
@@ -20,9 +20,8 @@ def pair_exhaustively(scene: Scene, settings: PairSettings) -> Pairs:  # noqa: A
     """
     num_photos = len(scene.names)
     if num_photos > MAX_PHOTOS:
-        raise TooLarge(
+        raise refuse(
             "pairs.too_many_photos",
-            "too many photos for the pairing exhaustive; use another pairing",
             field="--pairs",
             expected=f"at most {MAX_PHOTOS} photos",
             got=num_photos,

@@ -46,20 +46,10 @@ def read_pairs(path: Path, scene: Scene) -> Pairs:
     first, second, scores = array("q"), array("q"), array("d")
     for fields in table:
         if len(fields) not in (2, 3):
-            raise table.error(
-                "pairs.column_count",
-                "wrong number of columns (names cannot contain commas)",
-                expected="two names, and a score or none",
-                got=len(fields),
-            )
+            raise table.error("pairs.column_count", got=len(fields))
         rows = [_row(row_of, name, table) for name in fields[:2]]
         if rows[0] == rows[1]:
-            raise table.error(
-                "pairs.same_photo",
-                "a photo is paired with itself; remove the line",
-                expected="two photos",
-                got=fields[0],
-            )
+            raise table.error("pairs.same_photo", got=fields[0])
         first.append(rows[0])
         second.append(rows[1])
         scores.extend(table.numbers(fields[2:]) or [1.0])
@@ -74,11 +64,5 @@ def _row(row_of: dict[str, int], name: str, table: Table) -> int:
         except ValueError:
             row = None
     if row is None:
-        raise table.error(
-            "pairs.unknown_photo",
-            "no photo that can be used has this name: it is not in the dataset, or was left out, "
-            "see the notes; remove the line or add the photo",
-            expected="the name of a photo that can be mapped",
-            got=name,
-        )
+        raise table.error("pairs.unknown_photo", got=name)
     return row

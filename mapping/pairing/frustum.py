@@ -45,7 +45,7 @@ from mapping.pairing.posed import PosedPhotos, nearest, posed_photos
 from mapping.pairing.ranking import best_pairs
 from mapping.pairing.scene import Pairs, Scene
 from mapping.pairing.settings import PairSettings
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Camera
 from visloc.pose.colmap import normalized_rays
 
@@ -131,13 +131,7 @@ def _image_at_depth_one(
     rays = normalized_rays(camera, pixels)
     usable = np.abs(rays).max(axis=1) <= _MAX_SLOPE  # false for NaN
     if not usable[: len(grid)].any():
-        raise InvalidInput(
-            "pairs.camera",
-            "no pixel of this photo's camera has a ray; correct the camera or pair by distance",
-            field=name,
-            expected="parameters whose distortion can be undone",
-            got=f"{camera.model} {camera.params}",
-        )
+        raise refuse("pairs.camera", field=name, got=f"{camera.model} {camera.params}")
     seen = rays[usable, :2]
     return (
         np.resize(rays[: len(grid)][usable[: len(grid)]], (len(grid), 3)),

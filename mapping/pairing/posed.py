@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mapping.pairing.scene import Scene
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,23 +35,11 @@ def posed_photos(scene: Scene, pairing: str, *, with_camera: bool = False) -> Po
     """
     posed = {row: pose for row, pose in enumerate(scene.cam_from_world) if pose is not None}
     if len(posed) < 2:
-        raise InvalidInput(
-            "pairs.no_poses",
-            f"the pairing {pairing} needs poses; use retrieval, sequence or exhaustive instead",
-            field="--pairs",
-            expected="two photos or more with a pose",
-            got=len(posed),
-        )
+        raise refuse("pairs.no_poses", field="--pairs", got=len(posed), pairing=pairing)
     if with_camera:
         posed = {row: pose for row, pose in posed.items() if scene.cameras[row] is not None}
         if len(posed) < 2:
-            raise InvalidInput(
-                "pairs.no_cameras",
-                f"the pairing {pairing} needs intrinsics; give them or use distance instead",
-                field="--pairs",
-                expected="two photos or more with a pose and a camera of known model",
-                got=len(posed),
-            )
+            raise refuse("pairs.no_cameras", field="--pairs", got=len(posed), pairing=pairing)
     return PosedPhotos(
         rows=np.array(list(posed), dtype=np.int64),
         centers=np.stack([pose.center for pose in posed.values()]),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mapping.pairing.ranking import Candidates, best_of_rows, unite
 from mapping.pairing.scene import Pairs, Scene
 from mapping.pairing.settings import PairSettings
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.retrieval.fusion import equal_weights, gharm
 
 # Similarities held at a time, per descriptor: 32 MiB in float64.
@@ -29,22 +29,11 @@ def pair_by_retrieval(scene: Scene, settings: PairSettings) -> Pairs:
             numbers that are not finite.
     """
     if not scene.global_descriptors:
-        raise InvalidInput(
-            "pairs.no_global_descriptors",
-            "the pairing retrieval needs global descriptors; choose one or more with "
-            "--global-features, or use another pairing",
-            field="--pairs",
-            expected="global descriptors of the photos",
-        )
+        raise refuse("pairs.no_global_descriptors", field="--pairs")
     for name, rows in scene.global_descriptors.items():
         unusable = np.flatnonzero(~np.isfinite(rows).all(axis=1))
         if len(unusable):
-            raise InvalidInput(
-                "pairs.global_descriptor",
-                f"the global descriptor {name} of this photo is not usable; extract it again",
-                field=scene.names[unusable[0]],
-                expected="finite numbers",
-            )
+            raise refuse("pairs.global_descriptor", field=scene.names[unusable[0]], name=name)
     return unite(_ranked_blocks(list(scene.global_descriptors.values()), settings.top_k))
 
 

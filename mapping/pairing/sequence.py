@@ -7,7 +7,7 @@ import numpy as np
 from mapping.pairing.ranking import best_pairs
 from mapping.pairing.scene import Pairs, Scene
 from mapping.pairing.settings import PairSettings
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 
 
 def pair_by_sequence(scene: Scene, settings: PairSettings) -> Pairs:
@@ -34,10 +34,5 @@ def pair_by_sequence(scene: Scene, settings: PairSettings) -> Pairs:
         rows.append(pairs.astype(np.int64))
         scores.append(np.full(len(pairs), 1.0 - step / settings.top_k))
     if not rows:
-        raise InvalidInput(
-            "pairs.no_sequence",
-            "the pairing sequence needs photos by the same camera; use another pairing",
-            field="--pairs",
-            expected="a camera with two photos or more",
-        )
+        raise refuse("pairs.no_sequence", field="--pairs")
     return best_pairs(np.concatenate(rows), np.concatenate(scores), settings.top_k)

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from mapping.options import SFM_PANEL
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 
 _option = partial(typer.Option, rich_help_panel=SFM_PANEL)
 
@@ -50,10 +50,6 @@ class PairSettings:
 
 def _check(name: str, good: bool, expected: str, got: float) -> None:
     if not good:  # comparisons with NaN are false
-        raise InvalidInput(
-            f"pairs.{name}",
-            "not usable for pairing",
-            field=f"--{name.replace('_', '-')}",
-            expected=expected,
-            got=got,
+        raise refuse(
+            f"pairs.{name}", field=f"--{name.replace('_', '-')}", expected=expected, got=got
         )

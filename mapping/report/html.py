@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from visloc.errors import Unavailable
+from visloc.errors import refuse
 
 # In JSON these stand in strings only, where an escape means the same character; without them no
 # name of a photo can end the element that it is written into.
@@ -61,11 +61,7 @@ def _embeddable(text: str, element: str) -> str:
     lowered = text.lower()
     # After <!-- a browser takes <script for the beginning of another one.
     if f"</{element}" in lowered or ("<!--" in lowered and f"<{element}" in lowered):
-        raise Unavailable(
-            "page.not_embeddable",
-            f"the built report holds what ends a {element} element",
-            expected="the files that `make page` builds",
-        )
+        raise refuse("page.not_embeddable", element=element)
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 

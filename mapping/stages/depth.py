@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from visloc.errors import DatasetError, InvalidInput, TooLarge
+from visloc.errors import VislocError, refuse
 from visloc.geometry import Camera, Pose, rotation_angle
 from visloc.kapture import Dataset, FileRecord
 from visloc.pose.colmap import normalized_rays, project
@@ -83,9 +83,8 @@ class DepthMatcher:
         }
         if depth_sensor is not None:
             if depth_sensor not in self._cameras:
-                raise DatasetError(
+                raise refuse(
                     "depth.sensor",
-                    "not a depth sensor with known intrinsics",
                     field="--depth-sensor",
                     expected=f"one of {', '.join(self._cameras) or 'none in this dataset'}",
                     got=depth_sensor,
@@ -115,21 +114,16 @@ class DepthMatcher:
             elif (pose := self._pose_in_world(image, record)) is not None:
                 of_world.append(DepthMatch(record, camera, pose))
             elif self._named:
-                raise DatasetError(
-                    "depth.pose",
-                    "nothing tells where the depth sensor is relative to the photo's camera",
-                    field=record.path,
-                    expected="both in one rig with known transforms, or both with poses",
-                    got=f"{record.sensor_id} and {image.sensor_id}",
+                raise refuse(
+                    "depth.pose", field=record.path, got=f"{record.sensor_id} and {image.sensor_id}"
                 )
         registered = [match for match in of_rig + of_world if self._is_registered(image, match)]
         candidates = registered or of_rig or of_world
         if len(candidates) > 1:
-            raise DatasetError(
+            raise refuse(
                 "depth.ambiguous",
-                "several depth maps could belong to the photo; choose with --depth-sensor",
                 field=image.path,
-                expected=f"one of {', '.join(match.record.sensor_id for match in candidates)}",
+                expected=(match.record.sensor_id for match in candidates),
                 got="no choice",
             )
         return candidates[0] if candidates else None
@@ -190,17 +184,10 @@ def read_depth(path: Path, camera: Camera, depth_scale: float) -> NDArray[np.flo
         TooLarge: ``depth.too_many_pixels``.
     """
     if not (math.isfinite(depth_scale) and depth_scale > 0):
-        raise InvalidInput(
-            "depth.scale",
-            "not a scale",
-            field="--depth-scale",
-            expected="metres per unit, positive",
-            got=depth_scale,
-        )
+        raise refuse("depth.scale", field="--depth-scale", got=depth_scale)
     if camera.width * camera.height > MAX_DEPTH_PIXELS:
-        raise TooLarge(
+        raise refuse(
             "depth.too_many_pixels",
-            "the depth map is too large",
             field=str(path),
             expected=f"at most {MAX_DEPTH_PIXELS} pixels",
             got=f"{camera.width} x {camera.height}",
@@ -218,9 +205,7 @@ def read_depth(path: Path, camera: Camera, depth_scale: float) -> NDArray[np.flo
             with np.errstate(invalid="ignore"):  # comparing a signalling NaN
                 invalid = ~((depth > 0) & (depth < _NO_DEPTH_FROM_M))
     except OSError as error:
-        raise DatasetError(
-            "depth.missing", "the depth map cannot be read", field=str(path), got=error.strerror
-        ) from error
+        raise refuse("depth.missing", field=str(path), got=error.strerror) from error
     depth[invalid] = np.nan
     return depth
 
@@ -229,9 +214,9 @@ def _read_raw(path: Path, camera: Camera) -> NDArray[np.float32]:
     expected = 4 * camera.width * camera.height
     size = path.stat().st_size
     if size != expected:
-        raise DatasetError(
+        raise refuse(
             "depth.size",
-            "the depth map has the wrong size (and is not a PNG)",
+            "the depth map has the wrong size and is not a PNG",
             field=str(path),
             expected=f"{expected} bytes, float32 of {camera.width} x {camera.height}",
             got=f"{size} bytes",
@@ -245,17 +230,14 @@ def _check_png_header(path: Path, header: bytes, camera: Camera) -> None:
         raise _damaged(path, "no header")
     width, height, bit_depth, color_type = struct.unpack_from(">IIBB", header, 16)
     if (bit_depth, color_type) != (16, _PNG_GREY):
-        raise DatasetError(
+        raise refuse(
             "depth.format",
-            "the PNG is not a depth map",
             field=str(path),
-            expected="16 bits per pixel, grey",
             got=f"{bit_depth} bits per channel, PNG colour type {color_type}",
         )
     if (width, height) != (camera.width, camera.height):
-        raise DatasetError(
+        raise refuse(
             "depth.size",
-            "the depth map has the wrong size",
             field=str(path),
             expected=f"{camera.width} x {camera.height} as its sensor",
             got=f"{width} x {height}",
@@ -280,10 +262,8 @@ def _decode_png(path: Path) -> NDArray[np.uint16]:
         raise _damaged(path, str(error)) from error
 
 
-def _damaged(path: Path, got: str) -> DatasetError:
-    return DatasetError(
-        "depth.damaged", "the PNG is damaged", field=str(path), expected="a whole PNG", got=got
-    )
+def _damaged(path: Path, got: str) -> VislocError:
+    return refuse("depth.damaged", field=str(path), got=got)
 
 
 def register_depth(

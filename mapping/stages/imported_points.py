@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from visloc.archive import Map
 from visloc.archive.npz import read_npz
-from visloc.errors import MapCorrupt
+from visloc.errors import VislocError, refuse
 
 FILE_NAME = "imported_points.npz"
 # name -> dtype and columns; None for a vector
@@ -93,11 +93,5 @@ def read_imported_points(opened: Map) -> ImportedPoints | None:
     )
 
 
-def _corrupt(path: Path, got: Any) -> MapCorrupt:
-    return MapCorrupt(
-        "map.imported_points",
-        "the points of the imported reconstruction cannot be read",
-        field=str(path),
-        expected=", ".join(_ARRAYS),
-        got=got,
-    )
+def _corrupt(path: Path, got: Any) -> VislocError:
+    return refuse("map.imported_points", field=str(path), expected=", ".join(_ARRAYS), got=got)

@@ -15,7 +15,7 @@ from mapping.stages.networks import Networks, refuse_other_computing
 from mapping.stages.photos import MappingPhoto
 from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc.archive import FingerprintRecord
-from visloc.errors import DatasetError, InvalidInput
+from visloc.errors import DatasetError, InvalidInput, refuse
 from visloc.features.local.readymade import (
     MAX_READY_MADE_KEYPOINTS,
     is_ready_made,
@@ -148,12 +148,13 @@ class ReadyMadeFeatures:
         """
         count = self.descriptors.count(photo.name)
         if count > MAX_READY_MADE_KEYPOINTS:
-            raise DatasetError(
+            raise refuse(
                 "features.too_many",
                 "the photo has too many keypoints",
                 field=self.descriptors.label(photo.name),
                 expected=f"at most {MAX_READY_MADE_KEYPOINTS}",
                 got=count,
+                kind=DatasetError,
             )
         size = (photo.camera.width, photo.camera.height)
         rows = read_local(self.keypoints, self.descriptors, photo.name, size, self.origin)
@@ -220,10 +221,4 @@ def errors_in(features: FeatureSet, photo: MappingPhoto) -> Iterator[None]:
     try:
         yield
     except InvalidInput as error:
-        raise DatasetError(
-            error.code,
-            error.message,
-            field=features.label(photo.name),
-            expected=error.expected,
-            got=error.got,
-        ) from error
+        raise error.about(features.label(photo.name), DatasetError) from error

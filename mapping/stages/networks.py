@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from visloc.errors import Unavailable
+from visloc.errors import refuse
 from visloc.features import (
     GlobalDescriptor,
     LocalFeatureExtractor,
@@ -55,12 +55,6 @@ def refuse_other_computing(name: str, expected: str | None, here: str | None) ->
         Unavailable: ``build.other_computing``.
     """
     if here != expected:
-        raise Unavailable(
-            "build.other_computing",
-            f"a machine of the cluster computes {name} in another way than the one that builds; "
-            "their results would be mixed in one map. Choose a way that all have, or machines "
-            "that are alike",
-            field="--inference",
-            expected=expected,
-            got=here,
+        raise refuse(
+            "build.other_computing", field="--inference", expected=expected, got=here, name=name
         )

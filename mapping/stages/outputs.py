@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from visloc.errors import Conflict
+from visloc.errors import refuse
 
 
 def refuse_existing(output: Path, code: str) -> None:
@@ -18,12 +18,7 @@ def refuse_existing(output: Path, code: str) -> None:
         Conflict: ``code``.
     """
     if output.exists() or output.is_symlink():
-        raise Conflict(
-            code,
-            "there is something already; name another place or remove it",
-            field=str(output),
-            expected="a path that does not exist",
-        )
+        raise refuse(code, field=str(output))
 
 
 @contextmanager

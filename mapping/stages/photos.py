@@ -9,7 +9,7 @@ from pathlib import Path
 from mapping.progress import ItemProgress
 from mapping.stages.depth import DepthMatch, DepthMatcher
 from visloc.archive import sha256_of
-from visloc.errors import DatasetError
+from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo, read_photo_file, upright
 from visloc.kapture import Dataset, FileRecord
@@ -76,9 +76,8 @@ def read_in_frame(path: Path, size: tuple[int, int], sensor_id: str) -> Photo:
         return photo
     if photo.is_on_its_side and stored[::-1] == size:
         return replace(photo, rgb=upright(photo.rgb, photo.exif_orientation), exif_orientation=1)
-    raise DatasetError(
+    raise refuse(
         "dataset.photo_size",
-        "the photo is not of the size of its camera",
         field=str(path),
         expected=f"{size[0]} x {size[1]} as sensors.txt has it for {sensor_id}",
         got=f"{stored[0]} x {stored[1]}",
@@ -131,7 +130,7 @@ def collect_photos(
         for why, names in left_out.items()
     ]
     if not photos:
-        raise DatasetError(
+        raise refuse(
             "dataset.no_photos",
             "no photo of the dataset can be used" + "".join(f"; {note}" for note in notes),
             field=str(dataset.root / "sensors" / "records_camera.txt"),
@@ -202,6 +201,4 @@ def _checksum(dataset: Dataset, record: FileRecord) -> str:
     try:
         return sha256_of(path) if dataset.files is None else dataset.files.identity(record.path)
     except OSError as error:
-        raise DatasetError(
-            "dataset.unreadable", f"cannot be read: {error.strerror}", field=str(path)
-        ) from error
+        raise refuse("dataset.unreadable", field=str(path), got=error.strerror) from error

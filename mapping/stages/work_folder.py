@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from mapping.cluster.stage_timings import wrote
 from mapping.cluster.storage import is_remote, remove_folder
 from visloc.archive.npz import read_npz
-from visloc.errors import Conflict, InvalidInput, Unavailable
+from visloc.errors import refuse
 
 # Marks a folder of finished work, which may be removed.
 _MARKER = "visloc-work.txt"
@@ -78,10 +78,8 @@ class WorkFolder:
         if marker.is_file():
             return
         if self.root.exists() and any(self.root.iterdir()):
-            raise InvalidInput(
+            raise refuse(
                 "build.work_dir",
-                "the folder for finished work has files that no build made; it would be removed "
-                "with them when the map is published. Choose another one, or move them away",
                 field="--work-dir",
                 expected=f"a folder that is not there yet, or is empty, or has {_MARKER}",
                 got=str(self.root),
@@ -108,21 +106,10 @@ class WorkFolder:
         try:
             return self._load(key)
         except FileNotFoundError as error:
-            raise Unavailable(
-                "build.missing_item",
-                "finished work is not there: it was removed, or this work folder is not that of "
-                "the machine that did it; the same command makes it again",
-                field=str(self._path(key)),
-                expected="one work folder for all machines, see --work-dir",
-            ) from error
+            raise refuse("build.missing_item", field=str(self._path(key))) from error
         except ValueError as error:
             self._path(key).unlink(missing_ok=True)
-            raise Unavailable(
-                "build.damaged_item",
-                "finished work was damaged, maybe by a loss of power, and is now removed; "
-                "the same command makes it again",
-                field=str(self._path(key)),
-            ) from error
+            raise refuse("build.damaged_item", field=str(self._path(key))) from error
 
     def get(self, key: str, compute: Callable[[], Item]) -> Item:
         """Read an item, or compute and keep it."""
@@ -169,7 +156,5 @@ def exclusive(lock: Path) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise Conflict(
-                "build.running", "another build of this map is running", field=str(lock)
-            ) from None
+            raise refuse("build.running", field=str(lock)) from None
         yield

@@ -8,7 +8,7 @@ from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import asynccontextmanager
 from typing import TypeVar
 
-from visloc.errors import InvalidInput, TimedOut
+from visloc.errors import refuse
 from visloc_api.words.wire import TIMEOUT_HEADER
 
 T = TypeVar("T")
@@ -33,13 +33,7 @@ def timeout_of(header: str | None, limit_s: float) -> float:
     except ValueError:
         seconds = math.nan
     if not seconds > 0:  # NaN fails too
-        raise InvalidInput(
-            "request.timeout",
-            "not a time",
-            field=TIMEOUT_HEADER,
-            expected="seconds, more than 0",
-            got=header,
-        )
+        raise refuse("request.timeout", field=TIMEOUT_HEADER, got=header)
     return min(seconds, limit_s)
 
 
@@ -54,9 +48,9 @@ async def within(seconds: float) -> AsyncIterator[None]:
         async with asyncio.timeout(seconds):
             yield
     except TimeoutError:
-        raise TimedOut(
+        raise refuse(
             "server.deadline",
-            "the time for the request is over; the server is busy, or it asks for much",
+            "the time for the request is over; the server is busy, or the request is large",
             expected=f"an answer within {seconds:g} s",
         ) from None
 

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from visloc.archive import Geodetic
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Pose
 from visloc.geopose import geopose_of
 from visloc.types import Near as NearCore
@@ -49,13 +49,7 @@ def near_from_text(text: str) -> Near:
     try:
         latitude, longitude, radius = (float(number) for number in text.split(","))
     except ValueError:
-        raise InvalidInput(
-            "near.syntax",
-            "not a place",
-            field="near",
-            expected="latitude,longitude,radius in degrees and metres, such as 48.27,2.7,100",
-            got=text,
-        ) from None
+        raise refuse("near.syntax", field="near", got=text) from None
     return Near(latitude=latitude, longitude=longitude, radius=radius)
 
 

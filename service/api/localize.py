@@ -9,7 +9,7 @@ from pydantic import FailFast, Field
 
 from service.api.geopose import GivenNear, GivenYpr, Near, flag_from_text
 from service.values import RigJob, Where, photo_job
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc_api.words.features import GivenFeatures, GivenImage, query_to_core
 from visloc_api.words.geometry import GivenCamera
 from visloc_api.words.message import IncomingMessage, converted
@@ -28,8 +28,8 @@ def _maps_from_text(value: object) -> object:
     try:
         return json.loads(value)
     except (ValueError, RecursionError):
-        raise InvalidInput(
-            "request.malformed", "not JSON", field="maps", expected="id,id,... or a list in JSON"
+        raise refuse(
+            "request.malformed", field="maps", expected="id,id,... or a list in JSON"
         ) from None
 
 
@@ -65,22 +65,16 @@ def where_to_core(map_ref: str | None, maps: list[str] | None, near: Near | None
         if value is not None
     ]
     if len(given) != 1 or maps == []:
-        raise InvalidInput(
-            "request.map",
-            "a request names a map, or several, or a place",
-            field="map",
-            expected="one of map, maps, near",
-            got=" and ".join(given) or "none of them",
-        )
+        raise refuse("request.map", field="map", got=" and ".join(given) or "none of them")
     if near is not None:
         return near.to_core()
     if maps is None:
         assert map_ref is not None
         return (map_ref,)
     if len(maps) > MAX_MAPS or len(set(maps)) != len(maps):
-        raise InvalidInput(
+        raise refuse(
             "request.map",
-            "too many maps" if len(maps) > MAX_MAPS else "a map is named twice",
+            "there are too many maps" if len(maps) > MAX_MAPS else "a map is named twice",
             field="maps",
             expected=f"at most {MAX_MAPS} different ones",
             got=len(maps) if len(maps) > MAX_MAPS else ", ".join(maps),
@@ -121,13 +115,7 @@ class LocalizeRequest(IncomingMessage):
                 ``camera...``, ``options...``, ``priors...``, ``pose...`` or ``debug.needs_photo``.
         """
         if self.debug and self.features is not None:
-            raise InvalidInput(
-                "debug.needs_photo",
-                "matches are drawn on the photo, and features come without it",
-                field="debug",
-                expected="false or left out with features",
-                got="true",
-            )
+            raise refuse("debug.needs_photo", field="debug", got="true")
         return photo_job(
             where_to_core(self.map, self.maps, self.near),
             query_to_core(self.image, self.features),

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from service.api.oscp_images import image_bytes
 from service.values import ImageJob, RigJob, photo_job
-from visloc.errors import InvalidInput, TooLarge, inside
+from visloc.errors import inside, refuse
 from visloc.geometry import Camera, Pose
 from visloc.types import MAX_RADIUS_M, LocalizeOptions, Near, RigSensor
 from visloc_api.words.geopose import GeoPose
@@ -145,7 +145,7 @@ class GeoPoseRequest(_Read):
         try:
             body = json.loads(text, parse_constant=_refuse_constant)
         except (ValueError, RecursionError):
-            raise InvalidInput("request.malformed", "not JSON", expected="JSON") from None
+            raise refuse("request.malformed", expected="JSON") from None
         body = _object(body, "")
         readings = body.get("sensorReadings")
         sensors = _list(body.get("sensors"), "sensors")
@@ -194,18 +194,12 @@ class GeoPoseRequest(_Read):
             if (reading.imageFormat or "").upper() != _DEPTH
         ]
         if not photos:
-            raise InvalidInput(
-                "geopose.no_camera",
-                "there is no photo to localize",
-                field="sensorReadings",
-                expected="a camera reading",
-            )
+            raise refuse("geopose.no_camera", field="sensorReadings")
         near, options = self._near(), LocalizeOptions()
         rig = _rig_of(photos)
         if len(rig) > max_images:
-            raise TooLarge(
+            raise refuse(
                 "rig.too_many_images",
-                "an instant has too many images",
                 field="sensorReadings",
                 expected=f"at most {max_images}",
                 got=len(rig),
@@ -304,9 +298,9 @@ def _size(reading: CameraReading) -> tuple[int, int] | None:
         return None
     sides = [int(side) for side in reading.size if math.isfinite(side) and side == int(side)]
     if len(sides) != 2 or len(reading.size) != 2 or min(sides) < 1:
-        raise InvalidInput(
+        raise refuse(
             "request.invalid",
-            "not the size of a photo",
+            "the size is not the size of a photo",
             field="size",
             expected="width and height in pixels",
             got=str(reading.size[:4]),
@@ -326,9 +320,9 @@ def _camera(reading: CameraReading, sensor: Sensor | None) -> Camera | None:
         return None
     size = _size(reading)
     if size is None:
-        raise InvalidInput(
+        raise refuse(
             "request.missing_field",
-            "the intrinsics of a camera go with the size of its photo",
+            "the intrinsics of a camera require the size of its photo",
             field="size",
             expected="width and height in pixels",
         )
@@ -400,12 +394,8 @@ def _in_its_words(refused: ValidationError) -> Mapping[str, Any]:
 
 def _object(value: object, field: str) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise InvalidInput(
-            "request.invalid",
-            "cannot be used",
-            field=field or None,
-            expected="an object",
-            got=type(value).__name__,
+        raise refuse(
+            "request.invalid", field=field or None, expected="an object", got=type(value).__name__
         )
     return value
 
@@ -414,9 +404,8 @@ def _list(value: object, field: str) -> list[object]:
     if value is None:
         return []
     if not isinstance(value, list) or len(value) > _MAX_SENSORS:
-        raise InvalidInput(
+        raise refuse(
             "request.invalid",
-            "cannot be used",
             field=field,
             expected=f"a list of at most {_MAX_SENSORS}",
             got=f"{len(value)} in it" if isinstance(value, list) else type(value).__name__,

@@ -9,7 +9,7 @@ import zlib
 
 import numpy as np
 
-from visloc.errors import InvalidInput, TooLarge
+from visloc.errors import refuse
 
 # JPEG, PNG, TIFF; RIFF is followed by the name WEBP. Two letters of BMP say too little.
 _FILE_BEGINNINGS = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"RIFF")
@@ -40,9 +40,8 @@ def image_bytes(
         text = text.partition(",")[2]
     # Before it is decoded: four letters make three bytes, and one in 76 may be a line break.
     if len(text) * 3 // 4 > max_bytes * 78 // 76 + 4:
-        raise TooLarge(
+        raise refuse(
             "image.too_large",
-            "the photo has too many bytes",
             field="imageBytes",
             expected=f"at most {max_bytes}",
             got=f"about {len(text) * 3 // 4}",
@@ -51,15 +50,11 @@ def image_bytes(
     try:
         data = base64.b64decode(text + "=" * (-len(text) % 4), validate=True)
     except (binascii.Error, ValueError) as error:  # ValueError: letters outside ASCII
-        raise InvalidInput(
-            "image.base64",
-            "not base64",
-            field="imageBytes",
-            expected="the photo in base64",
-            got=str(error),
+        raise refuse(
+            "image.base64", field="imageBytes", expected="the photo in base64", got=str(error)
         ) from None
     if not data:
-        raise InvalidInput("image.empty", "the photo has no bytes", field="imageBytes")
+        raise refuse("image.empty", field="imageBytes")
     if data.startswith(_FILE_BEGINNINGS):
         return data
     pixels = 0 if size is None else size[0] * size[1]
@@ -67,9 +62,9 @@ def image_bytes(
         return _png(data, *size)
     if data.startswith(b"BM"):
         return data
-    raise InvalidInput(
+    raise refuse(
         "image.format",
-        "neither a file of a photo nor pixels of the size that the reading says",
+        "the bytes are neither a photo file nor pixels of the size in the reading",
         field="imageBytes",
         expected="JPEG or PNG; or width x height x 4 bytes (RGBA32), or width x height (GRAY8)",
         got=f"{len(data)} bytes, imageFormat {image_format!r}, size {size}",

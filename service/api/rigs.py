@@ -13,7 +13,7 @@ import visloc.types
 from service.api.geopose import GivenNear, GivenYpr
 from service.api.localize import GivenMaps, where_to_core
 from service.values import ONLY_SENSOR, ImageJob, RigJob
-from visloc.errors import InvalidInput, TooLarge, inside
+from visloc.errors import inside, refuse
 from visloc_api.words.features import GivenFeatures, GivenImage, query_to_core
 from visloc_api.words.geometry import GivenCamera, Transform
 from visloc_api.words.message import IncomingMessage, converted, counted
@@ -54,9 +54,9 @@ class Parts:
             InvalidInput: ``request.part`` when it was not sent, or is another image's already.
         """
         if name not in self._left:
-            raise InvalidInput(
+            raise refuse(
                 "request.part",
-                "this part is another image's already"
+                "another image already uses this part"
                 if name in self._names
                 else "no file part of this name was sent",
                 field="part",
@@ -73,7 +73,7 @@ class Parts:
         """
         if self._left:
             name = next(iter(self._left))
-            raise InvalidInput(
+            raise refuse(
                 "request.part",
                 "no image of the request names this part",
                 field=name[:100],
@@ -97,9 +97,8 @@ class RigSensor(IncomingMessage):
 def _check_id(value: object, field: str) -> None:
     """Refuse the id of a rig or a sensor that no answer or error could name."""
     if isinstance(value, str) and len(value) > MAX_ID:
-        raise InvalidInput(
+        raise refuse(
             "rig.id",
-            "the id of a rig or a sensor is too long",
             field=field,
             expected=f"at most {MAX_ID} characters",
             got=f"{len(value)} characters",
@@ -109,9 +108,8 @@ def _check_id(value: object, field: str) -> None:
 def _sensors_in_bounds(value: object) -> object:
     if isinstance(value, dict):
         if len(value) > MAX_SENSORS:
-            raise TooLarge(
+            raise refuse(
                 "rig.too_many_sensors",
-                "the rig has too many sensors",
                 field="sensors",
                 expected=f"at most {MAX_SENSORS}",
                 got=len(value),
@@ -142,9 +140,7 @@ class RigCalibration(IncomingMessage):
             InvalidInput: ``rig.empty``, ``rig.rotation``, ``pose.translation`` or ``camera...``.
         """
         if not self.sensors:
-            raise InvalidInput(
-                "rig.empty", "a rig has at least one camera", field="rig.sensors", got="none"
-            )
+            raise refuse("rig.empty", field="rig.sensors", got="none")
         return {name: _sensor_to_core(name, sensor) for name, sensor in self.sensors.items()}
 
 
@@ -213,13 +209,13 @@ class RigImage(IncomingMessage):
                 ``features...`` or ``camera...``.
         """
         if has_rig and not self.sensor:
-            raise InvalidInput("request.missing_field", "this field is needed", field="sensor")
+            raise refuse("request.missing_field", field="sensor")
         image = self.image
         if self.part is not None:
             if image is not None or self.features is not None:
-                raise InvalidInput(
+                raise refuse(
                     "request.query",
-                    "an image is given in one way",
+                    "an image must be given in exactly one way",
                     field="image",
                     expected="one of image, features, part",
                     got="part and another",
@@ -238,9 +234,8 @@ def _few_images(images: object, limits: object) -> None:
         and isinstance(images, list)
         and len(images) > limits.max_images
     ):
-        raise TooLarge(
+        raise refuse(
             "rig.too_many_images",
-            "an instant has too many images",
             field="images",
             expected=f"at most {limits.max_images}",
             got=len(images),
@@ -267,9 +262,8 @@ def images_to_core(
     for number, image in enumerate(images):
         with inside(f"images[{number}]"):
             if image.timestamp is not None and timestamp not in (None, image.timestamp):
-                raise InvalidInput(
+                raise refuse(
                     "rig.timestamps",
-                    "the images are of different instants",
                     field="timestamp",
                     expected=f"{timestamp}, as of the others",
                     got=image.timestamp,
@@ -303,7 +297,7 @@ class LocalizeRigRequest(IncomingMessage):
         """
         where = where_to_core(self.map, self.maps, self.near)
         if self.rig is None:
-            raise InvalidInput("request.missing_field", "this field is needed", field="rig")
+            raise refuse("request.missing_field", field="rig")
         rig, parts = rig_to_core(self.rig), Parts(files)
         images, timestamp = images_to_core(self.images, None, parts, has_rig=True)
         parts.check_all_taken()

@@ -22,7 +22,7 @@ from service.api.rigs import (
     rig_to_core,
 )
 from service.values import DEFAULT_MAX_GAP_S
-from visloc.errors import InvalidInput, TooLarge, inside
+from visloc.errors import inside, refuse
 from visloc.sequences.filling import TimeUnit
 from visloc_api.words.geometry import Numbers, Transform, covariance_to_core
 from visloc_api.words.message import IncomingMessage, counted
@@ -115,12 +115,8 @@ class SequenceStart(IncomingMessage):
         """
         units = [str(unit) for unit in TimeUnit]
         if self.time_unit and self.time_unit not in units:
-            raise InvalidInput(
-                "sequence.time_unit",
-                "unknown unit of time",
-                field="time_unit",
-                expected=f"one of {', '.join(units)}",
-                got=self.time_unit,
+            raise refuse(
+                "sequence.time_unit", field="time_unit", expected=units, got=self.time_unit
             )
         return service.values.SequenceStart(
             maps=where_to_core(self.map, self.maps, self.near),
@@ -139,9 +135,8 @@ def _few_instants(instants: object, limits: object) -> None:
         and isinstance(instants, list)
         and len(instants) > limits.max_instants
     ):
-        raise TooLarge(
+        raise refuse(
             "sequence.too_many_instants",
-            "the sequence has too many instants; send it in pieces",
             field="instants",
             expected=f"at most {limits.max_instants}",
             got=len(instants),

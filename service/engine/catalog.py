@@ -20,7 +20,7 @@ from service.workers.tasks import Vision
 from visloc.archive import SetOutline, read_any_outline
 from visloc.archive.set_rules import refuse_if_tile
 from visloc.archive.version_rules import version_in_use
-from visloc.errors import MapCorrupt, NotFound, Unavailable, VislocError
+from visloc.errors import MapCorrupt, NotFound, Unavailable, VislocError, refuse
 from visloc.types import Near
 
 logger = logging.getLogger(__name__)
@@ -235,7 +235,7 @@ class Catalog:
         """Return ``id@version``, which stays until it is released."""
         version = self._versions.setdefault(ref, _Version())
         if version.is_leaving:
-            raise NotFound("map.version", "the version is being deleted", field="map", got=ref)
+            raise refuse("map.version", "the version is being deleted", field="map", got=ref)
         version.users += 1
         try:
             return await self._prepare(ref)
@@ -393,5 +393,5 @@ class Catalog:
         task.add_done_callback(self._background.discard)
 
 
-def _gone_meanwhile(map_id: str) -> NotFound:
-    return NotFound("map.unknown", "the map was deleted a moment ago", field="map", got=map_id)
+def _gone_meanwhile(map_id: str) -> VislocError:
+    return refuse("map.unknown", "the map was deleted a moment ago", field="map", got=map_id)

@@ -21,7 +21,7 @@ from service.telemetry.metrics import Metrics
 from service.values import Instant, Localization, RigJob, SequenceStart, ServedMap, WorkerSettings
 from service.workers.judging import judged
 from service.workers.pool import Workers
-from visloc.errors import InvalidInput, Overloaded, Unavailable, VislocError
+from visloc.errors import VislocError, refuse
 from visloc.types import Near
 
 logger = logging.getLogger(__name__)
@@ -177,7 +177,7 @@ class Engine:
         """
         self._check_ready()
         if self._photos >= self._max_photos:
-            raise Overloaded("server.busy", "too many photos are waiting; try again shortly")
+            raise refuse("server.busy", "too many photos are waiting; try again shortly")
 
     @contextmanager
     def admit_batch(self) -> Iterator[None]:
@@ -189,7 +189,9 @@ class Engine:
         """
         self._check_ready()
         if self._batches >= self._max_batches:
-            raise Overloaded("server.busy", "too many rigs and sequences; try again shortly")
+            raise refuse(
+                "server.busy", "too many rigs and sequences are in progress; try again shortly"
+            )
         self._batches += 1
         try:
             yield
@@ -207,7 +209,7 @@ class Engine:
             VislocError: errors of the store.
         """
         if not job.images:
-            raise InvalidInput("rig.empty", "there is no image", field="images")
+            raise refuse("rig.empty", "there is no image", field="images")
         return await self._search(job)
 
     async def _search(self, job: RigJob) -> Localization:
@@ -237,9 +239,8 @@ class Engine:
         async with self._catalog.using(start.maps) as maps:
             sets, alone = parted(maps, start.priors)
             if sets and len(maps) > 1:
-                raise InvalidInput(
+                raise refuse(
                     "sequence.set",
-                    "a sequence is localized in one set of maps, or in maps",
                     field="maps",
                     expected=f"one set, such as {sets[0].ref}, or no set",
                     got=", ".join(each.ref for each in maps),
@@ -324,4 +325,4 @@ class Engine:
         if self._draining:
             raise stopping_error()
         if not self._started:
-            raise Unavailable("server.starting", "the maps are being loaded; try again shortly")
+            raise refuse("server.starting")

@@ -9,7 +9,7 @@ from contextlib import suppress
 from service.engine.stores import Store
 from service.values import ServedMap
 from visloc.archive import MapOutline, SetOutline
-from visloc.errors import InvalidInput, MapCorrupt, NotFound, VislocError
+from visloc.errors import MapCorrupt, NotFound, VislocError, refuse
 from visloc.priors import MAX_TILES
 from visloc.sets.choosing import tiles_near
 from visloc.types import Near
@@ -99,15 +99,13 @@ class Listing:
                 if _reaches(self.describe(map_id).outline, near):
                     found.append(map_id)
         if not found:
-            raise NotFound(
+            raise refuse(
                 "map.none_near",
-                "no map that is tied to the Earth reaches into this circle",
                 field="near",
-                expected="a place that a map covers: GET /maps?near=latitude,longitude,radius",
                 got=f"{near.latitude:g}, {near.longitude:g}, {near.radius:g} m",
             )
         if len(found) > MAX_MAPS:
-            raise InvalidInput(
+            raise refuse(
                 "request.map",
                 "too many maps reach into this circle",
                 field="near.radius",

@@ -42,7 +42,7 @@ from service.values import (
 from service.workers.pool import Workers
 from service.workers.tasks import Vision
 from visloc.archive import SetOutline
-from visloc.errors import InvalidInput, NotFound, Unavailable, VislocError, inside
+from visloc.errors import InvalidInput, NotFound, Unavailable, VislocError, inside, refuse
 from visloc.pose.centre import moved_pose
 from visloc.priors import Priors
 from visloc.sequences.filling import guess_time_unit
@@ -122,7 +122,7 @@ class SetSequence:
                         yield answer
                 index += 1
             if index == 0:
-                raise InvalidInput("sequence.empty", "there is no instant", field="instants")
+                raise refuse("sequence.empty", field="instants")
         except VislocError:
             # An error of one instant does not discard the answers before it.
             for answer in await self._finish():

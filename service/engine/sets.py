@@ -26,7 +26,15 @@ from service.workers.judging import judged
 from service.workers.pool import Workers
 from visloc.archive import SetOutline, TileRecord
 from visloc.archive.places import anchor_rms
-from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound, Unavailable, VislocError
+from visloc.errors import (
+    Conflict,
+    InvalidInput,
+    MapCorrupt,
+    NotFound,
+    Unavailable,
+    VislocError,
+    refuse,
+)
 from visloc.priors import Priors
 from visloc.sets.choosing import TileScore, allowed_tiles, is_clear, plan, tiles_near
 from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
@@ -189,14 +197,10 @@ class SetSearch:
         return await together(search(row) for row in rows)
 
 
-def tile_unavailable(tile: TileRecord, error: VislocError) -> Unavailable:
+def tile_unavailable(tile: TileRecord, error: VislocError) -> VislocError:
     """Return the error for a tile that cannot be opened."""
-    return Unavailable(
-        "set.tile_unavailable",
-        f"a tile of the set that may show this cannot be opened: {error.message}",
-        field="map",
-        expected=tile.ref,
-        got=error.code,
+    return refuse(
+        "set.tile_unavailable", field="map", expected=tile.ref, got=error.code, why=error.message
     )
 
 
@@ -241,7 +245,7 @@ def parted(
 def check_no_tiles(maps: Sequence[MapFolder], priors: Priors) -> None:
     """Refuse priors that name tiles for maps that have none."""
     if priors.maps is not None:
-        raise InvalidInput(
+        raise refuse(
             "priors.maps",
             "only a set of maps has tiles",
             field="priors.maps",

@@ -13,7 +13,7 @@ from typing import ParamSpec, TypeVar
 from service.engine.stores import Store
 from visloc.archive.packed import unpack_map
 from visloc.archive.version_rules import checked_name
-from visloc.errors import Conflict, InvalidInput, MapCorrupt, TooLarge
+from visloc.errors import InvalidInput, MapCorrupt, refuse
 
 # Uploads that are written or verified at once.
 MAX_UPLOADS = 4
@@ -48,20 +48,14 @@ class Uploads:
         """
         ref = f"{checked_name(map_id, 'map')}@{checked_name(version, 'map version')}"
         if version in await asyncio.to_thread(self._store.versions, map_id):
-            raise Conflict(
+            raise refuse(
                 "map.version_exists",
-                "the version exists already; versions never change",
                 field="version",
                 expected="a version that is not there",
                 got=ref,
             )
         if ref in self._running:
-            raise Conflict(
-                "map.upload_runs",
-                "this version is being uploaded by another request",
-                field="version",
-                got=ref,
-            )
+            raise refuse("map.upload_runs", field="version", got=ref)
         self._running.add(ref)
         try:
             async with self._incoming() as folder:
@@ -93,7 +87,7 @@ class Uploads:
             async for chunk in chunks:
                 size += len(chunk)
                 if size > self._max_bytes:
-                    raise TooLarge(
+                    raise refuse(
                         "request.too_large",
                         "the packed map has too many bytes",
                         expected=f"at most {self._max_bytes} bytes",
@@ -111,9 +105,8 @@ class Uploads:
             manifest = unpack_map(packed, target, self._max_bytes)
             packed.unlink()
             if (manifest.id, manifest.version) != (map_id, version):
-                raise InvalidInput(
+                raise refuse(
                     "packed.renamed",
-                    "the packed map is another map or version",
                     field="version",
                     expected=f"{manifest.id}@{manifest.version}",
                     got=f"{map_id}@{version}",
@@ -122,9 +115,7 @@ class Uploads:
         except MapCorrupt as error:
             # Damaged before it arrived; and the caller must not learn the server's folders.
             field = None if error.field is None else error.field.removeprefix(f"{target}/")
-            raise InvalidInput(
-                error.code, error.message, field=field, expected=error.expected, got=error.got
-            ) from error
+            raise error.about(field, InvalidInput) from error
 
     async def _to_end(self, work: Callable[P, T], *given: P.args, **named: P.kwargs) -> T:
         """Run in a thread, and wait for its end even if cancelled.

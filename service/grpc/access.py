@@ -20,7 +20,7 @@ from service.security.access import (
 )
 from service.security.key_file import Key
 from service.telemetry.logs import UNMATCHED
-from visloc.errors import Overloaded, TimedOut, VislocError
+from visloc.errors import Overloaded, VislocError, refuse
 
 # How long a call without a key, such as a health watch, may stay open. Watchers ask again.
 _KEYLESS_S = 300.0
@@ -72,14 +72,16 @@ class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
 
         async def serve(messages: AsyncIterator[Any], context: Context) -> Any:
             if self._keyless >= self._max_keyless:
-                busy = Overloaded("server.busy", "too many calls without a key; try again shortly")
+                busy = refuse(
+                    "server.busy", "there are too many calls without an API key; try again shortly"
+                )
                 await self._envelope.refuse(_name(method), busy, context)
             self._keyless += 1
             try:
                 async with asyncio.timeout(_KEYLESS_S):
                     return await behaviour(messages, context)
             except TimeoutError:
-                over = TimedOut("server.deadline", "watching ends after a while; ask again")
+                over = refuse("server.deadline", "watching ends after a while; call again")
                 await self._envelope.refuse(_name(method), over, context)
             finally:
                 self._keyless -= 1

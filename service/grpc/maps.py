@@ -10,7 +10,7 @@ from service.api.request_ids import request_id
 from service.engine.engine import Engine
 from service.grpc.envelope import Context, Envelope, message_of
 from service.telemetry.observer import Observer
-from visloc.errors import InvalidInput
+from visloc.errors import VislocError, refuse
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.v1 import localization_pb2_grpc as pb2_grpc
 
@@ -67,11 +67,5 @@ async def _chunks(messages: AsyncIterator[pb2.PutVersionRequest]) -> AsyncGenera
         yield message.chunk
 
 
-def _wrong_message(expected: str, got: str | None) -> InvalidInput:
-    return InvalidInput(
-        "upload.message",
-        "a message of the stream is not what it must be: first one start, then only chunks",
-        field="message",
-        expected=expected,
-        got=got or "nothing",
-    )
+def _wrong_message(expected: str, got: str | None) -> VislocError:
+    return refuse("upload.message", field="message", expected=expected, got=got or "nothing")

@@ -17,7 +17,7 @@ from service.api import Instant as InstantWords
 from service.api import SequenceStart as SequenceStartWords
 from service.api.geopose import Near as NearWords
 from service.values import Instant, RigJob, SequenceStart
-from visloc.errors import InvalidInput, TooLarge, inside
+from visloc.errors import VislocError, inside, refuse
 from visloc.types import Near
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.words.message import MAX_INSTANT_VALUES, check_num_values
@@ -54,11 +54,8 @@ def localize_job_of(request: pb2.LocalizeRequest, max_bytes: int) -> RigJob:
     """
     size = request.ByteSize()
     if size > max_bytes:
-        raise TooLarge(
-            "request.too_large",
-            "the request has too many bytes",
-            expected=f"at most {max_bytes} bytes",
-            got=f"{size} bytes",
+        raise refuse(
+            "request.too_large", expected=f"at most {max_bytes} bytes", got=f"{size} bytes"
         )
     return LocalizeRequest.read(_plain(request)).to_job()
 
@@ -109,13 +106,9 @@ def instant_of(
         return words.to_core(Parts({}), has_rig=has_rig)
 
 
-def _wrong_message(name: str, expected: str, got: str | None) -> InvalidInput:
-    return InvalidInput(
-        "sequence.message",
-        f"{name} of the stream is not what it must be: first one start, then only instants",
-        field="message",
-        expected=expected,
-        got=got or "nothing",
+def _wrong_message(name: str, expected: str, got: str | None) -> VislocError:
+    return refuse(
+        "sequence.message", field="message", expected=expected, got=got or "nothing", name=name
     )
 
 

@@ -14,7 +14,7 @@ from service.grpc.calls import Handler, behaviour_of, handler_like
 from service.grpc.connections import GrpcConnections
 from service.grpc.envelope import Context, Envelope
 from service.settings import SLOWEST_BYTES_PER_S
-from visloc.errors import InvalidInput, TimedOut
+from visloc.errors import InvalidInput, TimedOut, refuse
 
 # Calls whose only message may be large.
 _LARGE_MESSAGES = ("Localize", "LocalizeRig")
@@ -93,9 +93,9 @@ async def _timely(messages: AsyncIterator[Any], patience_s: float) -> AsyncGener
         if message is None:
             return
         if isinstance(message, _Unreadable):
-            raise InvalidInput(
+            raise refuse(
                 "request.malformed",
-                "the message is not what the method takes",
+                "the message does not fit the method",
                 expected="a protobuf message as in localization.proto",
                 got=message.reason,
             )

@@ -20,7 +20,7 @@ from service.http.oscp.routes import add_geopose_routes
 from service.http.responses import problem_response
 from service.http.scenes import add_scene_routes
 from service.http.static_page import add_page_routes
-from visloc.errors import InvalidInput, NotFound, VislocError
+from visloc.errors import InvalidInput, NotFound, VislocError, refuse
 from visloc_api.words.message import refusal_of
 
 
@@ -72,8 +72,9 @@ async def _on_http_exception(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     status = HTTPStatus(error.status_code)
     kind = NotFound if status == HTTPStatus.NOT_FOUND else InvalidInput
-    code = "http." + status.phrase.lower().replace(" ", "_").replace("-", "_")
-    refused = kind(code, status.phrase, got=f"{request.method} {request.url.path}")
+    name = status.phrase.lower().replace(" ", "_").replace("-", "_")
+    asked = f"{request.method} {request.url.path}"
+    refused = refuse(f"http.{name}", status.phrase, got=asked, kind=kind)
     response = _refused(request, refused, status)
     response.headers.update(error.headers or {})
     return response

@@ -21,7 +21,7 @@ from service.http.backend import backend_of
 from service.http.forms import Form, FormLimits, parse_form
 from service.settings import REQUEST_OVERHEAD_BYTES, ServiceSettings
 from service.values import Instant, RigJob, SequenceStart
-from visloc.errors import InvalidInput
+from visloc.errors import VislocError, refuse
 from visloc_api.words.message import MAX_INSTANT_VALUES
 
 # The parts of the form of one photo that are files, and the file names in curl's examples.
@@ -164,9 +164,8 @@ def checked_media_type(request: Request, kinds: Collection[str]) -> str:
     """
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type not in kinds:
-        raise InvalidInput(
+        raise refuse(
             "request.content_type",
-            "this kind of body is not read here",
             field="Content-Type",
             expected=" or ".join(kinds),
             got=media_type or "none",
@@ -197,11 +196,11 @@ async def _read_batch(request: Request, to_job: ToJob[JobT], *, max_files: int) 
         return await _BATCHES.parse(to_job, text, files)
 
 
-def _no_request_text(form: Form) -> InvalidInput:
+def _no_request_text(form: Form) -> VislocError:
     name = next(iter(form.texts), None)
-    return InvalidInput(
+    return refuse(
         "request.missing_field" if name is None else "request.unknown_field",
-        "the form needs the request as a text",
+        "the form needs the request as a text part",
         field="request" if name is None else name[:100],
         expected="a text, as of curl -F 'request=<request.json'",
         got="a file" if name is None and "request" in form.files else name,
@@ -215,16 +214,16 @@ def _check_kinds(form: Form) -> None:
         InvalidInput: ``request.invalid``.
     """
     for name in form.texts.keys() & _FILES.keys():
-        raise InvalidInput(
+        raise refuse(
             "request.invalid",
-            "the wrong kind of form part",
+            "the form has the wrong kind of part here",
             field=name,
             expected=f"a file, as of curl -F {name}=@{_FILES[name]}",
         )
     for name in form.files.keys() & (LocalizeRequest.model_fields.keys() - _FILES.keys()):
-        raise InvalidInput(
+        raise refuse(
             "request.invalid",
-            "the wrong kind of form part",
+            "the form has the wrong kind of part here",
             field=name,
             expected="a text, without a file name",
         )

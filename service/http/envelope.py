@@ -16,7 +16,7 @@ from service.http.backend import Backend
 from service.http.responses import problem_response
 from service.telemetry.logs import UNMATCHED, RequestRecord
 from service.telemetry.tracing import traceparent_of
-from visloc.errors import InvalidInput, Overloaded, VislocError
+from visloc.errors import VislocError, refuse
 
 logger = logging.getLogger(__name__)
 
@@ -104,16 +104,9 @@ def route_of(scope: Scope) -> str:
     return f"{method} {path}"
 
 
-def _busy() -> Overloaded:
-    return Overloaded(
-        "server.busy", "requests are being served on all connections; try again shortly"
-    )
+def _busy() -> VislocError:
+    return refuse("server.busy", "all connections are busy; try again shortly")
 
 
-def _ambiguous() -> InvalidInput:
-    return InvalidInput(
-        "request.framing",
-        "the request says in two ways where its body ends",
-        field="Transfer-Encoding",
-        expected="Content-Length or Transfer-Encoding, not both",
-    )
+def _ambiguous() -> VislocError:
+    return refuse("request.framing", field="Transfer-Encoding")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,15 +44,15 @@ def parse_form(content_type: str, body: bytes, limits: FormLimits, expected: str
     try:
         parts = _parts_of(content_type, body, limits)
     except _Malformed as error:
-        raise InvalidInput("request.malformed", str(error), expected=expected) from None
+        raise refuse("request.malformed", str(error), expected=expected) from None
     except FormParserError:
         message = "Invalid multipart data."
-        raise InvalidInput("request.malformed", message, expected=expected) from None
+        raise refuse("request.malformed", message, expected=expected) from None
     texts: dict[str, str] = {}
     files: dict[str, bytes] = {}
     for name, value in parts:
         if name in texts or name in files:
-            raise InvalidInput("request.duplicate_field", "given twice", field=name[:100])
+            raise refuse("request.duplicate_field", field=name[:100])
         if isinstance(value, str):
             texts[name] = value
         else:

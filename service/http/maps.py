@@ -15,7 +15,7 @@ from service.http.backend import backend_of
 from service.http.bodies import checked_media_type, read_use_version
 from service.http.openapi.app import problems
 from service.http.responses import json_response
-from visloc.errors import TooLarge
+from visloc.errors import refuse
 
 _PACKED = ("application/zip", "application/octet-stream")
 _PACKED_BODY: dict[str, Any] = {
@@ -125,7 +125,7 @@ async def delete_version(request: Request, map_id: str, version: str) -> Respons
 def _check_declared_size(request: Request, limit: int) -> None:
     declared = request.headers.get("content-length", "")
     if declared.isdecimal() and int(declared[:20]) > limit:
-        raise TooLarge(
+        raise refuse(
             "request.too_large",
             "the packed map has too many bytes",
             expected=f"at most {limit} bytes",

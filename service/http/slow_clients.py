@@ -13,7 +13,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from service.errors import too_slow
 from service.http.acceptor import Connection, OpenConnections
 from service.settings import SLOWEST_BYTES_PER_S
-from visloc.errors import Overloaded, TooLarge
+from visloc.errors import VislocError, refuse
 
 
 class TimelyProtocol(H11Protocol, Connection):
@@ -135,7 +135,7 @@ class Arrivals:
                     if len(body) + len(chunk) > limit:
                         raise _too_large(limit, "more")
                     if self._held + len(chunk) > self._max_bytes:
-                        raise Overloaded(
+                        raise refuse(
                             "server.busy", "too many bytes are arriving; try again shortly"
                         )
                     self._held += len(chunk)
@@ -167,10 +167,5 @@ class Arrivals:
                 yield chunk
 
 
-def _too_large(limit: int, got: str) -> TooLarge:
-    return TooLarge(
-        "request.too_large",
-        "the request has too many bytes",
-        expected=f"at most {limit} bytes",
-        got=got,
-    )
+def _too_large(limit: int, got: str) -> VislocError:
+    return refuse("request.too_large", expected=f"at most {limit} bytes", got=got)

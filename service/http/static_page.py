@@ -12,7 +12,7 @@ from pathlib import Path
 from fastapi import FastAPI, Request, Response
 
 from service.http.cache_headers import ASK_ALWAYS, FOR_EVER, is_current, not_modified, takes_gzip
-from visloc.errors import NotFound, Unavailable
+from visloc.errors import Unavailable, refuse
 from visloc_web import page_folder
 
 logger = logging.getLogger(__name__)
@@ -69,17 +69,13 @@ def add_page_routes(app: FastAPI) -> None:
     @app.api_route("/", methods=_READING, include_in_schema=False)
     async def page(request: Request) -> Response:
         if index is None:
-            raise NotFound(
-                "page.not_built",
-                "this server has no page, as its files were not built; the API is here",
-                expected="GET /openapi.json, which describes the API",
-            )
+            raise refuse("page.not_built")
         return _answer(index, request, ASK_ALWAYS)
 
     @app.api_route("/assets/{name}", methods=_READING, include_in_schema=False)
     async def asset(request: Request, name: str) -> Response:
         if name not in assets:
-            raise NotFound("http.not_found", "the page has no such file", got=name)
+            raise refuse("http.not_found", got=name)
         return _answer(assets[name], request, FOR_EVER)  # names contain a hash of the content
 
 

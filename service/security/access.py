@@ -14,7 +14,7 @@ from service.security.key_file import Key, Scope
 from service.security.key_ring import KeyRing
 from service.settings import ServiceSettings, SettingsError
 from service.telemetry.logs import note_key
-from visloc.errors import Forbidden, InvalidInput, Overloaded, Unauthenticated
+from visloc.errors import InvalidInput, refuse
 from visloc_api.v1 import localization_pb2 as pb2
 
 # What a request needs: a key with these scopes, or no key at all. Unknown paths and methods need
@@ -151,22 +151,10 @@ class Access:
         if self._ring is not None:
             return
         if not is_loopback(_without_port(host)):
-            raise Forbidden(
-                "access.host",
-                "a server without API keys answers to names of its own machine only",
-                field="Host",
-                expected="localhost, 127.0.0.1 or [::1]",
-                got=host[:100],
-            )
+            raise refuse("access.host", field="Host", got=host[:100])
         for origin in origins:
             if origin not in self.origins and origin != f"{scheme}://{host}":
-                raise Forbidden(
-                    "access.origin",
-                    "a web page of another origin may not call this server",
-                    field="Origin",
-                    expected="an origin in the setting cors_origins",
-                    got=origin[:100],
-                )
+                raise refuse("access.origin", field="Origin", got=origin[:100])
 
     def key_of(self, tokens: Collection[str], needed: Needed) -> Key | None:
         """Return the key of a request and note it for the log; None when no key is needed.
@@ -182,25 +170,14 @@ class Access:
         if self._ring is None or needed is None:
             return None
         if not tokens:
-            raise Unauthenticated(
-                "access.key_missing",
-                "this server answers to holders of an API key",
-                field="Authorization",
-                expected="Authorization: Bearer KEY, or X-API-Key: KEY",
-            )
+            raise refuse("access.key_missing", field="Authorization")
         key = self._ring.find(next(iter(tokens))) if len(set(tokens)) == 1 else None
         if key is None:
-            raise Unauthenticated(
-                "access.key_unknown",
-                "this is no API key of this server, or no longer",
-                field="Authorization",
-                expected="one key, as the server's operator gave it",
-            )
+            raise refuse("access.key_unknown", field="Authorization")
         note_key(key.name)
         if not needed <= key.scopes:
-            raise Forbidden(
+            raise refuse(
                 "access.scope",
-                "the API key is not good for this",
                 field="Authorization",
                 expected=f"a key with the scope {', '.join(sorted(needed))}",
                 got=f"one with {', '.join(sorted(key.scopes))}",
@@ -219,16 +196,10 @@ class Access:
             return
         use = self._use_of(key)
         if key.concurrency is not None and use.running >= key.concurrency:
-            raise Overloaded(
-                "access.concurrency",
-                "too many requests of this API key are being served; wait for one to end",
-                expected=f"at most {key.concurrency} at once",
-            )
+            raise refuse("access.concurrency", expected=f"at most {key.concurrency} at once")
         if use.left < 1:
-            raise Overloaded(
-                "access.rate",
-                f"too many requests of this API key; try again in {self.wait_s(key)} s",
-                expected=f"at most {key.rate:g} per second",
+            raise refuse(
+                "access.rate", expected=f"at most {key.rate:g} per second", wait_s=self.wait_s(key)
             )
         use.left -= 1
         use.running += 1

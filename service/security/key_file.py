@@ -26,7 +26,7 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field, PlainSerializer, TypeAdapter, ValidationError
 
-from visloc.errors import InvalidInput
+from visloc.errors import VislocError, refuse
 
 FORMAT: Literal[1] = 1
 MAX_FILE_BYTES = 8 * 2**20
@@ -157,20 +157,14 @@ def _content_of(path: Path) -> bytes:
             mode = os.fstat(file.fileno()).st_mode
             content = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
-        raise InvalidInput(
+        raise refuse(
             "keys.file",
             "the file of API keys cannot be read; `python -m service.keys init` makes one",
             field=str(path),
             got=error.strerror,
         ) from None
     if mode & (stat.S_IWGRP | stat.S_IWOTH):
-        raise InvalidInput(
-            "keys.permissions",
-            "others may write the file of API keys, and so let themselves in; chmod go-w",
-            field=str(path),
-            expected="a mode such as 600",
-            got=f"{stat.S_IMODE(mode):o}",
-        )
+        raise refuse("keys.permissions", field=str(path), got=f"{stat.S_IMODE(mode):o}")
     if len(content) > MAX_FILE_BYTES:
         raise _malformed(str(path), f"at most {MAX_FILE_BYTES} bytes", "more")
     return content
@@ -194,7 +188,7 @@ def _check_burst(key: Key, field: str) -> None:
         raise _bad_limit(field, f"rate {key.rate}, burst {key.burst}")
 
 
-def _refusal(refused: ValidationError, field: str) -> InvalidInput:
+def _refusal(refused: ValidationError, field: str) -> VislocError:
     """Turn the first of pydantic's errors into ours."""
     error = refused.errors(include_url=False)[0]
     match error["loc"]:
@@ -205,34 +199,21 @@ def _refusal(refused: ValidationError, field: str) -> InvalidInput:
     match error["type"], *place:
         case "string_pattern_mismatch", "name":
             got = error["input"]
-            return InvalidInput("keys.name", "not a name", field=field, expected=NAME_RULE, got=got)
+            return refuse("keys.name", field=field, expected=NAME_RULE, got=got)
         case "too_short", "scopes":
-            return InvalidInput(
-                "keys.scopes",
-                "a key without a scope is good for nothing",
-                field=field,
-                expected=f"some of {', '.join(Scope)}",
-            )
+            return refuse("keys.scopes", field=field, expected=f"some of {', '.join(Scope)}")
         case kind, ("rate" | "burst" | "concurrency") as name if kind != "missing":
             return _bad_limit(field, f"{name} {error['input']}")
     got = " ".join([*map(str, place), error["msg"]])
     return _malformed(field, f'"format": {FORMAT} and "keys", as this program writes them', got)
 
 
-def _bad_limit(field: str, got: str) -> InvalidInput:
-    return InvalidInput(
-        "keys.limit",
-        "a limit that cannot be used",
-        field=field,
-        expected="rate above 0 with burst, concurrency from 1, each to a million",
-        got=got,
-    )
+def _bad_limit(field: str, got: str) -> VislocError:
+    return refuse("keys.limit", field=field, got=got)
 
 
-def _malformed(field: str, expected: str, got: str) -> InvalidInput:
-    return InvalidInput(
-        "keys.file", "not a file of API keys", field=field, expected=expected, got=got
-    )
+def _malformed(field: str, expected: str, got: str) -> VislocError:
+    return refuse("keys.file", field=field, expected=expected, got=got)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from service.values import ONLY_SENSOR, ImageJob, Localization, Rig
 from service.workers.photos import DecodedQuery, summed
 from visloc.archive import Map
 from visloc.archive.places import anchor_rms
-from visloc.errors import InvalidInput, NotFound, TooLarge
+from visloc.errors import InvalidInput, refuse
 from visloc.geometry import Pose
 from visloc.localization.constraints import Constraints
 from visloc.localization.localizer import Localizer
@@ -91,14 +91,14 @@ def rig_in_map(rig: Rig | None, opened: Map) -> Mapping[str, RigSensor]:
         return rig
     known = opened.rigs.get(rig)
     if known is None:
-        raise NotFound(
+        raise refuse(
             "rig.unknown",
-            f"map {opened.ref} knows no such rig",
             field="rig",
             expected=f"one of {', '.join(opened.rigs)[:_MAX_LISTED]}"
             if opened.rigs
             else "a rig given inline",
             got=rig,
+            ref=opened.ref,
         )
     return {
         sensor: RigSensor(cam_from_rig, opened.cameras.get(sensor))
@@ -114,39 +114,22 @@ def check_images(
     The rig is None when every instant is one image.
     """
     if len(images) > max_images:
-        raise TooLarge(
-            "rig.too_many_images",
-            "too many images at one instant",
-            field=where,
-            expected=f"at most {max_images}",
-            got=len(images),
+        raise refuse(
+            "rig.too_many_images", field=where, expected=f"at most {max_images}", got=len(images)
         )
     if rig is None and len(images) > 1:
-        raise InvalidInput(
-            "sequence.rig",
-            "an instant of several images needs a rig that says how their cameras sit",
-            field=where,
-            expected="a rig, or one image",
-            got=f"{len(images)} images",
-        )
+        raise refuse("sequence.rig", field=where, got=f"{len(images)} images")
     for index, image in enumerate(images):
         if rig is not None and image.sensor not in rig:
-            raise InvalidInput(
+            raise refuse(
                 "rig.sensor",
-                "the rig has no such camera",
                 field=f"{where}[{index}].sensor",
                 expected=f"one of {', '.join(rig)[:_MAX_LISTED]}",
                 got=image.sensor,
             )
     twice = [sensor for sensor, n in Counter(image.sensor for image in images).items() if n > 1]
     if twice:
-        raise InvalidInput(
-            "rig.duplicate",
-            "a camera takes one image at an instant",
-            field=where,
-            expected="every sensor once",
-            got=f"{twice[0]} more than once",
-        )
+        raise refuse("rig.duplicate", field=where, got=f"{twice[0]} more than once")
 
 
 def check_options(targets: Sequence[Target], options: LocalizeOptions) -> None:
@@ -167,12 +150,13 @@ def check_options(targets: Sequence[Target], options: LocalizeOptions) -> None:
     if len(targets) == 1:
         raise first
     names = ", ".join(refused)[:_MAX_LISTED]
-    raise type(first)(
+    raise refuse(
         first.code,
-        f"not for every map that is searched ({names}); in {ref}: {first.message}",
+        f"the option does not fit all of the maps ({names}); in {ref}: {first.message}",
         field=first.field,
         expected=first.expected,
         got=first.got,
+        kind=type(first),
     ) from first
 
 

@@ -12,7 +12,7 @@ from time import perf_counter
 from service.values import MapFolder, OpenMap, WorkerSettings
 from service.workers.tiles import TileRanker
 from visloc.archive.store import open_published, open_published_set
-from visloc.errors import Conflict, InvalidInput, MapCorrupt, VislocError
+from visloc.errors import Conflict, InvalidInput, VislocError, refuse
 from visloc.features import (
     GlobalDescriptor,
     LocalFeatureExtractor,
@@ -90,13 +90,7 @@ class OpenMaps:
             try:
                 opened = self._open_set(version) if version.is_set else self._open_map(version)
             except InvalidInput as error:  # features that are not here: not the caller's mistake
-                raise Conflict(
-                    error.code,
-                    error.message,
-                    field=error.field,
-                    expected=error.expected,
-                    got=error.got,
-                ) from error
+                raise error.about(error.field, Conflict) from error
             opened.warm_up()
         logger.info("map %s loaded in %.1f s", version.ref, perf_counter() - start)
         return opened
@@ -136,9 +130,4 @@ def _damage_named(ref: str) -> Iterator[None]:
         raise
     except (Exception, SystemExit) as error:
         logger.exception("map %s cannot be used", ref)
-        raise MapCorrupt(
-            "map.unusable",
-            "the map cannot be used; rebuild it, or see the server's log for the cause",
-            field=ref,
-            got=type(error).__name__,
-        ) from error
+        raise refuse("map.unusable", field=ref, got=type(error).__name__) from error

@@ -27,7 +27,7 @@ from service.errors import stopping_error
 from service.values import MapFolder, OpenMap, WorkerSettings
 from service.workers import process
 from service.workers.tasks import Vision
-from visloc.errors import TimedOut, Unavailable, VislocError
+from visloc.errors import VislocError, refuse
 
 logger = logging.getLogger(__name__)
 
@@ -321,7 +321,7 @@ class _Worker:
                 await asyncio.wait({future})
                 with suppress(BrokenProcessPool):
                     future.result()
-                raise TimedOut(
+                raise refuse(
                     "server.deadline",
                     "the request took too long; ask for less, or raise request_timeout_s",
                     expected=f"at most {limit_s:g} s",
@@ -339,8 +339,5 @@ class _Worker:
                 os.kill(self.pid, signal.SIGKILL)
 
 
-def _died() -> Unavailable:
-    return Unavailable(
-        "server.worker_died",
-        "the process that worked on the request died, and is being replaced; try again",
-    )
+def _died() -> VislocError:
+    return refuse("server.worker_died")

@@ -8,7 +8,7 @@ from dataclasses import replace
 from service.values import Instant, Localization, SequenceStart, check_order
 from service.workers.instants import Target, check_images, check_options, check_priors
 from service.workers.judging import judged
-from visloc.errors import InvalidInput, TooLarge, inside
+from visloc.errors import inside, refuse
 from visloc.localization.solving import SeenImage, Solved
 from visloc.priors import Priors
 from visloc.sequences.filling import TimeUnit, guess_time_unit
@@ -43,9 +43,8 @@ class SequenceRun:
         Instants are checked in order, which may begin again with the first.
         """
         if index >= self._max_instants:
-            raise TooLarge(
+            raise refuse(
                 "sequence.too_many_instants",
-                "too many instants in one sequence; send it in parts",
                 field="instants",
                 expected=f"at most {self._max_instants}",
             )
@@ -96,7 +95,7 @@ class SequenceRun:
     def finish(self) -> list[InstantAnswer]:
         """Return the answers that waited for further instants."""
         if not self._solvers:
-            raise InvalidInput("sequence.empty", "there is no instant", field="instants")
+            raise refuse("sequence.empty", field="instants")
         for held, solver in zip(self._held, self._solvers, strict=True):
             held += solver.finish()
         # Motion may place instants that no image localizes, but not in several maps.
@@ -169,10 +168,10 @@ def _is_metric(target: Target) -> bool:
 def _guessed_unit(timestamp: int) -> TimeUnit:
     unit = guess_time_unit([timestamp])
     if unit is None:
-        raise InvalidInput(
+        raise refuse(
             "sequence.time_unit",
-            "the unit of the timestamps cannot be told by their size",
+            "the size of the timestamps does not reveal their unit",
             field="time_unit",
-            expected=f"one of {', '.join(TimeUnit)}",
+            expected=TimeUnit,
         )
     return unit

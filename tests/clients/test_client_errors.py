@@ -65,7 +65,7 @@ def test_a_server_that_is_not_there_is_named_with_what_to_check(
         client.maps()
     assert caught.value.code == "server.unreachable"
     assert url in str(caught.value)
-    assert "check that it runs" in str(caught.value)
+    assert "whether it runs" in str(caught.value)
 
 
 @pytest.mark.parametrize("scheme", ["http", "grpc"])

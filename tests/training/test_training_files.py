@@ -54,9 +54,9 @@ def test_equal_content_gives_equal_bytes(tmp_path: Path) -> None:
 def test_other_files_are_neither_packs_nor_rooms(data: bytes, tmp_path: Path) -> None:
     path = tmp_path / "other"
     path.write_bytes(data)
-    with pytest.raises(InvalidInput, match="no pack of photos") as caught:
+    with pytest.raises(InvalidInput, match="not a pack of photos") as caught:
         read_pack(path, CPU)
     assert caught.value.code == "training.pack"
-    with pytest.raises(InvalidInput, match="no rooms") as caught:
+    with pytest.raises(InvalidInput, match="the rooms cannot be read") as caught:
         read_rooms(path, CPU)
     assert caught.value.code == "training.rooms"

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ValidationError
 from visloc.archive.npz import read_npy_header, read_npz
 from visloc.archive.schema import FORMAT_MAJOR, FORMAT_MINOR, Manifest
 from visloc.archive.set_schema import SET_FORMAT, SET_MAJOR, SET_MINOR, SetManifest
-from visloc.errors import InvalidInput, MapCorrupt
+from visloc.errors import VislocError, refuse
 
 RecordType = TypeVar("RecordType", bound=BaseModel)
 
@@ -107,9 +107,8 @@ def parse_any_manifest(content: bytes, address: str) -> Manifest | SetManifest:
     newest = (SET_MAJOR, SET_MINOR) if of_set else (FORMAT_MAJOR, FORMAT_MINOR)
     major = version.partition(".")[0]
     if major.isascii() and major.isdigit() and len(major) < 9 and int(major) > newest[0]:
-        raise MapCorrupt(
+        raise refuse(
             "map.format_version",
-            "the map was written by a newer visloc; upgrade visloc or rebuild the map",
             field=address,
             expected=f"format {newest[0]}.x or older (this program writes {newest[0]}.{newest[1]})",
             got=version,
@@ -119,16 +118,10 @@ def parse_any_manifest(content: bytes, address: str) -> Manifest | SetManifest:
     return _parse(Manifest, text, address, "map.manifest")
 
 
-def is_set(ref: str, manifest: SetManifest) -> InvalidInput:
+def is_set(ref: str, manifest: SetManifest) -> VislocError:
     """``map.is_set``."""
     some = ", ".join(tile.ref for tile in manifest.tiles[:3])
-    return InvalidInput(
-        "map.is_set",
-        "this is a set of maps, not a map; name one of its tiles",
-        field="map",
-        expected=f"a map, such as {some}",
-        got=ref,
-    )
+    return refuse("map.is_set", field="map", expected=f"a map, such as {some}", got=ref)
 
 
 def check_files(folder: Path, manifest: Manifest | SetManifest) -> None:
@@ -140,24 +133,18 @@ def check_files(folder: Path, manifest: Manifest | SetManifest) -> None:
     for name, entry in manifest.files.items():
         parts = PurePosixPath(name).parts
         if not parts or ".." in parts or name.startswith("/") or "\\" in name or "\0" in name:
-            raise MapCorrupt(
-                "map.file_name",
-                "a file name leads out of the map",
-                field=str(folder / "manifest.json"),
-                got=name,
-            )
+            raise refuse("map.file_name", field=str(folder / "manifest.json"), got=name)
         path = folder / name
         try:
             status = path.lstat()
         except (OSError, ValueError):  # ValueError: lone surrogates
             status = None
         if status is None or not stat.S_ISREG(status.st_mode):
-            raise MapCorrupt("map.file_missing", "a file of the map is missing", field=str(path))
+            raise refuse("map.file_missing", field=str(path))
         size = status.st_size
         if size != entry.size:
-            raise MapCorrupt(
+            raise refuse(
                 "map.file_size",
-                "a file of the map has another size than when it was published",
                 field=str(path),
                 expected=f"{entry.size} bytes",
                 got=f"{size} bytes",
@@ -173,9 +160,8 @@ def check_checksums(folder: Path, manifest: Manifest | SetManifest) -> None:
     for name, entry in manifest.files.items():
         digest = sha256_of(folder / name)
         if digest != entry.sha256:
-            raise MapCorrupt(
+            raise refuse(
                 "map.checksum",
-                "a file of the map was altered after it was published; restore or rebuild it",
                 field=str(folder / name),
                 expected=f"sha256 {entry.sha256}",
                 got=digest,
@@ -188,11 +174,7 @@ def check_checksums(folder: Path, manifest: Manifest | SetManifest) -> None:
         or manifest_hash(fields) != manifest.manifest_hash
         or content_hash(fields) != manifest.content_hash
     ):
-        raise MapCorrupt(
-            "map.manifest_hash",
-            "the manifest was altered after it was published; restore or rebuild the map",
-            field=str(path),
-        )
+        raise refuse("map.manifest_hash", field=str(path))
 
 
 def read_record(folder: Path, name: str, record: type[RecordType]) -> RecordType:
@@ -291,9 +273,9 @@ def read_model(folder: Path, name: str) -> dict[str, NDArray[np.float32]]:
     try:
         model = read_npz(path)
     except (ValueError, OSError) as error:
-        raise MapCorrupt(
+        raise refuse(
             "map.array",
-            "not a model file",
+            "the file does not hold a model",
             field=str(path),
             expected="an .npz without compression",
             got=str(error),
@@ -302,9 +284,9 @@ def read_model(folder: Path, name: str) -> dict[str, NDArray[np.float32]]:
         model[key] = _widened(model[key], model.pop(key + SCALES))
     for key, array in model.items():
         if array.dtype != np.float32 or not np.isfinite(array).all():
-            raise MapCorrupt(
+            raise refuse(
                 "map.array",
-                f"array {key!r} of a model is not usable",
+                f"array {key!r} of a model is not valid",
                 field=str(path),
                 expected="finite float32, or int8 with finite float32 scales of its columns",
                 got=str(array.dtype),
@@ -331,14 +313,14 @@ def _array_header(
             offset = file.tell()
             size = file.seek(0, os.SEEK_END)
     except (ValueError, OSError) as error:
-        raise MapCorrupt("map.array", "not a NumPy array file", field=str(path)) from error
+        raise refuse("map.array", "the file is not a NumPy array", field=str(path)) from error
     expected = np.dtype(dtype if before is None or found != np.dtype(before) else before)
     whole = size == offset + math.prod(shape) * expected.itemsize
     # Before memory is allocated, as a header can claim any shape.
     if found != expected or found_shape != shape or not whole:
-        raise MapCorrupt(
+        raise refuse(
             "map.array",
-            "an array of the map is not what the manifest says",
+            "an array of the map does not match the manifest; restore or rebuild the map",
             field=str(path),
             expected=f"{expected} of shape {shape}, in a file as long as that",
             got=f"{found} of shape {found_shape}, in {size} bytes",
@@ -346,11 +328,9 @@ def _array_header(
     return expected, offset, "F" if fortran else "C"
 
 
-def _cut_short(path: Path) -> MapCorrupt:
-    return MapCorrupt(
-        "map.array",
-        "an array of the map could not be read to its end; restore or rebuild the map",
-        field=str(path),
+def _cut_short(path: Path) -> VislocError:
+    return refuse(
+        "map.array", "an array of the map is cut short; restore or rebuild the map", field=str(path)
     )
 
 
@@ -358,29 +338,27 @@ def _read_bytes(path: Path, limit: int, code: str) -> bytes:
     try:
         status = path.lstat()
         if not stat.S_ISREG(status.st_mode):  # opening a pipe waits for its other end
-            raise MapCorrupt(code, "not a file", field=str(path), expected="a plain file")
+            raise refuse(code, "this is not a plain file", field=str(path), expected="a plain file")
         if status.st_size > limit:
             raise _too_large(str(path), limit, code)
         return path.read_bytes()
     except FileNotFoundError:
-        raise MapCorrupt(code, "the file is missing", field=str(path)) from None
+        raise refuse(code, "the file is missing", field=str(path)) from None
     except OSError as error:
-        raise MapCorrupt(
+        raise refuse(
             code, "the file cannot be read", field=str(path), got=error.strerror
         ) from error
 
 
-def _too_large(address: str, limit: int, code: str) -> MapCorrupt:
-    return MapCorrupt(
-        code, "the file is too large", field=address, expected=f"at most {limit} bytes"
-    )
+def _too_large(address: str, limit: int, code: str) -> VislocError:
+    return refuse(code, "the file is too large", field=address, expected=f"at most {limit} bytes")
 
 
 def _decoded(content: bytes, address: str, code: str) -> str:
     try:
         return content.decode()
     except UnicodeDecodeError as error:
-        raise MapCorrupt(code, "the file is not UTF-8 text", field=address) from error
+        raise refuse(code, "the file is not UTF-8 text", field=address) from error
 
 
 def _parse(record: type[RecordType], text: str, address: str, code: str) -> RecordType:
@@ -389,7 +367,7 @@ def _parse(record: type[RecordType], text: str, address: str, code: str) -> Reco
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise MapCorrupt(
+        raise refuse(
             code, f"{where or 'the file'}: {first['msg']}", field=address, got=first["input"]
         ) from error
 

@@ -28,7 +28,7 @@ from visloc.archive.npz import zip_errors
 from visloc.archive.schema import FILE_NAME
 from visloc.archive.set_rules import AnyManifest
 from visloc.archive.sets import SET_CODES
-from visloc.errors import InvalidInput, TooLarge
+from visloc.errors import VislocError, refuse
 
 MAX_ENTRIES = 100_000
 _MAX_DIRECTORY_BYTES = 16 * 2**20
@@ -130,7 +130,7 @@ def _check_end(source: BinaryIO) -> int:
     if start + length != stop:
         raise _bad_format("the list of its entries is not where it should be")
     if count > MAX_ENTRIES or length > _MAX_DIRECTORY_BYTES:
-        raise TooLarge(
+        raise refuse(
             "packed.too_large",
             "the archive has too many entries",
             field="map",
@@ -167,8 +167,11 @@ def _read_entries(
     if position != archive.start_dir:
         raise _bad_format("bytes that belong to no entry")
     if MANIFEST not in entries:
-        raise InvalidInput(
-            "packed.files", "not a packed map", field="map", expected=f"an entry {MANIFEST}"
+        raise refuse(
+            "packed.files",
+            "the file is not a packed map: it has no manifest",
+            field="map",
+            expected=f"an entry {MANIFEST}",
         )
     _check_sizes(entries, max_bytes)
     return entries
@@ -177,9 +180,8 @@ def _read_entries(
 def _check_sizes(entries: dict[str, zipfile.ZipInfo], max_bytes: int) -> None:
     total = sum(entry.file_size for entry in entries.values())
     if total > max_bytes:
-        raise TooLarge(
+        raise refuse(
             "packed.too_large",
-            "the map is too large",
             field="map",
             expected=f"at most {max_bytes} bytes",
             got=f"{total} bytes",
@@ -188,7 +190,7 @@ def _check_sizes(entries: dict[str, zipfile.ZipInfo], max_bytes: int) -> None:
     if SET_CODES in entries:
         limit = MAX_MANIFEST_BYTES
     if entries[MANIFEST].file_size > limit:
-        raise TooLarge(
+        raise refuse(
             "packed.too_large",
             "the manifest is too large",
             field=MANIFEST,
@@ -239,16 +241,18 @@ def _check_listed(entries: dict[str, zipfile.ZipInfo], manifest: AnyManifest) ->
     del files[MANIFEST]
     listed = {name: entry.size for name, entry in manifest.files.items()}
     for name in sorted(files.keys() ^ listed.keys()):
-        raise InvalidInput(
+        raise refuse(
             "packed.files",
-            "is not in the archive" if name in listed else "is not listed in the manifest",
+            "the archive does not have this file of the manifest"
+            if name in listed
+            else "the manifest does not list this file",
             field=name,
         )
     for name, size in files.items():
         if size != listed[name]:
-            raise InvalidInput(
+            raise refuse(
                 "packed.files",
-                "has another size than the manifest says",
+                "the file does not have the size in the manifest",
                 field=name,
                 expected=f"{listed[name]} bytes",
                 got=f"{size} bytes",
@@ -285,15 +289,9 @@ def _format_errors() -> Iterator[None]:
         raise _bad_format(str(error)) from error
 
 
-def _bad_format(why: str) -> InvalidInput:
-    return InvalidInput(
-        "packed.format",
-        "not a packed map",
-        field="map",
-        expected="a file as `mapping pack` writes it",
-        got=why,
-    )
+def _bad_format(why: str) -> VislocError:
+    return refuse("packed.format", field="map", got=why)
 
 
-def _bad_entry(name: str, why: str) -> InvalidInput:
-    return InvalidInput("packed.entry", f"an entry {why}", field="map", got=name)
+def _bad_entry(name: str, why: str) -> VislocError:
+    return refuse("packed.entry", field="map", got=name, why=why)

@@ -31,7 +31,7 @@ from visloc.archive.schema import (
     photo_file,
 )
 from visloc.archive.set_schema import SetManifest
-from visloc.errors import InvalidInput, MapCorrupt
+from visloc.errors import InvalidInput, refuse
 from visloc.geometry import Camera, Pose
 from visloc.retrieval.fusion import LateFusion
 from visloc.retrieval.rows import GlobalRows
@@ -179,7 +179,7 @@ def outline_of(folder: Path, manifest: Manifest) -> MapOutline:
             },
         )
     except InvalidInput as error:
-        raise MapCorrupt("map.cameras", str(error), field=str(folder / "cameras.json")) from error
+        raise refuse("map.cameras", str(error), field=str(folder / "cameras.json")) from error
 
 
 def open_map(folder: Path) -> Map:
@@ -247,11 +247,7 @@ def read_images(folder: Path, outline: MapOutline) -> tuple[ImageRecord, ...]:
     images = read_record(folder, "images.json", ImagesFile).images
     num = outline.manifest.counts.images
     if len(images) != num or any(image.camera not in outline.cameras for image in images):
-        raise MapCorrupt(
-            "map.images",
-            "the photos do not fit the manifest or the cameras",
-            field=str(folder / "images.json"),
-        )
+        raise refuse("map.images", field=str(folder / "images.json"))
     return images
 
 
@@ -283,9 +279,7 @@ def verify_map(folder: Path) -> Map:
             fine[f"index/{stem}.members.npy"] = _are_good(rows.clusters, counts.images)
     for name, good in fine.items():
         if not good:
-            raise MapCorrupt(
-                "map.range", "numbers are out of their range", field=str(folder / name)
-            )
+            raise refuse("map.range", field=str(folder / name))
     return opened
 
 
@@ -336,9 +330,9 @@ def _check_listed(folder: Path, manifest: Manifest) -> None:
     """Refuse a manifest that does not list the files that every such map has."""
     records = manifest.global_features
     if len(set(map(_rows_file, records))) != len(records):
-        raise MapCorrupt(
+        raise refuse(
             "map.manifest",
-            "two global descriptors of one name",
+            "two global descriptors have the same name",
             field=str(folder / "manifest.json"),
             got=", ".join(record.fingerprint.name for record in records),
         )
@@ -347,8 +341,10 @@ def _check_listed(folder: Path, manifest: Manifest) -> None:
         files += [name for name, _, _ in _beside_rows(record, manifest.counts.images)]
     for name in files:
         if name not in manifest.files:
-            raise MapCorrupt(
-                "map.file_missing", "a file that every such map has is not listed", field=name
+            raise refuse(
+                "map.file_missing",
+                "the manifest does not list a file that every such map has",
+                field=name,
             )
 
 
@@ -367,9 +363,8 @@ def _check_photos(folder: Path, manifest: Manifest) -> None:
     files = [manifest.files.get(photo_file(row)) for row in range(manifest.counts.images)]
     kept = [file for file in files if file is not None]
     if kept and (len(kept) < len(files) or max(file.size for file in kept) > MAX_PHOTO_BYTES):
-        raise MapCorrupt(
+        raise refuse(
             "map.photos",
-            "the map keeps some of its photos only, or large ones",
             field=str(folder / "photos"),
             expected=f"{len(files)} files of at most {MAX_PHOTO_BYTES} bytes, or none",
             got=f"{len(kept)} files, the largest of {max(file.size for file in kept)} bytes",

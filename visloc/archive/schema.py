@@ -231,7 +231,7 @@ class Manifest(Record):
     ) -> RetrievalRecord:
         if retrieval.weights is not None:
             try:
-                check_fusion_weights(retrieval.weights, "weights")
+                check_fusion_weights(retrieval.weights, "map.manifest", "weights")
             except InvalidInput as error:
                 raise ValueError(str(error)) from error
             known = {g.fingerprint.name for g in info.data.get("global_features", ())}

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from visloc.archive.schema import FingerprintRecord, Manifest
 from visloc.archive.set_schema import SetManifest
-from visloc.errors import Conflict, MapCorrupt, NotFound
+from visloc.errors import MapCorrupt, NotFound, VislocError, refuse
 
 AnyManifest = Manifest | SetManifest
 # Yields the manifests of (id, version) in order; raises NotFound for a missing one.
@@ -25,17 +25,8 @@ def refuse_other_kind(incoming: AnyManifest, published: AnyManifest | None) -> N
     """
     if published is None or isinstance(published, SetManifest) == isinstance(incoming, SetManifest):
         return
-    if isinstance(incoming, SetManifest):
-        code, is_now, other = "set.id_is_map", "a map", "set"
-    else:
-        code, is_now, other = "map.id_is_set", "a set", "map"
-    raise Conflict(
-        code,
-        f"{is_now} has this id already; give the {other} another one",
-        field="map",
-        expected=f"an id that {is_now} does not have",
-        got=incoming.id,
-    )
+    code = "set.id_is_map" if isinstance(incoming, SetManifest) else "map.id_is_set"
+    raise refuse(code, field="map", got=incoming.id)
 
 
 def refuse_missing_tiles(incoming: AnyManifest, read_manifests: ReadManifests) -> None:
@@ -53,17 +44,13 @@ def refuse_missing_tiles(incoming: AnyManifest, read_manifests: ReadManifests) -
         try:
             found = next(manifests)
         except NotFound as error:
-            raise NotFound(
-                "set.tile",
-                "a tile of the set is not in this store; publish it first",
-                field="tiles",
-                expected=tile.ref,
-                got=error.message,
+            raise refuse(
+                "set.tile", field="tiles", expected=tile.ref, got=error.message, kind=NotFound
             ) from error
         if isinstance(found, SetManifest) or found.content_hash != tile.content_hash:
-            raise Conflict(
+            raise refuse(
                 "set.tile",
-                "a tile of the set is another one in this store; make the set anew",
+                "the store has another tile under this name; build the set again",
                 field="tiles",
                 expected=f"{tile.ref}, a map of content hash {tile.content_hash}",
                 got="a set" if isinstance(found, SetManifest) else found.content_hash,
@@ -78,13 +65,7 @@ def refuse_other_features(ref: str, found: FingerprintRecord, expected: Fingerpr
         Conflict: ``set.features``.
     """
     if found != expected:
-        raise Conflict(
-            "set.features",
-            f"{ref} has other local features than the set; build all of its maps with the same",
-            field="tiles",
-            expected=str(expected),
-            got=str(found),
-        )
+        raise refuse("set.features", field="tiles", expected=str(expected), got=str(found), ref=ref)
 
 
 def refuse_if_tile(map_id: str, version: str, current: Iterable[tuple[str, AnyManifest]]) -> None:
@@ -102,21 +83,20 @@ def refuse_if_tile(map_id: str, version: str, current: Iterable[tuple[str, AnyMa
         if isinstance(manifest, SetManifest) and any(
             (tile.map, tile.version) == (map_id, version) for tile in manifest.tiles
         ):
-            raise Conflict(
+            raise refuse(
                 "map.in_set",
-                "the version is a tile of a set in use; publish the set without it first",
                 field="map",
                 expected=f"a version that {ref} does not name",
                 got=f"{map_id}@{version}",
             )
 
 
-def unreadable_set(ref: str, error: MapCorrupt) -> Conflict:
+def unreadable_set(ref: str, error: MapCorrupt) -> VislocError:
     """``map.in_set``, because a set in use cannot be read."""
-    return Conflict(
+    return refuse(
         "map.in_set",
-        f"{ref} is a set in use that cannot be read, so that nobody knows its tiles; publish it "
-        "anew, or remove it first",
+        f"{ref} is a set in use that cannot be read, so its tiles are unknown; first "
+        "publish it again or remove it",
         field="map",
         expected="sets that can be read",
         got=f"{error.message}: {error.field}",

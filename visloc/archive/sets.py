@@ -29,7 +29,7 @@ from visloc.archive.set_schema import (
     TileRecord,
 )
 from visloc.archive.writer import Files
-from visloc.errors import InvalidInput, MapCorrupt
+from visloc.errors import refuse
 from visloc.retrieval.rows import GlobalRows
 
 SET_CODES = "coarse/codes.npy"
@@ -158,13 +158,7 @@ def read_set_outline(folder: Path) -> SetOutline:
     """
     outline = read_any_outline(folder)
     if not isinstance(outline, SetOutline):
-        raise InvalidInput(
-            "set.is_map",
-            "this is a map, not a set of maps",
-            field="map",
-            expected="a set",
-            got=outline.ref,
-        )
+        raise refuse("set.is_map", field="map", got=outline.ref)
     return outline
 
 
@@ -190,16 +184,20 @@ def open_set(folder: Path) -> MapSet:
     check_files(folder, manifest)
     for name in _FILES:
         if name not in manifest.files:
-            raise MapCorrupt(
-                "map.file_missing", "a file that every set has is not listed", field=name
+            raise refuse(
+                "map.file_missing",
+                "the manifest does not list a file that every set has",
+                field=name,
             )
     record, num_tiles = manifest.coarse, manifest.counts.tiles
     num_rows = num_tiles * record.centroids
     offsets = map_array(folder, _OFFSETS, "<i8", (num_tiles + 1,), load=True)
     expected = np.cumsum([0, *(tile.images for tile in manifest.tiles)])
     if not np.array_equal(offsets, expected):
-        raise MapCorrupt(
-            "map.range", "the offsets are not those of the tiles", field=str(folder / _OFFSETS)
+        raise refuse(
+            "map.range",
+            "the offsets of the tiles do not match the manifest",
+            field=str(folder / _OFFSETS),
         )
     coarse = CoarseIndex(
         fingerprint=record.fingerprint,
@@ -227,7 +225,7 @@ def verify_set(folder: Path) -> MapSet:
     check_checksums(folder, opened.manifest)
     scales = opened.coarse.centroids.scales
     if scales is None or not is_finite(scales) or scales.min() < 0:
-        raise MapCorrupt("map.range", "numbers are out of their range", field=str(folder / _SCALES))
+        raise refuse("map.range", field=str(folder / _SCALES))
     return opened
 
 
@@ -268,7 +266,7 @@ def _read_coarse_model(folder: Path, manifest: SetManifest) -> dict[str, NDArray
         "planes": (record.dim, record.bits),
     }
     if len(shapes["vocabulary"]) != 2 or shapes != expected or model.keys() != expected.keys():
-        raise MapCorrupt(
+        raise refuse(
             "map.array",
             "the arrays of the coarse model do not fit each other or the manifest",
             field=str(folder / _MODEL),

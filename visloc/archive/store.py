@@ -30,7 +30,7 @@ from visloc.archive.version_rules import (
     version_exists,
     version_in_use,
 )
-from visloc.errors import MapCorrupt, NotFound
+from visloc.errors import MapCorrupt, VislocError, refuse
 
 # Every map has it, and no set.
 _IMAGE_POSES = "image_poses.npy"
@@ -73,7 +73,7 @@ class MapStore:
             raise none_in_use(map_id, versions) if versions else self._unknown_map(map_id)
         if not ID_PATTERN.fullmatch(version):
             field = self.backend.address(map_id, CURRENT)
-            raise MapCorrupt("map.current", "does not name a version", field=field, got=version)
+            raise refuse("map.current", field=field, got=version)
         return version
 
     def folder(self, ref: str) -> Path:
@@ -218,11 +218,9 @@ class MapStore:
             )
         return map_id, version
 
-    def _unknown_map(self, map_id: str) -> NotFound:
+    def _unknown_map(self, map_id: str) -> VislocError:
         known = ", ".join(self.ids()) or "none"
-        return NotFound(
-            "map.unknown", "no such map", field="map", expected=f"one of: {known}", got=map_id
-        )
+        return refuse("map.unknown", field="map", expected=f"one of {known}", got=map_id)
 
     def _manifests(self, refs: Sequence[tuple[str, str]]) -> Iterator[AnyManifest]:
         """The manifests of versions; raises NotFound and MapCorrupt in their turn."""
@@ -230,7 +228,9 @@ class MapStore:
             if found is None:
                 self._found(f"{map_id}@{version}")
                 field = self.backend.address(map_id, version, MANIFEST)
-                raise MapCorrupt("map.manifest", "the file is missing", field=field)
+                raise refuse(
+                    "map.manifest", "two global descriptors have the same name", field=field
+                )
             if isinstance(found, MapCorrupt):
                 raise found
             yield found

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 
 from visloc.archive.schema import ID_PATTERN
 from visloc.archive.set_rules import AnyManifest
-from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound
+from visloc.errors import VislocError, refuse
 
 
 def checked_name(name: str, what: str) -> str:
     """Return an id of a map or version; raise InvalidInput ``map.id`` for any other text."""
     if not ID_PATTERN.fullmatch(name):
-        raise InvalidInput(
+        raise refuse(
             "map.id",
-            f"not a {what} name",
+            f"this is not a valid name of a {what}",
             field="map",
             expected="up to 64 letters, digits, '.', '_', '-', beginning with a letter or digit",
             got=name,
@@ -28,63 +28,49 @@ def refuse_renamed(manifest: AnyManifest, address: str, map_id: str, version: st
     Answers from such a map would carry its old name.
     """
     if (manifest.id, manifest.version) != (map_id, version):
-        raise MapCorrupt(
+        raise refuse(
             "map.renamed",
-            "the map's folder was copied or renamed; build the map under its new id",
             field=address,
             expected=f"{manifest.id}/{manifest.version}",
             got=f"{map_id}/{version}",
         )
 
 
-def unknown_version(map_id: str, version: str, versions: Sequence[str]) -> NotFound:
+def unknown_version(map_id: str, version: str, versions: Sequence[str]) -> VislocError:
     """``map.version``."""
-    return NotFound(
+    return refuse(
         "map.version",
-        f"map {map_id!r} has no such version",
         field="map",
         expected=f"one of: {', '.join(versions) or 'none'}",
         got=version,
+        map_id=map_id,
     )
 
 
-def none_in_use(map_id: str, versions: Sequence[str]) -> NotFound:
+def none_in_use(map_id: str, versions: Sequence[str]) -> VislocError:
     """``map.none_in_use``."""
-    return NotFound(
+    return refuse(
         "map.none_in_use",
-        "no version of the map is in use; put one into use, or name one",
         field="map",
-        expected=f"one of: {', '.join(f'{map_id}@{version}' for version in versions)}",
+        expected=(f"{map_id}@{version}" for version in versions),
         got=map_id,
     )
 
 
-def version_exists(map_id: str, version: str) -> Conflict:
+def version_exists(map_id: str, version: str) -> VislocError:
     """``map.version_exists``."""
-    return Conflict(
-        "map.version_exists",
-        "the version exists already; versions never change, publish under another name",
-        field="map",
-        got=f"{map_id}@{version}",
-    )
+    return refuse("map.version_exists", field="map", got=f"{map_id}@{version}")
 
 
-def version_in_use(map_id: str, version: str, others: Sequence[str]) -> Conflict:
+def version_in_use(map_id: str, version: str, others: Sequence[str]) -> VislocError:
     """``map.version_in_use``."""
-    return Conflict(
-        "map.version_in_use",
-        "the version is in use; make another one current first",
-        field="map",
-        expected=f"one of: {', '.join(others)}",
-        got=f"{map_id}@{version}",
-    )
+    return refuse("map.version_in_use", field="map", expected=others, got=f"{map_id}@{version}")
 
 
-def outdated(map_id: str, based_on: str, current: str | None) -> Conflict:
+def outdated(map_id: str, based_on: str, current: str | None) -> VislocError:
     """``map.outdated``."""
-    return Conflict(
+    return refuse(
         "map.outdated",
-        "another version of the map came into use meanwhile; run the same command again on it",
         field="map",
         expected=f"{map_id}@{based_on}",
         got="no version" if current is None else f"{map_id}@{current}",

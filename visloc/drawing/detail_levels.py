@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from visloc.archive.checks import is_finite, map_array
 from visloc.archive.schema import Manifest
-from visloc.errors import MapCorrupt
+from visloc.errors import refuse
 
 # How often cells are halved; three axes of the finest cell numbers fit into 64 bits.
 _LEVELS = 21
@@ -28,9 +28,7 @@ def read_landmarks(folder: Path, manifest: Manifest) -> NDArray[np.float32]:
     """
     landmarks = map_array(folder, LANDMARKS_FILE, "<f4", (manifest.counts.landmarks, 3), load=True)
     if not is_finite(landmarks):
-        raise MapCorrupt(
-            "map.range", "numbers are out of their range", field=str(folder / LANDMARKS_FILE)
-        )
+        raise refuse("map.range", field=str(folder / LANDMARKS_FILE))
     return landmarks
 
 

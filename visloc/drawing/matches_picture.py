@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from visloc.archive import Map
 from visloc.archive.schema import MAX_PHOTO_BYTES, MAX_PHOTO_SIDE
-from visloc.errors import InvalidInput, MapCorrupt
+from visloc.errors import InvalidInput, refuse
 from visloc.images import ImageLimits, Photo, read_photo, turn_of, upright, upright_from_stored
 from visloc.localization.solving import Look
 from visloc.types import Answer, NotLocalized, ReadAs, Refusal, RigPose
@@ -201,9 +201,8 @@ def _preview(opened: Map, row: int) -> NDArray[np.uint8] | None:
     try:
         return read_photo(data, _PREVIEW_LIMITS).rgb
     except InvalidInput as error:
-        raise MapCorrupt(
+        raise refuse(
             "map.photo",
-            "a photo that the map keeps cannot be read; restore or rebuild the map",
             field=f"{opened.ref}: {opened.images[row].name}",
             expected=error.expected,
             got=error.got,

@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import cast
 
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.features.base import Fingerprint, GlobalDescriptor, LocalFeatureExtractor
 from visloc.features.descriptors.image_descriptor import ImageDescriptor
 from visloc.features.plugins import (
@@ -117,18 +117,18 @@ def _make(
         return getattr(import_module(module), function)(weights_dir, inference, threads)
     others = plugin_names(group)
     if name not in others:
-        message = "unknown feature; if a package brings it, install that package"
+        message = "the features are unknown; if a package provides them, install that package"
         unusable = passed_over(group)
         if unusable:
             message += (
-                f". Passed over, because a name has only lower-case letters, digits, '_', '.' and "
-                f"'-', at most 64: {', '.join(unusable)}"
+                "; these names are not usable, because a name has at most 64 lower-case letters, "
+                f"digits, '_', '.' and '-': {', '.join(unusable)}"
             )
-        raise InvalidInput(
+        raise refuse(
             "features.unknown",
             message,
             field=group.removeprefix("visloc."),
-            expected=f"one of {', '.join(sorted({*registry, *others}))}",
+            expected=sorted({*registry, *others}),
             got=name,
         )
     return make_plugin(group, name, weights_dir, inference, threads)

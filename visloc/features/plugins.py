@@ -12,7 +12,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-from visloc.errors import InvalidInput, VislocError
+from visloc.errors import VislocError, refuse
 from visloc.features.base import GlobalDescriptor, LocalFeatureExtractor
 from visloc.types import Fingerprint, Inference
 
@@ -57,9 +57,9 @@ def make_plugin(
     entries = list(entry_points(group=group, name=name))
     packages = sorted(_package(entry) for entry in entries)
     if len(entries) > 1:
-        raise InvalidInput(
+        raise refuse(
             "features.plugin",
-            "several installed packages offer features of this name; uninstall all but one",
+            "several installed packages provide features of this name; uninstall all but one",
             field=name,
             expected="one package",
             got=", ".join(packages),
@@ -72,7 +72,7 @@ def make_plugin(
         raise
     # Some packages exit where a library is missing; that must not end a server of other maps.
     except (Exception, SystemExit) as error:
-        raise InvalidInput(
+        raise refuse(
             "features.plugin",
             f"the package {packages[0]} cannot make these features; repair or uninstall it",
             field=name,
@@ -80,18 +80,18 @@ def make_plugin(
             got=f"{type(error).__name__}: {error}",
         ) from error
     if lacking:
-        raise InvalidInput(
+        raise refuse(
             "features.plugin",
-            f"what the package {packages[0]} makes is not of {group}; repair or uninstall it",
+            f"the package {packages[0]} does not make an object of {group}; repair or uninstall it",
             field=name,
             expected=f"an object with {', '.join(_MEMBERS[group])}",
             got=f"{type(made).__name__} without {', '.join(lacking)}",
         )
     if not isinstance(fingerprint, Fingerprint) or fingerprint.name != name:
-        raise InvalidInput(
+        raise refuse(
             "features.plugin",
-            f"what the package {packages[0]} makes has another name, so that nothing could open "
-            "the map again",
+            f"the package {packages[0]} makes features of another name, so nothing could "
+            "open the map again",
             field=name,
             expected=f"a fingerprint with the name of the entry point, {name}",
             got=getattr(fingerprint, "name", fingerprint),

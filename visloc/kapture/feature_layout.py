@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from visloc.errors import DatasetError
+from visloc.errors import refuse
 from visloc.kapture.text import relative_path
 
 FeatureKind = Literal["keypoints", "descriptors", "global_features"]
@@ -42,9 +42,9 @@ def feature_file(kind: FeatureKind, image_path: str) -> str:
     try:
         return relative_path(image_path) + SUFFIXES[kind]
     except ValueError:
-        raise DatasetError(
+        raise refuse(
             "kapture.path",
-            f"no {kind.replace('_', ' ')} can belong to this image",
+            f"an image of this path cannot have {kind.replace('_', ' ')}",
             field="image_path",
             expected="a relative path that stays inside the dataset",
             got=image_path,

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import DatasetError, InvalidInput
+from visloc.errors import VislocError, refuse
 from visloc.kapture.feature_layout import COLUMNS, DTYPES, FeatureKind, feature_file, parse_dtype
 from visloc.kapture.feature_tar import index_tar
 from visloc.kapture.table import Table
@@ -86,7 +86,7 @@ class FeatureSet:
         except OSError as error:
             raise self._unreadable(image_path, error) from error
         if len(content) != size:
-            raise DatasetError(
+            raise refuse(
                 "kapture.unreadable",
                 "the file became shorter while it was read",
                 field=self.label(image_path),
@@ -121,38 +121,34 @@ class FeatureSet:
     def _num_rows(self, image_path: str, size: int) -> int:
         row_bytes = self.dtype.itemsize * self.dsize
         if size > _MAX_FILE_BYTES:
-            raise DatasetError(
+            raise refuse(
                 "kapture.feature_too_large",
-                "the file is too large to be the features of one image",
                 field=self.label(image_path),
                 expected=f"at most {_MAX_FILE_BYTES} bytes",
                 got=f"{size} bytes",
             )
         rows_expected = "1 row" if self.kind == "global_features" else "whole rows"
         if size % row_bytes or (self.kind == "global_features" and size != row_bytes):
-            raise DatasetError(
+            raise refuse(
                 "kapture.feature_size",
-                f"the size does not fit what {self.kind}.txt says, or the file is cut short",
                 field=self.label(image_path),
                 expected=f"{rows_expected} of {self.dsize} {self.dtype.name}, {row_bytes} bytes",
                 got=f"{size} bytes",
+                what=self.kind,
             )
         return size // row_bytes
 
-    def _missing(self, image_path: str) -> DatasetError:
-        return DatasetError(
+    def _missing(self, image_path: str) -> VislocError:
+        return refuse(
             "kapture.feature_missing",
-            f"the image has no {self.kind.replace('_', ' ')} of type {self.type_name}",
             field=self.label(image_path),
-            expected="such a file",
+            what=self.kind.replace("_", " "),
+            type_name=self.type_name,
         )
 
-    def _unreadable(self, image_path: str, error: OSError) -> DatasetError:
-        return DatasetError(
-            "kapture.unreadable",
-            "the file cannot be read",
-            field=self.label(image_path),
-            got=error.strerror or str(error),
+    def _unreadable(self, image_path: str, error: OSError) -> VislocError:
+        return refuse(
+            "kapture.unreadable", field=self.label(image_path), got=error.strerror or str(error)
         )
 
 
@@ -176,13 +172,7 @@ def open_features(
             file with its line.
     """
     if not _TYPE_NAME.fullmatch(type_name):
-        raise InvalidInput(
-            "kapture.feature_type",
-            "not the name of a type of features",
-            field=kind,
-            expected="up to 64 letters, digits, '.', '_', '-', beginning with a letter or digit",
-            got=type_name,
-        )
+        raise refuse("kapture.feature_type", field=kind, got=type_name)
     for pattern in _patterns(kind, features_dir):
         folder = (features_dir or root) / pattern.format(type_name)
         if (folder / f"{kind}.txt").is_file():
@@ -239,26 +229,26 @@ def _folders(folder: Path) -> Iterator[str]:
 
 def _not_found(
     root: Path, kind: FeatureKind, type_name: str, features_dir: Path | None
-) -> DatasetError:
+) -> VislocError:
     base = features_dir or root
     words = kind.replace("_", " ")
     old = base / "reconstruction" / kind / f"{kind}.txt"
     if old.is_file():
-        return DatasetError(
+        return refuse(
             "kapture.version",
-            f"these {words} lie as in kapture 1.0; move the files one folder down, into "
-            f"{kind}/{type_name}, and complete the line of {kind}.txt",
+            f"the {words} are stored as in kapture 1.0; move the files one folder down, "
+            f"into {kind}/{type_name}, and complete the line of {kind}.txt",
             field=str(old),
             expected=f"reconstruction/{kind}/TYPE/{kind}.txt with {', '.join(COLUMNS[kind])}",
         )
     places = ", ".join(pattern.format(type_name) for pattern in _patterns(kind, features_dir))
     types = ", ".join(feature_types(root, kind, features_dir)) or "none"
-    return DatasetError(
+    return refuse(
         "kapture.no_features",
-        f"there are no {words} of this type",
         field=str(base),
         expected=f"{kind}.txt in {places}; types there: {types}",
         got=type_name,
+        what=words,
     )
 
 
@@ -270,18 +260,12 @@ def _open_folder(folder: Path, kind: FeatureKind, type_name: str) -> FeatureSet:
         name, dtype_name, dsize_text, *rest = fields
         dtype = parse_dtype(dtype_name)
         if dtype is None:
-            raise table.error(
-                "kapture.dtype",
-                "unknown type of numbers",
-                expected=f"one of {', '.join(DTYPES)}",
-                got=dtype_name,
-            )
+            raise table.error("kapture.dtype", expected=DTYPES, got=dtype_name)
         fewest = 2 if kind == "keypoints" else 1  # x and y
         dsize = int(dsize_text) if re.fullmatch(r"[0-9]{1,7}", dsize_text) else 0
         if not fewest <= dsize <= _MAX_DSIZE:
             raise table.error(
                 "kapture.dsize",
-                "not a number of values per row",
                 expected=f"an integer from {fewest} to {_MAX_DSIZE}",
                 got=dsize_text,
             )
@@ -290,9 +274,9 @@ def _open_folder(folder: Path, kind: FeatureKind, type_name: str) -> FeatureSet:
     if len(sets) != 1:
         raise table.error(
             "kapture.feature_config",
-            f"not the description of one type of {kind.replace('_', ' ')}",
             expected=f"one line: {', '.join(COLUMNS[kind])}",
             got=f"{len(sets)} lines",
+            what=kind.replace("_", " "),
         )
     tar = folder / f"{kind}.tar"
     members = index_tar(tar) if tar.exists() else None

@@ -7,7 +7,7 @@ import tarfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from visloc.errors import DatasetError
+from visloc.errors import VislocError, refuse
 from visloc.kapture.text import relative_path
 
 
@@ -50,11 +50,5 @@ def index_tar(path: Path) -> Mapping[str, tuple[int, int]]:
     return members
 
 
-def _damaged(path: Path, got: str) -> DatasetError:
-    return DatasetError(
-        "kapture.tar",
-        "the archive cannot be read",
-        field=str(path),
-        expected="a complete, uncompressed tar archive",
-        got=got,
-    )
+def _damaged(path: Path, got: str) -> VislocError:
+    return refuse("kapture.tar", field=str(path), got=got)

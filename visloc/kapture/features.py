@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import Conflict, DatasetError, InvalidInput
+from visloc.errors import Conflict, refuse
 from visloc.kapture.feature_layout import COLUMNS, DTYPES, FeatureKind, feature_file
 from visloc.kapture.text import is_field, is_folder_name
 from visloc.kapture.writer import VERSION_LINE, write_atomically
@@ -43,12 +43,8 @@ def write_local_features(
         DatasetError: ``kapture.path``, ``kapture.field``.
     """
     if keypoints.ndim != 2 or keypoints.shape[1] < 2 or len(keypoints) != len(descriptors):
-        raise InvalidInput(
-            "kapture.features",
-            "not the features of an image",
-            field="keypoints",
-            expected="(N, 2 or more) keypoints and as many descriptors",
-            got=f"{keypoints.shape} and {descriptors.shape}",
+        raise refuse(
+            "kapture.features", field="keypoints", got=f"{keypoints.shape} and {descriptors.shape}"
         )
     write_keypoints(root, feature_type, image_path, keypoints, name=name)
     _write("descriptors", root, feature_type, image_path, descriptors, name, (feature_type, "L2"))
@@ -87,9 +83,9 @@ def _write(
     last_fields: tuple[str, ...],
 ) -> None:
     if not is_folder_name(feature_type) or not (name and is_field(name) and name[0] != "#"):
-        raise DatasetError(
+        raise refuse(
             "kapture.field",
-            "not the name of a feature type",
+            "this is not a valid name of a feature type",
             field="feature_type",
             expected="a folder name without commas",
             got=f"type {feature_type!r}, name {name!r}",
@@ -97,9 +93,9 @@ def _write(
     file = feature_file(kind, image_path)
     dtype_name = rows.dtype.newbyteorder("=").name
     if rows.ndim != 2 or rows.shape[1] == 0 or dtype_name not in DTYPES:
-        raise InvalidInput(
+        raise refuse(
             "kapture.features",
-            "kapture cannot hold these features",
+            "kapture cannot store these features",
             field=kind,
             expected=f"(N, D) numbers of {', '.join(DTYPES)}",
             got=f"{rows.shape} {rows.dtype}",
@@ -121,10 +117,11 @@ def _declare(path: Path, columns: tuple[str, ...], fields: tuple[str, ...]) -> N
     lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     data = [line for line in lines if line.strip() and not line.strip().startswith("#")]
     if [tuple(field.strip() for field in line.split(",")) for line in data] != [fields]:
-        raise Conflict(
+        raise refuse(
             "kapture.feature_type",
             "the folder holds features of another kind",
             field=str(path),
             expected=", ".join(fields),
             got="; ".join(data),
+            kind=Conflict,
         )

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import DatasetError
+from visloc.errors import refuse
 from visloc.geometry import MAX_IMAGE_SIDE, PixelOrigin
 from visloc.kapture.feature_reader import FeatureSet
 
@@ -41,25 +41,24 @@ def read_local(
     """
     rows, described = keypoints.read(image_path), descriptors.read(image_path)
     if len(rows) != len(described):
-        raise DatasetError(
+        raise refuse(
             "kapture.feature_count",
-            f"{len(rows)} keypoints, but {len(described)} descriptors in "
-            f"{descriptors.label(image_path)}; one of the files is of another run, or its dtype "
-            "or dsize is not what the config file says",
             field=keypoints.label(image_path),
-            expected="as many keypoints as descriptors",
             got=f"{len(rows)} keypoints of {keypoints.dsize} {keypoints.dtype.name}, "
             f"{len(described)} descriptors of {descriptors.dsize} {descriptors.dtype.name}",
+            keypoints=len(rows),
+            descriptors=len(described),
+            file=descriptors.label(image_path),
         )
     for features, array in ((keypoints, rows), (descriptors, described)):
         finite = np.isfinite(array).all(axis=1)
         if not finite.all():
-            raise DatasetError(
+            raise refuse(
                 "kapture.feature_values",
-                f"not finite in row {int(np.argmin(finite))}; the file is damaged, or its dtype is "
-                f"not what {features.kind}.txt says",
                 field=features.label(image_path),
                 expected=f"finite {features.dtype.name}",
+                row=int(np.argmin(finite)),
+                what=features.kind,
             )
     pixels = rows[:, :2].astype(np.float64)
     if len(pixels):
@@ -95,7 +94,7 @@ def _check_pixels(
     else:
         return
     width, height = (f"{side}" for side in size)
-    raise DatasetError(
+    raise refuse(
         "kapture.feature_pixels",
         what,
         field=keypoints.label(image_path),

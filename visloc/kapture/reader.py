@@ -51,18 +51,13 @@ def read_dataset(root: Path, files: RecordFiles | None = None) -> Dataset:
 def _read_sensors(root: Path, notes: list[str]) -> dict[str, Sensor]:
     table = Table(root, "sensors/sensors.txt", None)
     if not table.exists():
-        raise table.error(
-            "kapture.no_dataset",
-            f"{root} is not a kapture dataset: the file is missing",
-            expected="a folder that holds sensors/sensors.txt",
-        )
+        raise table.error("kapture.no_dataset", root=root)
     _check_version(table, notes)
     sensors: dict[str, Sensor] = {}
     for fields in table:
         if len(fields) < 3:
             raise table.error(
                 "kapture.column_count",
-                "wrong number of columns",
                 expected="sensor_id, name, sensor_type, parameters",
                 got=len(fields),
             )
@@ -81,8 +76,7 @@ def _check_version(table: Table, notes: list[str]) -> None:
             "kapture.version",
             "the first line does not declare a version"
             if version is None
-            else "this version of kapture is not known",
-            expected="'# kapture format: 1.1' or 1.0 in the first line",
+            else "this version of kapture is not supported",
             got=None if version is None else f"{version[0]}.{version[1]}",
         )
     if version == (1, 0):
@@ -93,24 +87,18 @@ def _parse_camera(table: Table, params: list[str]) -> Camera | None:
     model, *values = params or [""]
     names = () if model == UNKNOWN_CAMERA else CAMERA_MODELS.get(model)
     if names is None:
-        raise table.error(
-            "camera.model",
-            "unknown camera model",
-            expected=f"one of {', '.join((UNKNOWN_CAMERA, *CAMERA_MODELS))}",
-            got=model,
-        )
+        raise table.error("camera.model", expected=(UNKNOWN_CAMERA, *CAMERA_MODELS), got=model)
     if len(values) != 2 + len(names):
         raise table.error(
             "camera.param_count",
-            f"wrong number of parameters for {model}",
             expected=f"{2 + len(names)}: {', '.join(('width', 'height', *names))}",
             got=len(values),
+            model=model,
         )
     width, height, *numbers = table.numbers(values)
     if not all(0 < side <= MAX_IMAGE_SIDE and side.is_integer() for side in (width, height)):
         raise table.error(
             "camera.size",
-            "the image size of the camera is not usable",
             expected=f"1 to {MAX_IMAGE_SIDE} whole pixels",
             got=f"{values[0]} x {values[1]}",
         )
@@ -131,12 +119,7 @@ def _read_rigs(
     for rig_id, member_id, *fields in table:
         _refuse_empty(table, rig_id)
         if rig_id in sensors:
-            raise table.error(
-                "kapture.rig_is_sensor",
-                "a rig cannot have the id of a sensor",
-                expected="an id that sensors.txt does not have",
-                got=rig_id,
-            )
+            raise table.error("kapture.rig_is_sensor", got=rig_id)
         rig = members.setdefault(rig_id, {})
         _refuse_duplicate(table, member_id, rig)
         rig[member_id] = _parse_pose(table, fields)
@@ -209,7 +192,7 @@ def _read_files(
         if path in paths:
             raise table.error(
                 "kapture.duplicate",
-                "the path is listed twice; it must name one record",
+                "the path is listed twice",
                 expected="every path once",
                 got=path,
             )
@@ -255,7 +238,6 @@ def _refuse_duplicate(table: Table, key: object, known: Container[object]) -> No
     if key in known:
         raise table.error(
             "kapture.duplicate",
-            "listed before in this file",
             expected="every key once",
             got=", ".join(map(str, key)) if isinstance(key, tuple) else key,
         )

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import Conflict, DatasetError, InvalidInput
+from visloc.errors import VislocError, refuse
 from visloc.kapture.feature_reader import FeatureSet, feature_types, open_features
 from visloc.kapture.table import Table
 from visloc.kapture.text import is_field, relative_path
@@ -65,7 +65,7 @@ def read_reconstruction(
     table = Table(root, _POINTS, None)
     if not table.exists():
         if Table(root, _OBSERVATIONS, None).exists():
-            raise table.error("kapture.unreadable", "observations of points that are missing")
+            raise table.error("kapture.unreadable", "the observed points are missing")
         return None
     points, colors = _read_points(table)
     table = Table(root, _OBSERVATIONS, None)
@@ -96,9 +96,9 @@ def write_reconstruction(root: Path, reconstruction: Reconstruction) -> None:
     _check(reconstruction)
     for relative in (_OBSERVATIONS, _POINTS):
         if (root / relative).exists():
-            raise Conflict(
+            raise refuse(
                 "kapture.exists",
-                "there is a reconstruction already",
+                "the dataset already has a reconstruction",
                 field=str(root / relative),
                 expected="a dataset without points",
             )
@@ -124,13 +124,12 @@ def _read_points(table: Table) -> tuple[NDArray[np.float64], NDArray[np.uint8] |
         if len(fields) != num_columns:
             raise table.error(
                 "kapture.column_count",
-                "wrong number of columns",
                 expected=str(num_columns or "X, Y, Z or X, Y, Z, R, G, B"),
                 got=len(fields),
             )
         numbers = table.numbers(fields)
         if num_columns == 6 and (min(numbers[3:]) < 0 or max(numbers[3:]) > 255):
-            raise table.error("kapture.color", "not a color", expected="0 to 255", got=fields[3:])
+            raise table.error("kapture.color", got=fields[3:])
         values.extend(numbers)
     rows = np.frombuffer(values).reshape(-1, num_columns or 3)
     colors = np.rint(rows[:, 3:]).astype(np.uint8) if num_columns == 6 else None
@@ -153,9 +152,7 @@ class _Tracks:
         table = self._table
         (point,) = _indices(table, fields[:1], self._num_points, "point in points3d.txt")
         if point in self._seen:
-            raise table.error(
-                "kapture.duplicate", "a second line for the same point and type", got=fields[0]
-            )
+            raise table.error("kapture.duplicate", got=fields[0])
         self._seen.add(point)
         track = _indices(table, fields[3::2], _MAX_INDEX, "keypoint")
         for name, keypoint in zip(fields[2::2], track, strict=True):
@@ -201,7 +198,7 @@ def _read_observations(
         if len(fields) < 2 or len(fields) % 2:
             raise table.error(
                 "kapture.column_count",
-                "wrong number of columns (in kapture 1.0 the type of keypoints is missing)",
+                "the line has the wrong number of columns (kapture 1.0 has no type of keypoints)",
                 expected="point3d_id, keypoints_type, then image_path and feature_id in turn",
                 got=len(fields),
             )
@@ -218,9 +215,8 @@ def _read_observations(
                 expected=" or ".join(types),
             )
     if keypoints_type is not None and types and keypoints_type not in types:
-        raise DatasetError(
+        raise refuse(
             "kapture.keypoints_type",
-            "no keypoints of this type observe the points",
             field=table.relative,
             expected=" or ".join(types),
             got=keypoints_type,
@@ -237,7 +233,7 @@ def _indices(table: Table, texts: list[str], limit: int, what: str) -> list[int]
             return indices
     raise table.error(
         "kapture.index",
-        f"no such {what}",
+        f"there is no such {what}",
         expected=f"integers from 0 to {limit - 1}" if limit else "no rows: there are none",
         got=", ".join(texts),
     )
@@ -258,12 +254,9 @@ def _check(reconstruction: Reconstruction) -> None:
         and len(set(r.images)) == len(r.images)
     )
     if not fine:
-        raise InvalidInput(
+        raise refuse(
             "kapture.reconstruction",
-            "not a reconstruction that can be written",
             field="reconstruction",
-            expected="finite (P, 3) float64 points, (P, 3) uint8 colors, (M, 3) integer rows "
-            "of existing points and images, each image once, and the type of the keypoints",
             got=f"points {r.points.shape} {r.points.dtype}, {len(r.images)} images, "
             f"observations {r.observations.shape} {r.observations.dtype}",
         )
@@ -281,10 +274,10 @@ def _normalized(text: str) -> str | None:
         return None
 
 
-def _not_a_field(text: str) -> DatasetError:
-    return DatasetError(
+def _not_a_field(text: str) -> VislocError:
+    return refuse(
         "kapture.field",
-        "kapture has no way to write this name",
+        "kapture cannot store this name",
         field=_OBSERVATIONS,
         expected="a relative path, or a type, without commas or blanks around it",
         got=text,

@@ -32,12 +32,7 @@ def unroll_rigs(
     try:
         innermost_first = list(TopologicalSorter(subrigs).static_order())
     except CycleError as error:
-        raise table.error(
-            "kapture.rig_cycle",
-            "a rig contains itself",
-            expected="rigs that nest without a cycle",
-            got=" -> ".join(error.args[1]),
-        ) from None
+        raise table.error("kapture.rig_cycle", got=" -> ".join(error.args[1])) from None
 
     depth: dict[str, int] = {}
     unrolled: dict[str, dict[str, Pose | None]] = {}
@@ -45,10 +40,7 @@ def unroll_rigs(
         depth[rig_id] = 1 + max((depth[subrig] for subrig in subrigs[rig_id]), default=0)
         if depth[rig_id] > MAX_RIG_DEPTH:
             raise table.error(
-                "kapture.rig_depth",
-                "rigs are nested too deeply",
-                expected=f"at most {MAX_RIG_DEPTH} levels",
-                got=rig_id,
+                "kapture.rig_depth", expected=f"at most {MAX_RIG_DEPTH} levels", got=rig_id
             )
         sensors: dict[str, Pose | None] = {}
         for member_id, member_from_rig in members[rig_id].items():
@@ -57,7 +49,7 @@ def unroll_rigs(
                 if sensor_id in sensors:
                     raise table.error(
                         "kapture.duplicate",
-                        "a sensor comes into a rig twice, once through another rig",
+                        "the rig has a sensor twice, once through another rig",
                         expected="every sensor once in a rig",
                         got=f"{sensor_id!r} in {rig_id!r}",
                     )

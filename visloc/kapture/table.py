@@ -9,8 +9,9 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from visloc.errors import DatasetError, InvalidInput
+from visloc.errors import DatasetError, InvalidInput, VislocError, refuse
 from visloc.kapture.text import relative_path
 
 _VERSION = re.compile(r"#\s*kapture format:\s*(\d{1,4})\.(\d{1,4})", re.ASCII)
@@ -60,18 +61,16 @@ class Table:
             if self._num_columns is not None and len(fields) != self._num_columns:
                 raise self.error(
                     "kapture.column_count",
-                    "wrong number of columns (fields cannot contain commas)",
+                    "the line has the wrong number of columns (fields cannot contain commas)",
                     expected=str(self._num_columns),
                     got=len(fields),
                 )
             yield fields
 
-    def error(
-        self, code: str, message: str, *, expected: str | None = None, got: object = None
-    ) -> DatasetError:
-        """Make an error about the current row."""
+    def error(self, code: str, message: str | None = None, **parts: Any) -> VislocError:
+        """Make an error about the current row; the arguments are those of ``refuse``."""
         where = f"{self.relative}:{self.line}" if self.line else self.relative
-        return DatasetError(code, message, field=where, expected=expected, got=got)
+        return refuse(code, message, field=where, kind=DatasetError, **parts)
 
     @contextmanager
     def errors_at_row(self) -> Iterator[None]:
@@ -101,9 +100,7 @@ class Table:
             value = int(text)
             if -_INT64_LIMIT <= value < _INT64_LIMIT:
                 return value
-        raise self.error(
-            "kapture.timestamp", "not a timestamp", expected="a 64-bit integer", got=text
-        )
+        raise self.error("kapture.timestamp", got=text)
 
     def path(self, text: str, folder: str) -> str:
         """Parse a relative path."""
@@ -111,10 +108,7 @@ class Table:
             return relative_path(text)
         except ValueError:
             raise self.error(
-                "kapture.path",
-                "the path cannot be used",
-                expected=f"a relative path that stays inside {folder}",
-                got=text,
+                "kapture.path", expected=f"a relative path that stays inside {folder}", got=text
             ) from None
 
     def numbers(self, texts: list[str]) -> list[float]:
@@ -126,9 +120,7 @@ class Table:
             except ValueError:
                 value = math.nan
             if not math.isfinite(value):
-                raise self.error(
-                    "kapture.number", "not a number", expected="a finite number", got=text
-                )
+                raise self.error("kapture.number", got=text)
             numbers.append(value)
         return numbers
 
@@ -137,21 +129,19 @@ class Table:
         try:
             # A pipe blocks, and a device may have no end.
             if not stat.S_ISREG(self._path.stat().st_mode):
-                raise self.error("kapture.unreadable", "not a file", expected="a plain file")
+                raise self.error(
+                    "kapture.unreadable", "this is not a plain file", expected="a plain file"
+                )
             with self._path.open(encoding="utf-8-sig") as file:
                 for line in file:
                     self.line += 1
                     yield line
         except UnicodeDecodeError as error:
             self.line = 0  # text is decoded in blocks, so the line would be wrong
-            raise self.error(
-                "kapture.encoding", "not a text file in UTF-8", expected="UTF-8", got=str(error)
-            ) from error
+            raise self.error("kapture.encoding", got=str(error)) from error
         except OSError as error:
             raise self._unreadable(error) from error
 
-    def _unreadable(self, error: OSError) -> DatasetError:
+    def _unreadable(self, error: OSError) -> VislocError:
         self.line = 0
-        return self.error(
-            "kapture.unreadable", "the file cannot be read", got=error.strerror or str(error)
-        )
+        return self.error("kapture.unreadable", got=error.strerror or str(error))

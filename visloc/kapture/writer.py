@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
 
-from visloc.errors import Conflict, DatasetError
+from visloc.errors import refuse
 from visloc.geometry import Pose
 from visloc.kapture.dataset import Dataset
 from visloc.kapture.text import is_field, relative_path
@@ -35,9 +35,9 @@ def write_dataset(dataset: Dataset) -> None:
     contents: dict[str, str] = {}
     for name, columns, rows in _tables(dataset):
         if (folder / name).exists():
-            raise Conflict(
+            raise refuse(
                 "kapture.exists",
-                "there is a dataset already",
+                "the folder already has a dataset",
                 field=str(folder / name),
                 expected="a folder without kapture files",
             )
@@ -56,12 +56,7 @@ def write_rigs(path: Path, rigs: Mapping[str, Mapping[str, Pose | None]]) -> Non
         DatasetError: ``kapture.field`` for a text that kapture cannot hold, such as a comma.
     """
     if path.exists() or path.is_symlink():
-        raise Conflict(
-            "kapture.exists",
-            "there is a file already",
-            field=str(path),
-            expected="a path that does not exist",
-        )
+        raise refuse("kapture.exists", field=str(path))
     text = _text("rigs.txt", _RIG_COLUMNS, _rig_rows(rigs))
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, text.encode("utf-8"))
@@ -135,14 +130,7 @@ def _text(name: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> s
         cells = list(zip_longest(columns[: len(row)], row, fillvalue=""))
         for index, (column, field) in enumerate(cells):
             if not _comes_back(field, is_first=index == 0, is_path=column in _PATHS):
-                raise DatasetError(
-                    "kapture.field",
-                    "kapture has no way to write this text",
-                    field=f"sensors/{name}",
-                    expected="no comma, control characters or blanks around it; an id that is not"
-                    " empty and does not start with #; a path that stays inside the dataset",
-                    got=field,
-                )
+                raise refuse("kapture.field", field=f"sensors/{name}", got=field)
         lines.append(", ".join(field.rjust(_WIDTHS.get(column, 0)) for column, field in cells))
     return "\n".join(lines) + "\n"
 

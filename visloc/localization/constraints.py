@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from visloc.archive import Map
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Pose
 from visloc.pose.centre import largest_std, with_origin
 from visloc.pose.colmap import normalized_rays
@@ -95,9 +95,8 @@ class Constraints:
         down = geometry.down
         if gravity is not None and gravity.world is not None:
             if down is not None and gravity.world @ down < math.cos(_MAX_DOWN_DIFFERENCE):
-                raise InvalidInput(
+                raise refuse(
                     "priors.gravity",
-                    "the map knows another down",
                     field="priors.gravity.world",
                     expected=f"none, or {' '.join(f'{x:.3f}' for x in down)}",
                     got=" ".join(f"{x:.3f}" for x in gravity.world),
@@ -106,9 +105,9 @@ class Constraints:
         band = priors.height
         if down is None and (gravity is not None or (band is not None and band.down is None)):
             name = "gravity" if gravity is not None else "height"
-            raise InvalidInput(
+            raise refuse(
                 f"priors.{name}",
-                "this map does not know which way is down",
+                "the down direction of this map is unknown",
                 field=f"priors.{name}",
                 expected="a map that was built with --gravity, or priors.gravity with its world",
             )

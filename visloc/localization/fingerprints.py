@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from visloc.archive import FingerprintRecord
-from visloc.errors import Conflict
+from visloc.errors import refuse
 from visloc.types import Fingerprint
 
 
@@ -17,10 +17,10 @@ def check_fingerprint(built_with: FingerprintRecord, at_hand: Fingerprint, ref: 
     differing = [name for name in {**there, **here} if there.get(name) != here.get(name)]
     if not differing:
         return
-    raise Conflict(
+    raise refuse(
         "map.features",
-        f"map {ref} was built with another {built_with.name}; use the weights and the version of "
-        "visloc that built it, or build it again",
+        f"map {ref} was built with another {built_with.name}; use the weights and the "
+        "version of visloc that built it, or build it again",
         field="weights_dir" if "weights_sha256" in differing else "map",
         expected=", ".join(f"{name} {there.get(name)}" for name in differing),
         got=", ".join(f"{name} {here.get(name)}" for name in differing),

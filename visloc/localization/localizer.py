@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import Map
-from visloc.errors import InvalidInput
+from visloc.errors import VislocError, refuse
 from visloc.features import GlobalDescriptor, LocalFeatureExtractor, make_global_descriptor
 from visloc.features.local.readymade import is_ready_made
 from visloc.features.networks.lightglue.load import make_lightglue
@@ -246,11 +246,8 @@ class Localizer:
     ) -> Look:
         """Find what features show of the map; arguments, errors as of ``localize_features``."""
         if camera is None:
-            raise InvalidInput(
-                "camera.required",
-                "features cannot be localized without the camera that they were seen with",
-                field="camera",
-                expected="its model, size and parameters",
+            raise refuse(
+                "camera.required", field="camera", expected="its model, size and parameters"
             )
         fusion = self._fusion(options)
         constraints = Constraints(self.geometry, priors)
@@ -416,12 +413,11 @@ class Localizer:
         counted = fusion.counted(self.map.global_descriptors)
         return self._extractor is not None and set(counted) <= set(self._descriptors)
 
-    def _features_required(self, fusion: LateFusion) -> InvalidInput:
+    def _features_required(self, fusion: LateFusion) -> VislocError:
         kind = self.map.manifest.local_features.fingerprint.name
         names = fusion.counted(self.map.global_descriptors)
-        return InvalidInput(
+        return refuse(
             "features.required",
-            "the map's features are not computed here: send the features of the photo instead",
             field="image",
             expected=f"features of kind {kind}, with {', '.join(names)}",
             got="a photo",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Camera
 from visloc.images import Photo
 from visloc.types import CameraSource
@@ -32,16 +32,14 @@ def resolve_camera(photo: Photo, given: Camera | None) -> tuple[Camera, CameraSo
     if given.has_aspect_of(width, height):
         return given.scaled(width, height), CameraSource.GIVEN_SCALED
     turned = photo.is_on_its_side and given.has_aspect_of(height, width)
-    raise InvalidInput(
+    message = (
+        "the camera does not fit the photo, which is stored turned (EXIF orientation "
+        f"{photo.exif_orientation}); send the camera of the stored pixels, or turn the pixels and "
+        "remove the EXIF orientation"
+    )
+    raise refuse(
         "camera.size_mismatch",
-        "the camera is not for this photo"
-        + (
-            "; the photo is stored turned (EXIF orientation "
-            f"{photo.exif_orientation}), and the camera must be that of the stored pixels: send "
-            "that one, or turn the photo's pixels and leave the EXIF orientation out"
-            if turned
-            else ""
-        ),
+        message if turned else None,
         field="camera",
         expected=f"{width} x {height} or another size of the same aspect",
         got=f"{given.width} x {given.height}",

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import Manifest
-from visloc.errors import InvalidInput, TooLarge
+from visloc.errors import VislocError, refuse
 from visloc.features.local.readymade import (
     MAX_READY_MADE_KEYPOINTS,
     is_ready_made,
@@ -43,12 +43,11 @@ def checked_local_features(
     _check_kind(features.kind, manifest)
     keypoints, descriptors = features.keypoints, features.descriptors
     if keypoints.ndim != 2 or keypoints.shape[1] != 2:
-        raise _unusable("keypoints", "not keypoints", "(N, 2): x, y", keypoints.shape)
+        raise _unusable("keypoints", "the keypoints are not valid", "(N, 2): x, y", keypoints.shape)
     most = max_sent_keypoints(manifest)
     if len(keypoints) > most:
-        raise TooLarge(
+        raise refuse(
             "features.too_many",
-            "too many keypoints; send the strongest",
             field="features.keypoints",
             expected=f"at most {most}",
             got=len(keypoints),
@@ -57,7 +56,7 @@ def checked_local_features(
     if descriptors.shape != (len(keypoints), dim):
         raise _unusable(
             "descriptors",
-            "not the descriptors of these keypoints for this map",
+            "the descriptors do not fit the keypoints or the map",
             f"a row of {dim} for each of the {len(keypoints)} keypoints",
             descriptors.shape,
         )
@@ -89,9 +88,10 @@ def checked_global_descriptors(
     if unknown or missing:
         raise _unusable(
             "global_descriptors",
-            "a global descriptor that the map does not have"
+            "the map does not have this global descriptor"
             if unknown
-            else "a global descriptor of the map is missing, and cannot be made of what was sent",
+            else "a global descriptor of the map is missing and cannot be computed from the "
+            "other features",
             ", ".join(f"{name} ({'may' if name in optional else 'must'} be sent)" for name in dims),
             ", ".join(map(repr, sorted(sent))) or "none",
         )
@@ -100,7 +100,7 @@ def checked_global_descriptors(
         if row.shape != (dims[name],):
             raise _unusable(
                 "global_descriptors",
-                "not this global descriptor as the map has it",
+                "the global descriptor does not have the size of the map's",
                 f"shape ({dims[name]},)",
                 row.shape,
                 field,
@@ -116,13 +116,7 @@ def checked_global_descriptors(
 def _check_kind(kind: str, manifest: Manifest) -> None:
     name = manifest.local_features.fingerprint.name
     if kind != name:
-        raise InvalidInput(
-            "features.kind",
-            "the map was built with other local features",
-            field="features.kind",
-            expected=name,
-            got=kind,
-        )
+        raise refuse("features.kind", field="features.kind", expected=name, got=kind)
 
 
 def _check_inside(keypoints: NDArray[np.generic], camera: Camera) -> None:
@@ -134,7 +128,7 @@ def _check_inside(keypoints: NDArray[np.generic], camera: Camera) -> None:
         row = int(outside[0])
         raise _unusable(
             "keypoints",
-            f"keypoint {row} does not lie in the camera's image",
+            f"keypoint {row} lies outside the camera's image",
             f"0 to {camera.width}, 0 to {camera.height}",
             f"{xy[row, 0]:g}, {xy[row, 1]:g}",
         )
@@ -146,13 +140,15 @@ def _check_finite(part: str, field: str, values: NDArray[np.generic]) -> None:
         finite = np.isfinite(values.astype(np.float32, copy=False))
     if not finite.all():
         where = ", ".join(str(int(i)) for i in np.argwhere(~finite)[0])
-        raise _unusable(part, f"[{where}] is not a number", "finite numbers", "NaN or inf", field)
+        raise _unusable(
+            part, f"[{where}] is not a finite number", "finite numbers", "NaN or inf", field
+        )
 
 
 def _unusable(
     part: str, message: str, expected: str, got: object, field: str | None = None
-) -> InvalidInput:
-    return InvalidInput(
+) -> VislocError:
+    return refuse(
         f"features.{part}",
         message,
         field=field or f"features.{part}",

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import InvalidInput, VislocError
+from visloc.errors import VislocError, refuse
 from visloc.geometry import Camera, Pose
 from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.gates import Problem, accepted, not_better_elsewhere
@@ -175,9 +175,8 @@ def check_solver(options: LocalizeOptions, num_cameras: int) -> None:
         InvalidInput: ``options.solver``.
     """
     if options.solver is Solver.REGISTRATION and num_cameras > 1:
-        raise InvalidInput(
+        raise refuse(
             "options.solver",
-            "registration finds the pose of one photo, not of several together",
             field="options.solver",
             expected=f"{Solver.PYCOLMAP} or {Solver.POSELIB} for a rig",
             got=options.solver,

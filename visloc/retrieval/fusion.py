@@ -19,7 +19,7 @@ from functools import wraps
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.types import Fusion, LocalizeOptions
 
 FusionOperator = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
@@ -203,9 +203,9 @@ def chosen_fusion(
     known = tuple(names)
     for name in options.fusion_weights or ():
         if name not in known:
-            raise InvalidInput(
+            raise refuse(
                 "options.fusion_weights",
-                "a global descriptor that the map does not have",
+                "the map does not have this global descriptor",
                 field="options.fusion_weights",
                 expected=f"weights of {', '.join(known)}",
                 got=name,

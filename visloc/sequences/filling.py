@@ -17,7 +17,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import (
     Pose,
     center_covariance,
@@ -294,17 +294,15 @@ class _Track:
 def _check(times_s: Sequence[float], max_gap_s: float) -> None:
     for i, time in enumerate(times_s):
         if not math.isfinite(time) or (i > 0 and time <= times_s[i - 1]):
-            raise InvalidInput(
+            raise refuse(
                 "sequence.timestamps",
-                "the instants are not in the order of time",
                 field=f"times_s[{i}]",
                 expected="finite numbers, each greater than the one before",
                 got=time if i == 0 else f"{time} after {times_s[i - 1]}",
             )
     if not (math.isfinite(max_gap_s) and max_gap_s >= 0):
-        raise InvalidInput(
+        raise refuse(
             "sequence.max_gap",
-            "not a gap in time",
             field="max_gap_s",
             expected="a finite number of seconds, not negative",
             got=max_gap_s,

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import center_covariance, covariance_from_center, rotation_angle
 from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.gates import contradicts_priors, registration_for
@@ -330,9 +330,8 @@ def check_max_gap(max_gap_s: float) -> None:
         InvalidInput: ``sequence.max_gap``.
     """
     if not 0 <= max_gap_s <= MAX_GAP_S:  # NaN fails too
-        raise InvalidInput(
+        raise refuse(
             "sequence.max_gap",
-            "not usable",
             field="max_gap_s",
             expected=f"0 to {MAX_GAP_S:g} seconds",
             got=max_gap_s,
@@ -350,12 +349,7 @@ def check_odometry(odometry: Odometry | None, *, metric: bool) -> None:
         InvalidInput: ``sequence.odometry``.
     """
     if odometry is not None and not metric:
-        raise InvalidInput(
-            "sequence.odometry",
-            "odometry is in metres, and this map's world has another unit",
-            field="odometry",
-            expected="a metric map, or a sequence without odometry",
-        )
+        raise refuse("sequence.odometry", field="odometry")
 
 
 def _window_instant(solved: Solved) -> WindowInstant:

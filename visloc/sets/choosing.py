@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from visloc.archive import SetOutline
 from visloc.archive.places import circles_of
-from visloc.errors import InvalidInput, NotFound
+from visloc.errors import refuse
 from visloc.geodesy import ground_distances
 from visloc.localization.judge import measured_pose
 from visloc.pose.centre import largest_std
@@ -97,13 +97,7 @@ def allowed_tiles(
         slack = HEIGHT_REACH * (band.max - band.min)
         allowed &= (middle + half >= band.min - slack) & (middle - half <= band.max + slack)
     if not allowed.any():
-        raise NotFound(
-            "set.no_tile",
-            "no tile of the set has photos where the priors allow the device",
-            field="priors",
-            expected="priors that a tile obeys; what the tiles hold is in the set's description",
-            got=outline.ref,
-        )
+        raise refuse("set.no_tile", field="priors", got=outline.ref)
     return allowed
 
 
@@ -168,11 +162,11 @@ def _named(outline: SetOutline, names: Sequence[str]) -> NDArray[np.bool_]:
     for name in names:
         if name not in known:
             some = ", ".join(dict.fromkeys(tile.map for tile in outline.tiles[:_NAMED]))
-            raise InvalidInput(
+            raise refuse(
                 "priors.maps",
-                f"not a tile of {outline.ref}",
                 field="priors.maps",
                 expected=f"id or id@version of its tiles, such as {some}",
                 got=name,
+                ref=outline.ref,
             )
     return named

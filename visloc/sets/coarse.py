@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import CoarseIndex, FingerprintRecord, Map, MapSet
-from visloc.errors import MapCorrupt
+from visloc.errors import refuse
 from visloc.features import GlobalDescriptor, make_global_descriptor
 from visloc.features.descriptors.vlad import KMEANS_MAX_WORDS, learn_words
 from visloc.features.descriptors.whitening import WHITENING_MAX_PHOTOS, unit_rows
@@ -182,9 +182,10 @@ def rank_tiles(
     check_descriptor(map_set)
     dim, expected = local.descriptors.shape[1], map_set.coarse.model["vocabulary"].shape[1]
     if dim != expected:
-        raise MapCorrupt(
+        raise refuse(
             "map.array",
-            f"the coarse model of {map_set.ref} is not of its local features; make the set anew",
+            f"the coarse model of {map_set.ref} does not fit its local features; build "
+            "the set again",
             field="vocabulary",
             expected=f"{dim} columns",
             got=f"{expected} columns",

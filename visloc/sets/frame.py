@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Pose, Similarity
 from visloc.pose.centre import moved_pose, position_covariance
 from visloc.priors import HeightBand, PosePrior, PositionPrior, Priors
@@ -39,9 +39,9 @@ def down_in_set(priors: Priors, down: NDArray[np.float64] | None) -> NDArray[np.
     if priors.gravity is not None and priors.gravity.world is not None:
         return priors.gravity.world
     if down is None:
-        raise InvalidInput(
+        raise refuse(
             "priors.height",
-            "this set does not know which way is down",
+            "this set does not know its down direction",
             field="priors.height",
             expected="a set of maps that were built with --gravity, or priors.gravity with its "
             "world",

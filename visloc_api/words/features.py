@@ -14,7 +14,7 @@ from pydantic.json_schema import WithJsonSchema
 from pydantic_core import PydanticCustomError
 
 import visloc.types
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc_api.words.message import IncomingMessage, converted
 from visloc_api.words.wire import ARRAY_DTYPES
 
@@ -29,9 +29,8 @@ def _bytes_from_base64(value: object) -> object:
     try:
         return base64.b64decode(value, validate=True)
     except (binascii.Error, ValueError) as error:  # ValueError: letters outside ASCII
-        raise InvalidInput(
+        raise refuse(
             "image.base64",
-            "not base64",
             field="image",
             expected="the encoded photo in standard base64",
             got=str(error),
@@ -77,26 +76,20 @@ class Array(IncomingMessage):
         """
         dtype = ARRAY_DTYPES.get(self.dtype)
         if dtype is None:
-            raise InvalidInput(
-                "features.dtype",
-                "an array of these is not read here",
-                field=f"{field}.dtype",
-                expected=f"one of {', '.join(ARRAY_DTYPES)}",
-                got=self.dtype,
+            raise refuse(
+                "features.dtype", field=f"{field}.dtype", expected=ARRAY_DTYPES, got=self.dtype
             )
         if len(self.shape) != ndim or not all(0 <= n <= _MAX_ARRAY_SIDE for n in self.shape):
-            raise InvalidInput(
+            raise refuse(
                 "features.shape",
-                "not the shape of such an array",
                 field=f"{field}.shape",
                 expected="two numbers: rows, columns" if ndim == 2 else "one number: its length",
                 got=str(self.shape[:8]),
             )
         num_bytes = math.prod(self.shape) * dtype.itemsize
         if len(self.data) != num_bytes:
-            raise InvalidInput(
+            raise refuse(
                 "features.data",
-                "the array does not have the bytes that its dtype and shape say",
                 field=f"{field}.data",
                 expected=f"{num_bytes} bytes",
                 got=f"{len(self.data)} bytes",
@@ -106,9 +99,8 @@ class Array(IncomingMessage):
 
 def _few(value: object) -> object:
     if isinstance(value, dict) and len(value) > MAX_GLOBAL_DESCRIPTORS:
-        raise InvalidInput(
+        raise refuse(
             "features.global_descriptors",
-            "too many global descriptors",
             field="global_descriptors",
             expected=f"at most {MAX_GLOBAL_DESCRIPTORS}, as the map has them",
             got=len(value),
@@ -176,10 +168,4 @@ def query_to_core(
         return image
     if features is not None and image is None:
         return features.to_core()
-    raise InvalidInput(
-        "request.query",
-        "a request has a photo, or the features of one",
-        field="image",
-        expected="one of image, features",
-        got="neither" if image is None else "both",
-    )
+    raise refuse("request.query", field="image", got="neither" if image is None else "both")

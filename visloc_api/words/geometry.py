@@ -12,7 +12,7 @@ from pydantic.json_schema import WithJsonSchema
 
 import visloc.geometry
 import visloc.priors
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc_api.words.message import IncomingMessage, converted
 
 _CAMERA_TEXT = "PINHOLE,640,480,525,525,320,240"
@@ -99,9 +99,9 @@ class Transform(IncomingMessage):
         length = math.hypot(*self.rotation_wxyz)
         # NaN fails too.
         if len(self.rotation_wxyz) != 4 or not abs(length - 1) <= _MAX_QUATERNION_ERROR:
-            raise InvalidInput(
+            raise refuse(
                 rotation_code,
-                "not a rotation; a transform with a scale cannot be used",
+                "the rotation is not valid; a transform with a scale cannot be used",
                 field=f"{field}.rotation_wxyz",
                 expected=f"a quaternion w, x, y, z of length 1 within {_MAX_QUATERNION_ERROR}",
                 got=f"length {length:.6g}"
@@ -110,9 +110,8 @@ class Transform(IncomingMessage):
             )
         far = [number for number in self.translation if not abs(number) <= _MAX_TRANSLATION]
         if len(self.translation) != 3 or far:  # NaN is far too
-            raise InvalidInput(
+            raise refuse(
                 "pose.translation",
-                "not a translation",
                 field=f"{field}.translation",
                 expected=f"three finite numbers, none beyond {_MAX_TRANSLATION:g}",
                 got=str(self.translation[:4]),

@@ -15,7 +15,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from visloc.errors import InvalidInput, TooLarge, VislocError, placed
+from visloc.errors import InvalidInput, VislocError, placed, refuse
 
 _NOT_AN_OBJECT, _UNKNOWN_FIELD, _REFUSED = "not_an_object", "unknown_field", "refused"
 _MAX_NAME = 100  # characters of a name from outside
@@ -116,9 +116,9 @@ def check_num_values(values: int, max_values: int, field: str = "") -> None:
         TooLarge: ``request.too_large``.
     """
     if values > max_values:
-        raise TooLarge(
+        raise refuse(
             "request.too_large",
-            "the request has too many values; numbers of features go in base64",
+            "the request has too many values; send numbers of features in base64",
             field=field or None,
             expected=f"at most {max_values}",
             got=values,
@@ -166,22 +166,18 @@ def refusal_of(complaint: Mapping[str, Any], path: str = "") -> VislocError:
     if kind == _UNKNOWN_FIELD:
         name, expected = complaint["ctx"]["name"], complaint["ctx"]["expected"]
         field = path + _joined([*location, name])
-        return InvalidInput(
-            "request.unknown_field", message, field=field, expected=expected, got=name
-        )
+        return refuse("request.unknown_field", message, field=field, expected=expected, got=name)
     field = path + _joined(location) if location else path.rstrip(".")
     got = complaint["input"]
     if kind == _NOT_AN_OBJECT:
         expected, got = complaint["ctx"]["expected"], type(got).__name__
-        return InvalidInput(
-            "request.invalid", message, field=field or None, expected=expected, got=got
-        )
+        return refuse("request.invalid", message, field=field or None, expected=expected, got=got)
     if kind == "json_invalid":
-        return InvalidInput("request.malformed", message, field=field or None, expected="JSON")
+        return refuse("request.malformed", message, field=field or None, expected="JSON")
     if kind == "missing":
-        return InvalidInput("request.missing_field", "this field is needed", field=field)
+        return refuse("request.missing_field", field=field)
     got = got if isinstance(got, str | int | float | None) else type(got).__name__
-    return InvalidInput("request.invalid", "cannot be used", field=field, expected=message, got=got)
+    return refuse("request.invalid", field=field, expected=message, got=got)
 
 
 def _joined(location: Sequence[str | int]) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_args, get_type_h
 from pydantic import Field, create_model
 
 import visloc.types
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc_api.words.message import IncomingMessage, converted
 
 # More global descriptors than any map has, and longer names.
@@ -50,18 +50,18 @@ def _check_names(value: object) -> object:
     """Refuse too many or too long names before any weight is looked at."""
     if isinstance(value, Mapping):
         if len(value) > _MAX_WEIGHTS:
-            raise InvalidInput(
+            raise refuse(
                 "options.fusion_weights",
-                "too many weights",
+                "there are too many weights",
                 field="fusion_weights",
                 expected=f"at most {_MAX_WEIGHTS}",
                 got=len(value),
             )
         for name in value:
             if not isinstance(name, str) or not 0 < len(name) <= _MAX_NAME:
-                raise InvalidInput(
+                raise refuse(
                     "options.fusion_weights",
-                    "not the name of a global descriptor",
+                    "this is not the name of a global descriptor",
                     field="fusion_weights",
                     expected=f"a text of 1 to {_MAX_NAME} characters",
                     got=f"{len(name)} characters" if isinstance(name, str) else type(name).__name__,
@@ -79,11 +79,11 @@ class OptionsMessage(IncomingMessage):
         given = self.model_dump(exclude_none=True)
         for name in given.keys() & _MESSAGES.keys():
             if given[name] not in CHOICES[name]:
-                raise InvalidInput(
+                raise refuse(
                     f"options.{name}",
                     _MESSAGES[name],
                     field=f"options.{name}",
-                    expected=f"one of {', '.join(CHOICES[name])}",
+                    expected=CHOICES[name],
                     got=given[name],
                 )
             given[name] = KINDS[name](given[name])

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import FailFast, Field
 
 import visloc.priors
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.priors import MAX_TILES
 from visloc_api.words.geometry import Numbers, Transform, covariance_to_core
 from visloc_api.words.message import IncomingMessage, converted
@@ -162,12 +162,7 @@ class Priors(IncomingMessage):
         """
         position, height, pose = priors.position, priors.height, priors.pose
         if height is not None and height.down is not None:
-            raise InvalidInput(
-                "priors.height",
-                "heights are measured along what the map, or the gravity prior, knows of down",
-                field="priors.height",
-                expected="no down",
-            )
+            raise refuse("priors.height", field="priors.height")
         return Priors(
             position=None if position is None else PositionPrior.from_core(position),
             height=None if height is None else HeightBand.from_core(height),

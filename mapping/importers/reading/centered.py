@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapping.importers.model import ImportedImage, ImportedModel
 from mapping.importers.reading.tracks import Measurements, keypoints_of, projections
-from visloc.errors import DatasetError
+from visloc.errors import refuse
 from visloc.kapture import Sensor
 
 # A measurement agrees with a camera if the point projects this near to it, in image diagonals.
@@ -30,13 +30,7 @@ def note_on_absent(path: Path, photos: Path, names: list[str], kept: list[int]) 
     if not absent:
         return []
     if not kept:
-        raise DatasetError(
-            "import.no_photos",
-            "none of the model's photos is there, and only they tell the image sizes; give the "
-            "folder that holds them",
-            field=str(path),
-            expected=f"{photos / names[0]}",
-        )
+        raise refuse("import.no_photos", field=str(path), expected=f"{photos / names[0]}")
     some = ", ".join(names[index] for index in absent[:3]) + (", ..." if len(absent) > 3 else "")
     return [f"{len(absent)} of {len(names)} photos are absent and were left out: {some}"]
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from visloc.errors import DatasetError
+from visloc.errors import VislocError, refuse
 
 LARGEST = 1e15  # of any number: what poses and points are made of must not overflow
 
@@ -41,11 +41,11 @@ class JsonValue:
         path = "".join(reversed(steps)).removeprefix(".")
         return f"{self.file}: {path}" if path else str(self.file)
 
-    def error(self, message: str, expected: str | None = None) -> DatasetError:
+    def error(self, message: str, expected: str | None = None) -> VislocError:
         """Make an error about this value."""
         text = repr(self.value) if isinstance(self.value, bool | int | float | str) else None
         kind = text or ("null" if self.value is None else type(self.value).__name__)
-        return DatasetError("import.json", message, field=self.where, expected=expected, got=kind)
+        return refuse("import.json", message, field=self.where, expected=expected, got=kind)
 
     def __getitem__(self, key: str) -> JsonValue:
         """Return a field of this object.
@@ -55,25 +55,25 @@ class JsonValue:
         """
         found = self.get(key)
         if found is None:
-            raise DatasetError("import.json", f"{key!r} is missing", field=self.where)
+            raise refuse("import.json", f"{key!r} is missing", field=self.where)
         return found
 
     def get(self, key: str) -> JsonValue | None:
         """Return a field of this object, None without it."""
         if not isinstance(self.value, dict):
-            raise self.error("not an object", expected="an object")
+            raise self.error("the value is not an object", expected="an object")
         return JsonValue(self.value[key], self.file, self, key) if key in self.value else None
 
     def fields(self) -> Iterator[tuple[str, JsonValue]]:
         """Go through the fields of this object, in the file's order."""
         if not isinstance(self.value, dict):
-            raise self.error("not an object", expected="an object")
+            raise self.error("the value is not an object", expected="an object")
         return ((key, JsonValue(value, self.file, self, key)) for key, value in self.value.items())
 
     def elements(self) -> list[JsonValue]:
         """Return the elements of this array."""
         if not isinstance(self.value, list):
-            raise self.error("not an array", expected="an array")
+            raise self.error("the value is not an array", expected="an array")
         return [JsonValue(value, self.file, self, i) for i, value in enumerate(self.value)]
 
     def number(self) -> float:
@@ -85,25 +85,25 @@ class JsonValue:
                 number = math.inf
             if abs(number) <= LARGEST:  # NaN is not
                 return number
-        raise self.error("not a usable number", expected=f"a number within +-{LARGEST:g}")
+        raise self.error("the number is not valid", expected=f"a number within +-{LARGEST:g}")
 
     def numbers(self, count: int) -> list[float]:
         """Return this array of exactly ``count`` finite numbers."""
         elements = self.elements()
         if len(elements) != count:
-            raise self.error(f"has {len(elements)} elements", expected=f"{count} numbers")
+            raise self.error(f"the array has {len(elements)} elements", expected=f"{count} numbers")
         return [element.number() for element in elements]
 
     def integer(self, high: int) -> int:
         """Return this whole number from 0 to ``high``."""
         if type(self.value) is not int or not 0 <= self.value <= high:
-            raise self.error("not a usable number", expected=f"a whole number, 0 to {high}")
+            raise self.error("the number is not valid", expected=f"a whole number, 0 to {high}")
         return self.value
 
     def text(self) -> str:
         """Return this text."""
         if not isinstance(self.value, str):
-            raise self.error("not a text", expected="a text")
+            raise self.error("the value is not a text", expected="a text")
         return self.value
 
 
@@ -118,15 +118,11 @@ def read_json(path: Path) -> JsonValue:
             path.read_bytes(), parse_constant=_not_finite, object_pairs_hook=_unique_keys
         )
     except FileNotFoundError:
-        raise DatasetError("import.missing", "this file does not exist", field=str(path)) from None
+        raise refuse("import.missing", field=str(path)) from None
     except OSError as error:
-        raise DatasetError(
-            "import.unreadable", "cannot be read", field=str(path), got=error.strerror
-        ) from error
+        raise refuse("import.unreadable", field=str(path), got=error.strerror) from error
     except (ValueError, RecursionError) as error:  # of the syntax, of the text's coding, of depth
-        raise DatasetError(
-            "import.json", "not a usable JSON file", field=str(path), got=str(error)
-        ) from error
+        raise refuse("import.json", field=str(path), got=str(error)) from error
     return JsonValue(value, path)
 
 

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from PIL import ExifTags, Image
 
-from visloc.errors import DatasetError
+from visloc.errors import refuse
 from visloc.file_kinds import HEAD_BYTES, file_kind
 from visloc.kapture.text import has_control_characters, is_field
 
@@ -52,17 +52,11 @@ def photo_names(
         if is_shortened:
             shortened.append(text)
         if name in ("", ".", "..") or not is_field(name) or has_control_characters(text):
-            raise DatasetError(
-                "import.photo_name",
-                "not a usable name of a photo",
-                field=where,
-                expected="a path of UTF-8 text without commas and control characters",
-                got=repr(text),
-            )
+            raise refuse("import.photo_name", field=where, got=repr(text))
         if name in places:
-            raise DatasetError(
+            raise refuse(
                 "import.photo_name",
-                f"two photos have the name {name!r}; the other is at {places[name]}",
+                f"two photos have the name {name!r}; the other one is at {places[name]}",
                 field=where,
                 expected="different names below the folder of photos",
                 got=text,
@@ -116,13 +110,11 @@ def _from_header(path: Path, look: Callable[[Image.Image], T]) -> T:
         with path.open("rb") as file:
             kind = file_kind(file.read(HEAD_BYTES))
         if kind is not None and not kind.is_read:
-            raise DatasetError("import.photo", kind.refusal, field=str(path), got=kind.name)
+            raise refuse("import.photo", kind.refusal, field=str(path), got=kind.name)
         with Image.open(path) as image:
             return look(image)
     except (*_MALFORMED, Image.DecompressionBombError) as error:
-        raise DatasetError(
-            "import.photo", "not a readable photo", field=str(path), got=str(error)
-        ) from error
+        raise refuse("import.photo", field=str(path), got=str(error)) from error
 
 
 def _is_file(path: Path) -> bool:

@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Self
 
 from mapping.importers.reading.json_fields import LARGEST
-from visloc.errors import DatasetError
+from visloc.errors import VislocError, refuse
 
 
 class TextLines:
@@ -25,7 +25,7 @@ class TextLines:
             # Names may be in any coding; what is not UTF-8 is refused where names are checked.
             self._file = path.open(encoding="utf-8", errors="surrogateescape", newline=None)
         except FileNotFoundError:
-            raise DatasetError("import.missing", "there is no such file", field=str(path)) from None
+            raise refuse("import.missing", field=str(path)) from None
         except OSError as error:
             raise self._unreadable(error) from error
 
@@ -61,12 +61,7 @@ class TextLines:
         """
         line = self.next_or_none()
         if line is None:
-            raise DatasetError(
-                "import.truncated",
-                "the file ends too early",
-                field=f"{self.path}:{self.number}",
-                expected=expected,
-            )
+            raise refuse("import.truncated", field=f"{self.path}:{self.number}", expected=expected)
         return line
 
     def next_numbers(self, count: int, expected: str) -> list[float]:
@@ -74,7 +69,9 @@ class TextLines:
         fields = self.next(expected).split()
         if len(fields) != count:
             raise self.error(
-                "wrong number of fields", expected=f"{count}: {expected}", got=len(fields)
+                "the line has the wrong number of fields",
+                expected=f"{count}: {expected}",
+                got=len(fields),
             )
         return [self.to_number(field) for field in fields]
 
@@ -86,7 +83,7 @@ class TextLines:
             number = math.nan
         if not abs(number) <= LARGEST:  # NaN is not
             raise self.error(
-                "not a usable number", expected=f"a number within +-{LARGEST:g}", got=field
+                "the number is not valid", expected=f"a number within +-{LARGEST:g}", got=field
             )
         return number
 
@@ -96,23 +93,17 @@ class TextLines:
         number = int(field) if field.isascii() and field.isdigit() and len(field) < 20 else -1
         if not 0 <= number <= high:
             raise self.error(
-                "not a usable number", expected=f"a whole number, 0 to {high}", got=field
+                "the number is not valid", expected=f"a whole number, 0 to {high}", got=field
             )
         return number
 
     def error(
         self, message: str, *, expected: str | None = None, got: object = None
-    ) -> DatasetError:
+    ) -> VislocError:
         """Make an error about the line at hand."""
-        return DatasetError(
-            "import.line",
-            message,
-            field=f"{self.path}:{self.number}",
-            expected=expected,
-            got=got,
+        return refuse(
+            "import.line", message, field=f"{self.path}:{self.number}", expected=expected, got=got
         )
 
-    def _unreadable(self, error: OSError) -> DatasetError:
-        return DatasetError(
-            "import.unreadable", "cannot be read", field=str(self.path), got=error.strerror
-        )
+    def _unreadable(self, error: OSError) -> VislocError:
+        return refuse("import.unreadable", field=str(self.path), got=error.strerror)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapping.importers.model import ImportedImage, ImportedModel
-from visloc.errors import DatasetError
+from visloc.errors import refuse
 from visloc.geometry import Pose
 from visloc.kapture import Sensor
 from visloc.pose.colmap import project
@@ -67,12 +67,12 @@ def keypoints_of(
     moved = np.flatnonzero(np.abs(pixels[first][inverse] - pixels).max(axis=1, initial=0.0) > 0.01)
     if len(moved):
         image, feature = pairs[moved[0]]
-        raise DatasetError(
+        raise refuse(
             "import.feature_moved",
-            f"feature {feature} of image {image} (counted from 0) is at two positions",
             field=where,
-            expected="one position of each feature",
             got=f"{pixels[first][inverse][moved[0]].tolist()} and {pixels[moved[0]].tolist()}",
+            feature=feature,
+            image=image,
         )
     starts = np.searchsorted(unique[:, 0], np.arange(num_images + 1))
     positions = pixels[first].astype(np.float32)

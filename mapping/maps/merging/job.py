@@ -16,7 +16,7 @@ from mapping.stages.publishing import photo_files, publish_edited
 from mapping.stages.work_folder import exclusive
 from visloc.archive import GlobalFeatures, Map, MapContent, MapStore
 from visloc.archive.schema import ID_PATTERN
-from visloc.errors import Conflict, InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import Similarity
 from visloc.retrieval.fusion import EQUAL_GHARM
 
@@ -119,17 +119,14 @@ def _refuse_name(store: MapStore, new_id: str) -> None:
         Conflict: ``map.exists``.
     """
     if not ID_PATTERN.fullmatch(new_id):
-        raise InvalidInput(
+        raise refuse(
             "map.id",
-            "not a name of a map",
             field="--map",
             expected="up to 64 letters, digits, '.', '_', '-', beginning with a letter or digit",
             got=new_id,
         )
     if new_id in store.ids():
-        raise Conflict(
-            "map.exists", "there is a map or a set of this name", field="--map", got=new_id
-        )
+        raise refuse("map.exists", field="--map", got=new_id)
 
 
 def _lock_of(store: MapStore, new_id: str) -> Path:
@@ -138,16 +135,10 @@ def _lock_of(store: MapStore, new_id: str) -> Path:
 
 def _opened(store: MapStore, a_ref: str, b_ref: str, min_overlap: float) -> tuple[Map, Map]:
     if not 0 < min_overlap <= 1:
-        raise InvalidInput(
-            "merge.min_overlap",
-            "not a part of the photos",
-            field="--min-overlap",
-            expected="more than 0, at most 1",
-            got=min_overlap,
-        )
+        raise refuse("merge.min_overlap", field="--min-overlap", got=min_overlap)
     a, b = store.open(a_ref), store.open(b_ref)
     if a.ref == b.ref:
-        raise InvalidInput("merge.same", "a map and itself", field="MAP", got=a.ref)
+        raise refuse("merge.same", field="MAP", got=a.ref)
     return a, b
 
 

@@ -13,7 +13,7 @@ from mapping.frames.alignment import MIN_PHOTOS, NoTie, Seen, Tie, tie
 from mapping.frames.stored_queries import match_stored, solve_stored
 from mapping.maps.merging.describing import describe_together
 from visloc.archive import GlobalFeatures, Map
-from visloc.errors import Conflict
+from visloc.errors import VislocError, refuse
 from visloc.geometry import Pose
 from visloc.localization.constraints import MapGeometry
 from visloc.types import LocalizeOptions
@@ -66,12 +66,8 @@ def register(a: Map, b: Map, min_overlap: float, progress: Progress) -> Registra
     rigid = a.manifest.world.metric and b.manifest.world.metric
     found = tie(list(seen.values()), list(back.values()), rigid=rigid)
     if isinstance(found, NoTie) and found.unit:
-        raise Conflict(
-            "merge.unit",
-            f"{tried} photos of {b.ref} were looked for in {a.ref}, but {found.why}",
-            field="MAP",
-            expected="maps whose units and depth agree; build one of them anew (--not-metric, "
-            "--depth-scale)",
+        raise refuse(
+            "merge.unit", field="MAP", tried=tried, from_ref=b.ref, to_ref=a.ref, why=found.why
         )
     if isinstance(found, NoTie):
         raise _no_overlap(a, b, tried, found.why)
@@ -98,13 +94,8 @@ def _by_depth(opened: Map) -> bool:
     )
 
 
-def _no_overlap(a: Map, b: Map, tried: int, why: str) -> Conflict:
-    return Conflict(
-        "merge.overlap",
-        f"{tried} photos of {b.ref} were looked for in {a.ref}, but {why}: the maps do not show "
-        "the same place, or too little of it",
-        field="MAP",
-    )
+def _no_overlap(a: Map, b: Map, tried: int, why: str) -> VislocError:
+    return refuse("merge.overlap", field="MAP", tried=tried, from_ref=b.ref, to_ref=a.ref, why=why)
 
 
 def _seen(

@@ -15,7 +15,7 @@ from mapping.report.held_out import left_out_sets, vanishing
 from mapping.report.viewpoints import Viewpoints
 from mapping.stages.photos import read_in_frame
 from visloc.archive import Map
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.evaluation import Threshold, median_errors_localized, pose_error
 from visloc.features import GlobalDescriptor, LocalFeatureExtractor
 from visloc.geometry import Pose
@@ -85,13 +85,7 @@ def of_queries(
     dataset = read_dataset(queries)
     records = [record for record in dataset.images if dataset.pose(record) is not None]
     if not records:
-        raise InvalidInput(
-            "prune.queries",
-            "no photo of the dataset has a pose to compare with",
-            field="--queries",
-            expected="a kapture folder with trajectories.txt, in the frame of the map",
-            got=str(queries),
-        )
+        raise refuse("prune.queries", field="--queries", got=str(queries))
     localizers = [Localizer(opened, extractor, make_descriptor) for opened in maps]
     errors: list[list[tuple[float, float]]] = [[] for _ in maps]
     for done, record in enumerate(records):

@@ -13,7 +13,7 @@ from mapping.stages.publishing import link_photos, photo_files, write_content
 from mapping.stages.work_folder import exclusive
 from visloc.archive import Map, MapContent, MapStore, open_map
 from visloc.archive.version_rules import outdated
-from visloc.errors import Conflict, InvalidInput
+from visloc.errors import refuse
 
 Measure = Callable[[Map, Map], tuple[Accuracy, Accuracy]]
 
@@ -93,9 +93,8 @@ def keep_within(opened: Map, max_bytes: int | None, max_landmarks: int | None) -
     if (max_bytes is None or size <= max_bytes) and (
         max_landmarks is None or count <= max_landmarks
     ):
-        raise Conflict(
+        raise refuse(
             "prune.small_already",
-            "the map is not larger than it may be",
             field="--max-bytes" if max_landmarks is None else "--max-landmarks",
             expected=f"less than {size} bytes" if max_landmarks is None else f"less than {count}",
             got=max_bytes if max_landmarks is None else max_landmarks,
@@ -117,17 +116,16 @@ def keep_within(opened: Map, max_bytes: int | None, max_landmarks: int | None) -
             for name, entry in opened.manifest.files.items()
             if name.endswith(".model.npz") or name == "cameras.json"
         )
-        raise InvalidInput(
+        raise refuse(
             "prune.too_small",
-            f"no photo or landmark could be kept as it is needed: the models of the global "
-            f"features alone take {fixed} bytes, whatever is left out",
+            f"the models of the global features alone take {fixed} bytes, which leaves no "
+            "room for photos or landmarks",
             field="--max-bytes",
             expected=f"at least {size_with(opened, smallest)}",
             got=max_bytes,
         )
-    raise InvalidInput(
+    raise refuse(
         "prune.too_small",
-        "the photos that cover the map would see too little to be localized by",
         field="--max-landmarks",
         expected=f"at least {num_landmarks(opened, smallest)}",
         got=max_landmarks,

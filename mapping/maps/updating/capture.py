@@ -23,7 +23,7 @@ from mapping.stages.photos import MappingPhoto, collect_photos, some
 from mapping.stages.work_folder import WorkFolder
 from visloc.archive import Map
 from visloc.archive.schema import photo_file
-from visloc.errors import Conflict, DatasetError
+from visloc.errors import refuse
 from visloc.features.local.readymade import is_ready_made
 from visloc.kapture import Dataset
 from visloc.localization.fingerprints import check_fingerprint
@@ -86,12 +86,7 @@ def collect_capture(
         )
     photos = [photo for photo in photos if photo.camera_known]
     if not photos:
-        raise DatasetError(
-            "dataset.no_photos",
-            "no photo of the dataset has a camera of a known model",
-            field=str(dataset.root / "sensors" / "sensors.txt"),
-            expected="a model with its parameters",
-        )
+        raise refuse("dataset.no_photos", field=str(dataset.root / "sensors" / "sensors.txt"))
     names = [
         photo.name if settings.capture is None else f"{settings.capture}/{photo.name}"
         for photo in photos
@@ -99,14 +94,7 @@ def collect_capture(
     known = {image.name for image in opened.images}
     both = [name for name in names if name in known]
     if both:
-        raise Conflict(
-            "update.photos",
-            "the map has photos of these names; if these are others, name the capture: "
-            "--capture NAME puts NAME/ before the names of its photos",
-            field="--capture",
-            expected="names that the map does not have",
-            got=f"{len(both)}: {some(both)}",
-        )
+        raise refuse("update.photos", field="--capture", got=f"{len(both)}: {some(both)}")
     return Capture(photos, names, {}), [*dataset.notes, *notes]
 
 

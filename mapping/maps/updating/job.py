@@ -57,7 +57,7 @@ from mapping.stages.work_folder import WorkFolder, exclusive
 from visloc.archive import Map, MapContent, MapStore, open_map
 from visloc.archive.schema import photo_file
 from visloc.archive.version_rules import outdated
-from visloc.errors import Unavailable
+from visloc.errors import refuse
 from visloc.evaluation import pose_error
 from visloc.geometry import Similarity
 from visloc.kapture import Dataset, read_dataset
@@ -149,11 +149,8 @@ def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
                 folder = publish_edited(store, content, map_id, photos=pictures, based_on=version)
             shutil.rmtree(work.root, ignore_errors=True)
     except OSError as error:
-        raise Unavailable(
-            "storage.failed",
-            f"reading or writing failed: {error.strerror or error}; "
-            "finished work is kept, the same command resumes",
-            field=str(error.filename or work.root),
+        raise refuse(
+            "storage.failed", field=str(error.filename or work.root), why=error.strerror or error
         ) from error
     return Updated(folder, record, notes)
 

@@ -25,7 +25,7 @@ from mapping.frames.alignment import (
 from mapping.maps.updating.localizing import Placed
 from mapping.stages.photos import MappingPhoto
 from visloc.archive import Map
-from visloc.errors import Conflict
+from visloc.errors import VislocError, refuse
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose, Similarity
 from visloc.localization.gates import registration_for
@@ -271,11 +271,5 @@ def _reasons(placed: Sequence[Placed]) -> dict[str, int]:
     return dict(Counter(one.reason for one in placed if not one.localized).most_common())
 
 
-def _elsewhere(message: str, expected: str, got: str | None = None) -> Conflict:
-    return Conflict(
-        "update.elsewhere",
-        f"the capture does not fit the map: {message}",
-        field="DATASET",
-        expected=expected,
-        got=got,
-    )
+def _elsewhere(message: str, expected: str, got: str | None = None) -> VislocError:
+    return refuse("update.elsewhere", field="DATASET", expected=expected, got=got, why=message)

@@ -24,7 +24,7 @@ from mapping.options import (
 )
 from visloc.archive import Map
 from visloc.archive.schema import ID_PATTERN
-from visloc.errors import Conflict, InvalidInput
+from visloc.errors import refuse
 from visloc.geometry import PixelOrigin
 from visloc.types import Inference
 
@@ -89,29 +89,11 @@ def check_settings(settings: UpdateSettings) -> None:
         ("method", settings.method, METHODS),
     ):
         if value is not None and value not in known:
-            raise InvalidInput(
-                f"update.{option}",
-                "unknown",
-                field=f"--{option}",
-                expected=f"one of {', '.join(known)}",
-                got=value,
-            )
+            raise refuse(f"update.{option}", field=f"--{option}", expected=known, got=value)
     if settings.capture is not None and not ID_PATTERN.fullmatch(settings.capture):
-        raise InvalidInput(
-            "update.capture",
-            "not a name of a capture",
-            field="--capture",
-            expected="up to 64 letters, digits, '.', '_', '-', beginning with a letter or digit",
-            got=settings.capture,
-        )
+        raise refuse("update.capture", field="--capture", got=settings.capture)
     if not 0 < settings.depth_scale < math.inf:
-        raise InvalidInput(
-            "update.depth_scale",
-            "not usable",
-            field="--depth-scale",
-            expected="metres, more than 0",
-            got=settings.depth_scale,
-        )
+        raise refuse("update.depth_scale", field="--depth-scale", got=settings.depth_scale)
 
 
 def method_for(settings: UpdateSettings, opened: Map) -> str:
@@ -123,14 +105,7 @@ def method_for(settings: UpdateSettings, opened: Map) -> str:
     made_by = opened.manifest.method.name
     method = settings.method or (made_by if made_by in METHODS else "sfm")
     if method == "rgbd" and settings.poses != "tie" and not opened.manifest.world.metric:
-        raise InvalidInput(
-            "update.unit",
-            "how long a metre of the depth maps is in the map's unit tells only a trajectory of "
-            "the capture's own",
-            field="--poses",
-            expected="tie, or --method sfm, or a metric map",
-            got=settings.poses,
-        )
+        raise refuse("update.unit", field="--poses", got=settings.poses)
     return method
 
 
@@ -152,12 +127,13 @@ def refuse_strange_settings(opened: Map) -> None:
         ("voxel_size", is_length, "a length, more than 0"),
     ):
         if not known:
-            raise Conflict(
+            raise refuse(
                 "update.settings",
-                f"the settings of map {opened.ref} have a strange {name}",
                 field=name,
                 expected=expected,
                 got=str(settings[name]),
+                ref=opened.ref,
+                name=name,
             )
 
 
@@ -168,10 +144,4 @@ def refuse_few(count: int) -> None:
         InvalidInput: ``update.photos_few``.
     """
     if count < 2:
-        raise InvalidInput(
-            "update.photos_few",
-            "new photos are matched with each other",
-            field="--method",
-            expected="two photos or more, or --method rgbd",
-            got=f"{count} to be matched",
-        )
+        raise refuse("update.photos_few", field="--method", got=f"{count} to be matched")

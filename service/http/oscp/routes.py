@@ -21,7 +21,7 @@ from service.http.oscp.examples import GEOPOSE_BODY, GEOPOSE_RESPONSES
 from service.http.responses import json_response, problem_response, while_connected
 from service.settings import ServiceSettings
 from service.values import Localization, RigJob
-from visloc.errors import InvalidInput, NotFound
+from visloc.errors import InvalidInput, refuse
 from visloc.geometry import Pose
 from visloc.geopose import accuracy_of
 
@@ -106,9 +106,8 @@ def answer_kind(accept: list[str]) -> str:
             kind = f"{kind}; version={version}"
         best, best_quality = kind, quality
     if best is None:
-        raise InvalidInput(
+        raise refuse(
             "geopose.accept",
-            "such an answer is not given here",
             field="Accept",
             expected=f"{OSCP}; version=1.0 or 2.0, {OGC}, {JSON}, or nothing",
             got=", ".join(accept),
@@ -139,10 +138,7 @@ async def _answer(
     geopose, _ = geoposes_to_words(cam_from_world, found.geodetic, ypr=False)
     if geopose is None or found.geodetic is None:
         # The map was chosen by its anchor, and then replaced by a version without one.
-        raise NotFound(
-            "geopose.not_anchored",
-            f"map {map_ref} localizes the photo and is not anchored to the Earth",
-        )
+        raise refuse("geopose.not_anchored", ref=map_ref)
     # An anchor that was given, not estimated, has no known accuracy.
     anchor = (await engine.map(map_ref)).outline.manifest.world.anchor
     rms = None if anchor is None else anchor.rms
@@ -163,7 +159,7 @@ def _first_camera(found: Localization) -> tuple[Pose, NDArray[np.float64]]:
     pose, refusal = found.answer.pose, found.answer.refusal
     if pose is None:
         assert refusal is not None  # an instant has a pose or a refusal
-        raise NotFound(
+        raise refuse(
             "geopose.not_localized", refusal.message, got=f"{refusal.stage}: {refusal.reason}"
         )
     cam_from_rig = found.answer.images[0].cam_from_rig

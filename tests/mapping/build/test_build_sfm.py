@@ -314,11 +314,11 @@ def test_a_bad_dataset_is_refused_by_name_and_nothing_is_published(
     ("text", "code", "named"),
     [
         ("mapping/left/0001.jpg, elsewhere.jpg\n", "pairs.unknown_photo", r"my.txt:1.*elsewhere"),
-        ("# nothing\n", "pairs.none", r"my.txt: no two photos are paired"),
+        ("# nothing\n", "pairs.none", r"my.txt: the pairing found no pair"),
         (
             "mapping/left/0001.jpg, mapping/right/0008.jpg\n",
             "sfm.no_matches",
-            "too few matches to triangulate",
+            "too few matches for triangulation",
         ),
     ],
 )

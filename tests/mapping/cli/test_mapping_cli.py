@@ -138,14 +138,17 @@ def test_verify_tells_that_the_features_of_a_map_are_others(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("inspect", "kitchen"), "[map.unknown] map: no such map (expected one of: room, got"),
-        (("inspect", "room@v9"), "[map.version] map: map 'room' has no such version"),
-        (("verify", "../room"), "[map.id] map: not a map name"),
+        (
+            ("inspect", "kitchen"),
+            "[map.unknown] map: there is no such map (expected one of room, got",
+        ),
+        (("inspect", "room@v9"), "[map.version] map: map room has no such version"),
+        (("verify", "../room"), "[map.id] map: this is not a valid name of a map"),
         (("build", "nowhere", "--map", "new"), "[kapture.no_dataset] sensors/sensors.txt: nowhere"),
         (("build", "nowhere", "--map", "room"), "[map.exists] --map: map 'room' exists"),
         (
             ("build", "nowhere", "--map", "new", "--local-features", "surf"),
-            "[features.unknown] local_features: unknown feature; if a package brings it",
+            "[features.unknown] local_features: the features are unknown; if a package provides",
         ),
         (
             ("build", "nowhere", "--map", "new", "--local-features", "r2d2"),
@@ -161,16 +164,25 @@ def test_verify_tells_that_the_features_of_a_map_are_others(
         (("build", "x", "--map", "new", "--max-angle", "270"), "[pairs.max_angle] --max-angle"),
         (("build", "x", "--map", "new", "--near", "9", "--far", "2"), "[pairs.far] --far"),
         (("build", "x", "--map", "new", "--covisible-in", "y"), "[map.unknown]"),
-        (("build", "x", "--map", "new", "--gravity", "down"), "[build.gravity] --gravity: not a"),
-        (("build", "x", "--map", "new", "--gravity", "0,0"), "[build.gravity] --gravity: not a"),
-        (("build", "x", "--map", "new", "--gravity", "0,0,0"), "[build.gravity] --gravity: not a"),
+        (
+            ("build", "x", "--map", "new", "--gravity", "down"),
+            "[build.gravity] --gravity: this is not a",
+        ),
+        (
+            ("build", "x", "--map", "new", "--gravity", "0,0"),
+            "[build.gravity] --gravity: this is not a",
+        ),
+        (
+            ("build", "x", "--map", "new", "--gravity", "0,0,0"),
+            "[build.gravity] --gravity: this is not a",
+        ),
         (("build", "x", "--map", "new", "--gravity", "0,nan,1"), "[build.gravity] --gravity"),
         (("calibrate-rig", "nowhere"), "[kapture.no_dataset] sensors/sensors.txt: nowhere"),
-        (("import", "colmap", "x"), "[import.target] --map: say what to make"),
+        (("import", "colmap", "x"), "[import.target] --map: say whether to make"),
         (("import", "colmap", "x", "--map", "m", "--output", "o"), "[import.target] --map"),
         (("import", "meshroom", "x", "--output", "o"), "[import.unknown_format] FORMAT"),
         (("export", "room", "--output", "o", "--format", "e57"), "[export.unknown_format] --f"),
-        (("export", "attic", "--output", "o"), "[map.unknown] map: no such map"),
+        (("export", "attic", "--output", "o"), "[map.unknown] map: there is no such map"),
     ],
 )
 def test_an_error_is_one_line_with_its_code(
@@ -190,8 +202,8 @@ def test_an_error_is_one_line_with_its_code(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--size", "640"), "[sample.size] --size: not a size (expected WxH"),
-        (("--size", "8x8"), "[sample.size] --size: cannot make photos of this size"),
+        (("--size", "640"), "[sample.size] --size: the size is not valid (expected WxH"),
+        (("--size", "8x8"), "[sample.size] --size: photos of this size cannot be made"),
         (("--images", "1"), "[sample.images] --images"),
         (("--seed", "-1"), "[sample.seed] --seed"),
     ],
@@ -470,10 +482,13 @@ def test_a_rig_is_calibrated_shown_and_written_once(run: Run, sample: Path, tmp_
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--cameras", "left,roof"), "[rig.cameras] --cameras: not cameras of the dataset"),
-        (("--cameras", ""), "[rig.cameras] --cameras: a rig has two cameras at least"),
+        (
+            ("--cameras", "left,roof"),
+            "[rig.cameras] --cameras: the dataset does not have these cameras",
+        ),
+        (("--cameras", ""), "[rig.cameras] --cameras: a rig needs at least two cameras"),
         (("--reference", "roof"), "[rig.reference] --reference: the reference is not one"),
-        (("--rig", "left"), "[rig.id] --rig: not the id of a rig"),
+        (("--rig", "left"), "[rig.id] --rig: this is not a valid id of a rig"),
         (("--rig", "a,b"), "[kapture.field]"),
     ],
 )

@@ -131,7 +131,7 @@ def test_items_of_a_url_are_read_again_and_damaged_ones_made_again(
     assert work.has(key)
     assert work.read(key)["a"].tolist() == [0, 1, 2]
     (place / f"{key}.npz").write_bytes(b"PK torn")
-    with pytest.raises(Unavailable, match="same command makes it again"):
+    with pytest.raises(Unavailable, match="same command again to redo it"):
         work.read(key)
     assert not work.has(key)
     work.get(key, lambda: {"a": np.ones(1)})

@@ -154,7 +154,7 @@ def test_fixes_that_do_not_determine_the_place_are_refused(room: Map) -> None:
     centers = centers_of(room)  # a few metres apart
     noisy = TURNED.apply(centers) + np.random.default_rng(1).normal(scale=3.0, size=centers.shape)
     dataset = dataset_with_fixes(room, geodetic_from_enu(noisy, HOME))
-    with pytest.raises(InvalidInput, match="do not tell where the map lies") as caught:
+    with pytest.raises(InvalidInput, match="do not determine where the map lies") as caught:
         georeference(room, correspondences_from_fixes(room, dataset))
     assert caught.value.code == "anchor.undetermined"
 

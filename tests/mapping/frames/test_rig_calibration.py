@@ -282,7 +282,7 @@ def test_numbers_too_large_to_compute_with_are_refused() -> None:
         ({"rig": ""}, "rig.id", "--rig"),
         ({"cameras": ["left", "roof"]}, "rig.cameras", "front, left, rear, got roof"),
         ({"cameras": ["left", "left"]}, "rig.cameras", "each named once"),
-        ({"cameras": ["left"]}, "rig.cameras", "two cameras at least"),
+        ({"cameras": ["left"]}, "rig.cameras", "at least two cameras"),
         ({"cameras": []}, "rig.cameras", "got none"),
         ({"reference": "roof"}, "rig.reference", "one of front, left, rear, got roof"),
         (

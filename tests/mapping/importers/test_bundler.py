@@ -169,7 +169,7 @@ def test_a_list_of_other_photos_is_refused(folder: Path) -> None:
     (folder / "list.txt").write_text("a.jpg\nb.jpg\n")
     path = write(folder, bundle_text())
 
-    with pytest.raises(DatasetError, match="is not of this file") as caught:
+    with pytest.raises(DatasetError, match="belongs to another file") as caught:
         read(path)
     assert caught.value.field == f"{path}:2"
 
@@ -203,20 +203,20 @@ def test_photos_that_are_absent_are_left_out_or_asked_for(folder: Path) -> None:
     [
         (1, "# Bundle file v0.4", "not a Bundler file"),
         (2, "3", "wrong number of fields"),
-        (2, "3 -49", "not a usable number"),
-        (2, f"3 {10**12}", "not a usable number"),
+        (2, "3 -49", "the number is not valid"),
+        (2, f"3 {10**12}", "the number is not valid"),
         (3, "500 0", "wrong number of fields"),
-        (3, "-500 0 0", "not a usable focal length"),
-        (3, "nan 0 0", "not a usable number"),
+        (3, "-500 0 0", "the focal length is not valid"),
+        (3, "nan 0 0", "the number is not valid"),
         (4, "2 0 0", "not a rotation"),
-        (7, "0 0 1e300", "not a usable number"),
+        (7, "0 0 1e300", "the number is not valid"),
         (18, "0 0", "wrong number of fields"),
-        (19, "10 20 300", "not a usable number"),
+        (19, "10 20 300", "the number is not valid"),
         (19, "10 20", "wrong number of fields"),
         (20, "2 0 0 1 2", "wrong number of fields"),
-        (20, "1 3 0 1 2", "not a usable number"),
-        (20, "1 0 -1 1 2", "not a usable number"),
-        (20, "1 0 0 1 inf", "not a usable number"),
+        (20, "1 3 0 1 2", "the number is not valid"),
+        (20, "1 0 -1 1 2", "the number is not valid"),
+        (20, "1 0 0 1 inf", "the number is not valid"),
     ],
 )
 def test_what_is_malformed_is_named_by_its_line(

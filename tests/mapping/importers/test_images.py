@@ -165,7 +165,7 @@ def test_every_file_is_used_or_left_out_with_its_reason(tmp_path: Path) -> None:
     assert reasons.keys() == told
     for name, part in {
         "cut.jpg": "damaged or cut off",
-        "text.png": "not an image that is read here",
+        "text.png": "does not read this image format",
         "notes.txt": "not photos",
         "sub/a.HEIC": "HEIC photos are not read here; convert them to JPEG, such as with: heif-con",
         "sub/phone.jpg": reasons["sub/a.HEIC"],

@@ -255,7 +255,7 @@ def test_descriptors_that_announce_another_count_are_refused(
         (tmp_path / f"{name}.feat").write_text("1 2 3 0.5\n")
         (tmp_path / f"{name}.desc").write_bytes(announced.to_bytes(8, "little") + bytes(128))
 
-    with pytest.raises(DatasetError, match="not those of the features") as caught:
+    with pytest.raises(DatasetError, match="do not match the features") as caught:
         read(write(tmp_path, scene()))
     assert caught.value.code == "import.descriptors"
 

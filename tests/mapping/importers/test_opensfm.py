@@ -371,7 +371,7 @@ def test_a_malformed_track_is_named_by_its_line(tmp_path: Path, row: str) -> Non
 
 
 def test_an_unknown_version_of_tracks_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="unknown version"):
+    with pytest.raises(DatasetError, match="version is unknown"):
         read(write(tmp_path, tracks="OPENSFM_TRACKS_VERSION_v9\n"))
 
 
@@ -424,17 +424,17 @@ def featured(tmp_path: Path) -> Path:
     ("arrays", "complaint"),
     [
         ({"points": POINT}, "is missing"),
-        ({"points": POINT, "descriptors": BYTES[:0]}, "not as many descriptors"),
+        ({"points": POINT, "descriptors": BYTES[:0]}, "numbers of descriptors and points differ"),
         ({"points": POINT, "descriptors": BYTES[:, :64]}, "differ in kind"),
-        ({"points": POINT[:, :3], "descriptors": BYTES}, "points are not usable"),
-        ({"points": POINT * np.nan, "descriptors": BYTES}, "points are not usable"),
-        ({"points": POINT.astype("<f8") * 1e300, "descriptors": BYTES}, "points are not usable"),
-        ({"points": POINT[0], "descriptors": BYTES}, "'points' is not usable"),
-        ({"points": huge_header(), "descriptors": BYTES}, "'points' is not usable"),
+        ({"points": POINT[:, :3], "descriptors": BYTES}, "points are not valid"),
+        ({"points": POINT * np.nan, "descriptors": BYTES}, "points are not valid"),
+        ({"points": POINT.astype("<f8") * 1e300, "descriptors": BYTES}, "points are not valid"),
+        ({"points": POINT[0], "descriptors": BYTES}, "'points' is not valid"),
+        ({"points": huge_header(), "descriptors": BYTES}, "'points' is not valid"),
         ({"points": b"\x93NUMPY", "descriptors": BYTES}, "not an array"),
         (
             {"points": np.array([[{}]], dtype=object), "descriptors": BYTES},
-            "'points' is not usable",
+            "'points' is not valid",
         ),
     ],
 )
@@ -464,5 +464,5 @@ def test_cut_off_features_are_refused(featured: Path, cut: int) -> None:
 def test_tracks_of_other_features_are_refused(featured: Path, feature: int, x: float) -> None:
     row = f"a.jpg\t17\t{feature}\t{x}\t0.2\t0.01\t1\t2\t3"
 
-    with pytest.raises(DatasetError, match=r"not those that .* was made of"):
+    with pytest.raises(DatasetError, match=r"the tracks in .* were made from other features"):
         read(write(featured, tracks=TRACKS + row))

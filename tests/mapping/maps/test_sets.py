@@ -481,7 +481,7 @@ def test_a_set_knows_down_when_all_of_its_maps_do(store: MapStore) -> None:
 
 
 def test_a_map_without_a_place_needs_a_pose(store: MapStore) -> None:
-    with pytest.raises(InvalidInput, match="not tied to the Earth") as caught:
+    with pytest.raises(InvalidInput, match="not anchored to the Earth") as caught:
         poses_on_earth(store, ["hall"])
     assert caught.value.code == "set.poses"
 
@@ -595,5 +595,5 @@ def test_metres_of_a_map_without_are_refused(
     moved_map(store, "hall", "small", Similarity(0.1, np.eye(3), np.zeros(3)))
 
     status, said = command("split", "small", "--tile", "2m", "--set", "cut")
-    assert (status, "nobody knows its metres" in said) == (1, True)
+    assert (status, "lengths in metres have no meaning" in said) == (1, True)
     assert command("split", "small", "--tile", "0.2", "--set", "cut")[0] == 0

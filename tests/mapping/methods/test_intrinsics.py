@@ -208,7 +208,7 @@ def test_photos_of_a_camera_that_no_lens_has_are_refused_by_name(tmp_path: Path)
         solved(around_an_object(), None, tmp_path, NONSENSE, radius=230)
     assert caught.value.code == "sfm.camera"
     assert caught.value.field == "cam/0.jpg, cam/1.jpg, cam/2.jpg, ..."
-    assert "no lens has" in caught.value.message
+    assert "not plausible for any lens" in caught.value.message
     assert "import photos with --output first" in str(caught.value.expected)
 
 

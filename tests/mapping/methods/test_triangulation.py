@@ -108,7 +108,7 @@ def test_wrong_matches_make_no_points(tmp_path: Path) -> None:
 
 def test_tracks_of_two_photos_are_points_unless_more_are_asked_for(tmp_path: Path) -> None:
     world = make_world(num_photos=2)
-    with pytest.raises(InvalidInput, match="too few matches to triangulate"):
+    with pytest.raises(InvalidInput, match="too few matches for triangulation"):
         triangulate(
             world.photos, {}, world.matches, replace(CONFIG, min_track_length=3), (), tmp_path
         )

@@ -149,7 +149,7 @@ def test_a_folder_is_not_overwritten(
 ) -> None:
     status, out, err = run("room", "--maps-dir", built_maps, "--output", tmp_path)
     assert (status, out) == (1, "")
-    assert err.startswith("error [report.output] --output: this is a folder")
+    assert err.startswith("error [report.output] --output: the path is a folder")
     assert computed == {}
 
 
@@ -236,7 +236,7 @@ def test_an_unbuilt_viewer_is_told_before_the_long_work(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def absent() -> tuple[str, str]:
-        raise Unavailable("page.not_built", "the page's files are not here")
+        raise Unavailable("page.not_built", "the files of the page are missing")
 
     monkeypatch.setattr(command, "report_parts", absent)
     status, _, err = run("room", "--maps-dir", built_maps, "--output", tmp_path / "room.html")

@@ -56,7 +56,7 @@ def test_a_damaged_item_is_named_and_made_again_by_the_next_build(tmp_path: Path
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     assert work.has(key)
-    with pytest.raises(Unavailable, match="same command makes it again") as caught:
+    with pytest.raises(Unavailable, match="same command again to redo it") as caught:
         work.read(key)
     assert (caught.value.code, caught.value.field) == ("build.damaged_item", str(path))
     assert not work.has(key)

@@ -166,7 +166,7 @@ def test_an_empty_place_has_no_maps(store: RemoteMapStore) -> None:
     assert store.versions("room") == []
     with pytest.raises(NotFound) as caught:
         store.folder("room")
-    assert (caught.value.code, caught.value.expected) == ("map.unknown", "one of: none")
+    assert (caught.value.code, caught.value.expected) == ("map.unknown", "one of none")
 
 
 def test_a_published_map_is_in_the_storage_as_in_a_folder(

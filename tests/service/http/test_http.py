@@ -254,7 +254,7 @@ def test_a_wrong_camera_is_refused(
 def test_an_unknown_map_is_not_found(doors: Any, query: Any) -> None:
     body = problem(post(doors, query.image, map="hall"), 404, "map.unknown")
 
-    assert (body["field"], body["expected"], body["got"]) == ("map", "one of: room", "hall")
+    assert (body["field"], body["expected"], body["got"]) == ("map", "one of room", "hall")
     problem(doors.http.get("/maps/hall"), 404, "map.unknown")
 
 

@@ -202,7 +202,7 @@ def test_without_the_built_files_the_server_says_so_and_does_all_else(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def not_built() -> Path:
-        raise Unavailable("page.not_built", "the page's files are not here", field="/a/folder")
+        raise Unavailable("page.not_built", "the files of the page are missing", field="/a/folder")
 
     monkeypatch.setattr(service.http.static_page, "page_folder", not_built)
     with caplog.at_level(logging.WARNING, "service.http.static_page"):

@@ -146,12 +146,18 @@ def test_init_makes_one_key_and_a_second_time_none(
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["add", "admin", "--scope", "read"], "there is a key of this name"),
-        (["add", "a b", "--scope", "read"], "not a name"),
-        (["add", "x", "--scope", "read", "--rate", "0"], "a limit that cannot be used"),
-        (["add", "x", "--scope", "read", "--rate", "nan"], "a limit that cannot be used"),
-        (["add", "x", "--scope", "read", "--burst", "3"], "a limit that cannot be used"),
-        (["add", "x", "--scope", "read", "--concurrency", "-1"], "a limit that cannot be used"),
+        (["add", "admin", "--scope", "read"], "a key has this name"),
+        (["add", "a b", "--scope", "read"], "the name of the key is not valid"),
+        (["add", "x", "--scope", "read", "--rate", "0"], "the limits of the key are out of range"),
+        (
+            ["add", "x", "--scope", "read", "--rate", "nan"],
+            "the limits of the key are out of range",
+        ),
+        (["add", "x", "--scope", "read", "--burst", "3"], "the limits of the key are out of range"),
+        (
+            ["add", "x", "--scope", "read", "--concurrency", "-1"],
+            "the limits of the key are out of range",
+        ),
         (["limit", "nobody"], "no such key"),
         (["remove", "nobody"], "no such key"),
     ],

@@ -262,7 +262,7 @@ def test_programs_that_know_formats_1_call_this_one_newer(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("visloc.archive.checks.FORMAT_MAJOR", 1)
-    with pytest.raises(MapCorrupt, match="newer visloc; upgrade") as caught:
+    with pytest.raises(MapCorrupt, match="newer visloc wrote the map; upgrade") as caught:
         open_map(folder)
     assert (caught.value.code, caught.value.got) == ("map.format_version", "2.2")
 

@@ -277,7 +277,7 @@ def test_scales_of_scales_widen_nothing(folder: Path) -> None:
     assert found["axes"].tolist() == [[2, 6], [6, 12]]
     arrays["axes" + SCALES] = np.ones((2, 2), np.int8)
     np.savez(folder / "model.npz", **arrays)
-    with pytest.raises(MapCorrupt, match="'axes' of a model is not usable"):
+    with pytest.raises(MapCorrupt, match="'axes' of a model is not valid"):
         read_model(folder, "model.npz")
 
 

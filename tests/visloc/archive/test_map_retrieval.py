@@ -63,9 +63,9 @@ def test_maps_that_do_not_say_are_asked_by_gharm_of_all(
     [
         ({"fusion": "borda"}, "retrieval.fusion: Input should be 'gharm'"),
         ({"weights": {"gem": 1.0}}, "weights of others than the map's densevlad"),
-        ({"weights": {"densevlad": 0.0}}, "not a weight"),
-        ({"weights": {"densevlad": 1e300}}, "not a weight"),
-        ({"weights": {}}, "no weights"),
+        ({"weights": {"densevlad": 0.0}}, "the weight is out of range"),
+        ({"weights": {"densevlad": 1e300}}, "the weight is out of range"),
+        ({"weights": {}}, "there are no weights"),
         ({"weights": ["densevlad"]}, "should be an object"),
         ("gharm", "retrieval"),
     ],

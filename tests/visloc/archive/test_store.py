@@ -111,7 +111,7 @@ def test_the_version_in_use_is_not_removed_while_there_are_others(two_versions: 
     with pytest.raises(Conflict) as caught:
         two_versions.remove("room", "v2")
 
-    assert (caught.value.code, caught.value.expected) == ("map.version_in_use", "one of: v1")
+    assert (caught.value.code, caught.value.expected) == ("map.version_in_use", "one of v1")
     assert two_versions.open("room").ref == "room@v2"
 
 

@@ -86,7 +86,7 @@ def test_our_own_features_cannot_be_replaced(install: Install) -> None:
 def test_names_that_no_map_can_have_are_no_features(install: Install, name: str) -> None:
     install(name, "grid_features:load")
     assert name not in local_feature_names()
-    with pytest.raises(InvalidInput, match="unknown feature") as caught:
+    with pytest.raises(InvalidInput, match="the features are unknown") as caught:
         make_local_features(name)
     assert caught.value.code == "features.unknown"
     assert caught.value.expected == f"one of {', '.join(local_feature_names())}"
@@ -137,6 +137,6 @@ def test_a_plugin_speaks_for_itself_about_its_weights(install: Install) -> None:
 
 def test_a_plugin_whose_features_have_another_name_is_refused(install: Install) -> None:
     install("mesh", "grid_features:load")
-    with pytest.raises(InvalidInput, match="has another name") as caught:
+    with pytest.raises(InvalidInput, match="makes features of another name") as caught:
         make_local_features("mesh")
     assert (caught.value.code, caught.value.got) == ("features.plugin", "grid")

@@ -157,7 +157,7 @@ def test_a_dataset_without_points_has_none(tmp_path: Path) -> None:
 def test_observations_of_missing_points_are_refused(tmp_path: Path) -> None:
     write_text(tmp_path, "0,0,1\n", "0, sift, a.jpg, 0\n")
     (tmp_path / "reconstruction/points3d.txt").unlink()
-    with pytest.raises(DatasetError, match="points that are missing"):
+    with pytest.raises(DatasetError, match="observed points are missing"):
         read_reconstruction(tmp_path)
 
 

@@ -144,7 +144,7 @@ def test_tiles_are_named_by_id_or_version(outline: MakeOutline) -> None:
 
     assert allowed_tiles(made, Priors(maps=("floor",))).tolist() == [True, True, False]
     assert allowed_tiles(made, Priors(maps=("barn@v1",))).tolist() == [False, False, True]
-    with pytest.raises(InvalidInput, match="not a tile") as caught:
+    with pytest.raises(InvalidInput, match="has no such tile") as caught:
         allowed_tiles(made, Priors(maps=("barn", "attic")))
     assert (caught.value.code, caught.value.got) == ("priors.maps", "attic")
 

@@ -217,7 +217,7 @@ def test_a_vocabulary_of_other_features_is_named(rooms: MapSet) -> None:
         np.zeros(5, np.float32),
     )
 
-    with pytest.raises(MapCorrupt, match="not of its local features"):
+    with pytest.raises(MapCorrupt, match="does not fit its local features"):
         rank_tiles(rooms, other)
 
 

@@ -176,7 +176,7 @@ def test_a_floor_far_from_the_origin_of_a_tilted_tile_is_the_floor_of_the_set(
 
 
 def test_a_height_band_without_any_down_is_refused() -> None:
-    with pytest.raises(InvalidInput, match="which way is down") as caught:
+    with pytest.raises(InvalidInput, match="down direction") as caught:
         priors_in_tile(Priors(height=HeightBand(0.0, 3.0)), SET_FROM_TILE, None)
 
     assert caught.value.code == "priors.height"

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 
 from visloc.archive.backends.folder import FolderBackend
-from visloc.errors import StorageFull
+from visloc.errors import refuse
 
 logger = logging.getLogger(__name__)
 
@@ -54,9 +54,9 @@ class Copies:
             StorageFull: ``maps.storage_full`` when it is larger than the room for all.
         """
         if size > self._max_bytes:
-            raise StorageFull(
+            raise refuse(
                 "maps.storage_full",
-                "the map is larger than the room for copies (max_cache_bytes)",
+                "the map is larger than the space for copies (max_cache_bytes)",
                 field=str(self.root),
                 expected=f"at least {size} bytes",
                 got=f"{self._max_bytes} bytes",

@@ -24,7 +24,7 @@ from visloc.archive.schema import ID_PATTERN
 from visloc.archive.set_rules import AnyManifest
 from visloc.archive.sets import SetOutline, read_any_outline
 from visloc.archive.version_rules import refuse_renamed
-from visloc.errors import Forbidden, MapCorrupt, StorageFull
+from visloc.errors import MapCorrupt, refuse
 
 INCOMING, REMOVED = ".incoming", ".removed-"
 FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -173,18 +173,9 @@ def storage_errors(place: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in FULL:
-            raise StorageFull(
-                "maps.storage_full",
-                "no room on the disk; remove maps or versions that are not needed",
-                field=str(place),
-            ) from error
+            raise refuse("maps.storage_full", field=str(place)) from error
         if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
-            raise Forbidden(
-                "maps.read_only",
-                "the folder of maps may not be written to by this program",
-                field=str(place),
-                got=error.strerror,
-            ) from error
+            raise refuse("maps.read_only", field=str(place), got=error.strerror) from error
         raise
 
 

@@ -32,7 +32,7 @@ from visloc.archive.set_rules import AnyManifest
 from visloc.archive.set_schema import SetManifest
 from visloc.archive.sets import SetOutline, read_any_outline, verify_any
 from visloc.archive.version_rules import refuse_renamed
-from visloc.errors import MapCorrupt, NotFound, Unavailable
+from visloc.errors import MapCorrupt, Unavailable, VislocError, refuse
 
 logger = logging.getLogger(__name__)
 
@@ -208,7 +208,7 @@ class ObjectBackend:
             with self.storage.asking():
                 sizes = self.storage.sizes_in(place)
             if MANIFEST not in sizes:
-                raise NotFound("map.version", "the version was removed", field="map", got=version)
+                raise refuse("map.version", "the version was removed", field="map", got=version)
             self._fetch_small(map_id, version, MANIFEST, target)
             manifest = read_any_manifest(target)
             self.copies.make_room(sum(entry.size for entry in manifest.files.values()))
@@ -232,8 +232,8 @@ class ObjectBackend:
             except FileNotFoundError:
                 raise self._damaged(map_id, version, name, "is missing") from None
 
-    def _damaged(self, map_id: str, version: str, name: str, why: str) -> MapCorrupt:
-        return MapCorrupt(
+    def _damaged(self, map_id: str, version: str, name: str, why: str) -> VislocError:
+        return refuse(
             "map.file_size",
             f"a file of the map in the storage {why}",
             field=self.address(map_id, version, name),

@@ -28,7 +28,7 @@ from visloc.archive.backends.base import CURRENT, MANIFEST, text_of_current
 from visloc.archive.backends.storage import Storage
 from visloc.archive.checks import sha256_of
 from visloc.archive.version_rules import outdated, version_exists
-from visloc.errors import Conflict
+from visloc.errors import VislocError, refuse
 
 logger = logging.getLogger(__name__)
 
@@ -192,8 +192,8 @@ def _is_condition(error: OSError) -> bool:
     return isinstance(error, FileExistsError) or code in _CONDITION_CODES
 
 
-def _upload_runs(map_id: str, version: str) -> Conflict:
-    return Conflict(
+def _upload_runs(map_id: str, version: str) -> VislocError:
+    return refuse(
         "map.upload_runs",
         "another server is publishing this version, or was interrupted in the last hour; "
         "try again later, or publish under another name",

@@ -15,7 +15,7 @@ import fsspec
 
 from visloc.archive.backends.folder import FULL
 from visloc.archive.schema import ID_PATTERN
-from visloc.errors import Unavailable, VislocError
+from visloc.errors import VislocError, refuse
 
 logger = logging.getLogger(__name__)
 
@@ -122,11 +122,6 @@ class Storage:
             raise self.away(type(error).__name__) from None  # its text may tell secrets
         self.away_until = NEVER
 
-    def away(self, why: str) -> Unavailable:
+    def away(self, why: str) -> VislocError:
         """``maps.storage_away``."""
-        return Unavailable(
-            "maps.storage_away",
-            "the storage of the maps does not answer; try again in a few seconds",
-            field=self.url,
-            got=why,
-        )
+        return refuse("maps.storage_away", field=self.url, got=why)

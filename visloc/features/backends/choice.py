@@ -6,7 +6,7 @@ import logging
 from functools import cache
 from pathlib import Path
 
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.features.backends.openvino import import_openvino
 from visloc.types import Inference
 
@@ -35,19 +35,19 @@ def choose_inference(wanted: Inference) -> Inference:
         return wanted
     missing = _missing_openvino()
     if missing is not None:
-        raise InvalidInput(
+        raise refuse(
             "inference.unavailable",
-            f"this way of computing networks needs OpenVINO, but {missing}: "
-            "pip install openvino, or choose another way",
+            f"this way of computing networks requires OpenVINO, but {missing}: pip "
+            "install openvino, or choose another way",
             field="inference",
             expected=f"{Inference.AUTO} or {Inference.TORCH}",
             got=wanted.value,
         )
     has_eight_bits, reason = _eight_bits()
     if wanted is Inference.INT8 and not has_eight_bits:
-        raise InvalidInput(
+        raise refuse(
             "inference.unavailable",
-            f"networks are not computed in 8 bits here, as sums may overflow: {reason}",
+            f"this machine cannot compute networks in 8 bits, because sums may overflow: {reason}",
             field="inference",
             expected=Inference.FP32.value,
             got=wanted.value,

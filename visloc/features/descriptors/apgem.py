@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from visloc.errors import WeightsError
+from visloc.errors import refuse
 from visloc.features.backends.torch import torch_device
 from visloc.features.base import GlobalDescriptor
 from visloc.features.descriptors.network_descriptor import (
@@ -119,9 +119,9 @@ def whitened(vectors: NDArray[np.float32], pca: PrincipalComponents) -> NDArray[
 def _whitening(checkpoint: Checkpoint) -> PrincipalComponents:
     field = f"{checkpoint.path}, pca"
     if PCA_NAME not in checkpoint.pca:
-        raise WeightsError(
+        raise refuse(
             "weights.network",
-            "the file brings whitening along, but not the one that AP-GeM is published with",
+            "the file holds whitening, but not that of the published AP-GeM",
             field=field,
             expected=PCA_NAME,
             got=", ".join(sorted(checkpoint.pca)),
@@ -129,16 +129,16 @@ def _whitening(checkpoint: Checkpoint) -> PrincipalComponents:
     try:
         pca = principal_components(checkpoint.pca[PCA_NAME])
     except ValueError as error:
-        raise WeightsError(
+        raise refuse(
             "weights.format",
             f"the whitening of AP-GeM cannot be read: {error}",
             field=field,
             expected="a PCA of scikit-learn",
         ) from error
     if len(pca.mean) != FEATURES:
-        raise WeightsError(
+        raise refuse(
             "weights.network",
-            "the whitening is not of this network",
+            "the whitening belongs to another network",
             field=field,
             expected=f"a PCA of vectors of {FEATURES} numbers",
             got=str(len(pca.mean)),

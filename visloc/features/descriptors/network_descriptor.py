@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from visloc.errors import WeightsError
+from visloc.errors import refuse
 from visloc.features.backends.torch import computed_with
 from visloc.features.descriptors.image_descriptor import ImageDescriptor
 from visloc.features.descriptors.whitening import WHITENING_PARAMETERS, unit_rows
@@ -104,9 +104,9 @@ def exponent_of(checkpoint: Checkpoint, name: str) -> float:
     """
     exponent = float(checkpoint.tensors[name][0])
     if not 0.0 < exponent <= MAX_EXPONENT:
-        raise WeightsError(
+        raise refuse(
             "weights.values",
-            f"the tensor {name} is no exponent of a generalized mean",
+            f"the tensor {name} is not an exponent of a generalized mean",
             field=str(checkpoint.path),
             expected=f"more than 0, at most {MAX_EXPONENT:g}",
             got=str(exponent),

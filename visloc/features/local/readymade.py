@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.kapture import READY_MADE_PREFIX, FeatureSet
 from visloc.types import Fingerprint, LocalFeatures
 
@@ -33,9 +33,9 @@ def ready_made_type(name: str) -> str:
         InvalidInput: ``features.unknown`` for another name.
     """
     if not is_ready_made(name):
-        raise InvalidInput(
+        raise refuse(
             "features.unknown",
-            "not the name of ready-made features",
+            "this is not the name of ready-made features",
             field="features",
             expected="kapture:TYPE",
             got=name,
@@ -54,9 +54,8 @@ def ready_made_fingerprint(features: FeatureSet) -> Fingerprint:
     """
     metric = (features.metric_type or "").lower()
     if metric not in _METRICS:
-        raise InvalidInput(
+        raise refuse(
             "features.metric",
-            "descriptors with this metric cannot be compared here",
             field=str(features.folder / f"{features.kind}.txt"),
             expected=f"metric_type L2, cosine or dot for {features.kind} {features.type_name}",
             got=features.metric_type,
@@ -89,9 +88,9 @@ def to_local_features(keypoints: NDArray[np.float32], descriptors: NDArray[Any])
             that is zero or not finite. None is dropped: rows are what observations refer to.
     """
     if descriptors.ndim != 2 or keypoints.shape != (len(descriptors), 2):
-        raise InvalidInput(
+        raise refuse(
             "features.shape",
-            "not the features of one photo",
+            "these are not the features of one photo",
             field="descriptors",
             expected="(N, 2) keypoints and (N, D) descriptors",
             got=f"{keypoints.shape} and {descriptors.shape}",
@@ -112,9 +111,9 @@ def to_global_descriptor(row: NDArray[Any]) -> NDArray[np.float32]:
         InvalidInput: ``features.shape``; ``features.descriptor`` when it is zero or not finite.
     """
     if row.ndim != 1:
-        raise InvalidInput(
+        raise refuse(
             "features.shape",
-            "not a global descriptor",
+            "this is not a global descriptor",
             field="global_descriptor",
             expected="one row (D,)",
             got=str(row.shape),
@@ -130,13 +129,7 @@ def _unit_rows(rows: NDArray[Any], field: str) -> NDArray[np.float32]:
     usable = (np.isfinite(largest) & (largest > 0)).ravel()
     if not usable.all():
         row = int(np.argmin(usable))
-        raise InvalidInput(
-            "features.descriptor",
-            f"row {row} has no direction",
-            field=field,
-            expected="finite numbers, not all zero",
-            got=rows[row, :4].tolist(),
-        )
+        raise refuse("features.descriptor", field=field, got=rows[row, :4].tolist(), row=row)
     wide /= largest
     wide /= np.linalg.norm(wide, axis=1, keepdims=True)
     return wide.astype(np.float32)

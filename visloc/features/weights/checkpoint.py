@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load as load_safetensors
 
-from visloc.errors import WeightsError
+from visloc.errors import refuse
 from visloc.features.weights import pickled_pca
 from visloc.features.weights.pickled_pca import Pickled, PickledPca
 
@@ -140,24 +140,13 @@ def read_checkpoint(
         with path.open("rb") as file:
             data = file.read(max_bytes + 1)
     except OSError as error:
-        raise WeightsError(
-            "weights.unreadable", "cannot be read", field=str(path), got=error.strerror
-        ) from error
+        raise refuse("weights.unreadable", field=str(path), got=error.strerror) from error
     if len(data) > max_bytes:
-        raise WeightsError(
-            "weights.too_large",
-            "too large for weights",
-            field=str(path),
-            expected=f"at most {max_bytes} bytes",
-        )
+        raise refuse("weights.too_large", field=str(path), expected=f"at most {max_bytes} bytes")
     found_sha256 = hashlib.sha256(data).hexdigest()
     if sha256 not in (None, found_sha256):
-        raise WeightsError(
-            "weights.altered",
-            "not the weights that this version was shipped with; install it anew",
-            field=str(path),
-            expected=f"sha256 {sha256}",
-            got=found_sha256,
+        raise refuse(
+            "weights.altered", field=str(path), expected=f"sha256 {sha256}", got=found_sha256
         )
     try:
         if data[_SAFETENSORS_LENGTH_BYTES : _SAFETENSORS_LENGTH_BYTES + 1] == b"{":
@@ -165,12 +154,8 @@ def read_checkpoint(
         content = _read_torch(data)
         return Checkpoint(path, found_sha256, _state_dict(content), _pca_of(content))
     except _MALFORMED as error:
-        raise WeightsError(
-            "weights.format",
-            "not a whole file of plain tensors",
-            field=str(path),
-            expected="safetensors, or a state dict saved by torch.save",
-            got=f"{type(error).__name__}: {_reason(error)}",
+        raise refuse(
+            "weights.format", field=str(path), got=f"{type(error).__name__}: {_reason(error)}"
         ) from error
 
 

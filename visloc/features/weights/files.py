@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from visloc.errors import WeightsError
+from visloc.errors import refuse
 from visloc.features.weights.checkpoint import MAX_FILE_BYTES, Checkpoint, read_checkpoint
 
 Shapes = Mapping[str, tuple[int, ...]]
@@ -99,11 +99,12 @@ def read_weights(weights_dir: Path | None, published: PublishedWeights) -> Check
     """
     path = None if weights_dir is None else weights_dir / published.file_name
     if path is None or not path.is_file():
-        raise WeightsError(
+        raise refuse(
             "weights.missing",
             f"the weights of {published.network} are not part of this software: download "
-            f"{published.file_name} ({published.source}; licence {published.licence}), put it "
-            "into a folder and name the folder with --weights-dir or VISLOC_WEIGHTS_DIR",
+            f"{published.file_name} ({published.source}; licence {published.licence}), "
+            "put it into a folder and name the folder with --weights-dir or "
+            "VISLOC_WEIGHTS_DIR",
             field="weights_dir" if path is None else str(path),
             expected=f"a folder with {published.file_name}",
             got="no weights folder" if weights_dir is None else f"no such file in {weights_dir}",
@@ -141,7 +142,7 @@ def find_weights(
         if path.is_file():
             return path
     got = "no such package" if found is None else "a package without that file"
-    raise WeightsError(
+    raise refuse(
         "weights.missing",
         missing,
         field=field,
@@ -167,9 +168,9 @@ def check_shapes(checkpoint: Checkpoint, expected: Shapes, *, network: str, held
     if found != dict(expected):
         wrong = sorted(set(found.items()) ^ set(expected.items()))
         name = wrong[0][0]
-        raise WeightsError(
+        raise refuse(
             "weights.network",
-            f"not the weights of {network} but of {held}; first difference: {name}",
+            f"these are weights of {held}, not of {network}; the first difference is {name}",
             field=str(checkpoint.path),
             expected=str(expected.get(name, "no such tensor")),
             got=str(found.get(name, "no such tensor")),
@@ -177,9 +178,4 @@ def check_shapes(checkpoint: Checkpoint, expected: Shapes, *, network: str, held
     for name, array in checkpoint.tensors.items():
         negative = name.endswith("running_var") and bool((array < 0).any())
         if negative or not np.isfinite(array).all():
-            raise WeightsError(
-                "weights.values",
-                f"the tensor {name} holds numbers that no network has",
-                field=str(checkpoint.path),
-                expected="finite numbers, variances not negative",
-            )
+            raise refuse("weights.values", field=str(checkpoint.path), name=name)

@@ -247,7 +247,7 @@ def _hollow(tmp_path: Path, **changes: Tensor | None) -> Path:
 def test_other_tensors_than_the_networks_are_refused_by_name(
     changes: dict[str, Tensor | None], named: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(WeightsError, match=f"first difference: {named}") as caught:
+    with pytest.raises(WeightsError, match=f"first difference is {named}") as caught:
         load_apgem(_hollow(tmp_path, **changes))
     assert caught.value.code == "weights.network"
 

@@ -201,7 +201,7 @@ def test_101_layers_are_told_by_the_tensors(tmp_path: Path) -> None:
 def test_other_tensors_than_the_networks_are_refused_by_name(
     changes: dict[str, Tensor | None], named: str, depth: int, tmp_path: Path
 ) -> None:
-    with pytest.raises(WeightsError, match=f"first difference: {named}") as caught:
+    with pytest.raises(WeightsError, match=f"first difference is {named}") as caught:
         load_delg(_hollow(tmp_path, depth, **changes))
     assert caught.value.code == "weights.network"
 

@@ -204,7 +204,9 @@ def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
     state = {name: torch.tensor(array) for name, array in random_weights().tensors.items()}
     state["_blocks.3._depthwise_conv.weight"] = torch.zeros(144, 1, 3, 3)
     torch.save(OrderedDict(state), tmp_path / FILE)
-    with pytest.raises(WeightsError, match=r"first difference: _blocks\.3\._depthwise_conv") as got:
+    with pytest.raises(
+        WeightsError, match=r"first difference is _blocks\.3\._depthwise_conv"
+    ) as got:
         load_gem(tmp_path)
     assert got.value.code == "weights.network"
 

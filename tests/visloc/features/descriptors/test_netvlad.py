@@ -191,7 +191,7 @@ def test_other_tensors_than_the_networks_are_refused_by_name(
         if tensor is not None:
             hollow[name] = tensor
     torch.save({"state_dict": hollow}, tmp_path / PUBLISHED.file_name)
-    with pytest.raises(WeightsError, match=f"first difference: {named}") as caught:
+    with pytest.raises(WeightsError, match=f"first difference is {named}") as caught:
         load_netvlad(tmp_path)
     assert caught.value.code == "weights.network"
 

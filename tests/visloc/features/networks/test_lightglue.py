@@ -237,7 +237,7 @@ def test_weights_of_another_network_are_refused(
 ) -> None:
     tensors = random_tensors(SMALL)
     change(tensors)
-    with pytest.raises(WeightsError, match=r"first difference: posenc\.W") as caught:
+    with pytest.raises(WeightsError, match=r"first difference is posenc\.W") as caught:
         read_tensors(saved(tmp_path, tensors), "", SMALL)
     assert caught.value.code == "weights.network"
 

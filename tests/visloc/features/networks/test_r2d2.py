@@ -168,7 +168,7 @@ def test_weights_of_the_other_network_are_refused_by_name(name: str, tmp_path: P
     other = "faster2d2" if name == "r2d2" else "r2d2"
     _save(tmp_path, name, _random_state(other))
     wanted, held = ("R2D2", "Fast-R2D2") if name == "r2d2" else ("Fast-R2D2", "R2D2")
-    with pytest.raises(WeightsError, match=f"not the weights of {wanted} but of {held};") as caught:
+    with pytest.raises(WeightsError, match=f"weights of {held}, not of {wanted};") as caught:
         LOADERS[name](tmp_path)
     assert caught.value.code == "weights.network"
     assert FILE_NAMES[name] in str(caught.value)
@@ -180,7 +180,7 @@ def test_published_weights_of_the_other_network_are_refused_by_name(
 ) -> None:
     other = "faster2d2" if name == "r2d2" else "r2d2"
     (tmp_path / FILE_NAMES[name]).symlink_to(shared_weights / FILE_NAMES[other])
-    with pytest.raises(WeightsError, match="not the weights of"):
+    with pytest.raises(WeightsError, match="these are weights of"):
         LOADERS[name](tmp_path)
 
 

@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from visloc.errors import InvalidInput
+from visloc.errors import refuse
 from visloc.features.networks.lightglue.model import Design, expected_shapes
 from visloc.features.weights.checkpoint import Checkpoint, read_checkpoint
 from visloc.features.weights.files import check_shapes, find_weights
@@ -79,12 +79,12 @@ def make_lightglue(local_features: str, weights_dir: Path | None = None) -> Ligh
             and ``check_shapes``.
     """
     if local_features not in LIGHTGLUE:
-        raise InvalidInput(
+        raise refuse(
             "options.matcher",
-            f"there is no LightGlue for the map's local features, {local_features}",
             field="options.matcher",
             expected=f"mutual or ratio; lightglue in maps of {' or '.join(sorted(LIGHTGLUE))}",
             got="lightglue",
+            local_features=local_features,
         )
     from visloc.features.networks.lightglue.torch import LightGlue  # torch takes a second to load
 
