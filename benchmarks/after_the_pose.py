@@ -32,10 +32,11 @@ from visloc.kapture import read_dataset
 from visloc.localization.feature_cache import FeatureCache
 from visloc.localization.localizer import Localizer
 from visloc.matching.correspondences import Correspondences, settled
+from visloc.options import LocalizeOptions
 from visloc.pose.colmap import project
 from visloc.pose.generalized import refine_generalized_pose
 from visloc.pose.views import MatchedView
-from visloc.types import LocalFeatures, Localized, LocalizeOptions
+from visloc.types import LocalFeatures, Localized
 
 WINDOW_PX = 6.0
 MAX_ANGLE_DEG = 60.0

@@ -43,7 +43,8 @@ from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import Dataset, FileRecord, Sensor, read_dataset, write_dataset
 from visloc.localization.localizer import Localizer
-from visloc.types import Localized, LocalizeOptions
+from visloc.options import LocalizeOptions
+from visloc.types import Localized
 
 _SYNTHETIC_FEATURES = "sift"
 _NUM_MAPPING, _NUM_QUERIES = 40, 120

@@ -22,8 +22,9 @@ from visloc.evaluation import pose_error
 from visloc.geometry import Pose
 from visloc.localization.localizer import Localizer
 from visloc.matching.products import start_threads
+from visloc.options import LocalizeOptions
 from visloc.retrieval.index import retrieve
-from visloc.types import Localized, LocalizeOptions, QueryFeatures
+from visloc.types import Localized, QueryFeatures
 
 # What a query differs by from the photo that it was made from: pixels, and of each component of a
 # local descriptor; a global one by as much as photos of the map differ.

@@ -28,7 +28,8 @@ from visloc.features import DEFAULT_LOCAL_FEATURES, make_global_descriptor, make
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
-from visloc.types import Localized, LocalizeOptions
+from visloc.options import LocalizeOptions
+from visloc.types import Localized
 
 # Stages that depend on the way; features and global descriptors do not.
 STAGES = ("depth", "landmarks", "pairs", "matches", "verified", "triangulation")

@@ -35,7 +35,8 @@ from visloc.evaluation import pose_error
 from visloc.geometry import PixelOrigin
 from visloc.kapture import open_features, open_local_features
 from visloc.localization.localizer import Localizer
-from visloc.types import LocalFeatures, Localized, LocalizeOptions, QueryFeatures
+from visloc.options import LocalizeOptions
+from visloc.types import LocalFeatures, Localized, QueryFeatures
 
 LOCAL, GLOBAL = "r2d2_500", "AP-GeM-LM18"
 KEPT = 0.98

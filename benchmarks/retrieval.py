@@ -47,10 +47,10 @@ from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.feature_cache import FeatureCache
 from visloc.localization.localizer import Localizer
+from visloc.options import LocalizeOptions
 from visloc.pose.colmap import project
 from visloc.retrieval.fusion import FUSION_OPERATORS, LateFusion
 from visloc.retrieval.index import retrieve
-from visloc.types import LocalizeOptions
 
 MAX_ANGLE_DEG = 60.0
 MAX_DISTANCE_RATIO = 2.0

@@ -29,10 +29,11 @@ from visloc.images import ImageLimits, read_photo
 from visloc.kapture import Dataset, read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import Look, SeenImage
+from visloc.options import LocalizeOptions
 from visloc.priors import NO_PRIORS
 from visloc.sequences.filling import Odometry, TimeUnit, TracedPose, fill_rig, interpolate_pose
 from visloc.sequences.solver import SeenInstant, SequenceSolver
-from visloc.types import InstantAnswer, LocalizeOptions, PoseSource
+from visloc.types import InstantAnswer, PoseSource
 
 Pixels = NDArray[np.uint8]
 BLUR_SIGMA_PX = 12.0

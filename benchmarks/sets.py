@@ -29,7 +29,8 @@ from visloc.archive import MapStore
 from visloc.geometry import Similarity
 from visloc.images import ImageLimits
 from visloc.kapture import read_dataset
-from visloc.types import LocalizeOptions, Reason
+from visloc.options import LocalizeOptions
+from visloc.types import Reason
 
 APART_M = 10_000.0
 OPTIONS = LocalizeOptions()

@@ -21,8 +21,9 @@ from visloc.features import make_global_descriptor, make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
+from visloc.options import LocalizeOptions
 from visloc.pose.centre import position_covariance
-from visloc.types import Localized, LocalizeOptions
+from visloc.types import Localized
 
 
 def main(maps_dir: Path, map_ref: str, queries: Path, weights_dir: Path | None = None) -> None:

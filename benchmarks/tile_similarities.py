@@ -39,6 +39,7 @@ from visloc.archive import Map, MapStore
 from visloc.features import LocalFeatureExtractor, make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
+from visloc.options import Extraction
 from visloc.sets.coarse import (
     BITS,
     CoarseModel,
@@ -48,7 +49,6 @@ from visloc.sets.coarse import (
     descriptors_of,
     learn_of_words,
 )
-from visloc.types import Extraction
 
 LEVELS = (0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 0.9999)
 # What is compared, see above.

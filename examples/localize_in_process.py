@@ -18,7 +18,8 @@ from visloc.archive import MapStore
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.images import read_photo_file
 from visloc.localization.localizer import Localizer
-from visloc.types import Localized, LocalizeOptions
+from visloc.options import LocalizeOptions
+from visloc.types import Localized
 
 
 def main(maps_dir: str, map_ref: str, photo_path: str, camera: str | None = None) -> None:

@@ -20,7 +20,7 @@ from mapping.cluster.workers import DEFAULT_WORKERS
 from visloc.errors import refuse
 from visloc.features import global_feature_names, local_feature_names
 from visloc.geometry import PixelOrigin
-from visloc.types import Inference
+from visloc.options import Inference
 
 RGBD_PANEL, SFM_PANEL, CLUSTER_PANEL = "Method rgbd", "Method sfm", "On a cluster"
 MAPS_DIR_VARIABLE = "VISLOC_MAPS_DIR"

@@ -30,7 +30,7 @@ from service.telemetry.metrics import Metrics, ServiceState
 from service.telemetry.observer import Observer
 from service.telemetry.tracing import open_spans
 from service.values import WorkerSettings
-from visloc.types import Inference
+from visloc.options import Inference
 
 # When the server stops: the time in which requests that are already on their way over open
 # connections still get an answer, 503. After it, idle connections are closed.

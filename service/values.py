@@ -13,18 +13,11 @@ from numpy.typing import NDArray
 from visloc.archive import Geodetic, MapOutline, SetOutline
 from visloc.errors import refuse
 from visloc.geometry import Camera
+from visloc.options import Inference, LocalizeOptions
 from visloc.priors import NO_PRIORS, Priors
 from visloc.sequences.filling import Odometry, TimeUnit
 from visloc.sets.choosing import TileScore
-from visloc.types import (
-    Inference,
-    InstantAnswer,
-    LocalizeOptions,
-    Near,
-    QueryFeatures,
-    RigPose,
-    RigSensor,
-)
+from visloc.types import InstantAnswer, Near, QueryFeatures, RigPose, RigSensor
 
 # The longest time between two measured instants across which gaps are filled, by default.
 DEFAULT_MAX_GAP_S = 1.0

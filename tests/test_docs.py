@@ -43,17 +43,9 @@ from tests.docs_check import commands_of
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput, catalogue
 from visloc.geometry import Camera, Pose
+from visloc.options import PRESETS, Extraction, Fusion, LocalizeOptions, Matcher, ReadAs, Solver
 from visloc.pose.centre import position_covariance
-from visloc.types import (
-    PRESETS,
-    Extraction,
-    Fusion,
-    LocalizeOptions,
-    Matcher,
-    ReadAs,
-    Reason,
-    Solver,
-)
+from visloc.types import Reason
 from visloc_api.words.answers import PoseEstimate
 
 ROOT = Path(__file__).resolve().parents[1]

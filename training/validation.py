@@ -19,7 +19,7 @@ from training.photos import Photo
 from visloc.features import LocalFeatureExtractor, make_local_features
 from visloc.matching.correspondences import mutual_nearest_neighbours
 from visloc.matching.products import round_descriptors
-from visloc.types import Extraction, Inference
+from visloc.options import Extraction, Inference
 
 THRESHOLDS_PX = (1.0, 3.0, 5.0)
 SIDE_PX = 320

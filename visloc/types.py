@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from visloc.errors import VislocError, refuse
 from visloc.geometry import Camera, Pose
+from visloc.options import ReadAs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,68 +145,6 @@ class CameraSource(StrEnum):
     ESTIMATED = "estimated"  # nothing known: found together with the pose
 
 
-class ReadAs(StrEnum):
-    """The orientation in which the features of a photo were found."""
-
-    STORED = "stored"
-    UPRIGHT = "upright"  # turned by the photo's EXIF orientation
-
-
-class Extraction(StrEnum):
-    """How much effort goes into the local features of a photo.
-
-    Fewer keypoints, and at fewer scales where an extractor looks at several, take less time to
-    find and to match. Maps are made with the most. Measured in docs/performance.md.
-    """
-
-    FAST = "fast"
-    DEFAULT = "default"
-    ACCURATE = "accurate"
-
-
-class Inference(StrEnum):
-    """How networks are computed. Descriptors of all ways match each other's."""
-
-    AUTO = "auto"  # torch where there is a CUDA GPU, else 8 bits where the CPU is made for them
-    INT8 = "int8"  # OpenVINO, 8-bit weights and activations
-    FP32 = "fp32"  # OpenVINO, 32-bit
-    TORCH = "torch"  # the reference; on a CUDA GPU where there is one
-
-
-class Fusion(StrEnum):
-    """How similarities under several global descriptors become one ranking.
-
-    Section 3.2 of Humenberger et al. 2020; ``visloc.retrieval.fusion`` has the formulas.
-    """
-
-    GHARM = "gharm"  # generalized harmonic mean
-    MEAN = "mean"
-    POWER = "power"  # weighted geometric mean
-    MIN = "min"
-    MAX = "max"
-    MEAN_AND_POWER = "mean_and_power"
-    MIN_AND_MAX = "min_and_max"
-    MEAN_AND_MIN = "mean_and_min"
-    HARMONIC = "harmonic"
-    ROUND_ROBIN = "round_robin"
-
-
-class Matcher(StrEnum):
-    """How a query's keypoints are matched with those of a mapping photo."""
-
-    MUTUAL = "mutual"  # mutual nearest neighbours
-    RATIO = "ratio"  # those of them that are clearly nearer than the second nearest
-    LIGHTGLUE = "lightglue"  # the best photos again, by a network made for the local features
-
-
-class Solver(StrEnum):
-    """What searches for a pose among 2D-3D correspondences."""
-
-    PYCOLMAP = "pycolmap"
-    POSELIB = "poselib"
-    REGISTRATION = "registration"  # thresholds and refinement of COLMAP's image_registrator
-
-
 class Reason(StrEnum):
     """Why a photo was not localized."""
 
@@ -224,178 +163,6 @@ class Reason(StrEnum):
 
 # The stages that can give up.
 Stage = Literal["features", "retrieval", "matching", "pose", "gate"]
-
-
-def check_fusion_weights(weights: Mapping[str, float], code: str, field: str | None = None) -> None:
-    """Make sure that weights of global descriptors mean something.
-
-    Args:
-        weights: by name.
-        code: of the error.
-        field: what the weights are called where they were given; None for what the code says.
-
-    Raises:
-        InvalidInput: with the code.
-    """
-    field = code if field is None else field
-    for name, weight in weights.items():
-        if not 1e-6 <= weight <= 1e6:  # NaN fails too
-            raise refuse(
-                code,
-                "the weight is out of range; leave a descriptor out to ignore it",
-                field=f"{field}.{name}",
-                expected="0.000001 to 1000000",
-                got=weight,
-            )
-    if not weights:
-        raise refuse(
-            code,
-            "there are no weights",
-            field=field,
-            expected="a weight for one global descriptor or more",
-            got="{}",
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class RegistrationPreset:
-    """Thresholds under which a pose is accepted.
-
-    Attributes:
-        max_error_px: largest reprojection error of an inlier, pixels.
-        min_inliers: fewest inliers of an accepted pose.
-        min_inlier_ratio: smallest share of inliers among the correspondences.
-    """
-
-    max_error_px: float
-    min_inliers: int
-    min_inlier_ratio: float
-
-
-DEFAULT_PRESET = "default"
-# config1 and config2: table 2 of Humenberger et al. 2020 (abs_pose_max_error,
-# abs_pose_min_num_inliers, abs_pose_min_inlier_ratio). config2 was made to give an answer
-# whenever it can; it is for comparisons with the paper, not for robots.
-PRESETS: Mapping[str, RegistrationPreset] = {
-    DEFAULT_PRESET: RegistrationPreset(max_error_px=12.0, min_inliers=30, min_inlier_ratio=0.05),
-    "config1": RegistrationPreset(max_error_px=12.0, min_inliers=30, min_inlier_ratio=0.25),
-    "config2": RegistrationPreset(max_error_px=20.0, min_inliers=4, min_inlier_ratio=0.05),
-}
-
-
-_PRESETS_VALUE, _MAPS_VALUE = "the preset's", "the map's"
-
-
-def _option(
-    default: Any,
-    description: str,
-    low: float | None = None,
-    high: float | None = None,
-    *,
-    unset: str | None = None,
-    details: str = "",
-    **more: Any,
-) -> Any:
-    """An option of ``LocalizeOptions``; the API's words and the clients are made from these.
-
-    Args:
-        default: its value when the caller leaves it out.
-        description: what it is, without its values.
-        low: least value, when it is a number.
-        high: greatest value.
-        unset: whose value is taken when the default is None.
-        details: sentences to add.
-        more: for ``dataclasses.field``.
-    """
-    metadata = {
-        "description": description,
-        "range": None if low is None else (low, high),
-        "default": unset or default,
-        "details": details,
-    }
-    return field(default=default, metadata=metadata, **more)
-
-
-@dataclass(frozen=True, slots=True)
-class LocalizeOptions:
-    """What a caller may choose per query; None takes the preset's or the map's value.
-
-    The default largest error is for photos of 640 px and more on the longer side, and shrinks
-    with smaller ones. Equal seeds give equal answers.
-    """
-
-    preset: str = _option(DEFAULT_PRESET, "the thresholds to start from")
-    top_k: int = _option(20, "mapping photos to match against", 1, 1000)
-    max_error_px: float | None = _option(
-        None, "largest reprojection error of an inlier, pixels", 0.1, 1000.0, unset=_PRESETS_VALUE
-    )
-    min_inliers: int | None = _option(
-        None, "fewest inliers of an accepted pose", 4, 1_000_000, unset=_PRESETS_VALUE
-    )
-    min_inlier_ratio: float | None = _option(
-        None,
-        "smallest share of inliers among the correspondences",
-        0.0,
-        1.0,
-        unset=_PRESETS_VALUE,
-    )
-    read_as: ReadAs = _option(
-        ReadAs.UPRIGHT,
-        "orientation in which features are found",
-        details="upright turns the photo by its EXIF orientation first. Camera, keypoints and "
-        "pose are those of the stored pixels either way. It has no meaning for features that are "
-        "sent.",
-    )
-    extraction: Extraction = _option(
-        Extraction.DEFAULT,
-        "effort that goes into finding the photo's features",
-        details="Features that are sent are taken as they are.",
-    )
-    fusion: Fusion | None = _option(
-        None,
-        "how similarities under several global descriptors become one ranking",
-        unset=_MAPS_VALUE,
-    )
-    fusion_weights: Mapping[str, float] | None = _option(
-        None,
-        "positive weight by global descriptor",
-        unset=_MAPS_VALUE,
-        details="Descriptors without a weight are left out.",
-        hash=False,  # a dict
-    )
-    matcher: Matcher = _option(Matcher.MUTUAL, "how keypoints are matched")
-    solver: Solver = _option(Solver.PYCOLMAP, "what searches for the pose")
-    seed: int = _option(0, "of RANSAC", 0, 2**31 - 1)
-
-    def __post_init__(self) -> None:
-        if self.preset not in PRESETS:
-            raise refuse(
-                "options.preset", field="options.preset", expected=PRESETS, got=self.preset
-            )
-        for option in fields(self):
-            value = getattr(self, option.name)
-            if value is None or option.metadata["range"] is None:
-                continue
-            low, high = option.metadata["range"]
-            if not low <= value <= high:  # NaN fails too
-                raise refuse(
-                    f"options.{option.name}",
-                    field=f"options.{option.name}",
-                    expected=f"{low} to {high}",
-                    got=value,
-                )
-        if self.fusion_weights is not None:
-            check_fusion_weights(self.fusion_weights, "options.fusion_weights")
-
-    @property
-    def registration(self) -> RegistrationPreset:
-        """The preset's thresholds, with those replaced that the caller named."""
-        preset = PRESETS[self.preset]
-        return RegistrationPreset(
-            preset.max_error_px if self.max_error_px is None else self.max_error_px,
-            preset.min_inliers if self.min_inliers is None else self.min_inliers,
-            preset.min_inlier_ratio if self.min_inlier_ratio is None else self.min_inlier_ratio,
-        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,7 +32,7 @@ from benchmarks.speed.served import ask_service
 from benchmarks.speed.steps import Steps, say
 from benchmarks.speed.tables import describe_machine, tables
 from visloc.archive import MapStore
-from visloc.types import Inference
+from visloc.options import Inference
 
 
 def main(

@@ -14,7 +14,7 @@ from mapping.build.build import build_map
 from mapping.build.settings import BuildSettings
 from mapping.methods.sfm_settings import SfmSettings
 from visloc.archive import open_map
-from visloc.types import Inference
+from visloc.options import Inference
 
 MAP_ID = "bench"
 # What is no part of "without extraction": looking for features, and describing whole photos.

@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.speed.building import landmark_seconds
 from benchmarks.speed.dataset import num_within
 from benchmarks.speed.queries import DEFAULT, TORCH
-from visloc.types import LocalizeOptions
+from visloc.options import LocalizeOptions
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from visloc.features import make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
-from visloc.types import Inference, LocalizeOptions
+from visloc.options import Inference, LocalizeOptions
 
 _SIZES = ((640, 480), (1024, 768), (1600, 1200))
 _REPEATS = 20

@@ -12,7 +12,7 @@ from benchmarks.speed.dataset import Bench, read_errors
 from benchmarks.speed.steps import say
 from mapping.maps.export_features import export_features
 from visloc.errors import Conflict
-from visloc.types import Inference
+from visloc.options import Inference
 
 # As builds of ours have it.
 _MAX_KEYPOINTS = 5000

@@ -17,7 +17,8 @@ from visloc.features import LocalFeatureExtractor, make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import Dataset, FileRecord, read_dataset
 from visloc.localization.localizer import Localizer
-from visloc.types import Extraction, Inference, Localized, LocalizeOptions
+from visloc.options import Extraction, Inference, LocalizeOptions
+from visloc.types import Localized
 
 _ALL_KEYPOINTS = 10**6
 

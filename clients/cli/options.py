@@ -23,8 +23,8 @@ from clients.evaluation.readers import Reader, choose_reader
 from clients.wire.types import LocalizeOptions
 from visloc.evaluation import DEFAULT_THRESHOLDS, Threshold
 from visloc.geometry import PixelOrigin
-from visloc.types import PRESETS
-from visloc.types import LocalizeOptions as KnownOptions
+from visloc.options import PRESETS
+from visloc.options import LocalizeOptions as KnownOptions
 from visloc_api.words.maps import MapInfo
 
 T = TypeVar("T")

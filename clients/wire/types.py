@@ -31,7 +31,7 @@ _EXPECTED = {
 class LocalizeOptions:
     """What may be chosen per photo; None leaves the choice to the server.
 
-    ``visloc.types.LocalizeOptions`` says what each is, and ``localize image --help`` lists them.
+    ``visloc.options.LocalizeOptions`` says what each is, and ``localize image --help`` lists them.
 
     Raises:
         InvalidInput: ``options.NAME`` for a value that cannot be sent.

@@ -45,7 +45,7 @@ from visloc.errors import refuse
 from visloc.features.backends.choice import choose_inference
 from visloc.features.local.readymade import is_ready_made
 from visloc.kapture import Dataset
-from visloc.types import Inference
+from visloc.options import Inference
 
 
 def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None = None) -> Path:

@@ -22,7 +22,7 @@ from mapping.stages.photos import MappingPhoto
 from visloc.errors import refuse
 from visloc.features.local.readymade import is_ready_made
 from visloc.kapture import Dataset
-from visloc.types import check_fusion_weights
+from visloc.options import check_fusion_weights
 
 # Shorter vectors are round-off, not a direction.
 _MIN_LENGTH = 1e-6

@@ -35,8 +35,8 @@ from mapping.options import (
 from visloc.errors import refuse
 from visloc.features import DEFAULT_GLOBAL_FEATURES, DEFAULT_LOCAL_FEATURES
 from visloc.geometry import PixelOrigin
+from visloc.options import Fusion, Inference
 from visloc.retrieval.fusion import LateFusion
-from visloc.types import Fusion, Inference
 
 _cluster_option = partial(typer.Option, rich_help_panel=CLUSTER_PANEL)
 

@@ -28,7 +28,7 @@ from visloc.archive import open_map
 from visloc.errors import refuse
 from visloc.features import DEFAULT_LOCAL_FEATURES
 from visloc.kapture import read_dataset
-from visloc.types import Inference
+from visloc.options import Inference
 
 
 def pairs(

@@ -19,9 +19,9 @@ from mapping.frames.anchor import MAX_SCALE_ERROR, align_poses
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose, Similarity
 from visloc.localization.gates import registration_for
+from visloc.options import LocalizeOptions
 from visloc.pose.colmap import project
 from visloc.pose.refinement import LOSS_SCALE_PX
-from visloc.types import LocalizeOptions
 
 MIN_PHOTOS = 3
 # Pairs of photos that propose a similarity.

@@ -16,8 +16,9 @@ from visloc.localization.constraints import MapGeometry
 from visloc.localization.solving import Look, Matches, SeenImage, Solved, solve_instant
 from visloc.matching.correspondences import Correspondences, match_landmarks
 from visloc.matching.products import EightBitRows
+from visloc.options import LocalizeOptions, ReadAs
 from visloc.priors import NO_PRIORS
-from visloc.types import CameraSource, Evidence, LocalizeOptions, ReadAs
+from visloc.types import CameraSource, Evidence
 
 
 def match_stored(

@@ -28,7 +28,7 @@ from visloc.kapture import (
     write_global_features,
     write_local_features,
 )
-from visloc.types import Inference, ReadAs
+from visloc.options import Inference, ReadAs
 
 
 def export_features(

@@ -12,7 +12,7 @@ from scipy.special import expit
 
 from mapping.report.sight import Sight
 from visloc.geometry import Camera, cross_matrix
-from visloc.types import DEFAULT_PRESET, PRESETS
+from visloc.options import DEFAULT_PRESET, PRESETS
 
 # A pose has six numbers, a match two.
 _FEWEST = 4.0

@@ -27,10 +27,10 @@ from visloc.geometry import Pose
 from visloc.localization.constraints import MapGeometry
 from visloc.localization.gates import registration_for
 from visloc.matching.correspondences import Correspondences
+from visloc.options import LocalizeOptions
 from visloc.pose.reprojection import reprojection_errors
 from visloc.pose.views import MatchedView
 from visloc.retrieval.index import retrieve
-from visloc.types import LocalizeOptions
 
 _REVISION = 1
 # Photos that are localized; of larger maps evenly many.

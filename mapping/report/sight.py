@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from mapping.report.places import Places
 from mapping.report.viewpoints import Viewpoints
 from visloc.geometry import Camera, Pose
+from visloc.options import LocalizeOptions
 from visloc.pose.colmap import normalized_rays, project
-from visloc.types import LocalizeOptions
 
 # As many as a query is matched with. Those nearest in pose stand for those most alike.
 _NUM_PHOTOS = LocalizeOptions().top_k

@@ -13,7 +13,7 @@ from visloc.features import (
     make_global_descriptor,
     make_local_features,
 )
-from visloc.types import Inference
+from visloc.options import Inference
 
 
 @dataclass(frozen=True, slots=True)

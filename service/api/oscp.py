@@ -18,7 +18,8 @@ from service.api.oscp_images import image_bytes
 from service.values import ImageJob, RigJob, photo_job
 from visloc.errors import inside, refuse
 from visloc.geometry import Camera, Pose
-from visloc.types import MAX_RADIUS_M, LocalizeOptions, Near, RigSensor
+from visloc.options import LocalizeOptions
+from visloc.types import MAX_RADIUS_M, Near, RigSensor
 from visloc_api.words.geopose import GeoPose
 from visloc_api.words.message import MAX_INSTANT_VALUES, check_json_values, refusal_of
 

@@ -10,8 +10,8 @@ from service.engine.gather import together
 from service.values import ImageJob, Localization, MapFolder, PackedLooks, Rig, RigJob
 from service.workers.pool import Workers
 from service.workers.tasks import Vision
+from visloc.options import LocalizeOptions
 from visloc.priors import Priors
-from visloc.types import LocalizeOptions
 
 
 async def localize_in(workers: Workers, job: RigJob, maps: tuple[MapFolder, ...]) -> Localization:

@@ -14,8 +14,8 @@ from service.engine.gather import together
 from service.values import MapFolder, PackedQuery, Query
 from service.workers.pool import Workers
 from service.workers.tasks import Vision
+from visloc.options import LocalizeOptions
 from visloc.sets.choosing import TileScore
-from visloc.types import LocalizeOptions
 
 T = TypeVar("T")
 

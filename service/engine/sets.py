@@ -35,10 +35,11 @@ from visloc.errors import (
     VislocError,
     refuse,
 )
+from visloc.options import LocalizeOptions
 from visloc.priors import Priors
 from visloc.sets.choosing import TileScore, allowed_tiles, is_clear, plan, tiles_near
 from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
-from visloc.types import LocalizeOptions, Near
+from visloc.types import Near
 
 # Errors of reaching a map, not of the map itself, have codes that begin so.
 _OF_A_MAP = ("map.", "maps.")

@@ -17,8 +17,9 @@ from visloc.geometry import Pose
 from visloc.localization.constraints import Constraints
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import Look, Matches, SeenImage
+from visloc.options import LocalizeOptions
 from visloc.priors import Priors
-from visloc.types import InstantAnswer, LocalizeOptions, QueryFeatures, Reason, Refusal, RigSensor
+from visloc.types import InstantAnswer, QueryFeatures, Reason, Refusal, RigSensor
 
 _MAX_LISTED = 500  # characters of names from outside
 # Errors of the request, not of one image, have codes that begin so.

@@ -18,10 +18,11 @@ from visloc.features.local.readymade import (
 from visloc.images import Photo
 from visloc.localization.feature_cache import find_features
 from visloc.localization.fingerprints import check_fingerprint
+from visloc.options import LocalizeOptions
 from visloc.sets.choosing import TileScore
 from visloc.sets.coarse import rank_tiles
 from visloc.timing import timed
-from visloc.types import LocalFeatures, LocalizeOptions
+from visloc.types import LocalFeatures
 
 # Keypoints with the most effort. Maps have as many by default; a tile that was built with more
 # searches the photo again.

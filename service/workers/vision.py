@@ -45,8 +45,8 @@ from visloc.images import ImageLimits, Photo
 from visloc.localization.constraints import MapGeometry
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import Look, SeenImage, Solved
+from visloc.options import LocalizeOptions
 from visloc.priors import Priors
-from visloc.types import LocalizeOptions
 
 logger = logging.getLogger(__name__)
 

@@ -16,7 +16,8 @@ from visloc.features import make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
-from visloc.types import Answer, Localized, LocalizeOptions
+from visloc.options import LocalizeOptions
+from visloc.types import Answer, Localized
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import SeenImage
-from visloc.types import LocalizeOptions
+from visloc.options import LocalizeOptions
 
 pytestmark = pytest.mark.slow  # building and looking take minutes
 

@@ -17,7 +17,8 @@ from visloc.features import make_local_features
 from visloc.images import Photo, read_photo_file
 from visloc.kapture import Dataset, read_dataset
 from visloc.localization.localizer import Localizer
-from visloc.types import Localized, LocalizeOptions, NotLocalized
+from visloc.options import LocalizeOptions
+from visloc.types import Localized, NotLocalized
 
 OPTIONS = LocalizeOptions()
 

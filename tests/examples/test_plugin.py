@@ -20,7 +20,7 @@ from service.values import MapFolder, WorkerSettings, photo_job
 from service.workers.vision import Vision
 from visloc.archive import MapStore
 from visloc.kapture import read_dataset
-from visloc.types import LocalizeOptions
+from visloc.options import (LocalizeOptions)
 
 maps_dir, queries = Path(sys.argv[1]), read_dataset(Path(sys.argv[2]))
 opened = MapStore(maps_dir).open("room")

@@ -26,7 +26,8 @@ from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset, write_dataset
 from visloc.localization.localizer import Localizer
-from visloc.types import Localized, LocalizeOptions
+from visloc.options import LocalizeOptions
+from visloc.types import Localized
 
 
 class _WalkQuery(Protocol):

@@ -13,15 +13,8 @@ from service.grpc.envelope import message_of
 from service.values import Localization, MatchPicture
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
-from visloc.types import (
-    CameraSource,
-    Evidence,
-    ImageAnswer,
-    InstantAnswer,
-    ReadAs,
-    Reason,
-    Refusal,
-)
+from visloc.options import ReadAs
+from visloc.types import CameraSource, Evidence, ImageAnswer, InstantAnswer, Reason, Refusal
 from visloc_api.v1 import localization_pb2 as pb2
 
 PHOTO = base64.b64encode(b"photo").decode()

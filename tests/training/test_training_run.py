@@ -25,7 +25,7 @@ from visloc.errors import InvalidInput
 from visloc.features.networks.r2d2.extractor import R2D2Extractor
 from visloc.features.networks.r2d2.load import load_faster2d2
 from visloc.images import read_photo_file
-from visloc.types import Inference
+from visloc.options import Inference
 
 CPU = torch.device("cpu")
 SMOKE = PRESETS["smoke"]

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visloc.geometry import Camera, Pose
+from visloc.options import ReadAs
 from visloc.pose.centre import position_covariance
 from visloc.types import (
     CameraSource,
@@ -16,7 +17,6 @@ from visloc.types import (
     ImageAnswer,
     InstantAnswer,
     PoseSource,
-    ReadAs,
     Reason,
     Refusal,
     RigPose,

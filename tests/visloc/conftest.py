@@ -89,7 +89,8 @@ class Place:
         from visloc.errors import InvalidInput
         from visloc.geometry import Pose
         from visloc.localization.solving import Look, Matches, SeenImage
-        from visloc.types import CameraSource, Evidence, ReadAs
+        from visloc.options import ReadAs
+        from visloc.types import CameraSource, Evidence
 
         sits = Pose.identity() if cam_from_rig is None else cam_from_rig
         if matches is None:

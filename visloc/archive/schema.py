@@ -18,8 +18,9 @@ from pydantic import (
 from pydantic.dataclasses import dataclass
 
 from visloc.errors import InvalidInput
+from visloc.options import Fusion, check_fusion_weights
 from visloc.retrieval.fusion import LateFusion
-from visloc.types import Fingerprint, Fusion, check_fusion_weights
+from visloc.types import Fingerprint
 
 FORMAT = "visloc-map"
 FORMAT_MAJOR, FORMAT_MINOR = 2, 2

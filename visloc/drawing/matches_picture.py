@@ -18,7 +18,8 @@ from visloc.archive.schema import MAX_PHOTO_BYTES, MAX_PHOTO_SIDE
 from visloc.errors import InvalidInput, refuse
 from visloc.images import ImageLimits, Photo, read_photo, turn_of, upright, upright_from_stored
 from visloc.localization.solving import Look
-from visloc.types import Answer, NotLocalized, ReadAs, Refusal, RigPose
+from visloc.options import ReadAs
+from visloc.types import Answer, NotLocalized, Refusal, RigPose
 
 Canvas = NDArray[np.uint8]
 # A pose with its uncertainty, or why there is none.

@@ -21,7 +21,7 @@ from visloc.features.plugins import (
     passed_over,
     plugin_names,
 )
-from visloc.types import Inference
+from visloc.options import Inference
 
 __all__ = [
     "DEFAULT_GLOBAL_FEATURES",

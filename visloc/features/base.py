@@ -8,7 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.types import Extraction, Fingerprint, LocalFeatures
+from visloc.options import Extraction
+from visloc.types import Fingerprint, LocalFeatures
 
 __all__ = ["Fingerprint", "GlobalDescriptor", "LocalFeatureExtractor"]
 

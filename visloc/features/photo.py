@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from visloc.features import LocalFeatureExtractor
 from visloc.images import Photo, stored_from_upright, turn_of, upright
-from visloc.types import Extraction, LocalFeatures, ReadAs
+from visloc.options import Extraction, ReadAs
+from visloc.types import LocalFeatures
 
 
 def extract_features(

@@ -14,7 +14,8 @@ from typing import Any
 
 from visloc.errors import VislocError, refuse
 from visloc.features.base import GlobalDescriptor, LocalFeatureExtractor
-from visloc.types import Fingerprint, Inference
+from visloc.options import Inference
+from visloc.types import Fingerprint
 
 LOCAL_FEATURES_GROUP = "visloc.local_features"
 GLOBAL_FEATURES_GROUP = "visloc.global_features"

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from visloc.features import LocalFeatureExtractor
 from visloc.features.photo import extract_features
 from visloc.images import Photo
-from visloc.types import Extraction, LocalFeatures, LocalizeOptions, ReadAs
+from visloc.options import Extraction, LocalizeOptions, ReadAs
+from visloc.types import LocalFeatures
 
 # Keypoints of a query that are used, strongest first. ACCURATE uses as many as the mapping images.
 _MOST_KEYPOINTS: Mapping[Extraction, int] = {Extraction.FAST: 1000, Extraction.DEFAULT: 2500}

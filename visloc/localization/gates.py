@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from visloc.geometry import Camera, Pose
 from visloc.localization.constraints import Constraints
+from visloc.options import DEFAULT_PRESET, LocalizeOptions, RegistrationPreset
 from visloc.pose.distance import mahalanobis2
 from visloc.pose.generalized import (
     GeneralizedPose,
@@ -22,13 +23,7 @@ from visloc.pose.generalized import (
     refine_generalized_pose,
 )
 from visloc.pose.views import MatchedView
-from visloc.types import (
-    DEFAULT_PRESET,
-    LocalizeOptions,
-    Reason,
-    Refusal,
-    RegistrationPreset,
-)
+from visloc.types import Reason, Refusal
 
 # The default max_error_px applies to photos whose longer side has at least this many pixels, and
 # shrinks with smaller ones: 12 px are so large a part of a photo of 256 px that wrong poses

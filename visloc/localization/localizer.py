@@ -40,6 +40,7 @@ from visloc.localization.solving import (
 )
 from visloc.matching.correspondences import CLEAR_RATIO, match_landmarks
 from visloc.matching.products import EightBitRows, round_descriptors, start_threads
+from visloc.options import LocalizeOptions, Matcher, ReadAs
 from visloc.priors import NO_PRIORS, Priors
 from visloc.retrieval.fusion import LateFusion, chosen_fusion
 from visloc.retrieval.index import Retrieved, retrieve
@@ -50,11 +51,8 @@ from visloc.types import (
     Evidence,
     LocalFeatures,
     Localized,
-    LocalizeOptions,
-    Matcher,
     NotLocalized,
     QueryFeatures,
-    ReadAs,
     Reason,
     Refusal,
     RetrievedImage,

@@ -13,7 +13,8 @@ from visloc.features.networks.lightglue.model import SeenKeypoints
 from visloc.geometry import Camera
 from visloc.images import turn_of, upright_from_stored
 from visloc.matching.correspondences import Pairs
-from visloc.types import Evidence, LocalFeatures, ReadAs
+from visloc.options import ReadAs
+from visloc.types import Evidence, LocalFeatures
 
 if TYPE_CHECKING:
     from visloc.features.networks.lightglue.torch import LightGlue

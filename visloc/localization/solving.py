@@ -12,6 +12,7 @@ from visloc.errors import VislocError, refuse
 from visloc.geometry import Camera, Pose
 from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.gates import Problem, accepted, not_better_elsewhere
+from visloc.options import LocalizeOptions, ReadAs, Solver
 from visloc.pose.centre import position_covariance, with_origin
 from visloc.pose.generalized import (
     GeneralizedPose,
@@ -24,13 +25,10 @@ from visloc.types import (
     Evidence,
     ImageAnswer,
     InstantAnswer,
-    LocalizeOptions,
     PoseSource,
-    ReadAs,
     Reason,
     Refusal,
     RigPose,
-    Solver,
 )
 
 # What becomes of a photo whose features were found on its side.

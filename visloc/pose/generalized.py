@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.geometry import Camera, Pose
+from visloc.options import Solver
 from visloc.pose.covariance import pose_covariance
 from visloc.pose.gravity import KnownGravity, find_upright_poses
 from visloc.pose.refinement import LOSS_SCALE_PX, RefinedPose, refine
@@ -24,7 +25,6 @@ from visloc.pose.search import (
     search_with_pycolmap,
 )
 from visloc.pose.views import MatchedView
-from visloc.types import Solver
 
 # Focal lengths in units of the longer side, from 136 degrees across to 6: all that photos are
 # taken with. What lies beyond explains wrong matches, in a spot or in a flat picture.

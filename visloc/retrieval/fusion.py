@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.errors import refuse
-from visloc.types import Fusion, LocalizeOptions
+from visloc.options import Fusion, LocalizeOptions
 
 FusionOperator = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 

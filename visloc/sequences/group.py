@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from visloc.geometry import Pose
+from visloc.options import RegistrationPreset
 from visloc.pose.generalized import estimate_generalized_pose
 from visloc.pose.motion import UncertainPose, chain
 from visloc.pose.views import MatchedView
-from visloc.types import RegistrationPreset
 
 # Instants belong to one camera while drift, at one standard deviation, shifts pixels by less than
 # the largest error of an inlier.

@@ -27,13 +27,14 @@ from visloc.localization.solving import (
     solve_instant,
     with_inliers,
 )
+from visloc.options import LocalizeOptions
 from visloc.pose.centre import with_origin
 from visloc.pose.motion import RelativeMotion, default_motion_covariance, link_from_motion
 from visloc.priors import Priors
 from visloc.sequences.filling import MAX_GAP_S, Odometry, TimeUnit, TracedPose, fill_sequence
 from visloc.sequences.window import WindowInstant, WindowPose, solve_window
 from visloc.timing import timed
-from visloc.types import InstantAnswer, LocalizeOptions, PoseSource, Reason, Refusal, RigPose
+from visloc.types import InstantAnswer, PoseSource, Reason, Refusal, RigPose
 
 # At most so many instants wait, and as many answered ones are remembered, however long the gap
 # may be: what is further away in a fast sequence adds little and costs time.

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.geometry import Pose
+from visloc.options import RegistrationPreset
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
 from visloc.pose.motion import (
     RelativeMotion,
@@ -29,7 +30,6 @@ from visloc.pose.views import MatchedView
 from visloc.sequences.agreement import agreeing_pieces
 from visloc.sequences.group import carried, find_groups
 from visloc.sequences.pose_graph import Chain, error_scale, solve_chain
-from visloc.types import RegistrationPreset
 
 # Fewer inliers under a pose that others gave are chance: blurred images have such, too.
 _MIN_OWN_INLIERS = 8

@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+import visloc.options
 import visloc.types
 from visloc.geometry import Camera, Pose
 from visloc.types import PoseSource
@@ -208,7 +209,7 @@ class Orientation(Answer):
     exif: Annotated[int, Field(description="1 to 8 as stored in the photo, 1 when absent")]
     read_as: Annotated[
         str,
-        OneOf(visloc.types.ReadAs),
+        OneOf(visloc.options.ReadAs),
         Field(
             description="upright: features were found in the photo turned by its EXIF orientation; "
             "stored: in the pixels as stored, or the features were sent"

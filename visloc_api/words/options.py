@@ -1,4 +1,4 @@
-"""What may be chosen per query, made from ``visloc.types.LocalizeOptions`` field by field."""
+"""What may be chosen per query, made from ``visloc.options.LocalizeOptions`` field by field."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_args, get_type_h
 
 from pydantic import Field, create_model
 
+import visloc.options
 import visloc.types
 from visloc.errors import refuse
 from visloc_api.words.message import IncomingMessage, converted
@@ -33,11 +34,11 @@ def _kind_of(hint: Any) -> type:
 
 # The class of each option: int, float, str, Mapping, or an enumeration of texts.
 KINDS: Mapping[str, type] = {
-    name: _kind_of(hint) for name, hint in get_type_hints(visloc.types.LocalizeOptions).items()
+    name: _kind_of(hint) for name, hint in get_type_hints(visloc.options.LocalizeOptions).items()
 }
 # The texts that an option may have, where they are listed.
 CHOICES: Mapping[str, tuple[str, ...]] = {
-    "preset": tuple(visloc.types.PRESETS),
+    "preset": tuple(visloc.options.PRESETS),
     **{
         name: tuple(word.value for word in kind)
         for name, kind in KINDS.items()
@@ -74,7 +75,7 @@ class OptionsMessage(IncomingMessage):
 
     path: ClassVar[str] = "options."
 
-    def to_core(self) -> visloc.types.LocalizeOptions:
+    def to_core(self) -> visloc.options.LocalizeOptions:
         """Return the options, checked."""
         given = self.model_dump(exclude_none=True)
         for name in given.keys() & _MESSAGES.keys():
@@ -87,12 +88,12 @@ class OptionsMessage(IncomingMessage):
                     got=given[name],
                 )
             given[name] = KINDS[name](given[name])
-        return visloc.types.LocalizeOptions(**given)
+        return visloc.options.LocalizeOptions(**given)
 
 
 def describe(name: str) -> str:
     """Tell callers what an option is: its values, its default, and what else there is to know."""
-    option = visloc.types.LocalizeOptions.__dataclass_fields__[name]
+    option = visloc.options.LocalizeOptions.__dataclass_fields__[name]
     facts = option.metadata
     text = facts["description"]
     if name in CHOICES:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.features import Fingerprint, LocalFeatureExtractor
-from visloc.types import Extraction, Inference, LocalFeatures
+from visloc.options import Extraction, Inference
+from visloc.types import LocalFeatures
 
 _BITS = 256
 _PATCH_PX = 31  # in the layer of OpenCV's pyramid that a keypoint was found in

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.features import Fingerprint, GlobalDescriptor, ImageDescriptor
-from visloc.types import Inference
+from visloc.options import Inference
 
 _SIDE_PX = 12
 

@@ -16,7 +16,7 @@ from visloc.archive import GlobalFeatures, Map
 from visloc.errors import VislocError, refuse
 from visloc.geometry import Pose
 from visloc.localization.constraints import MapGeometry
-from visloc.types import LocalizeOptions
+from visloc.options import LocalizeOptions
 
 # Photos of each map that are tried, evenly chosen: a tie needs no more.
 _MAX_TRIED = 100

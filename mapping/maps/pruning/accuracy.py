@@ -23,8 +23,9 @@ from visloc.kapture import read_dataset
 from visloc.localization.constraints import MapGeometry
 from visloc.localization.feature_cache import FeatureCache
 from visloc.localization.localizer import Localizer
+from visloc.options import LocalizeOptions
 from visloc.retrieval.index import retrieve
-from visloc.types import Localized, LocalizeOptions
+from visloc.types import Localized
 
 # As in docs/results.md.
 BINS = (Threshold(0.05, 5.0), Threshold(0.25, 2.0), Threshold(0.5, 5.0))

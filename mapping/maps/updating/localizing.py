@@ -21,7 +21,8 @@ from visloc import __version__
 from visloc.archive import Map, open_map
 from visloc.geometry import Pose
 from visloc.localization.localizer import Localizer
-from visloc.types import Localized, LocalizeOptions, QueryFeatures
+from visloc.options import LocalizeOptions
+from visloc.types import Localized, QueryFeatures
 
 # Raised when the code of the stage changes what comes out.
 _REVISION = 1

@@ -29,9 +29,9 @@ from visloc.errors import VislocError, refuse
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose, Similarity
 from visloc.localization.gates import registration_for
+from visloc.options import LocalizeOptions
 from visloc.pose.reprojection import reprojection_errors
 from visloc.pose.views import MatchedView
-from visloc.types import LocalizeOptions
 
 T = TypeVar("T")
 Lift = Callable[[MappingPhoto, NDArray[np.float64]], tuple[NDArray[np.int64], NDArray[np.float64]]]

@@ -26,7 +26,7 @@ from visloc.archive import Map
 from visloc.archive.schema import ID_PATTERN
 from visloc.errors import refuse
 from visloc.geometry import PixelOrigin
-from visloc.types import Inference
+from visloc.options import Inference
 
 POSES = ("tie", "given", "localize")
 METHODS = ("rgbd", "sfm")

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from clients.cli.main import app
 from clients.cli.options import Connection, Photos, QueryOptions, spread
 from clients.wire.types import LocalizeOptions
-from visloc.types import LocalizeOptions as KnownOptions
-from visloc.types import Matcher, Solver
+from visloc.options import LocalizeOptions as KnownOptions
+from visloc.options import Matcher, Solver
 
 
 @dataclass(frozen=True, kw_only=True)

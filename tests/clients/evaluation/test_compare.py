@@ -23,8 +23,8 @@ from clients.evaluation.compare import DEFAULT_VALUES, Axis, make_variants, pars
 from clients.wire.answers import LocalizeResult
 from clients.wire.types import LocalizeOptions
 from visloc.errors import InvalidInput, Unavailable
-from visloc.types import Extraction, Fusion, Matcher, Solver
-from visloc.types import LocalizeOptions as CoreOptions
+from visloc.options import Extraction, Fusion, Matcher, Solver
+from visloc.options import LocalizeOptions as CoreOptions
 from visloc_api.words.maps import MapInfo
 
 Dataset = Callable[..., Path]

@@ -41,7 +41,8 @@ from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
-from visloc.types import Inference, Localized, LocalizeOptions
+from visloc.options import Inference, LocalizeOptions
+from visloc.types import Localized
 
 Damage = Callable[[Path], None]
 

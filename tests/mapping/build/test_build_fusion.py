@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 from mapping.cli.main import app
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput
+from visloc.options import Fusion
 from visloc.retrieval.fusion import LateFusion
-from visloc.types import Fusion
 
 
 def build(sample: Path, maps_dir: Path, *options: str) -> object:

@@ -25,7 +25,8 @@ from visloc.kapture import (
     write_local_features,
 )
 from visloc.localization.localizer import Localizer
-from visloc.types import LocalFeatures, Localized, LocalizeOptions, QueryFeatures
+from visloc.options import LocalizeOptions
+from visloc.types import LocalFeatures, Localized, QueryFeatures
 
 Build = Callable[..., Map]
 Rewrite = Callable[..., None]

@@ -16,7 +16,8 @@ from visloc.evaluation import pose_error
 from visloc.geometry import Camera, PixelOrigin, Pose
 from visloc.kapture import open_features, open_local_features, read_dataset, read_local
 from visloc.localization.localizer import Localizer
-from visloc.types import Fusion, Localized, LocalizeOptions, QueryFeatures
+from visloc.options import Fusion, LocalizeOptions
+from visloc.types import Localized, QueryFeatures
 
 APGEM = "kapture:AP-GeM-LM18"
 Asked = list[tuple[QueryFeatures, Camera, Pose]]

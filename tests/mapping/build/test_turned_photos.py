@@ -35,7 +35,8 @@ from visloc.geometry import Camera, PixelOrigin, Pose
 from visloc.images import read_photo, read_photo_file, turn_of
 from visloc.kapture import open_local_features, read_dataset, read_local
 from visloc.localization.localizer import Localizer
-from visloc.types import Inference, Localized, LocalizeOptions, ReadAs
+from visloc.options import Inference, LocalizeOptions, ReadAs
+from visloc.types import Localized
 
 SIZE = (256, 192)
 

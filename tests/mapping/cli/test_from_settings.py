@@ -22,7 +22,7 @@ from mapping.methods.sfm_settings import SfmSettings
 from mapping.options import Names, OnCommandLine
 from mapping.pairing import PairSettings
 from visloc.geometry import PixelOrigin
-from visloc.types import Fusion, Inference
+from visloc.options import Fusion, Inference
 
 
 def read_by(command: Any, *arguments: str) -> Any:

@@ -14,7 +14,7 @@ from visloc.errors import Conflict
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
-from visloc.types import Inference
+from visloc.options import Inference
 
 SIFT_DIM = 128
 

@@ -36,11 +36,12 @@ from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.judge import TIE_REACH_SHARE, Candidate, Tie, judge
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import SeenImage
+from visloc.options import LocalizeOptions
 from visloc.priors import NO_PRIORS, HeightBand, PositionPrior, Priors
 from visloc.sets.choosing import allowed_tiles, plan
 from visloc.sets.coarse import rank_tiles
 from visloc.sets.frame import answer_in_set, priors_in_tile
-from visloc.types import LocalizeOptions, Reason, Refusal
+from visloc.types import Reason, Refusal
 
 TURN = Pose.from_quaternion([0.8, 0.1, -0.5, 0.3], [0, 0, 0]).rotation
 ELSEWHERE = Similarity(1.0, TURN, np.array([300.0, -40.0, 7.0]))

@@ -15,8 +15,9 @@ from mapping.stages.photos import MappingPhoto
 from mapping.stages.work_folder import WorkFolder
 from visloc.geometry import Camera, Pose
 from visloc.kapture import FileRecord
+from visloc.options import Inference
 from visloc.pose.colmap import project
-from visloc.types import Fingerprint, Inference, LocalFeatures
+from visloc.types import Fingerprint, LocalFeatures
 
 CAMERA = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
 POINTS = np.random.default_rng(0).uniform([-2, -1.5, 4], [2, 1.5, 8], (60, 3))

@@ -12,7 +12,7 @@ from mapping.report.sight import Sight
 from mapping.report.viewpoints import Viewpoints
 from mapping.stages.work_folder import WorkFolder
 from visloc.geometry import Camera
-from visloc.types import LocalizeOptions
+from visloc.options import LocalizeOptions
 
 CAMERA = Camera("PINHOLE", 320, 240, (220.0, 220.0, 160.0, 120.0))
 

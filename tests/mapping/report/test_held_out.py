@@ -16,7 +16,7 @@ from mapping.report.held_out import (
 )
 from mapping.report.viewpoints import Viewpoints
 from mapping.stages.work_folder import WorkFolder
-from visloc.types import LocalizeOptions
+from visloc.options import LocalizeOptions
 
 
 def quiet(*_):

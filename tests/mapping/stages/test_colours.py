@@ -28,7 +28,7 @@ from visloc.errors import DatasetError
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import FileRecord, read_dataset
-from visloc.types import Inference
+from visloc.options import Inference
 
 Build = Callable[..., Map]
 RED, GREEN, BLUE, GREY = (250, 10, 20), (0, 200, 100), (30, 40, 255), (77, 77, 77)

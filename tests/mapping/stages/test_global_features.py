@@ -25,7 +25,8 @@ from visloc.errors import Unavailable
 from visloc.features import GLOBAL_FEATURES, ImageDescriptor
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
-from visloc.types import Fingerprint, Inference
+from visloc.options import Inference
+from visloc.types import Fingerprint
 
 WEIGHTS = Path("weights")
 

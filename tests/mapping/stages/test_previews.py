@@ -24,7 +24,7 @@ from visloc.errors import MapCorrupt
 from visloc.geometry import Camera
 from visloc.images import read_photo, read_photo_file
 from visloc.kapture import FileRecord
-from visloc.types import Inference
+from visloc.options import Inference
 
 NO_NETWORKS = Networks(None, Inference.AUTO)
 NO_FEATURES = cast("ExtractedFeatures", None)  # pictures need none

@@ -22,19 +22,18 @@ from service.settings import ServiceSettings
 from service.values import ONLY_SENSOR, Localization, RigJob
 from visloc.errors import InvalidInput, TooLarge
 from visloc.geometry import Camera, Pose
+from visloc.options import Fusion, ReadAs
+from visloc.options import LocalizeOptions as CoreOptions
 from visloc.sequences.filling import TimeUnit
 from visloc.types import (
     CameraSource,
     Evidence,
-    Fusion,
     ImageAnswer,
     InstantAnswer,
-    ReadAs,
     Reason,
     Refusal,
     RetrievedImage,
 )
-from visloc.types import LocalizeOptions as CoreOptions
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.words.message import MAX_INSTANT_VALUES, IncomingMessage
 

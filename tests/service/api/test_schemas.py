@@ -16,9 +16,9 @@ import service.api
 import visloc_api.words
 from service.api import LocalizeOptions, LocalizeRequest
 from visloc.errors import InvalidInput, TooLarge
+from visloc.options import Extraction, Fusion, Matcher, ReadAs, Solver
+from visloc.options import LocalizeOptions as CoreOptions
 from visloc.priors import NO_PRIORS, HeightBand
-from visloc.types import Extraction, Fusion, Matcher, ReadAs, Solver
-from visloc.types import LocalizeOptions as CoreOptions
 from visloc_api.v1 import localization_pb2 as pb2
 
 CAMERA = {"model": "PINHOLE", "width": 640, "height": 480, "params": [525, 525.5, 320, 240]}

@@ -43,9 +43,10 @@ from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
 from visloc.images import ImageLimits
 from visloc.kapture import read_dataset
+from visloc.options import LocalizeOptions
 from visloc.priors import NO_PRIORS, GravityPrior, PositionPrior, Priors
 from visloc.sequences.filling import Odometry, TimeUnit
-from visloc.types import LocalizeOptions, PoseSource, Reason, RigSensor
+from visloc.types import PoseSource, Reason, RigSensor
 
 T = TypeVar("T")
 

@@ -16,13 +16,13 @@ from service.telemetry.tracing import RequestSpan, parse_traceparent
 from service.values import Localization
 from visloc.errors import InvalidInput, VislocError
 from visloc.geometry import Camera, Pose
+from visloc.options import ReadAs
 from visloc.types import (
     CameraSource,
     Evidence,
     ImageAnswer,
     InstantAnswer,
     PoseSource,
-    ReadAs,
     Reason,
     Refusal,
     RigPose,

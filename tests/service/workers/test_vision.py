@@ -26,8 +26,9 @@ from service.workers.vision import Abandoned, Vision
 from visloc.archive import MapStore
 from visloc.errors import Conflict, InvalidInput, WeightsError
 from visloc.features import GlobalDescriptor, make_global_descriptor
+from visloc.options import Inference, LocalizeOptions, Matcher, Solver
 from visloc.priors import NO_PRIORS
-from visloc.types import Inference, LocalizeOptions, Matcher, QueryFeatures, Solver
+from visloc.types import QueryFeatures
 
 WEIGHTS = Path("weights")
 SETTINGS = WorkerSettings(WEIGHTS, 1, 10**9, 8, 8, 10**8, 10**8, Inference.FP32)

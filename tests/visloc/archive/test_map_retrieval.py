@@ -13,8 +13,8 @@ import pytest
 import tests.fuzz.tiny_map as tiny
 from visloc.archive import MapContent, open_map, verify_map, write_map
 from visloc.errors import MapCorrupt
+from visloc.options import Fusion
 from visloc.retrieval.fusion import EQUAL_GHARM, LateFusion
-from visloc.types import Fusion
 
 
 @pytest.fixture

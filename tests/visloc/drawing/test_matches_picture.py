@@ -17,16 +17,8 @@ from visloc.geometry import Camera
 from visloc.images import Photo, read_photo
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import Look, Matches
-from visloc.types import (
-    CameraSource,
-    Evidence,
-    Localized,
-    LocalizeOptions,
-    NotLocalized,
-    ReadAs,
-    Reason,
-    RetrievedImage,
-)
+from visloc.options import LocalizeOptions, ReadAs
+from visloc.types import CameraSource, Evidence, Localized, NotLocalized, Reason, RetrievedImage
 
 OPTIONS = LocalizeOptions()
 CAMERA = Camera("PINHOLE", 256, 192, (200.0, 200.0, 128.0, 96.0))

@@ -8,7 +8,7 @@ import pytest
 
 from visloc.errors import InvalidInput
 from visloc.features.backends.choice import choose_inference
-from visloc.types import Inference
+from visloc.options import Inference
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -14,7 +14,7 @@ from visloc.features import (
     make_local_features,
 )
 from visloc.features.local.sift import SiftExtractor
-from visloc.types import Inference
+from visloc.options import Inference
 
 Install = Callable[..., None]
 SOURCE = """

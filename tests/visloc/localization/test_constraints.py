@@ -17,6 +17,7 @@ from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose, covariance_from_center
 from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.localizer import Localizer
+from visloc.options import LocalizeOptions
 from visloc.pose.colmap import normalized_rays, project
 from visloc.pose.views import MatchedView
 from visloc.priors import (
@@ -29,7 +30,7 @@ from visloc.priors import (
     check_covariance,
 )
 from visloc.retrieval.rows import GlobalRows
-from visloc.types import Answer, Localized, LocalizeOptions, NotLocalized, QueryFeatures, Reason
+from visloc.types import Answer, Localized, NotLocalized, QueryFeatures, Reason
 
 TURNED = Pose(Rotation.from_rotvec([0.3, -1.2, 0.4]).as_matrix(), np.array([1.0, -2.0, 0.5]))
 

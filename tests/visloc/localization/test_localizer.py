@@ -25,16 +25,15 @@ from visloc.images import Photo, read_photo
 from visloc.localization.localizer import Localizer
 from visloc.localization.query_camera import resolve_camera
 from visloc.localization.query_features import max_sent_keypoints
+from visloc.options import LocalizeOptions, ReadAs
 from visloc.types import (
     Answer,
     CameraSource,
     Fingerprint,
     LocalFeatures,
     Localized,
-    LocalizeOptions,
     NotLocalized,
     QueryFeatures,
-    ReadAs,
     Reason,
 )
 

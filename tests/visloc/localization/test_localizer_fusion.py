@@ -18,17 +18,9 @@ from visloc.features import GlobalDescriptor, make_global_descriptor, make_local
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo, read_photo
 from visloc.localization.localizer import Localizer
+from visloc.options import Fusion, LocalizeOptions
 from visloc.priors import PositionPrior, Priors
-from visloc.types import (
-    Answer,
-    Fusion,
-    LocalFeatures,
-    Localized,
-    LocalizeOptions,
-    QueryFeatures,
-    Reason,
-    RetrievedImage,
-)
+from visloc.types import Answer, LocalFeatures, Localized, QueryFeatures, Reason, RetrievedImage
 
 LOCALVLAD = {"localvlad": 1.0}
 

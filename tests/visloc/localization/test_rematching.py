@@ -18,7 +18,8 @@ from visloc.images import Photo, read_photo
 from visloc.localization.localizer import Localizer
 from visloc.matching.correspondences import NUM_REMATCHED, mutual_nearest_neighbours
 from visloc.matching.products import round_descriptors
-from visloc.types import Localized, LocalizeOptions, Matcher
+from visloc.options import LocalizeOptions, Matcher
+from visloc.types import Localized
 
 LIGHTGLUE = LocalizeOptions(matcher=Matcher.LIGHTGLUE)
 

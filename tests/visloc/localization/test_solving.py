@@ -12,6 +12,7 @@ from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose, center_covariance
 from visloc.localization.gates import registration_for
 from visloc.localization.solving import Matches, Solved, solve_instant
+from visloc.options import LocalizeOptions
 from visloc.pose.centre import with_origin
 from visloc.pose.colmap import normalized_rays
 from visloc.priors import (
@@ -22,7 +23,7 @@ from visloc.priors import (
     PositionPrior,
     Priors,
 )
-from visloc.types import LocalizeOptions, PoseSource, Reason, Refusal
+from visloc.types import PoseSource, Reason, Refusal
 
 OPTIONS = LocalizeOptions()
 TRUTH = Pose(Rotation.from_rotvec([0.3, -1.2, 0.4]).as_matrix(), np.array([1.0, -2.0, 0.5]))

@@ -12,6 +12,7 @@ from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
 from visloc.geometry import CAMERA_MODELS, Camera, Pose, center_covariance
 from visloc.localization.solving import SeenImage, Solved, solve_instant
+from visloc.options import LocalizeOptions, Solver
 from visloc.pose.colmap import normalized_rays
 from visloc.pose.generalized import (
     SOLVERS,
@@ -21,7 +22,7 @@ from visloc.pose.generalized import (
 )
 from visloc.pose.views import MatchedView
 from visloc.priors import GravityPrior, Priors
-from visloc.types import CameraSource, LocalizeOptions, Reason, Solver
+from visloc.types import CameraSource, Reason
 
 CAMERA = Camera("PINHOLE", 640, 480, (500.0, 510.0, 322.0, 239.0))
 GUESS = Camera("SIMPLE_PINHOLE", 640, 480, (768.0, 320.0, 240.0))

@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 import visloc.retrieval.index as retrieval
+from visloc.options import Fusion
 from visloc.retrieval.fusion import LateFusion
 from visloc.retrieval.index import retrieve
 from visloc.retrieval.rows import GlobalRows
 from visloc.retrieval.shortlist import make_clusters
-from visloc.types import Fusion
 
 EVERY = pytest.mark.parametrize("fusion", Fusion)
 NUM, DIM = 400, 16

@@ -10,6 +10,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from visloc.errors import InvalidInput
+from visloc.options import Fusion, LocalizeOptions
 from visloc.retrieval.fusion import (
     EQUAL_GHARM,
     FUSION_OPERATORS,
@@ -18,7 +19,6 @@ from visloc.retrieval.fusion import (
     equal_weights,
     gharm,
 )
-from visloc.types import Fusion, LocalizeOptions
 
 Floats = NDArray[np.float64]
 FEW = settings(max_examples=30, deadline=None, derandomize=True)

@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
 from visloc.localization.solving import solve_instant
+from visloc.options import DEFAULT_PRESET, PRESETS, LocalizeOptions
 from visloc.pose.colmap import normalized_rays
 from visloc.pose.generalized import estimate_generalized_pose
 from visloc.pose.motion import UncertainPose
 from visloc.pose.views import MatchedView
 from visloc.priors import NO_PRIORS, PosePrior, Priors
 from visloc.sequences.group import find_groups
-from visloc.types import DEFAULT_PRESET, PRESETS, LocalizeOptions
 
 TRUTH = Pose(Rotation.from_rotvec([0.3, -1.2, 0.4]).as_matrix(), np.array([1.0, -2.0, 0.5]))
 RIG = [

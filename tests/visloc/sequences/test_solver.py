@@ -13,11 +13,12 @@ from scipy.spatial.transform import Rotation
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose, center_covariance
 from visloc.localization.solving import Matches, SeenImage, solve_instant
+from visloc.options import LocalizeOptions
 from visloc.priors import NO_PRIORS, HeightBand, PositionPrior, Priors
 from visloc.sequences import solver as sequence_module
 from visloc.sequences.filling import MAX_GAP_S, Odometry, TimeUnit
 from visloc.sequences.solver import MAX_WAITING, SeenInstant, SequenceSolver
-from visloc.types import CameraSource, InstantAnswer, LocalizeOptions, PoseSource, Reason
+from visloc.types import CameraSource, InstantAnswer, PoseSource, Reason
 
 OPTIONS = LocalizeOptions()
 ODOMETRY_FROM_LOCAL = Pose(

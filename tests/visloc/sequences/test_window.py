@@ -15,6 +15,7 @@ from scipy.stats import chi2
 
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
+from visloc.options import PRESETS, RegistrationPreset
 from visloc.pose.colmap import project
 from visloc.pose.covariance import pose_covariance
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
@@ -22,7 +23,6 @@ from visloc.pose.motion import RelativeMotion, default_motion_covariance
 from visloc.pose.refinement import LOSS_SCALE_PX
 from visloc.pose.views import MatchedView
 from visloc.sequences.window import WindowInstant, WindowPose, solve_window
-from visloc.types import PRESETS, RegistrationPreset
 
 GATE = PRESETS["default"]
 CAMERA = Camera("PINHOLE", 1240, 376, (700.0, 700.0, 620.0, 188.0))

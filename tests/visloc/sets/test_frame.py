@@ -11,19 +11,12 @@ from scipy.spatial.transform import Rotation
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose, Similarity
 from visloc.localization.constraints import Constraints
+from visloc.options import ReadAs
 from visloc.pose.centre import moved_pose, position_covariance
 from visloc.pose.distance import mahalanobis2
 from visloc.priors import NO_PRIORS, GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
 from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
-from visloc.types import (
-    CameraSource,
-    Evidence,
-    ImageAnswer,
-    InstantAnswer,
-    PoseSource,
-    ReadAs,
-    RigPose,
-)
+from visloc.types import CameraSource, Evidence, ImageAnswer, InstantAnswer, PoseSource, RigPose
 
 RANDOM = np.random.default_rng(0)
 SET_FROM_TILE = Similarity(

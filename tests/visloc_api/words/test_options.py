@@ -5,7 +5,7 @@ from dataclasses import fields
 import pytest
 
 import clients
-from visloc.types import LocalizeOptions, Solver
+from visloc.options import LocalizeOptions, Solver
 from visloc_api.words import options
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from visloc.errors import refuse
 from visloc.features.backends.openvino import import_openvino
-from visloc.types import Inference
+from visloc.options import Inference
 
 _LOGGER = logging.getLogger(__name__)
 _CPU_INFO = Path("/proc/cpuinfo")

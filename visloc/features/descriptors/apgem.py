@@ -35,7 +35,7 @@ from visloc.features.networks.resnet import FEATURES, TORCHVISION, ResNet, expec
 from visloc.features.weights.checkpoint import Checkpoint
 from visloc.features.weights.files import PublishedWeights, check_shapes, read_weights
 from visloc.features.weights.pickled_pca import PrincipalComponents, principal_components
-from visloc.types import Inference
+from visloc.options import Inference
 
 DEPTH = 101
 # The authors describe photos as large as they are; their time grows with the pixels, and 1024 is

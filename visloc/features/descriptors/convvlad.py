@@ -22,7 +22,8 @@ from visloc.features.networks.efficientnet.model import (
     network_input,
     read_efficientnet_lite0,
 )
-from visloc.types import Inference, LocalFeatures
+from visloc.options import Inference
+from visloc.types import LocalFeatures
 
 # The stem and all blocks before the last halving of the resolution: 112 channels.
 NUM_BLOCKS = 12

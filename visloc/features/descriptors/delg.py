@@ -37,7 +37,7 @@ from visloc.features.descriptors.whitening import unit_rows
 from visloc.features.networks.resnet import FEATURES, Layout, ResNet, depth_of, expected_shapes
 from visloc.features.weights.checkpoint import Checkpoint
 from visloc.features.weights.files import PublishedWeights, check_shapes, read_weights
-from visloc.types import Inference
+from visloc.options import Inference
 
 SCALES = (1 / sqrt(2), 1.0, sqrt(2))
 MAX_LONG_SIDE_PX = 1024  # at scale 1, as the authors' configuration has it

@@ -23,7 +23,7 @@ from visloc.features.networks.efficientnet.model import (
     network_input,
     read_efficientnet_lite0,
 )
-from visloc.types import Inference
+from visloc.options import Inference
 
 EXPONENT = 3.0  # with which the paper's networks start, and end near
 

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from visloc.features.base import Fingerprint, GlobalDescriptor
 from visloc.features.descriptors.vlad import VLAD_PARAMETERS, VladDescriptor
-from visloc.types import Inference, LocalFeatures
+from visloc.options import Inference
+from visloc.types import LocalFeatures
 
 
 def load_localvlad(

@@ -36,7 +36,7 @@ from visloc.features.descriptors.network_descriptor import (
 from visloc.features.descriptors.whitening import unit_rows
 from visloc.features.weights.checkpoint import Checkpoint
 from visloc.features.weights.files import PublishedWeights, check_shapes, read_weights
-from visloc.types import Inference
+from visloc.options import Inference
 
 CLUSTERS = 64
 # Widths of the 3 x 3 convolutions, up to each halving of the resolution.

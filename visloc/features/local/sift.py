@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.features.base import Fingerprint, LocalFeatureExtractor
-from visloc.types import Extraction, Inference, LocalFeatures
+from visloc.options import Extraction, Inference
+from visloc.types import LocalFeatures
 
 DESCRIPTOR_DIM = 128
 MAX_LONG_SIDE_PX = 1600

@@ -13,7 +13,7 @@ from visloc.errors import InvalidInput
 from visloc.features import make_local_features
 from visloc.features.backends import choice as inference
 from visloc.features.backends.choice import choose_inference
-from visloc.types import Inference
+from visloc.options import Inference
 
 ROOT = Path(__file__).resolve().parents[4]
 NOT_INSTALLED = ModuleNotFoundError("No module named 'openvino'", name="openvino")

@@ -29,7 +29,8 @@ from visloc.features.networks.efficientnet.model import (
 from visloc.features.networks.efficientnet.openvino import OpenVinoNetwork
 from visloc.features.networks.efficientnet.torch import TorchNetwork
 from visloc.features.weights.checkpoint import Checkpoint
-from visloc.types import Inference, LocalFeatures
+from visloc.options import Inference
+from visloc.types import LocalFeatures
 
 FILE = "efficientnet-lite0-57934424.pth"
 NO_FEATURES = LocalFeatures(

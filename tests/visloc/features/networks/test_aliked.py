@@ -35,7 +35,7 @@ from visloc.features.networks.aliked.model import (
 )
 from visloc.features.networks.aliked.torch import TorchNetwork
 from visloc.features.weights.checkpoint import read_checkpoint
-from visloc.types import Inference
+from visloc.options import Inference
 
 ARCHITECTURES = {"aliked": N16, "aliked-t16": T16}
 LOADERS = {"aliked": load_aliked, "aliked-t16": load_aliked_t16}

@@ -36,7 +36,8 @@ from visloc.features.networks.r2d2.openvino import OpenVinoNetwork, make_openvin
 from visloc.features.networks.r2d2.torch import TorchNetwork
 from visloc.features.weights import files as weights
 from visloc.features.weights.checkpoint import read_checkpoint
-from visloc.types import Extraction, Inference, LocalFeatures
+from visloc.options import Extraction, Inference
+from visloc.types import LocalFeatures
 
 # The published networks, written down a second time: number of the convolution in the state
 # dict, kernel, dilation, outputs as a multiple of the first layer's, batch norm, ReLU.

@@ -27,7 +27,7 @@ from visloc.features.networks.xfeat.extractor import (
 from visloc.features.networks.xfeat.load import load_xfeat
 from visloc.features.networks.xfeat.model import read_network
 from visloc.features.weights.checkpoint import read_checkpoint
-from visloc.types import Inference
+from visloc.options import Inference
 
 SHA256 = "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b"
 

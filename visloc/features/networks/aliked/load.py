@@ -8,7 +8,7 @@ from visloc.features.base import LocalFeatureExtractor
 from visloc.features.networks.aliked.extractor import AlikedExtractor
 from visloc.features.networks.aliked.model import N16, T16, Architecture, read_network
 from visloc.features.networks.aliked.torch import TorchNetwork
-from visloc.types import Inference
+from visloc.options import Inference
 
 
 def load_aliked(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from visloc.features.backends.choice import choose_inference
 from visloc.features.networks.efficientnet.model import Block
-from visloc.types import Inference
+from visloc.options import Inference
 
 
 class Network(Protocol):

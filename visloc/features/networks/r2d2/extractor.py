@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from visloc.features.base import Fingerprint
 from visloc.features.local.subpixel import peak_offsets
 from visloc.features.networks.r2d2.model import DESCRIPTOR_DIM
-from visloc.types import Extraction, LocalFeatures
+from visloc.options import Extraction
+from visloc.types import LocalFeatures
 
 SCALE_STEP = 2**0.25
 MAX_LONG_SIDE_PX = 1024

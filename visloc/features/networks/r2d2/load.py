@@ -8,7 +8,7 @@ from visloc.features.backends.choice import choose_inference
 from visloc.features.base import LocalFeatureExtractor
 from visloc.features.networks.r2d2.extractor import Network, R2D2Extractor
 from visloc.features.networks.r2d2.model import FAST_R2D2, R2D2, Architecture, read_network
-from visloc.types import Inference
+from visloc.options import Inference
 
 
 def load_r2d2(

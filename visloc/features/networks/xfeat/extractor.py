@@ -15,7 +15,8 @@ from scipy.sparse import csr_array
 from visloc.features.base import Fingerprint
 from visloc.features.local.subpixel import peak_offsets
 from visloc.features.networks.xfeat.model import CELL_PX
-from visloc.types import Extraction, LocalFeatures
+from visloc.options import Extraction
+from visloc.types import LocalFeatures
 
 DESCRIPTOR_DIM = 64
 MAX_LONG_SIDE_PX = 1280

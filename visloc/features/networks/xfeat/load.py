@@ -8,7 +8,7 @@ from visloc.features.backends.choice import choose_inference
 from visloc.features.base import LocalFeatureExtractor
 from visloc.features.networks.xfeat.extractor import Network, XFeatExtractor
 from visloc.features.networks.xfeat.model import read_network
-from visloc.types import Inference
+from visloc.options import Inference
 
 
 def load_xfeat(
