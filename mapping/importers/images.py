@@ -86,12 +86,11 @@ class _Files:
 def read(
     path: Path, photos: Path | None = None, progress: Callable[[int, int], None] | None = None
 ) -> ImportedModel:
-    """Read a folder of photos, with the folders in it.
+    """Read a folder of photos and its subfolders.
 
-    Links that lead out of the folder, and linked folders, are not followed. A camera is what has
-    the same maker, model, focal length and size: SIMPLE_RADIAL without distortion if EXIF tells
-    the focal length, else of unknown intrinsics. Every file that is not used is in the model's
-    ``left_out``, with the reason.
+    Linked folders, and links out of the folder, are not followed. Photos of the same maker, model,
+    focal length and size share a camera: SIMPLE_RADIAL if EXIF gives the focal length, else of
+    unknown intrinsics. ``left_out`` of the model lists unused files with the reason.
 
     Raises:
         InvalidInput: ``import.photos`` if ``photos`` is given; ``import.folder`` for a file.
@@ -103,7 +102,6 @@ def read(
             "import.photos",
             "a folder of photos does not take a second folder of photos",
             field="--photos",
-            expected="only PATH",
             got=str(photos),
         )
     if path.is_file():
