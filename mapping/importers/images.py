@@ -102,6 +102,7 @@ def read(
             "import.photos",
             "a folder of photos does not take a second folder of photos",
             field="--photos",
+            expected="only PATH",
             got=str(photos),
         )
     if path.is_file():
