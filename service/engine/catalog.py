@@ -248,7 +248,9 @@ class Catalog:
         self._drop_if_idle(ref)
 
     def _drop_if_idle(self, ref: str) -> None:
-        version = self._versions[ref]
+        version = self._versions.get(ref)  # two requests may delete the same version
+        if version is None:
+            return
         if version.folder is None and not version.users and not version.is_leaving:
             del self._versions[ref]
 

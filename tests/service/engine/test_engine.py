@@ -1035,3 +1035,17 @@ def test_a_version_is_deleted_after_the_requests_that_began_with_it(
 
     with started(maps_dir) as with_engine:
         with_engine(play)
+
+
+def test_requests_may_delete_the_same_version_at_once(maps_dir: Path) -> None:
+    old = MapStore(maps_dir).current_version("room")
+    publish(maps_dir, "v2")
+
+    async def play(engine: Engine) -> None:
+        deletions = [engine.delete("room", old) for _ in range(3)]
+        ended = await asyncio.gather(*deletions, return_exceptions=True)
+        assert [type(each) for each in ended if each is not None] == [NotFound, NotFound]
+        assert MapStore(maps_dir).versions("room") == ["v2"]
+
+    with started(maps_dir) as with_engine:
+        with_engine(play)
