@@ -170,7 +170,7 @@ class Localization:
 
     @property
     def ref(self) -> str:
-        """``id@version`` of the map, of a set of the tile, that gave the answer."""
+        """``id@version`` of the map, or, for a set, of the tile, that gave the answer."""
         return self.tile or f"{self.map_id}@{self.map_version}"
 
 

@@ -7,6 +7,7 @@ can guess, and every request would pay for the hash.
 
 from __future__ import annotations
 
+import codecs
 import hashlib
 import hmac
 import math
@@ -140,7 +141,7 @@ def read_keys(path: Path) -> tuple[Key, ...]:
     """
     content = _content_of(path)
     try:
-        keys = _KEY_FILE.validate_json(content).keys
+        keys = _KEY_FILE.validate_json(content.removeprefix(codecs.BOM_UTF8)).keys
     except ValidationError as refused:
         raise _refusal(refused, str(path)) from None
     for number, key in enumerate(keys):

@@ -88,6 +88,13 @@ def test_the_format_of_the_file_stays(path: Path) -> None:
     assert copy.read_text() == FILE
 
 
+def test_a_file_saved_by_an_editor_with_a_byte_order_mark_is_read(path: Path) -> None:
+    key, _ = new_key("robot", frozenset({Scope.LOCALIZE}))
+    stored(path, key)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert read_keys(path) == (key,)
+
+
 def test_equal_secrets_would_have_different_hashes() -> None:
     (first, _), (second, _) = (new_key("robot", frozenset(Scope)) for _ in range(2))
 
