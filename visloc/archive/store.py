@@ -6,7 +6,7 @@ A set of maps lies beside its tiles, as a version of the same kind.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 
 from visloc.archive.backends.base import CURRENT, MANIFEST, Backend
@@ -30,7 +30,7 @@ from visloc.archive.version_rules import (
     version_exists,
     version_in_use,
 )
-from visloc.errors import MapCorrupt, VislocError, refuse
+from visloc.errors import MapCorrupt, NotFound, VislocError, refuse
 
 # Every map has it, and no set.
 _IMAGE_POSES = "image_poses.npy"
@@ -175,11 +175,12 @@ class MapStore:
             NotFound: ``map.unknown`` or ``map.version``.
             Conflict: ``map.version_in_use`` for the current version of a map that has others;
                 ``map.in_set`` for a version that a set in use names.
+            MapCorrupt: ``map.current`` when nothing says which of several versions is current.
         """
         with self.backend.changing():
             self._found(f"{map_id}@{version}")
             others = [name for name in self.versions(map_id) if name != version]
-            if others and self.backend.current(map_id) == version:
+            if others and self._current_or_none(map_id) == version:
                 raise version_in_use(map_id, version, others)
             if self._may_be_tile(map_id, version):
                 refuse_if_tile(map_id, version, self._sets_in_use((map_id, version)))
@@ -201,6 +202,11 @@ class MapStore:
     def sweep(self) -> None:
         """Delete what killed processes left behind of uploads and removals."""
         self.backend.sweep()
+
+    def _current_or_none(self, map_id: str) -> str | None:
+        with suppress(NotFound):
+            return self.current_version(map_id)
+        return None
 
     def _found(self, ref: str) -> tuple[str, str]:
         """The id and version of ``id`` (its current version) or ``id@version``; raise NotFound."""

@@ -289,7 +289,7 @@ def test_photos_without_features_are_left_out_and_told(
 def test_a_descriptor_of_photos_is_refused_with_ready_made_local_features(
     described: Path, tmp_path: Path, build_walk: Build
 ) -> None:
-    with pytest.raises(InvalidInput, match="densevlad is made of the photo") as caught:
+    with pytest.raises(InvalidInput, match="densevlad is computed from the photo") as caught:
         build_walk(described, tmp_path, **KINDS | {"global_features": ("densevlad",)})
     assert caught.value.field == "--global-features"
 

@@ -202,7 +202,7 @@ def test_a_build_whose_worker_was_killed_says_so_and_resumes(
 ) -> None:
     died = run_build("worker:local features:3")
     assert (died.returncode, died.stdout) == (1, "")
-    assert "error [build.worker_died] --workers: a worker process ended" in died.stderr
+    assert "error [build.worker_died] --workers: a worker process was killed" in died.stderr
     assert "Traceback" not in died.stderr
     wait_for_the_end_of_workers(tmp_path)
     items = items_of(tmp_path / "maps")

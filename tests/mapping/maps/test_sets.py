@@ -492,7 +492,7 @@ def test_maps_that_contradict_each_other_are_refused(store: MapStore) -> None:
     copy = moved_map(store, "hall", "copy", Similarity.identity())
     larger = Similarity(1.5, np.eye(3), np.zeros(3))
 
-    with pytest.raises(Conflict, match="another down") as caught:
+    with pytest.raises(Conflict, match="the down direction of") as caught:
         publish(store, "pair", [("hall", flat), (copy, tilted)])
     assert caught.value.code == "set.gravity"
     assert caught.value.field == "MAP"

@@ -253,3 +253,25 @@ def test_a_storage_without_conditions_is_named_in_the_log_and_works(
         assert verify_map(store.folder("room")).ref == "room@v2"
         shutil.rmtree(tmp_path / "made-v1-0.0")
         shutil.rmtree(tmp_path / "made-v2-1.0")
+
+
+def test_processes_with_the_same_copies_do_not_take_each_other_s_for_theirs(
+    new_store: NewStore, make: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mine, other = new_store("same"), new_store("same")
+    backend = mine.backend
+    assert isinstance(backend, ObjectBackend)
+    make_room = backend.copies.make_room
+
+    def other_is_faster(size: int) -> None:
+        make_room(size)
+        assert isinstance(other.backend, ObjectBackend)
+        with other.incoming() as incoming:
+            kept = Path(shutil.copytree(make("v1", 1.0), incoming / "map"))
+            other.backend.copies.keep(kept, "room", "v1")
+
+    monkeypatch.setattr(backend.copies, "make_room", other_is_faster)
+    with mine.incoming() as incoming, pytest.raises(Conflict) as caught:
+        mine.publish(Path(shutil.copytree(make("v1"), incoming / "map")), "room", "v1")
+    assert caught.value.code == "map.version_exists"
+    assert mine.ids() == []

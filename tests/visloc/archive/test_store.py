@@ -126,6 +126,14 @@ def test_with_its_last_version_a_map_is_gone(two_versions: MapStore) -> None:
     assert caught.value.code == "map.unknown"
 
 
+def test_no_version_is_removed_where_nothing_says_which_is_in_use(two_versions: MapStore) -> None:
+    (two_versions.root / "room" / "current").write_text("??")
+    with pytest.raises(MapCorrupt) as caught:
+        two_versions.remove("room", "v1")
+    assert caught.value.code == "map.current"
+    assert two_versions.versions("room") == ["v1", "v2"]
+
+
 def test_a_full_disk_does_not_keep_a_version_from_being_removed(
     two_versions: MapStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:

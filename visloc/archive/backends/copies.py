@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 
 from visloc.archive.backends.folder import FolderBackend
+from visloc.archive.version_rules import version_exists
 from visloc.errors import refuse
 
 logger = logging.getLogger(__name__)
@@ -32,10 +33,14 @@ class Copies:
         return copy
 
     def keep(self, incoming: Path, map_id: str, version: str) -> Path:
-        """Take in a verified version; another process with the same copies may have been faster."""
+        """Take in a verified version.
+
+        Raises:
+            Conflict: ``map.version_exists`` when another process with the same copies was faster.
+        """
         with self._folder.changing():
             if self._folder.has_version(map_id, version):
-                return self._folder.local_folder(map_id, version)
+                raise version_exists(map_id, version)
             return self._folder.publish(incoming, map_id, version, make_current=False)
 
     def remove(self, map_id: str, version: str) -> None:

@@ -11,7 +11,7 @@ import logging
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from time import monotonic
 
@@ -32,7 +32,7 @@ from visloc.archive.set_rules import AnyManifest
 from visloc.archive.set_schema import SetManifest
 from visloc.archive.sets import SetOutline, read_any_outline, verify_any
 from visloc.archive.version_rules import refuse_renamed
-from visloc.errors import MapCorrupt, Unavailable, VislocError, refuse
+from visloc.errors import Conflict, MapCorrupt, Unavailable, VislocError, refuse
 
 logger = logging.getLogger(__name__)
 
@@ -218,9 +218,10 @@ class ObjectBackend:
                 (target / name).parent.mkdir(parents=True, exist_ok=True)
                 self.storage.fetch(f"{place}/{name}", target / name)
             refuse_renamed(verify_any(target).manifest, str(target), map_id, version)
-            copy = self.copies.keep(target, map_id, version)
+            with suppress(Conflict):  # another process with the same copies was faster
+                self.copies.keep(target, map_id, version)
         logger.info("%s@%s fetched in %.1f s", map_id, version, monotonic() - start)
-        return copy
+        return self.copies.root / map_id / version
 
     def _fetch_small(self, map_id: str, version: str, name: str, folder: Path) -> None:
         path = self.storage.path(map_id, version, name)

@@ -19,6 +19,7 @@ import pickletools
 import struct
 import threading
 import zipfile
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -46,6 +47,11 @@ _SHORT_TEXT = 100
 # An object fetched from the memo may be as large as all of the pickle before it. Together those
 # fetched may have this many bytes, and so many more for each byte of the pickle.
 _MAX_FETCHED_BYTES, _MAX_FETCHED_SHARE = 64 * 2**20, 32
+
+_PUTS, _GETS = ("BINPUT", "LONG_BINPUT"), ("BINGET", "LONG_BINGET")
+_OPCODES_OF_KEYS = frozenset(
+    ("PROTO", "EMPTY_LIST", "MARK", "BINUNICODE", "APPEND", "APPENDS", "STOP", *_PUTS)
+)
 
 # Magic number 0x1950a86a20f9469cfc6c and protocol version 1001, each a pickle of its own.
 _OLD_LAYOUT_START = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03."
@@ -217,7 +223,44 @@ def _check_old_layout(data: bytes) -> None:
     # torch reads the numbers as little-endian, whatever the file says.
     if pickle.NEWFALSE in data[start:end]:
         raise ValueError("not written by a little-endian machine")
-    _check_pickle(data, _check_pickle(data, end))  # the object, then the keys of its storages
+    keys = _check_pickle(data, end)
+    _check_pickle(data, keys)
+    # torch hands out a storage without numbers as it found the memory.
+    if not _storages(data, end) <= _keys(data, keys):
+        raise ValueError("a storage without numbers")
+
+
+def _storages(data: bytes, start: int) -> set[str]:
+    """The keys of the storages that a pickle of the older layout uses."""
+    found, texts = set[str](), dict[int, Any]()
+    pushed: deque[tuple[str, Any]] = deque(maxlen=5)
+    for opcode, argument, _ in _opcodes(data, start):
+        if opcode in _PUTS:
+            texts[argument] = pushed[-1][1] if pushed else None
+            continue
+        if opcode == "BINPERSID":
+            match list(pushed):
+                case [
+                    (_, str(key)),
+                    (_, str()),
+                    ("BININT" | "BININT1" | "BININT2" | "LONG1", _),
+                    ("NONE", _),
+                    ("TUPLE", _),
+                ]:
+                    found.add(key)
+                case _:
+                    raise ValueError("a storage that is named as torch names none")
+        text = argument if opcode == "BINUNICODE" else None
+        pushed.append((opcode, texts.get(argument) if opcode in _GETS else text))
+    return found
+
+
+def _keys(data: bytes, start: int) -> set[str]:
+    """The texts in a pickled list."""
+    found = [(opcode, text) for opcode, text, _ in _opcodes(data, start)]
+    if not {opcode for opcode, _ in found} <= _OPCODES_OF_KEYS:
+        raise ValueError("something else than a list of storages")
+    return {text for opcode, text in found if opcode == "BINUNICODE"}
 
 
 def _check_pickle(data: bytes, start: int) -> int:
@@ -226,7 +269,9 @@ def _check_pickle(data: bytes, start: int) -> int:
     cheap: set[int] = set()  # memo entries of names and short texts, which everything fetches
     fetched_bytes = num_tuples = 0
     last_is_cheap = False
+    encoding = _Encoding()
     for opcode, argument, end in _opcodes(data, start):
+        encoding.check(opcode, argument)
         match opcode:
             case "GLOBAL" if (name := argument.replace(" ", ".")) not in _NAMES:
                 raise ValueError(f"{name} is no name that a state dict needs")
@@ -244,6 +289,49 @@ def _check_pickle(data: bytes, start: int) -> int:
     if fetched_bytes > _MAX_FETCHED_BYTES + _MAX_FETCHED_SHARE * (end - start):
         raise ValueError("a pickle that uses the same objects again and again")
     return end
+
+
+class _Encoding:
+    """Refuses ``_codecs.encode`` unless it makes bytes of a text, as pickle does.
+
+    torch calls it with any codec: hexadecimal digits of hexadecimal digits, and so on, make a
+    terabyte of thirty calls.
+    """
+
+    def __init__(self) -> None:
+        self._functions, self._latin1 = set[int](), set[int]()  # memo entries
+        self._pushed: list[str] = []  # from the function on
+        self._last = ""
+
+    def check(self, opcode: str, argument: Any) -> None:
+        """Take the next opcode of a pickle."""
+        if opcode in _PUTS:
+            for kind, entries in (("function", self._functions), ("latin1", self._latin1)):
+                (entries.add if self._last == kind else entries.discard)(argument)
+            return
+        self._last = self._kind(opcode, argument)
+        if self._pushed or self._last == "function":
+            self._pushed.append(self._last)
+        match self._pushed:
+            case [] | ["function"] | ["function", "text" | "latin1"]:
+                pass
+            case ["function", "text" | "latin1", "latin1"]:
+                pass
+            case ["function", _, "latin1", "TUPLE2"]:
+                pass
+            case ["function", _, _, _, "REDUCE"]:
+                self._pushed.clear()
+            case _:
+                raise ValueError("_codecs.encode, but not for bytes as pickle writes them")
+
+    def _kind(self, opcode: str, argument: Any) -> str:
+        if opcode in _GETS and argument in self._functions:
+            return "function"
+        if opcode == "GLOBAL":
+            return "function" if argument == "_codecs encode" else opcode
+        if argument == "latin1" or (opcode in _GETS and argument in self._latin1):
+            return "latin1"
+        return "text" if opcode == "BINUNICODE" or opcode in _GETS else opcode
 
 
 def _opcodes(data: bytes, start: int) -> Iterator[tuple[str, Any, int]]:

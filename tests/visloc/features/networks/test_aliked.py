@@ -227,7 +227,7 @@ def test_missing_weights_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
 
 def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
     torch.save(_random_state(T16), tmp_path / N16.file_name)
-    with pytest.raises(WeightsError, match="not the weights of aliked-n16") as caught:
+    with pytest.raises(WeightsError, match="not of aliked-n16") as caught:
         load_aliked(tmp_path)
     assert caught.value.code == "weights.network"
 

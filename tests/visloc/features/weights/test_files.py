@@ -238,6 +238,15 @@ def test_storage_shorter_than_it_says_is_refused(tmp_path: Path) -> None:
             read_checkpoint(path)
 
 
+@pytest.mark.parametrize("keys", [[], ["6"], [["7"]], ("7",), {"6": "7"}])
+def test_storage_whose_numbers_are_not_there_is_refused(keys: object, tmp_path: Path) -> None:
+    """torch would hand it out as it found the memory."""
+    path = _old_file(tmp_path / "w.pt", _dict_of(_tensor()))
+    path.write_bytes(path.read_bytes().replace(pickle.dumps(["7"], 2), pickle.dumps(keys, 2)))
+    with pytest.raises(WeightsError, match="does not hold whole, plain tensors"):
+        read_checkpoint(path)
+
+
 def test_zip_that_unpacks_to_more_than_the_file_is_refused(tmp_path: Path) -> None:
     bomb = _zip_file(
         tmp_path / "w.pt",
