@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import (
     AsyncGenerator,
     AsyncIterable,
@@ -22,10 +21,10 @@ from types import TracebackType
 from typing import Any, Concatenate, ParamSpec, Protocol, Self, TypeVar
 
 from clients.errors import not_understood
+from clients.transport.blocking import read_items, run_blocking
 from clients.transport.connection import checked_connection
 from clients.transport.http import HttpTransport
 from clients.transport.loop_thread import LoopThread
-from clients.transport.read_in_thread import read_in_thread
 from clients.transport.uploads import OnProgress, Upload, upload_request
 from clients.wire import answers
 from clients.wire.answers import InstantResult, LocalizeResult, ServerInfo
@@ -142,7 +141,7 @@ class AsyncClient:
         """
         search = checked_search(map, options, priors, request_id, ypr=ypr)
         if isinstance(query, str | Path):
-            query = await asyncio.to_thread(read_query, query)
+            query = await run_blocking(partial(read_query, query))
         request = localize_request(search, query, camera, debug=debug)
         return await self._ask(request, answers.parse_result)
 
@@ -171,7 +170,7 @@ class AsyncClient:
             ypr: also return the GeoPose in yaw, pitch and roll.
         """
         search = checked_search(map, options, priors, request_id, ypr=ypr)
-        request = await asyncio.to_thread(rig_request, search, rig, images)
+        request = await run_blocking(partial(rig_request, search, rig, images))
         return await self._ask(request, answers.parse_instant)
 
     def localize_sequence(
@@ -189,9 +188,9 @@ class AsyncClient:
     ) -> AsyncGenerator[InstantResult, None]:
         """Estimate the poses of a sequence, each answered as soon as its answer is final.
 
-        An iterable that is not asynchronous is read in another thread. Over gRPC, its first
-        instant is taken before anything is sent, and the others as the server asks for them. Over
-        HTTP all instants are read before anything is sent: they go into one request. An error of
+        Over gRPC, the first instant is taken before anything is sent, and the others as the server
+        asks for them, from an iterable that is not asynchronous in other threads. Over HTTP all
+        instants are read before anything is sent: they go into one request. An error of
         ``instants`` is raised here, over gRPC after the answers to the instants before it.
 
         With odometry an instant is answered only when instants ``max_gap_s`` later, or 30
@@ -250,7 +249,7 @@ class AsyncClient:
             on_progress: is called with the number of bytes that were sent since the last call,
                 over gRPC, and by ``Client``, in another thread.
         """
-        upload = await asyncio.to_thread(upload_request, Path(packed), map_id, version)
+        upload = await run_blocking(partial(upload_request, Path(packed), map_id, version))
         raw = await self._transport.upload(upload, on_progress or _ignore)
         return answers.parse_answer(self.server, answers.parse_map, raw)
 
@@ -288,7 +287,7 @@ class AsyncClient:
         if isinstance(instants, AsyncIterable):
             sent = (count.sent(instant) async for instant in instants)
         else:
-            sent = read_in_thread(map(count.sent, instants))
+            sent = read_items(map(count.sent, instants))
         async with aclosing(self._transport.stream(start, sent)) as stream:
             async for raw in stream:
                 count.answers += 1

@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from enum import StrEnum
-from functools import wraps
+from functools import cached_property, wraps
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
@@ -106,14 +106,13 @@ class Connection:
         Raises:
             OSError: when the file with the key cannot be read.
         """
-        return Client(self.server, api_key=self._api_key(), ca=self.ca, timeout_s=self.timeout_s)
+        return Client(self.server, api_key=self._api_key, ca=self.ca, timeout_s=self.timeout_s)
 
     def async_client(self) -> AsyncClient:
         """Make a client for an event loop; raises as ``client``."""
-        return AsyncClient(
-            self.server, api_key=self._api_key(), ca=self.ca, timeout_s=self.timeout_s
-        )
+        return AsyncClient(self.server, api_key=self._api_key, ca=self.ca, timeout_s=self.timeout_s)
 
+    @cached_property  # read once: the file may be a pipe
     def _api_key(self) -> str | None:
         # Not an option of its own: everybody on the machine can see the arguments of a command.
         if self.api_key_file is not None:

@@ -115,7 +115,20 @@ class HttpTransport:
             error, httpx.ConnectTimeout
         ):
             return errors.timed_out(self._server, self._timeout_s)
-        return errors.unreachable(self._server, str(error) or type(error).__name__)
+        return errors.unreachable(self._server, _reason(error))
+
+
+def _reason(error: httpx.HTTPError) -> str:
+    cause: BaseException | None = error
+    # The libraries in between may only say that all attempts failed.
+    while isinstance(error, httpx.ConnectError) and cause is not None:
+        if isinstance(cause, OSError) and cause.errno is not None:
+            return str(cause)
+        if isinstance(cause, BaseExceptionGroup):
+            cause = cause.exceptions[-1]
+            continue
+        cause = cause.__cause__ or cause.__context__
+    return str(error) or type(error).__name__
 
 
 def _options(connection: Connection) -> dict[str, Any]:

@@ -9,7 +9,10 @@ import weakref
 from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator
 from concurrent.futures import CancelledError, Future
 from contextlib import suppress
+from queue import SimpleQueue
 from typing import Any, Generic, Protocol, TypeVar
+
+from clients.transport.blocking import Jobs, attended
 
 _END = object()
 
@@ -52,15 +55,31 @@ class LoopThread(Generic[C]):
     def run(self, call: Callable[[C], Coroutine[Any, Any, T]]) -> T:
         """Call the client and return what it answers; Ctrl-C cancels the call.
 
+        While it waits, this thread does the blocking work of the call (``run_blocking``).
+
         Raises:
             RuntimeError: when the client is closed, also during the call, or when the call comes
                 from the loop's own thread, which would wait for itself.
         """
-        future = self._submit(call)
+        jobs: Jobs = SimpleQueue()
+
+        async def attended_call(client: C) -> T:
+            try:
+                with attended(jobs):
+                    return await call(client)
+            except (KeyboardInterrupt, SystemExit) as error:  # by a callback: would end the loop
+                raise _Exit(error) from None
+
+        future = self._submit(attended_call)
+        future.add_done_callback(lambda _: jobs.put(None))
         try:
+            while (job := jobs.get()) is not None:
+                job()
             return future.result()
         except CancelledError:
             raise RuntimeError("the client was closed during this call") from None
+        except _Exit as error:
+            raise error.exit from None
         except BaseException:  # also KeyboardInterrupt, which must not leave the request running
             future.cancel()
             raise
@@ -107,12 +126,22 @@ class LoopThread(Generic[C]):
                 raise RuntimeError(
                     "the client was called by its own callback; use another client there"
                 )
+            if self._running.loop.is_closed():  # while the interpreter ends
+                raise RuntimeError("the client is closed")
             return asyncio.run_coroutine_threadsafe(call(self._client), self._running.loop)
 
     def _renew_after_fork(self) -> None:
         if self._running is not None and self._running.pid != os.getpid():
             self._running = None
             self._client = self._make()  # connections cannot be shared between processes
+
+
+class _Exit(Exception):
+    """Carries an exception that ends a thread out of the loop."""
+
+    def __init__(self, exit: BaseException) -> None:
+        super().__init__()
+        self.exit = exit
 
 
 class _Running:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import threading
 from collections.abc import Iterator
 from concurrent import futures
@@ -14,6 +15,7 @@ import pytest
 
 from clients import AsyncClient, Client, Instant, RigImage
 from clients.cli.main import main
+from clients.cli.options import Connection as Options
 from clients.transport.connection import Connection
 from visloc.errors import (
     Forbidden,
@@ -183,6 +185,16 @@ def test_the_arguments_of_the_command_name_a_file_and_the_environment_has_the_ke
     run("--api-key-file", str(file))
     sent = [headers.get("authorization") for headers in seen]
     assert sent == [None, f"Bearer {KEY}", "Bearer from-environment", f"Bearer {KEY}"]
+
+
+def test_the_file_with_the_key_is_read_once() -> None:
+    reading, writing = os.pipe()  # as from <(a command) in a shell
+    os.write(writing, KEY.encode())
+    os.close(writing)
+    connection = Options(api_key_file=Path(f"/dev/fd/{reading}"))
+    with connection.client():
+        asyncio.run(connection.async_client().close())
+    os.close(reading)
 
 
 def test_a_file_without_a_key_is_an_error_of_one_line(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import socket
 import threading
@@ -204,3 +205,9 @@ def test_an_answer_that_makes_no_sense_is_the_servers_fault(
     with pytest.raises(Unavailable) as caught:
         parse_answer("http://server", parse_result, raw)
     assert caught.value.code == "server.answer"
+
+
+def test_a_refused_connection_says_so() -> None:
+    with Client("http://127.0.0.1:9") as client, pytest.raises(Unavailable) as caught:
+        client.ready()
+    assert f"Errno {errno.ECONNREFUSED}" in str(caught.value.got)

@@ -6,12 +6,14 @@ import asyncio
 import gc
 import inspect
 import multiprocessing
+import os
 import signal
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -239,3 +241,53 @@ def test_a_process_ends_although_the_next_instant_never_comes(grpc_url: str) -> 
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
     )
     assert (ran.returncode, ran.stdout, ran.stderr) == (0, "1\n", "")
+
+
+def test_iterables_of_callers_are_read_in_their_thread(http_url: str, grpc_url: str) -> None:
+    readers: list[threading.Thread] = []
+
+    def noted(items: Iterator[Any]) -> Iterator[Any]:
+        for item in items:
+            readers.append(threading.current_thread())
+            yield item
+
+    with Client(http_url) as client:
+        assert len(list(client.localize_sequence(noted(instants(3)), "room", time_unit="ms"))) == 3
+    for url in (http_url, grpc_url):
+        with Client(url) as client:
+            images = (RigImage(name, b"photo") for name in ("left", "right"))
+            assert client.localize_rig(noted(images), "room", "stereo").localized
+    assert readers == [threading.main_thread()] * 7
+
+
+def test_an_iterable_that_exits_leaves_the_client_usable(url: str) -> None:
+    def images() -> Iterator[RigImage]:
+        yield RigImage("left", b"photo")
+        raise SystemExit(7)
+
+    def walk() -> Iterator[Instant]:
+        yield from instants(1)
+        raise SystemExit(7)
+
+    with Client(url) as client:
+        with pytest.raises(SystemExit, match="7"):
+            client.localize_rig(images(), "room", "stereo")
+        with pytest.raises((SystemExit, RuntimeError), match=r"7|SystemExit"):
+            list(client.localize_sequence(walk(), "room", time_unit="ms"))
+        assert client.localize(b"photo", "room").localized
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_an_interrupt_ends_the_reading_of_a_file_that_never_comes(url: str, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "photo.jpg")
+    code = (
+        "import os, signal, sys, threading\n"
+        "from clients import Client\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()\n"
+        "with Client(sys.argv[1]) as client:\n"
+        "    client.localize(sys.argv[2], 'room')\n"
+    )
+    command = [sys.executable, "-c", code, url, str(tmp_path / "photo.jpg")]
+    done = subprocess.run(command, timeout=20, capture_output=True, check=False)
+    assert b"KeyboardInterrupt" in done.stderr
