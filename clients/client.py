@@ -85,9 +85,9 @@ class AsyncClient:
         server: ``http://host:port`` or ``grpc://host:port``; with TLS ``https://`` or
             ``grpcs://``.
         api_key: from the server's operator; needed unless the server is on this machine and has
-            no keys. Without TLS it can be read on the way.
+            no keys. Without TLS it is sent in clear text.
         ca: PEM file of the certificate authorities to trust instead of the usual ones.
-        timeout_s: longest wait for an answer, seconds. The server is told, and gives up then too.
+        timeout_s: longest wait for an answer, seconds. The server gets the same limit.
     """
 
     def __init__(
@@ -163,7 +163,7 @@ class AsyncClient:
         Args:
             images: the photos, each of another camera; some may be missing.
             map: as for ``localize``.
-            rig: how the cameras sit, or the id of a rig that the map knows (``MapInfo.rigs``).
+            rig: the poses of the cameras, or the id of a rig that the map knows (``MapInfo.rigs``).
             options: choices for this instant.
             request_id: names the request in the server's logs; None lets the server choose.
             priors: what is known of the rig, also as the API's JSON.
@@ -188,20 +188,19 @@ class AsyncClient:
     ) -> AsyncGenerator[InstantResult, None]:
         """Estimate the poses of a sequence, each answered as soon as its answer is final.
 
-        Over gRPC, the first instant is taken before anything is sent, and the others as the server
-        asks for them, from an iterable that is not asynchronous in other threads. Over HTTP all
-        instants are read before anything is sent: they go into one request. An error of
-        ``instants`` is raised here, over gRPC after the answers to the instants before it.
+        Over gRPC, the first instant is read before anything is sent, the others when the server
+        asks for them, from a synchronous iterable in other threads. Over HTTP, all instants are
+        read first and sent in one request. An error of ``instants`` is raised here; over gRPC, the
+        answers to earlier instants come first.
 
-        With odometry an instant is answered only when instants ``max_gap_s`` later, or 30
-        instants, have come, even if its own photos localize it: its neighbours may contradict it.
-        A caller that waits for every answer before sending the next instant must use
-        ``max_gap_s`` 0 or no odometry.
+        With odometry, an answer waits for the instants of the next ``max_gap_s``, at most 30, even
+        if its own photos localize it: they may contradict it. A caller that waits for every answer
+        before sending the next instant must use ``max_gap_s`` 0 or no odometry.
 
         Args:
             instants: in the order of time.
             map: as for ``localize``; of several maps, the one of the first pose is kept.
-            rig: how the cameras sit, or the id of a rig that the map knows; None when every
+            rig: the poses of the cameras, or the id of a rig that the map knows; None when every
                 instant is one photo of one camera.
             time_unit: of the timestamps: s, ms, us or ns; None infers it from their size, which
                 must be that of Unix times.
@@ -334,9 +333,9 @@ def _iterating(
 class Client:
     """``AsyncClient`` for callers that wait: the same methods, without ``await``.
 
-    Use it with ``with``, from any thread, also where an event loop runs. Its requests are sent by a
-    thread of its own, which ends with it. Ctrl-C ends a call. A process that was forked after the
-    first call can go on over HTTP, over gRPC it gets a RuntimeError.
+    Use it with ``with``, from any thread, also where an event loop runs. A thread of its own sends
+    the requests and ends with it. Ctrl-C ends a call. In a process that was forked after the first
+    call, HTTP still works and gRPC raises RuntimeError.
     """
 
     def __init__(
@@ -381,7 +380,7 @@ class Client:
 
 
 class _Count:
-    """Checks the instants one after the other, and holds a server to one answer for each."""
+    """Checks instants as they are sent, and checks that the server answers each exactly once."""
 
     def __init__(self, server: str, time_unit: str | None) -> None:
         self._server, self._time_unit = server, time_unit

@@ -68,7 +68,7 @@ class ServiceSettings(BaseModel):
     """how networks run; auto: torch on a CUDA GPU, else int8 on processors with instructions for
     it, else fp32"""
     host: str = "127.0.0.1"
-    """address to listen on; others than this machine's own, such as 0.0.0.0, need keys_file"""
+    """address to listen on; addresses that other machines reach, such as 0.0.0.0, need keys_file"""
     http_port: Port = 8000
     """port of the HTTP API; 0 picks a free one"""
     grpc_port: Port = 50051
@@ -81,7 +81,7 @@ class ServiceSettings(BaseModel):
     """processor threads per worker; default: cores / workers"""
     keys_file: Path | None = None
     """file of API keys that `python -m service.keys` wrote; without keys, the service
-    accepts only callers on this machine, and these may do everything"""
+    accepts only callers on this machine, and lets them do everything"""
     tls_cert: Path | None = None
     """PEM file of the certificate chain; turns on TLS for HTTP and gRPC"""
     tls_key: Path | None = None

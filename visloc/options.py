@@ -189,9 +189,9 @@ class LocalizeOptions:
     read_as: ReadAs = _option(
         ReadAs.UPRIGHT,
         "orientation in which features are found",
-        details="upright turns the photo by its EXIF orientation first. Camera, keypoints and "
-        "pose are those of the stored pixels either way. It has no meaning for features that are "
-        "sent.",
+        details="upright rotates the photo by its EXIF orientation first. Camera, "
+        "keypoints and pose refer to the stored pixels either way. Ignored for "
+        "features that are sent.",
     )
     extraction: Extraction = _option(
         Extraction.DEFAULT,
@@ -200,7 +200,7 @@ class LocalizeOptions:
     )
     fusion: Fusion | None = _option(
         None,
-        "how similarities under several global descriptors become one ranking",
+        "how the similarities of several global descriptors become one ranking",
         unset=_MAPS_VALUE,
     )
     fusion_weights: Mapping[str, float] | None = _option(
@@ -211,8 +211,8 @@ class LocalizeOptions:
         hash=False,  # a dict
     )
     matcher: Matcher = _option(Matcher.MUTUAL, "how keypoints are matched")
-    solver: Solver = _option(Solver.PYCOLMAP, "what searches for the pose")
-    seed: int = _option(0, "of RANSAC", 0, 2**31 - 1)
+    solver: Solver = _option(Solver.PYCOLMAP, "pose solver")
+    seed: int = _option(0, "seed of RANSAC", 0, 2**31 - 1)
 
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:

@@ -67,7 +67,7 @@ class Comparison(Photos, QueryOptions):
         typer.Option(
             metavar="VALUE,VALUE...",
             help="The rows of the table; for global-features also sums such as "
-            f"densevlad+localvlad, and all. Without it {_DEFAULTS}.",
+            f"densevlad+localvlad, and all. Default: {_DEFAULTS}.",
         ),
     ] = None
     threshold: Thresholds = None
@@ -100,9 +100,9 @@ def compare(
     Writes a table with recall, errors, times and the size of the map for each value (compare.md,
     below the command that made it), a picture of it (compare.png) and all figures (compare.json).
 
-    The values take turns photo by photo, one request at a time. A first request of each value is
-    not counted. A value that the server refuses, such as a matcher that does not know the map's
-    features, is a row that says so. Needs matplotlib: the extra compare of visloc.
+    Each photo is sent with every value in turn, one request at a time. The first request of each
+    value is a warm-up. A value that the server refuses, such as a matcher that does not know the
+    map's features, gets a row that says so. Needs matplotlib: the extra compare of visloc.
 
     Exits with 0 when done, 1 on an error, 130 when stopped; then nothing was written.
     """

@@ -39,10 +39,10 @@ _out = Console()
 _err = Console(stderr=True)
 
 _MODES = (
-    "single: each photo on its own. rig: a photo without a pose takes it from the best camera of "
-    "its rig at the same instant. seq: it takes it from between the instants before and after, or "
-    "from the nearest one. rig+seq: both. gp3p: the photos of a rig and instant solve one pose, "
-    "which also fills the photos that did not contribute to it."
+    "single: each photo on its own. rig: a photo without a pose gets one from the best camera of "
+    "its rig at the same instant. seq: a photo without a pose gets one interpolated between the "
+    "instants before and after, or the nearest one. rig+seq: both. gp3p: one pose is solved from "
+    "all photos of a rig and instant; it also fills photos that did not contribute to it."
 )
 
 
@@ -64,7 +64,7 @@ class DatasetRun(Photos, QueryOptions):
         typer.Option(
             min=0,
             metavar="SECONDS",
-            help="For seq: longest time between the poses that others are filled from.",
+            help="For seq: longest gap between two measured poses that is filled.",
         ),
     ] = DEFAULT_MAX_GAP_S
     rig: Annotated[
@@ -104,16 +104,15 @@ def localize_batch(
     ] = False,
     connection: Connection,
 ) -> None:
-    """Localize all photos of a dataset or list, or their features for a map of ready-made ones.
+    """Localize all photos of a dataset or list, or their ready-made features.
 
     Writes results.jsonl, one answer per line, and at the end poses.txt with lines
     'name qw qx qy qz tx ty tz' (cam_from_world) of the localized photos, where a blank in a name
     is %20. The same command resumes a stopped run. A photo that cannot be answered is recorded
     and skipped; if that was the server's fault, the same command sends it again.
 
-    All modes except single fill photos without a pose of their own: their status is filled,
-    source says from what, and their poses are in poses_filled.txt. poses.txt has measured poses
-    only.
+    All modes except single fill photos that have no measured pose. Their status is filled, source
+    says how, and their poses are in poses_filled.txt. poses.txt has measured poses only.
 
     Exits with 0 when every photo has its line, 1 on an error, 130 when stopped.
     """
@@ -171,17 +170,17 @@ def benchmark(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Write the measured poses of the first mode, as localize batch does in "
-            "poses.txt. No file has the filled ones.",
+            help="Write the measured poses of the first mode, in the format of poses.txt of "
+            "localize batch. Filled poses are not written.",
         ),
     ] = None,
     connection: Connection,
 ) -> None:
-    """Measure how fast and, where the dataset has true poses, how well photos are localized.
+    """Measure how fast photos are localized, and how well if the dataset has true poses.
 
-    Recall counts all photos with a true pose; those without a pose of their own or a filled one
-    are failures. The errors are those of the photos that have a pose. Latencies are what this
-    client sees. Photos are sent once, whatever the number of modes, and once more for gp3p.
+    Recall counts all photos with a true pose; a photo with neither a measured nor a filled pose is
+    a failure. Errors are over the photos that have a pose. Latencies are measured by this client.
+    Each photo is sent once for all modes together, and once more for gp3p.
 
     Exits with 0 when done, 1 on an error, 130 when stopped; then there is no report.
     """

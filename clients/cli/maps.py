@@ -101,7 +101,7 @@ def push(
 def use(version: Version, connection: Connection) -> None:
     """Put a version into use, a newer or an older one, without dropping a request.
 
-    Ends when the service answers with it.
+    Returns when the service answers with it.
     """
     with connection.client() as client:
         info = client.use_version(*_names(version))

@@ -86,7 +86,7 @@ class Connection:
         Path | None,
         typer.Option(
             metavar="FILE",
-            help=f"File with the API key; without it, {KEY_VARIABLE} in the environment.",
+            help=f"File with the API key. Default: {KEY_VARIABLE} in the environment.",
         ),
     ] = None
     ca: Annotated[
@@ -180,8 +180,8 @@ class Photos:
     pixel_origin: Annotated[
         PixelOrigin,
         typer.Option(
-            help="Where the dataset's principal points and ready-made keypoints have the centre "
-            "of the top-left pixel: corner, at (0.5, 0.5), or center, at (0, 0).",
+            help="Coordinates of the centre of the first pixel, in the dataset's principal "
+            "points and ready-made keypoints. corner: (0.5, 0.5). center: (0, 0).",
         ),
     ] = PixelOrigin.CORNER
 
@@ -205,7 +205,7 @@ Thresholds = Annotated[
     typer.Option(
         "--threshold",
         metavar="METRES/DEGREES",
-        help="A pose within both is accurate; can be repeated. Without it: "
+        help="A pose within both limits is accurate; can be repeated. Default: "
         f"{', '.join(_DEFAULT_THRESHOLDS)}.",
     ),
 ]

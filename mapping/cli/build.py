@@ -62,7 +62,8 @@ class ImportSettings:
         str | None, typer.Option("--map", help="Id of the map to build straight away.")
     ] = None
     output: Annotated[
-        Path | None, typer.Option("--output", help="Or the dataset to write, for mapping build.")
+        Path | None,
+        typer.Option("--output", help="Or the dataset to write instead, for mapping build."),
     ] = None
     photos: Annotated[
         Path | None,

@@ -38,7 +38,7 @@ def pairs(
 ) -> None:
     """Pair the photos of a dataset without building, for build --pairs-file or other tools.
 
-    Only a build can pair by global features that it extracts; pairs.txt of its map has the pairs.
+    Pairing by extracted global features needs a build; pairs.txt of its map has the pairs.
     """
     known = None if covisible_in is None else open_map(map_folder(covisible_in, maps_dir))
     with StageProgress(ERR, if_stopped="nothing was written") as progress:

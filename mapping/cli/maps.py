@@ -61,7 +61,9 @@ class AnchorSettings:
     latitude: Annotated[
         float | None,
         typer.Option(
-            help="Or the place itself: degrees (WGS84) of the world's (0, 0, 0).", min=-90, max=90
+            help="Or the place itself: latitude of the world's (0, 0, 0), degrees (WGS84).",
+            min=-90,
+            max=90,
         ),
     ] = None
     longitude: Annotated[
@@ -201,9 +203,9 @@ def verify(
     maps_dir: MapsDirOption = Path("maps"),
     weights_dir: WeightsDirOption = None,
 ) -> None:
-    """Check every byte of a map (checksums, ranges), and that its features equal ours.
+    """Check every byte of a map (checksums, ranges), and its features against the installed ones.
 
-    For a set, its own files are checked; its tiles are maps of their own.
+    For a set, only its own files are checked; verify its tiles one by one.
     """
     folder = map_folder(map_ref, maps_dir)
     if isinstance(read_any_manifest(folder), SetManifest):

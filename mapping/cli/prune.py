@@ -38,7 +38,7 @@ def prune(
         Path | None,
         typer.Option(
             help="kapture folder of photos with poses in the map's frame, to measure accuracy. "
-            "Default: photos of the map, each localized without itself."
+            "Default: photos of the map, each localized in the rest of it."
         ),
     ] = None,
     maps_dir: MapsDirOption = Path("maps"),

@@ -62,7 +62,8 @@ def report(
     """Report where a map is weak: from which places and directions would a photo be localized?
 
     Writes one HTML file that needs neither network nor server, and prints the main points. Each
-    photo of the map is localized without itself, from stored features; no photo is needed.
+    photo of the map is localized in the rest of the map, from stored features; the photo files are
+    not needed.
     """
     opened = open_map(map_folder(map_ref, maps_dir))
     target = Path(f"{opened.manifest.id}-report.html") if output is None else output

@@ -33,9 +33,9 @@ def set_maps(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Pose of each map in the set, one per line: map qw qx qy qz tx ty tz [scale], "
-            "with x_set = scale R x_map + t. Default: by where the maps lie on Earth, in metres "
-            "east, north and up of the first.",
+            help="Pose of each map in the set, one per line: map qw qx qy qz tx ty tz "
+            "[scale], with x_set = scale R x_map + t. Default: from the anchors of the "
+            "maps, in metres east, north and up of the first.",
         ),
     ] = None,
     maps_dir: MapsDirOption = Path("maps"),

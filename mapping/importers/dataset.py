@@ -308,7 +308,7 @@ def _check_photos(model: ImportedModel) -> list[str]:
 def _check_sizes(model: ImportedModel) -> None:
     """Refuse photos of another size than their camera: its numbers are in pixels of that size.
 
-    A photo that is stored turned may have the size that it has when it is upright.
+    A photo that is stored rotated may have the size that it has when it is upright.
     """
     if model.photos is None:
         return

@@ -24,9 +24,7 @@ class PairSettings:
             or ``pairs.far``, with the option of the command line as field.
     """
 
-    top_k: Annotated[int, _option(min=1, help="Best pairs of a photo that each pairing keeps.")] = (
-        20
-    )
+    top_k: Annotated[int, _option(min=1, help="Best pairs to keep per photo and pairing.")] = 20
     max_distance: Annotated[
         float, _option(help="distance: largest distance between camera centres, metres.")
     ] = 25.0

@@ -272,8 +272,9 @@ def register_depth(
     """Show a depth map as the photo's camera sees it; the nearest surface wins.
 
     Every pixel of the map becomes a point, which goes into the pixel that sees it; depth on a
-    slanted surface may thus be off by half a pixel. If the photo is finer than the map, the result
-    is smaller than the photo, or hidden surfaces would show through holes.
+    slanted surface may thus be off by half a pixel. If the photo has more pixels than the depth
+    map, the result is smaller than the photo: at full size, hidden surfaces would show through
+    holes.
 
     Args:
         depth: (H, W) float32 as seen by ``depth_camera``.

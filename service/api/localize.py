@@ -83,7 +83,7 @@ def where_to_core(map_ref: str | None, maps: list[str] | None, near: Near | None
 
 
 class LocalizeRequest(IncomingMessage):
-    """A photo, or what was found in it, and the map to find it in."""
+    """A photo or its features, and the map to search."""
 
     map: Annotated[str | None, Field(description="id, or id@version")] = None
     image: Annotated[
@@ -91,13 +91,14 @@ class LocalizeRequest(IncomingMessage):
     ] = None
     features: Annotated[
         GivenFeatures,
-        Field(description="what was found in the photo, instead of it; needs a camera"),
+        Field(description="the photo's features, instead of the photo; need a camera"),
     ] = None
     camera: Annotated[
         GivenCamera,
         Field(
-            description="an object, or MODEL,width,height,params...; left out: the focal length "
-            "of the photo's EXIF, else one estimated or guessed, which the answer marks"
+            description="an object, or MODEL,width,height,params...; if left out, the server takes "
+            "the focal length from EXIF, else estimates or guesses it; the answer says "
+            "which"
         ),
     ] = None
     options: GivenOptions = Field(default_factory=LocalizeOptions)

@@ -239,7 +239,7 @@ class GeoPoseRequest(_Read):
 
 
 class GeoPoseAccuracy(BaseModel):
-    """How sure a GeoPose is: means of standard deviations, not radii."""
+    """The accuracy of a GeoPose: mean standard deviations, not radii."""
 
     position: Annotated[float, Field(description="metres, the mean of east, north and up")]
     orientation: Annotated[float, Field(description="degrees, the mean of the three axes")]
@@ -257,8 +257,8 @@ class GeoPoseResponse(BaseModel):
     geopose: Annotated[
         GeoPose,
         Field(
-            description="of the camera of the first camera reading: x forward, y left, z up, to "
-            "east, north, up"
+            description="of the camera of the first camera reading; rotates x forward, y left, z "
+            "up to east, north, up"
         ),
     ]
 

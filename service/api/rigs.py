@@ -88,7 +88,7 @@ NO_PARTS: Mapping[str, bytes] = {}
 class RigSensor(IncomingMessage):
     """One camera of a rig."""
 
-    cam_from_rig: Annotated[Transform, Field(description="where it sits")]
+    cam_from_rig: Annotated[Transform, Field(description="its pose in the rig")]
     camera: Annotated[
         GivenCamera, Field(description="intrinsics of its photos, where they are known")
     ] = None
@@ -125,7 +125,7 @@ def _sensor_id(value: object) -> object:
 
 
 class RigCalibration(IncomingMessage):
-    """How the cameras of a rig sit."""
+    """The poses of the cameras in a rig."""
 
     path: ClassVar[str] = "rig."
 
@@ -185,13 +185,14 @@ class RigImage(IncomingMessage):
     ] = None
     features: Annotated[
         GivenFeatures,
-        Field(description="what was found in the photo, instead of it; needs a camera"),
+        Field(description="the photo's features, instead of the photo; need a camera"),
     ] = None
     camera: Annotated[
         GivenCamera,
         Field(
-            description="left out: the rig's for this sensor; of a rig given by its id, the map's "
-            "for this sensor; else EXIF, else one estimated or guessed, which the answer marks"
+            description="if left out: the camera of this sensor in the rig (in the map, for a rig "
+            "given by id); else the server takes the focal length from EXIF, else "
+            "estimates or guesses it; the answer says which"
         ),
     ] = None
     timestamp: Annotated[
@@ -274,7 +275,7 @@ def images_to_core(
 
 
 class LocalizeRigRequest(IncomingMessage):
-    """The images of a rig at one instant, and the map to find it in."""
+    """The images of a rig at one instant, and the map to search."""
 
     map: Annotated[str | None, Field(description="id, or id@version")] = None
     maps: GivenMaps = None

@@ -31,7 +31,7 @@ from visloc_api.words.priors import GivenPriors, priors_to_core
 
 
 class Odometry(IncomingMessage):
-    """Where a tracker has the rig, in a world of its own whose unit is the metre."""
+    """The rig's pose from a tracker, in the tracker's own world, in metres."""
 
     rig_from_odometry: Annotated[
         Transform, Field(description="only the motion between instants is used")
@@ -40,8 +40,8 @@ class Odometry(IncomingMessage):
         Numbers | None,
         Field(
             description="6 x 6, row by row, of the motion since the previous instant, "
-            "rig_from_previous_rig: rotation (rad), then translation; left out: an allowance for "
-            "drift"
+            "rig_from_previous_rig: rotation (rad), then translation; if left out, a "
+            "default drift is assumed"
         ),
     ] = None
 
@@ -61,10 +61,11 @@ class Instant(IncomingMessage):
     timestamp: Annotated[Timestamp, Field(description="greater than that of the instant before")]
     images: Images
     odometry: Annotated[
-        Odometry | None, Field(description="what a tracker says of the motion since the last")
+        Odometry | None,
+        Field(description="the tracker's pose, which gives the motion since the previous instant"),
     ] = None
     priors: Annotated[
-        GivenPriors, Field(description="of this instant, instead of those of the sequence")
+        GivenPriors, Field(description="priors of this instant; they replace those of the sequence")
     ] = None
 
     def to_core(self, parts: Parts, *, has_rig: bool) -> service.values.Instant:
@@ -91,13 +92,15 @@ class SequenceStart(IncomingMessage):
     rig: GivenRig = None
     time_unit: Annotated[
         str | None,
-        Field(description="of timestamps: s, ms, us or ns; left out: by their size"),
+        Field(
+            description="unit of timestamps: s, ms, us or ns; if left out, inferred from their size"
+        ),
     ] = None
     max_gap_s: Annotated[
         float | None,
         Field(
-            description="longest time between two measured instants across which gaps are "
-            f"filled: 0 (none) to {visloc.sequences.filling.MAX_GAP_S:g}, by default "
+            description="longest gap between two measured instants that is filled, seconds: 0 "
+            f"(none) to {visloc.sequences.filling.MAX_GAP_S:g}, by default "
             f"{DEFAULT_MAX_GAP_S:g}"
         ),
     ] = None

@@ -55,7 +55,7 @@ class _Refused:
 
 @dataclass(slots=True, eq=False)
 class _Served:
-    """A map: the version in service, and what became of the one that is current in the store."""
+    """A map: the version in service, and the state of the version that is current in the store."""
 
     version: MapFolder | None = None
     refused: _Refused | None = None
@@ -113,7 +113,7 @@ class Catalog:
         """
         for ref in await asyncio.to_thread(self.listing.opened_at_start):
             if sum(self._workers.loaded.values()) >= max_bytes:
-                logger.info("max_loaded_bytes is reached: requests open the other maps")
+                logger.info("max_loaded_bytes is reached: the other maps are opened on request")
                 break
             try:
                 if "@" in ref:
@@ -143,7 +143,7 @@ class Catalog:
 
     @asynccontextmanager
     async def using(self, where: Where) -> AsyncIterator[tuple[MapFolder, ...]]:
-        """Give the maps to search; they stay until the block ends, even if others take over.
+        """Yield the maps to search. They stay open until the block ends, even if replaced.
 
         Raises:
             NotFound: ``map.unknown``, ``map.version``, ``map.none_near``.
@@ -164,7 +164,7 @@ class Catalog:
 
     @asynccontextmanager
     async def reading(self, ref: str) -> AsyncIterator[MapFolder]:
-        """Give ``id@version``, to be read in this process; it stays until the block ends."""
+        """Yield ``id@version`` to read in this process; it stays until the block ends."""
         version = await self._hold(ref)
         try:
             yield version
@@ -189,7 +189,7 @@ class Catalog:
             Conflict: ``map.version_in_use``, ``map.in_set``.
         """
         ref = f"{map_id}@{version}"
-        # One that answers while the current one cannot be opened is in use too.
+        # A version that answers because the current one cannot be opened is in use too.
         others = set(await asyncio.to_thread(self._store.versions, map_id)) - {version}
         if others and self._is_served(ref):
             raise version_in_use(map_id, version, sorted(others))
@@ -358,7 +358,7 @@ class Catalog:
         served.refused = _Refused(current, error, perf_counter())
         if before is not None and (known is None or known.ref != current):
             logger.error(
-                "map %s cannot take over, %s stays in service: %s", current, before.ref, error
+                "map %s cannot be opened; %s stays in service: %s", current, before.ref, error
             )
 
     def _gone(self, map_id: str) -> None:

@@ -32,7 +32,7 @@ class Status:
     """The state of the engine.
 
     Attributes:
-        ready: whether photos are accepted: the maps of the start are open and warm, a worker
+        ready: whether photos are accepted: the maps to open at start are open and warm, a worker
             process is alive, and the server is not being stopped.
         maps: ``id@version`` of loaded maps.
         not_loaded: why the current version of a map cannot be served, by map id. An older
@@ -225,10 +225,10 @@ class Engine:
     ) -> AsyncGenerator[Localization]:
         """Answer the instants of a sequence in order, each as soon as its answer is final.
 
-        It runs within ``admit_batch``, and takes the next instant when the answers before it have
-        been taken. Instants that are given as a list are checked before any work; in a set of maps,
-        only their order and the names of tiles are. With several maps, nothing is answered until
-        one map alone explains an instant; that map is kept.
+        It runs within ``admit_batch``. It takes the next instant only after the caller took the
+        previous answers. A list of instants is checked before any work (in a set of maps, only
+        their order and the names of tiles). With several maps, the answers wait until one map alone
+        explains an instant; that map is kept.
 
         Raises:
             InvalidInput: ``sequence.*``, ``rig.*``, ``options.*``, ``priors.*``.

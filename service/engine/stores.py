@@ -90,5 +90,5 @@ def open_store(maps_dir: str, cache_dir: Path, max_cache_bytes: int) -> Store:
     if not maps_dir or (folder.exists() and not folder.is_dir()):
         raise ValueError(f"{maps_dir!r} is no folder")
     if not folder.exists():
-        logger.warning("maps_dir: %s is not there yet; it is made with the first map", folder)
+        logger.warning("maps_dir: %s does not exist yet; the first map creates it", folder)
     return MapStore(folder)

@@ -99,7 +99,7 @@ class Envelope:
             except VislocError as error:
                 await self._refuse(error, id_, context, record)
             except Exception:  # the last line of defence: gRPC would show the caller the exception
-                logger.exception("request %s broke", id_)
+                logger.exception("request %s failed unexpectedly", id_)
                 await self._refuse(internal_error(), id_, context, record)
 
     async def refuse(self, method: str, error: VislocError, context: Context) -> None:

@@ -87,9 +87,11 @@ class RequestEnvelope:
                 raise
             await refuse(stopping_error())
         except ClientDisconnect:
-            logger.info("the client of request %s left before it was answered", record.request_id)
+            logger.info(
+                "the client of request %s disconnected before the answer", record.request_id
+            )
         except Exception:  # the last line of defence: every caller gets an answer
-            logger.exception("request %s broke", record.request_id)
+            logger.exception("request %s failed unexpectedly", record.request_id)
             if record.status:
                 raise  # too late to answer: the server closes the connection
             await refuse(internal_error())

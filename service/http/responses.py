@@ -123,7 +123,7 @@ class Lines(Response):
         except VislocError as error:
             await self._send_problem(send, error)
         except Exception:  # the last line of defence, as for all requests
-            logger.exception("request %s broke", self._id)
+            logger.exception("request %s failed unexpectedly", self._id)
             await self._send_problem(send, internal_error())
         await send({"type": "http.response.body", "body": b"", "more_body": False})
 

@@ -66,7 +66,7 @@ class OpenMaps:
         self._opened.move_to_end(version.ref)
         while len(self._opened) > 1 and self._size > self._settings.max_loaded_bytes:
             ref, _ = self._opened.popitem(last=False)
-            logger.info("map %s closed, to keep to max_loaded_bytes", ref)
+            logger.info("map %s closed, to stay within max_loaded_bytes", ref)
         return found
 
     def close(self, ref: str) -> None:

@@ -1,8 +1,8 @@
 """A pool of worker processes: always warm, replaced when they die, one task at a time each.
 
-Native code can end a process without an exception; that costs one request its answer, and nothing
-else. Each process has an executor of its own, because the standard one fails all its tasks when one
-process dies (docs/decisions/0013-worker-processes.md).
+Native code can end a process without an exception; only the request in that process is lost. Each
+process has an executor of its own, because the standard one fails all its tasks when one process
+dies (docs/decisions/0013-worker-processes.md).
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ class Workers:
         """Start all processes.
 
         Raises:
-            Unavailable: ``server.worker_died`` when one does not even begin.
+            Unavailable: ``server.worker_died`` when a process cannot be started.
         """
         await asyncio.gather(*(one.start(()) for one in self._workers))
         self._serving = [asyncio.create_task(self._serve(one)) for one in self._workers]
@@ -230,7 +230,7 @@ class Workers:
 
 
 class _Worker:
-    """One process, and those that replace it."""
+    """A worker process and its replacements."""
 
     def __init__(self, settings: WorkerSettings) -> None:
         self._settings = settings

@@ -52,7 +52,7 @@ logger = logging.getLogger(__name__)
 
 
 class Abandoned(Exception):
-    """Nobody waits for the task any more."""
+    """The caller no longer waits for the task."""
 
 
 class Vision:
@@ -101,9 +101,9 @@ class Vision:
     def localize(self, job: RigJob, maps: Sequence[MapFolder], submitted: float) -> Localization:
         """Localize a photo on its own in the best of the maps.
 
-        One task does it all: a photo is decoded where it is solved, and nothing of it travels.
-        The main process queued the task when it was ``submitted`` (``time.time``, which is the same
-        in all processes).
+        One task does it all in one process, so that no decoded photo passes between processes. The
+        main process queued the task when it was ``submitted`` (``time.time``, which is the same in
+        all processes).
         """
         started, queued = perf_counter(), time() - submitted
         targets = self._targets(maps, job.rig)
@@ -164,7 +164,7 @@ class Vision:
     def _solve(
         self, job: RigJob, targets: Sequence[Target], seen: Sequence[tuple[SeenImage, ...]]
     ) -> tuple[int, Localization, Solved]:
-        """Solve for a pose in every map; return the judged answer and the row that it rests on."""
+        """Solve for a pose in every map; return the chosen answer and the row of its map."""
         solved = []
         for target, images in zip(targets, seen, strict=True):
             self._step()
@@ -186,8 +186,8 @@ class Vision:
     ) -> RankedTiles:
         """Decode a photo, find its features, and rank tiles of a set by them.
 
-        A photo that cannot be used comes back as it is, and ranks nothing. The tiles to rank are
-        ``allowed`` (T,); None ranks none.
+        An unusable photo comes back as it is, and ranks no tile. The tiles to rank are ``allowed``
+        (T,); None ranks none.
         """
         queued, started = max(0.0, time() - submitted), perf_counter()
         self._step()
@@ -237,7 +237,7 @@ class Vision:
     def finish_sequence(
         self, sequence: PackedSequence, maps: Sequence[MapFolder]
     ) -> list[Localization]:
-        """Return the answers that waited for instants which will not come."""
+        """Return the answers that are still waiting, when no more instants come."""
         run = self._sequence(sequence, maps)
         return [run.localization(answer) for answer in run.finish()]
 

@@ -106,7 +106,7 @@ class CannedService:
             case b"huge":
                 raise TooLarge("image.too_large", "too many bytes", field="image")
             case b"crash":
-                raise VislocError("server.internal", "the server made a mistake")
+                raise VislocError("server.internal", "internal error")
             case b"gone":
                 raise NotFound("map.unknown", "no such map", field="map", got=asked["map"])
             case b"weights":
@@ -174,7 +174,7 @@ class CannedService:
             if content.startswith(b"broken"):
                 error = {"kind": "InvalidInput", "code": "image.undecodable", "message": "no photo"}
             elif content.startswith(b"crash"):
-                raise VislocError("server.internal", "the server made a mistake")
+                raise VislocError("server.internal", "internal error")
             elif content.startswith(b"busy"):
                 self.busy[content] += 1
                 if self.busy[content] <= 2:
@@ -254,7 +254,7 @@ class CannedService:
         if num_instants == 0:
             raise InvalidInput("sequence.empty", "there is no instant", field="instants")
         if self.fails_at_the_end:
-            raise VislocError("server.internal", "the server made a mistake")
+            raise VislocError("server.internal", "internal error")
 
     def map_info(self, ref: str) -> dict[str, Any]:
         if ref not in ("room", f"room@{self.version}"):

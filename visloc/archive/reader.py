@@ -309,14 +309,14 @@ def _beside_rows(
 
 
 def _lead_through(offsets: NDArray[np.int64], num_rows: int) -> bool:
-    """Tell whether offsets lead from the first row to the last and never back."""
+    """Whether offsets start at 0, never decrease, and end at the number of rows."""
     # Compared, not subtracted: differences of large numbers overflow.
     ascend = bool((offsets[1:] >= offsets[:-1]).all())
     return ascend and int(offsets[0]) == 0 and int(offsets[-1]) == num_rows
 
 
 def _are_good(clusters: Clusters, num_images: int) -> bool:
-    """Tell whether clusters hold every photo once."""
+    """Whether clusters hold every photo exactly once."""
     offsets, members = clusters.offsets, clusters.members
     return (
         is_finite(clusters.centers)

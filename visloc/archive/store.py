@@ -37,10 +37,10 @@ _IMAGE_POSES = "image_poses.npy"
 
 
 class MapStore:
-    """Finds, opens, publishes and removes the maps of one place. Several threads may use it.
+    """Finds, opens, publishes and removes the maps of one folder or bucket. Thread-safe.
 
-    A place on another machine raises Unavailable ``maps.storage_away`` where it does not answer
-    and nothing is known of it.
+    Remote storage that does not answer raises Unavailable ``maps.storage_away``, unless the answer
+    is already known.
     """
 
     def __init__(self, root: Path) -> None:
@@ -88,7 +88,7 @@ class MapStore:
         return self.backend.folder(*self._found(ref))
 
     def at_hand(self, ref: str) -> Path | None:
-        """The same as ``folder`` where that is quick; None when it must be fetched first."""
+        """The same as ``folder``, without fetching; None when it must be fetched first."""
         return self.backend.local_folder(*self._found(ref))
 
     def open(self, ref: str) -> Map:
@@ -100,7 +100,7 @@ class MapStore:
         return open_published_set(self.folder(ref))
 
     def outline(self, ref: str) -> MapOutline | SetOutline:
-        """Say what ``id`` or ``id@version`` is, without opening its arrays; raises as ``open``."""
+        """Describe ``id`` or ``id@version`` without opening its arrays; raises as ``open``."""
         return self.backend.outline(*self._found(ref))
 
     def publish(
@@ -114,8 +114,9 @@ class MapStore:
     ) -> Path:
         """Verify a finished map folder, give it its place, and make it current.
 
-        Every byte is read first. A reader sees the old map or the new one, never a half. Killed
-        before ``current`` is switched, the version is there and the one before it stays in use.
+        Every byte is verified first. A reader sees the old map or the new one, never a mixture. If
+        the process is killed before ``current`` is switched, the new version exists but the
+        previous one stays in use.
 
         Args:
             incoming: the map, within a folder that ``incoming()`` gave.
@@ -188,10 +189,10 @@ class MapStore:
         delete()
 
     def incoming(self) -> AbstractContextManager[Path]:
-        """Give an empty folder for a map that is to be published.
+        """Yield an empty folder for a map that will be published.
 
-        It is deleted in the end with all that is left in it. If the process is killed meanwhile,
-        the next ``sweep`` deletes it; every ``incoming`` begins with one.
+        The folder is deleted when the block ends. If the process is killed before that, the next
+        ``sweep`` deletes it; every ``incoming`` begins with a sweep.
 
         Raises:
             StorageFull: ``maps.storage_full``, also for a full disk within the block.
@@ -200,7 +201,7 @@ class MapStore:
         return self.backend.incoming()
 
     def sweep(self) -> None:
-        """Delete what killed processes left behind of uploads and removals."""
+        """Delete leftovers of uploads and removals whose process was killed."""
         self.backend.sweep()
 
     def _current_or_none(self, map_id: str) -> str | None:
@@ -255,7 +256,7 @@ class MapStore:
         return isinstance(manifest, Manifest)
 
     def _looks_like_map(self, map_id: str, version: str) -> bool:
-        """Tell by its files that a version is no set; one that lost files does not look like it."""
+        """Whether a version's files show that it is a map; a damaged map may lack them."""
         has_poses = self.backend.has_file(map_id, version, _IMAGE_POSES)
         return has_poses and not self.backend.has_file(map_id, version, SET_CODES)
 
@@ -290,7 +291,7 @@ def open_published(folder: Path) -> Map:
     """Open the map in a folder ``<id>/<version>``.
 
     Raises:
-        MapCorrupt: what ``open_map`` finds, or ``map.renamed`` for another folder than that.
+        MapCorrupt: what ``open_map`` finds, or ``map.renamed`` if the folder has another name.
     """
     opened = open_map(folder)
     refuse_renamed(opened.manifest, str(folder), folder.parent.name, folder.name)

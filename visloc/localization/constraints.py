@@ -26,11 +26,11 @@ from visloc.pose.views import MatchedView
 from visloc.priors import HEIGHT_REACH, POSE_PRIOR_STDS, REACH, Priors
 
 _LEAST_REACH = 1e-9  # of a map whose photos see nothing
-# A pose contradicts a prior when it is further away than so many of its own standard deviations.
+# A pose contradicts a prior beyond this many of its own standard deviations.
 _OWN_STDS = 3.0
 # Chi-square with six degrees of freedom is above this once in 10 000 times.
 _MAX_MAHALANOBIS2 = 27.86
-# What is sent for down and what the map knows may differ by so much.
+# Largest angle between the down direction of a request and that of the map.
 _MAX_DOWN_DIFFERENCE = math.radians(5.0)
 _LEAST_TANGENT = 1e-12  # of the angle between a ray and the camera's axis
 _NUM_REACH_PHOTOS, _NUM_REACH_LANDMARKS = 100, 200
@@ -127,7 +127,7 @@ class Constraints:
 
     @property
     def narrow(self) -> bool:
-        """Whether the priors leave out photos, or poses, before any is judged."""
+        """Whether the priors exclude photos or poses from the search."""
         priors = self._priors
         return any((priors.position, priors.height, priors.pose, priors.gravity))
 
@@ -168,12 +168,17 @@ class Constraints:
         if position is not None:
             away = float(np.linalg.norm(center - position.position))
             if away > position.radius + own:
-                return f"it lies {away:.2f} from the prior position, at most {position.radius:g}"
+                return (
+                    f"it lies {away:.2f} from the prior position, but at most "
+                    f"{position.radius:g} is allowed"
+                )
         band = self._priors.height
         if band is not None and self._up is not None:
             height = float(center @ self._up)
             if not band.min - own <= height <= band.max + own:
-                return f"its height is {height:.2f}, the prior says {band.min:g} to {band.max:g}"
+                return (
+                    f"its height is {height:.2f}, but the prior says {band.min:g} to {band.max:g}"
+                )
         if self.gravity is not None:
             angle = gravity_deviation(pose, self.gravity)
             allowed = _OWN_STDS * math.hypot(
@@ -181,8 +186,8 @@ class Constraints:
             )
             if angle > allowed:
                 return (
-                    f"its down is {math.degrees(angle):.2g} degrees from the prior gravity, at "
-                    f"most {math.degrees(allowed):.2g}"
+                    f"its down direction is {math.degrees(angle):.2g} degrees from the prior "
+                    f"gravity, but at most {math.degrees(allowed):.2g} is allowed"
                 )
         if self._pose is not None:
             excess = mahalanobis2(pose, covariance, *self._pose)
@@ -191,7 +196,7 @@ class Constraints:
                 turned = Rotation.from_matrix(pose.rotation @ self._pose[0].rotation.T).magnitude()
                 return (
                     f"it lies {away:.2f} and {math.degrees(turned):.1f} degrees from the prior "
-                    f"pose, {math.sqrt(excess):.0f} standard deviations of both together"
+                    f"pose, which is {math.sqrt(excess):.0f} combined standard deviations"
                 )
         return None
 
@@ -200,7 +205,7 @@ class Constraints:
     ) -> list[MatchedView] | None:
         """Keep the correspondences that a pose within the pose prior can explain.
 
-        Where the focal length is unknown, with any that photos are taken with.
+        If the focal length is unknown, any plausible one may explain them.
 
         Returns:
             The views with fewer correspondences; None without a pose prior.
@@ -228,7 +233,7 @@ class Constraints:
 
 
 def _nearest_rays(view: MatchedView, expected: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of the rays that pixels have with one focal length or another, those nearest to others.
+    """Return each pixel's ray that is nearest to an expected ray, over all focal lengths.
 
     Args:
         view: of an unknown focal length.

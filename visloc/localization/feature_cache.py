@@ -1,4 +1,4 @@
-"""Local features of one query photo, found once for all maps that are asked."""
+"""Local features of one query photo, computed once for all maps that are searched."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from visloc.images import Photo
 from visloc.options import Extraction, LocalizeOptions, ReadAs
 from visloc.types import LocalFeatures
 
-# Keypoints of a query that are used, strongest first. ACCURATE uses as many as the mapping images.
+# Most keypoints of a query, strongest first. ACCURATE uses as many as the mapping images.
 _MOST_KEYPOINTS: Mapping[Extraction, int] = {Extraction.FAST: 1000, Extraction.DEFAULT: 2500}
 
 
@@ -24,8 +24,8 @@ class FoundFeatures:
 
     Attributes:
         local: with keypoints in the stored pixels.
-        max_keypoints: how many the extractor might have returned.
-        rgb: (height, width, 3) pixels that it looked at, upright where that was asked for.
+        max_keypoints: the limit that the extractor was given.
+        rgb: (height, width, 3) pixels that it read, upright if that was asked for.
     """
 
     local: LocalFeatures
@@ -33,7 +33,7 @@ class FoundFeatures:
     rgb: NDArray[np.uint8]
 
 
-# Of one photo, by what found them and how.
+# The features of one photo, by extractor and settings.
 FeatureCache = dict[tuple[LocalFeatureExtractor, ReadAs, Extraction], FoundFeatures]
 
 

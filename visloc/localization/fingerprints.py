@@ -1,4 +1,4 @@
-"""Whether the features of a map are those that are at hand."""
+"""Check that a map was built with the installed features."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from visloc.types import Fingerprint
 
 
 def check_fingerprint(built_with: FingerprintRecord, at_hand: Fingerprint, ref: str) -> None:
-    """Refuse a map that was built with other features than those at hand.
+    """Refuse a map that was built with other features than the installed ones.
 
     Raises:
         Conflict: ``map.features``.
@@ -19,8 +19,8 @@ def check_fingerprint(built_with: FingerprintRecord, at_hand: Fingerprint, ref: 
         return
     raise refuse(
         "map.features",
-        f"map {ref} was built with another {built_with.name}; use the weights and the "
-        "version of visloc that built it, or build it again",
+        f"map {ref} was built with a different {built_with.name}; use the visloc "
+        "version and weights that built it, or rebuild the map",
         field="weights_dir" if "weights_sha256" in differing else "map",
         expected=", ".join(f"{name} {there.get(name)}" for name in differing),
         got=", ".join(f"{name} {here.get(name)}" for name in differing),

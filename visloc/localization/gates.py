@@ -26,11 +26,11 @@ from visloc.pose.views import MatchedView
 from visloc.types import Reason, Refusal
 
 # The default max_error_px applies to photos whose longer side has at least this many pixels, and
-# shrinks with smaller ones: 12 px are so large a part of a photo of 256 px that wrong poses
-# explain up to 10 % of the matches by chance.
+# shrinks with smaller ones. In a photo of 256 px, 12 px let wrong poses explain up to 10 % of the
+# matches by chance.
 FULL_ERROR_FROM_PX = 640
-# A prior decides between two poses that the photo leaves open. The photo leaves them open when the
-# pose that the prior allows has at least this share of the other's inliers.
+# When a photo fits two poses, a prior decides between them. It fits both when the pose that the
+# prior allows has at least this share of the other's inliers.
 _AMBIGUOUS_SHARE = 0.7
 # A pose with fewer inliers must be confirmed by two halves of the matches. Their distance is
 # chi-square with six degrees of freedom: above the limit once in a thousand times.
@@ -40,7 +40,7 @@ _MAX_HALVES_MAHALANOBIS2 = 22.46
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """The search for one pose: what the images show, and what is asked.
+    """The search for one pose: views, options and constraints.
 
     Attributes:
         views: of the images, relative to the map's origin.
@@ -59,7 +59,7 @@ class Problem:
         return sum(len(view) for view in self.views)
 
     def of(self, views: Sequence[MatchedView]) -> Problem:
-        """Return the same search in other views."""
+        """Return the same search with other views."""
         return replace(self, views=tuple(views))
 
     def solve(self, *, with_gravity: bool = True) -> GeneralizedPose | None:
@@ -91,7 +91,7 @@ def registration_for(options: LocalizeOptions, cameras: Sequence[Camera]) -> Reg
 def accepted(problem: Problem, best: GeneralizedPose) -> tuple[GeneralizedPose, Refusal | None]:
     """Judge the best pose of a problem.
 
-    Where the images leave the place open, a pose prior decides: another pose may be returned.
+    If the images fit two places, a pose prior decides: the returned pose may not be ``best``.
 
     Returns:
         The judged pose, and the reason to refuse it or None.
@@ -110,26 +110,26 @@ def first_refusal(gates: Sequence[Gate], problem: Problem, pose: GeneralizedPose
 
 
 def enough_inliers(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
-    """Refuse a pose that fewer matches agree with than ``min_inliers``."""
+    """Refuse a pose with fewer than ``min_inliers`` inliers."""
     needed = problem.registration.min_inliers
     if pose.num_inliers >= needed:
         return None
     return _refused(
         Reason.TOO_FEW_INLIERS,
-        f"the best pose explains {pose.num_inliers} matches, {needed} are needed; "
-        f"{_doubt(problem)}",
+        f"the best pose explains {pose.num_inliers} matches, but {needed} are "
+        f"needed; {_doubt(problem)}",
     )
 
 
 def enough_of_the_matches(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
-    """Refuse a pose that a smaller share of the matches agrees with than ``min_inlier_ratio``."""
+    """Refuse a pose whose inliers are a smaller share of the matches than ``min_inlier_ratio``."""
     ratio, needed = pose.num_inliers / problem.num_matches, problem.registration.min_inlier_ratio
     if ratio >= needed:
         return None
     return _refused(
         Reason.LOW_INLIER_RATIO,
-        f"the best pose explains {ratio:.1%} of the matches, {needed:.1%} are needed; "
-        f"{_doubt(problem)}",
+        f"the best pose explains {ratio:.1%} of the matches, but {needed:.1%} are "
+        f"needed; {_doubt(problem)}",
     )
 
 
@@ -138,11 +138,11 @@ def determined(_: Problem, pose: GeneralizedPose) -> Refusal | None:
     if pose.covariance is not None:
         return None
     if pose.camera is None:
-        why = "the matched landmarks leave the pose undetermined: they lie in a line or a spot"
+        why = "the matched landmarks lie on one line or in one spot: they do not fix the pose"
     else:
         why = (
-            "the matched landmarks, in a plane or a spot, leave focal length and distance "
-            "undetermined: send the camera"
+            "the matched landmarks lie in one plane or spot: they do not fix "
+            "focal length and distance: send the camera"
         )
     return _refused(Reason.UNCERTAIN_POSE, why)
 
@@ -165,8 +165,9 @@ def not_better_without_gravity(problem: Problem, pose: GeneralizedPose) -> Refus
         return None
     return _refused(
         Reason.CONTRADICTS_PRIOR,
-        f"a pose that the prior gravity excludes explains {other.num_inliers} matches, the one "
-        f"that it allows {pose.num_inliers}: the gravity is wrong, or the place looks alike twice",
+        f"a pose that the prior gravity excludes explains {other.num_inliers} "
+        f"matches, but the best allowed pose only {pose.num_inliers}: the gravity "
+        "is wrong, or two places look alike",
     )
 
 
@@ -174,8 +175,8 @@ def halves_agree(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
     """Refuse a pose of few inliers when two halves of the matches give different poses.
 
     Dozens of matches of a blurred photo can agree within 12 pixels on a pose that is metres off.
-    The covariance does not show it. With a focal length to find, halves agree too easily: such a
-    pose needs more inliers instead.
+    The covariance does not show it. If the focal length was estimated too, halves agree too easily:
+    such a pose needs more inliers instead.
     """
     options = problem.options
     if (
@@ -187,10 +188,10 @@ def halves_agree(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
     if pose.camera is not None:
         return _refused(
             Reason.UNCERTAIN_POSE,
-            f"the best pose, with a focal length found together with it, explains only "
-            f"{pose.num_inliers} matches, {_SURE_INLIERS} are needed: send the camera",
+            "the focal length was estimated with the pose; such a pose needs "
+            f"{_SURE_INLIERS} inliers, but has {pose.num_inliers}: send the camera",
         )
-    # Of two places that explain the photo, a pose prior may have decided for one.
+    # A pose prior may have decided between two places that explain the photo.
     near = problem.constraints.near_pose_prior(problem.views, problem.registration.max_error_px)
     views = near or problem.views
     random = np.random.default_rng(options.seed)
@@ -205,8 +206,9 @@ def halves_agree(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
         return None
     return _refused(
         Reason.UNCERTAIN_POSE,
-        f"the best pose explains only {pose.num_inliers} matches, and two halves of the matches "
-        "give poses that contradict each other: the photo is blurred, or of another place",
+        f"the best pose explains only {pose.num_inliers} matches, and two halves of "
+        "the matches give contradictory poses: the photo is blurred, or shows "
+        "another place",
     )
 
 
@@ -215,7 +217,7 @@ CONFIRMATIONS: tuple[Gate, ...] = (not_better_without_gravity, halves_agree)
 
 
 def not_better_elsewhere(elsewhere: Problem, pose: GeneralizedPose | None) -> Refusal | None:
-    """Refuse what the priors allow when a pose that they forbid explains the images better.
+    """Refuse the best allowed pose when a pose that the priors exclude explains the images better.
 
     Args:
         elsewhere: matches with the photos that the priors exclude.
@@ -235,8 +237,9 @@ def not_better_elsewhere(elsewhere: Problem, pose: GeneralizedPose | None) -> Re
         return None
     return _refused(
         Reason.CONTRADICTS_PRIOR,
-        f"a place that the priors exclude explains {other.num_inliers} matches, the one that "
-        f"they allow {num_inliers}: the priors are wrong, or both places look alike",
+        f"a place that the priors exclude explains {other.num_inliers} matches, but "
+        f"the allowed area only {num_inliers}: the priors are wrong, or both places "
+        "look alike",
     )
 
 
@@ -247,13 +250,11 @@ def contradicts_priors(
     contradiction = constraints.contradiction(rig_from_world, covariance)
     if contradiction is None:
         return None
-    return _refused(
-        Reason.CONTRADICTS_PRIOR, f"the best pose contradicts what is known: {contradiction}"
-    )
+    return _refused(Reason.CONTRADICTS_PRIOR, f"the best pose contradicts a prior: {contradiction}")
 
 
 def _near_pose_prior(problem: Problem, forbidden: GeneralizedPose) -> GeneralizedPose | None:
-    """Where the images leave the place open, return the pose that the pose prior decides for."""
+    """Return the best pose near the pose prior, if the images fit it about as well."""
     max_error_px = problem.registration.max_error_px
     near = problem.constraints.near_pose_prior(problem.views, max_error_px)
     start = None if near is None else problem.of(near).solve()
@@ -270,7 +271,7 @@ def _near_pose_prior(problem: Problem, forbidden: GeneralizedPose) -> Generalize
 
 def _doubt(problem: Problem) -> str:
     if problem.constraints.narrow:
-        return "only the part of the map that the priors allow was searched: are they right?"
+        return "only the area that the priors allow was searched: are the priors right?"
     return "is this photo of the mapped place?"
 
 

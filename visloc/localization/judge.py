@@ -1,7 +1,7 @@
-"""One answer of several places that were searched: maps, or tiles of a set.
+"""Choose one answer among several searched places: maps, or tiles of a set.
 
-Inliers say how well a place explains a photo, not that no other place explains it as well. So no
-answer is taken for having one inlier more: another place that explains half as much must agree.
+Many inliers do not rule out that another place explains the photo as well. So one more inlier does
+not decide: every place with at least half as many must agree.
 """
 
 from __future__ import annotations
@@ -17,23 +17,22 @@ from visloc.geometry import Similarity, rotation_angle
 from visloc.pose.centre import largest_std, moved_pose, position_covariance
 from visloc.types import InstantAnswer, Reason, Refusal, RigPose
 
-# Of the most inliers: answers of this share must agree with each other, or the answer is
-# ambiguous; of those of this share, the most certain counts.
+# As shares of the most inliers. All answers above the first share must agree, or the result is
+# ambiguous. Among the answers above the second share, the most certain wins.
 _RIVAL_SHARE, _SIMILAR_SHARE = 0.5, 0.8
-# Answers agree that are no further apart than what both leave open (three standard deviations),
-# and how well their places are tied to each other: a tenth of how far their photos see, five
-# degrees.
+# Two answers agree when they differ by less than three standard deviations plus the slack of the
+# tie between their places: a tenth of how far their photos see, and five degrees.
 STDS = 3.0
 TIE_REACH_SHARE, TIE_ANGLE = 0.1, math.radians(5.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """What one place answered.
+    """The answer of one place.
 
     Attributes:
         ref: the map, ``id@version``.
-        answer: in a frame of the place's own.
+        answer: in the place's own frame.
     """
 
     ref: str
@@ -42,38 +41,38 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tie:
-    """How the frames of two candidates lie to each other.
+    """The transform between the frames of two candidates.
 
     Attributes:
         a_from_b: from the frame of the second to that of the first.
-        slack: how far off that may be, in the unit of the first.
+        slack: largest error of that transform, in the unit of the first.
     """
 
     a_from_b: Similarity
     slack: float
 
 
-# Given two candidates, the tie of their frames; None where nothing ties them.
+# Returns the tie of two candidates, or None if the transform is unknown.
 Ties = Callable[[int, int], Tie | None]
 
 
 def judge(candidates: Sequence[Candidate], ties: Ties) -> int | Refusal:
     """Choose the answer among those of several places.
 
-    Of answers with a pose, the one with the most inliers counts, or one that has similarly many
-    and is more certain. The photo is refused where two places explain it at least half as well as
-    the best does, and their poses differ, or cannot be compared because nothing ties the places to
-    each other: guessing could put the device into the wrong building. All pairs are compared, since
-    an uncertain answer agrees with places that contradict each other.
+    The answer with the most inliers wins, or one with similarly many that is more certain. Places
+    that explain the photo at least half as well as the best are rivals. The photo is refused if the
+    poses of two rivals differ, or cannot be compared because no tie is known: guessing could put
+    the device into the wrong building. All pairs are compared, since an uncertain answer agrees
+    with places that contradict each other.
 
     Args:
-        candidates: at least one. One that was refused as ambiguous itself (by a set) counts
-            among the places that explain the photo.
+        candidates: at least one. An answer that a set refused as ambiguous counts as explaining the
+            photo.
         ties: between their frames.
 
     Returns:
-        The row of the answer; when no place gave a pose, of the one that came furthest. Or a
-        refusal, ``ambiguous``.
+        The row of the chosen answer, or a refusal, ``ambiguous``. If no place gave a pose, the row
+        of the answer that came closest to one.
     """
     answers = [candidate.answer for candidate in candidates]
     explains = [i for i, answer in enumerate(answers) if _explains(answer)]
@@ -122,7 +121,7 @@ def _spread(answer: InstantAnswer) -> float:
 
 
 def _agree(a: InstantAnswer, b: InstantAnswer, tie: Tie) -> bool:
-    """Whether two poses are those of one place, seen from two maps."""
+    """Whether two poses from two maps agree."""
     known_a, known_b = measured_pose(a), measured_pose(b)
     assert known_a is not None  # the caller has looked
     assert known_b is not None
@@ -136,15 +135,15 @@ def _agree(a: InstantAnswer, b: InstantAnswer, tie: Tie) -> bool:
 
 
 def _ambiguous(a: Candidate, b: Candidate, *, tied: bool) -> Refusal:
-    where = "at different places" if tied else "and nothing says how they lie to each other"
+    where = "at different places" if tied else "in frames without a known transform"
     advice = (
-        "say where it is (priors)"
+        "send priors that exclude one of them"
         if tied
         else "name one of them, put them into a set (mapping set), or anchor both (mapping anchor)"
     )
     return Refusal(
         "gate",
         Reason.AMBIGUOUS,
-        f"{a.ref} and {b.ref} both explain it, {where}, with {a.answer.num_inliers} and "
+        f"{a.ref} and {b.ref} both explain the query, {where}, with {a.answer.num_inliers} and "
         f"{b.answer.num_inliers} inliers; {advice}",
     )

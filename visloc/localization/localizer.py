@@ -64,8 +64,8 @@ if TYPE_CHECKING:
 
 # For global descriptors that do not look at the photo.
 _NO_PIXELS = np.empty((0, 0, 3), np.uint8)
-# Where priors narrow the search, photos elsewhere that would be among so many most similar ones are
-# asked too: they may show that the priors are wrong.
+# When priors narrow the search, excluded photos among this many most similar ones are matched too:
+# they may show that the priors are wrong.
 _NUM_ELSEWHERE = 5
 
 
@@ -75,7 +75,7 @@ class _Features:
 
     Attributes:
         local: with keypoints in the stored pixels.
-        sent: global descriptors by name; those of the map that are missing are computed.
+        sent: global descriptors by name; missing ones are computed.
         rgb: (height, width, 3) pixels for descriptors that look at them.
         seconds: of ``evidence``, to be added to.
     """
@@ -92,14 +92,15 @@ class Localizer:
 
     Args:
         opened: the map.
-        extractor: of its local features; None when only features are to be localized, as in maps
-            of ready-made features.
-        make_descriptor: of a global descriptor by name, for those that the map has.
-        make_matcher: of the network of ``Matcher.LIGHTGLUE`` by the name of local features, asked
-            by each query that wants it.
+        extractor: of its local features; None to localize features only, as in maps of ready-made
+            ones.
+        make_descriptor: makes a global descriptor by name.
+        make_matcher: makes the network of ``Matcher.LIGHTGLUE`` by the name of local features;
+            called by each query that uses it.
 
     Raises:
-        Conflict: ``map.features`` when the map was built with other features than those at hand.
+        Conflict: ``map.features`` when the map was built with other features than the installed
+            ones.
     """
 
     def __init__(
@@ -147,17 +148,17 @@ class Localizer:
         self.localize_features(features, camera, LocalizeOptions())
 
     def check(self, options: LocalizeOptions, num_cameras: int = 1) -> None:
-        """Refuse options that do not fit the map, before anything is looked at.
+        """Refuse options that do not fit the map, before any work.
 
         Args:
             options: of a query.
-            num_cameras: of the rig that is to be localized; 1 for a camera on its own.
+            num_cameras: cameras of the rig; 1 for a camera on its own.
 
         Raises:
             InvalidInput: ``options.fusion_weights`` of global descriptors that the map does not
                 have; ``options.matcher`` when there is none for its local features;
                 ``options.solver`` for a rig of several cameras with ``registration``.
-            WeightsError: when the weights of the matcher are not here, or damaged.
+            WeightsError: when the weights of the matcher are missing or damaged.
         """
         self._fusion(options)
         check_solver(options, num_cameras)
@@ -198,8 +199,8 @@ class Localizer:
         """Estimate the pose of the photo whose features these are.
 
         Args:
-            features: of the map's kind; with every global descriptor of the map that counts, but
-                for those that are made of local features, which are computed when not sent.
+            features: of the map's kind, with every global descriptor that counts. Those made of
+                local features may be left out and are then computed.
             camera: the intrinsics of the photo that the keypoints are of.
             options: thresholds and the like.
             priors: what is known of the camera.
@@ -221,7 +222,7 @@ class Localizer:
         priors: Priors = NO_PRIORS,
         cache: FeatureCache | None = None,
     ) -> Look:
-        """Find what one photo shows of the map; arguments and errors as of ``localize``."""
+        """Match one photo with the map; arguments and errors as for ``localize``."""
         fusion = self._fusion(options)
         if self._extractor is None or not self._takes_photos(fusion):
             raise self._features_required(fusion)
@@ -242,7 +243,7 @@ class Localizer:
         options: LocalizeOptions,
         priors: Priors = NO_PRIORS,
     ) -> Look:
-        """Find what features show of the map; arguments, errors as of ``localize_features``."""
+        """Match features with the map; arguments and errors as for ``localize_features``."""
         if camera is None:
             raise refuse(
                 "camera.required", field="camera", expected="its model, size and parameters"
@@ -274,16 +275,16 @@ class Localizer:
     def solve_look(
         self, look: Look, options: LocalizeOptions, priors: Priors = NO_PRIORS
     ) -> tuple[Answer, NDArray[np.bool_]]:
-        """Find the pose of one photo that was looked at: a rig of one camera, in terms of it.
+        """Find the pose of one photo that was matched.
 
         Args:
             look: what the photo shows.
-            options: those that it was looked at with.
+            options: those that it was matched with.
             priors: what is known of the camera.
 
         Returns:
-            The answer, and of the look's matches (n,) whether the best pose explains them, were
-            the pose accepted or not.
+            The answer, and for each match (n,) whether the best pose explains it, even if that pose
+            was refused.
         """
         solved = self.solve([SeenImage("camera", Pose.identity(), look)], options, priors)
         answer, pose = solved.answer, solved.answer.pose
@@ -327,7 +328,7 @@ class Localizer:
                 evidence,
                 "features",
                 Reason.NO_KEYPOINTS,
-                "the photo shows nothing to hold on to: it is blank, dark, blurred or too small",
+                "no keypoints were found: the photo is blank, dark, blurred or too small",
             )
         with timed(seconds, "global_features"):
             query = {
@@ -343,7 +344,7 @@ class Localizer:
                 evidence,
                 "retrieval",
                 Reason.NO_PHOTO_NEAR,
-                "the map has no photo where the priors say that this one was taken",
+                "the map has no photo in the area that the priors allow",
             )
         evidence = replace(evidence, retrieved=tuple(self._describe_retrieved(retrieved)))
         with timed(seconds, "matching"):
@@ -359,7 +360,7 @@ class Localizer:
         options: LocalizeOptions,
         rematching: Rematching | None,
     ) -> tuple[Matches, NDArray[np.int64]]:
-        """Match with the landmarks that photos of the map, most similar first, see; say which."""
+        """Match with the landmarks that these photos see, best photo first; also return rows."""
         scale = self.map.manifest.local_features.descriptor_scale
         observed = (self.map.observations(int(photo)) for photo in photos)
         pairs = match_landmarks(
@@ -381,16 +382,16 @@ class Localizer:
         weights: NDArray[np.float64] | None,
         fusion: LateFusion,
     ) -> NDArray[np.int64]:
-        """Photos that the priors exclude, though few others look as much like the query.
+        """Photos that the priors exclude although they look very much like the query.
 
-        Where two floors look alike, which photo looks most like the query is chance: hence not only
-        those that look more like it than all others.
+        On look-alike floors the most similar photo is a coin toss, so a photo need not be the very
+        best to count.
         """
         if weights is None:
             return np.empty(0, dtype=np.int64)
         excluded = np.asarray(weights == 0, dtype=np.float64)
         others = retrieve(query, self.map.global_descriptors, _NUM_ELSEWHERE, excluded, fusion)
-        # Fused anew, together: scores that are ranks compare those only that were ranked together.
+        # Fuse both lists together: scores that are ranks only compare within one ranking.
         found, num = (retrieved.similarities, others.similarities), len(retrieved.images)
         scores = fusion.scores({name: np.concatenate([f[name] for f in found]) for name in query})
         best = np.sort(scores[:num])[::-1][:_NUM_ELSEWHERE]

@@ -7,16 +7,16 @@ from visloc.geometry import Camera
 from visloc.images import Photo
 from visloc.types import CameraSource
 
-# Focal length in units of the longer side when nothing is known: 45 degrees across, between a
-# phone's main camera (0.7 to 0.8) and a long lens. It is COLMAP's guess too.
+# Focal length in units of the longer side when nothing is known: a view of 45 degrees, between a
+# phone's main camera (0.7 to 0.8) and a long lens. COLMAP guesses the same.
 GUESSED_FOCAL = 1.2
 
 
 def resolve_camera(photo: Photo, given: Camera | None) -> tuple[Camera, CameraSource]:
     """Choose the intrinsics of a photo: given, else EXIF's focal length, else a guess.
 
-    A camera given for another size of the same aspect is scaled to the photo. A guess is where the
-    search for the focal length of a photo on its own starts (``visloc.localization.solving``).
+    A camera given for another size of the same aspect is scaled to the photo. For a photo on its
+    own, the search for the focal length starts from the guess (``visloc.localization.solving``).
 
     Raises:
         InvalidInput: ``camera.size_mismatch``.
@@ -33,9 +33,9 @@ def resolve_camera(photo: Photo, given: Camera | None) -> tuple[Camera, CameraSo
         return given.scaled(width, height), CameraSource.GIVEN_SCALED
     turned = photo.is_on_its_side and given.has_aspect_of(height, width)
     message = (
-        "the camera does not fit the photo, which is stored turned (EXIF orientation "
-        f"{photo.exif_orientation}); send the camera of the stored pixels, or turn the pixels and "
-        "remove the EXIF orientation"
+        "the camera does not fit the photo, which is stored rotated (EXIF "
+        f"orientation {photo.exif_orientation}); send the camera of the stored "
+        "pixels, or rotate the pixels and remove the EXIF orientation"
     )
     raise refuse(
         "camera.size_mismatch",

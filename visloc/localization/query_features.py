@@ -25,7 +25,7 @@ EDGE_TOLERANCE_PX = 1.0
 def max_sent_keypoints(manifest: Manifest) -> int:
     """Return how many keypoints may be sent: as many as a photo of the map may have."""
     local = manifest.local_features
-    # A map of ready-made features took all that there were; its own number says nothing.
+    # A map of ready-made features keeps all keypoints; its max_keypoints is no limit.
     return (
         MAX_READY_MADE_KEYPOINTS if is_ready_made(local.fingerprint.name) else local.max_keypoints
     )
@@ -34,7 +34,7 @@ def max_sent_keypoints(manifest: Manifest) -> int:
 def checked_local_features(
     features: QueryFeatures, camera: Camera, manifest: Manifest
 ) -> LocalFeatures:
-    """Return sent keypoints and descriptors, rows of unit length, as if they were found here.
+    """Return sent keypoints and descriptors as local features, with rows of unit length.
 
     Raises:
         InvalidInput: ``features.kind``, ``features.keypoints`` or ``features.descriptors``.
@@ -64,7 +64,7 @@ def checked_local_features(
     _check_finite("descriptors", "features.descriptors", descriptors)
     empty = np.flatnonzero(~descriptors.any(axis=1))
     if len(empty):
-        raise _unusable("descriptors", f"row {empty[0]} has no direction", "not all zero", "zeros")
+        raise _unusable("descriptors", f"row {empty[0]} is all zeros", "not all zero", "zeros")
     return to_local_features(keypoints.astype(np.float32, copy=False), descriptors)
 
 
@@ -120,7 +120,7 @@ def _check_kind(kind: str, manifest: Manifest) -> None:
 
 
 def _check_inside(keypoints: NDArray[np.generic], camera: Camera) -> None:
-    with np.errstate(invalid="ignore"):  # of signalling NaN, which are outside as all others
+    with np.errstate(invalid="ignore"):  # signalling NaN; all NaN count as outside
         xy = keypoints.astype(np.float64)
     low, high = -EDGE_TOLERANCE_PX, np.array([camera.width, camera.height]) + EDGE_TOLERANCE_PX
     outside = np.flatnonzero(~((xy >= low) & (xy <= high)).all(axis=1))  # NaN is outside too
@@ -135,7 +135,7 @@ def _check_inside(keypoints: NDArray[np.generic], camera: Camera) -> None:
 
 
 def _check_finite(part: str, field: str, values: NDArray[np.generic]) -> None:
-    # What float32 cannot hold is refused as well, and NaN of any kind.
+    # Also refuse values beyond float32, and NaN of any kind.
     with np.errstate(over="ignore", invalid="ignore"):
         finite = np.isfinite(values.astype(np.float32, copy=False))
     if not finite.all():

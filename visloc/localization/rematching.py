@@ -1,4 +1,4 @@
-"""Matching a photo once more with those that it has most in common with, by a network."""
+"""Match a photo again, by a network, with the mapping photos that share most matches."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Rematching:
 
 
 def seen_as_found(local: LocalFeatures, evidence: Evidence) -> SeenKeypoints:
-    """Return the keypoints of a query where its descriptors were computed, in the upright photo."""
+    """Return a query's keypoints in the frame of its descriptors: the photo as it was read."""
     turn = turn_of(evidence.exif_orientation) if evidence.read_as is ReadAs.UPRIGHT else 1
     return _seen_upright(local.keypoints, local.descriptors, evidence.camera, turn)
 

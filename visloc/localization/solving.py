@@ -1,4 +1,4 @@
-"""From what the images of an instant show to one pose that can be believed, or a refusal."""
+"""Solve an instant: from the matches of its images to one accepted pose, or a refusal."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from visloc.types import (
     RigPose,
 )
 
-# What becomes of a photo whose features were found on its side.
+# Usual refusals of a photo whose features were found on its side.
 _REASONS_OF_TURNED_PHOTOS = (
     *(Reason.TOO_FEW_MATCHES, Reason.NO_POSE, Reason.TOO_FEW_INLIERS, Reason.LOW_INLIER_RATIO),
 )
@@ -57,15 +57,15 @@ class Matches:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Look:
-    """What one image shows of the map, before any pose is looked for.
+    """What one image shows of the map, before a pose is solved.
 
     Attributes:
         evidence: without inliers.
         matches: with landmarks.
         landmarks: (n,) int64 rows of the map's landmarks, those of ``matches``.
-        elsewhere: with landmarks of photos that the priors exclude, though they look more like
-            the query; mostly none.
-        refusal: why there is nothing to solve; None when there may be.
+        elsewhere: with landmarks of photos that look more like the query but that the priors
+            exclude; usually none.
+        refusal: why there is nothing to solve; None otherwise.
     """
 
     evidence: Evidence
@@ -81,7 +81,7 @@ class SeenImage:
 
     Attributes:
         sensor: the camera's id in the rig.
-        cam_from_rig: where it sits; the identity for a camera on its own.
+        cam_from_rig: its pose in the rig; the identity for a camera on its own.
         look: None when the image could not be used.
         error: why it could not.
     """
@@ -98,12 +98,12 @@ class Solved:
 
     Attributes:
         answer: for the caller.
-        views: what each usable image contributed, relative to the map's origin; nothing where its
-            camera was left out. A ``focal_unknown`` was found where there is a pose, and is still a
-            guess where there is none.
+        views: of the usable images, relative to the map's origin; empty for a camera that was left
+            out. The focal length of a ``focal_unknown`` view is estimated if there is a pose, else
+            a guess.
         pose: the accepted pose, relative to the map's origin; None when there is none.
-        inliers: of each view, (n,) whether the best pose explains the match, were the pose
-            accepted or not; () when no pose was found.
+        inliers: of each view, (n,) whether the best pose explains the match, even if it was
+            refused; () when no pose was found.
     """
 
     answer: InstantAnswer
@@ -125,16 +125,16 @@ def solve_instant(
 ) -> Solved:
     """Find one pose from all images of an instant; a photo on its own is a rig of one camera.
 
-    Where the camera of a photo on its own is a guess, its focal length is found with the pose. The
-    answer has the guess when the pose is refused. Otherwise nothing rests on a guess, whose poses
-    are metres off with centimetres of covariance: beside other images of a rig, one whose camera
-    is a guess is left out; ``registration``, which takes cameras as they are, leaves it out, too.
-    Where that leaves too few matches, the pose is refused: ``uncertain_pose``, "send the camera".
+    A camera that is a guess gives poses that are metres off with centimetres of covariance. For a
+    photo on its own, the focal length is therefore estimated with the pose; if the pose is refused,
+    the answer has the guess. In a rig, and with the solver ``registration``, an image whose camera
+    is a guess is left out. If too few matches remain, the pose is refused: ``uncertain_pose``,
+    "send the camera".
 
     Args:
         images: each of another camera of the rig.
         geometry: of the map.
-        options: those that the images were looked at with.
+        options: those that the images were matched with.
         priors: what is known of the rig.
         timestamp: for the answer.
 
@@ -167,7 +167,7 @@ def solve_instant(
 
 
 def check_solver(options: LocalizeOptions, num_cameras: int) -> None:
-    """Refuse a solver that does not take so many images at once.
+    """Refuse a solver that cannot take this many images at once.
 
     Raises:
         InvalidInput: ``options.solver``.
@@ -186,7 +186,7 @@ def _views_of(
 ) -> tuple[MatchedView, ...]:
     """The views of the images that could be used, with their ``matches`` in order.
 
-    One whose camera is a guess is empty unless its focal length will be found.
+    A view whose camera is a guess is empty, unless its focal length will be estimated.
     """
     usable = [(image.cam_from_rig, image.look) for image in images if image.look is not None]
     finds_focal = len(usable) == 1 and options.solver is not Solver.REGISTRATION
@@ -207,7 +207,7 @@ def _views_of(
 
 
 def _shown(image: SeenImage, found: Camera | None) -> ImageAnswer:
-    """What an image shows, with the camera that was ``found`` together with the pose."""
+    """An image's evidence, with the camera ``found`` together with the pose."""
     evidence = None if image.look is None else image.look.evidence
     if evidence is not None and found is not None:
         evidence = replace(evidence, camera=found, camera_source=CameraSource.ESTIMATED)
@@ -217,7 +217,7 @@ def _shown(image: SeenImage, found: Camera | None) -> ImageAnswer:
 def with_inliers(
     images: Sequence[ImageAnswer], inliers: Sequence[NDArray[np.bool_]]
 ) -> tuple[ImageAnswer, ...]:
-    """Say what each image contributed to a pose with these ``inliers``, one mask per usable image.
+    """Count the inliers of each image; ``inliers`` has one mask per usable image.
 
     No masks mean no inliers.
     """
@@ -267,15 +267,16 @@ def _find_pose(
         return None, Refusal(
             "matching",
             Reason.TOO_FEW_MATCHES,
-            f"only {num_matches} keypoints match the map, {needed} are needed",
+            f"only {num_matches} keypoints match the map, but {needed} are needed",
         )
     if num_counted < needed:
         return None, Refusal(
             "gate",
             Reason.UNCERTAIN_POSE,
-            f"{num_matches - num_counted} of {num_matches} matches do not count: the focal length "
-            "of their photo is a guess, and found only for a photo on its own, by a solver other "
-            f"than {Solver.REGISTRATION}: send the camera",
+            f"{num_matches - num_counted} of {num_matches} matches do not count, "
+            "because the focal length of their photo is a guess: send the camera. Only "
+            "a photo on its own can do without, and only with a solver other than "
+            f"{Solver.REGISTRATION}",
         )
     best = problem.solve()
     if best is None:
@@ -284,7 +285,7 @@ def _find_pose(
 
 
 def _with_turned_photos(refusal: Refusal, looks: Sequence[Look]) -> Refusal:
-    """Add to the message that photos were read on their side, where that may be the cause."""
+    """Add to the message that photos were read on their side, if that may be the cause."""
     orientations = sorted(
         {
             look.evidence.exif_orientation
@@ -295,8 +296,8 @@ def _with_turned_photos(refusal: Refusal, looks: Sequence[Look]) -> Refusal:
     if not orientations or refusal.reason not in _REASONS_OF_TURNED_PHOTOS:
         return refusal
     exif = ", ".join(map(str, orientations))
-    hint = f"stored turned, EXIF orientation {exif}, and was read as stored: try read_as=upright"
-    return replace(refusal, message=f"{refusal.message} (the photo is {hint})")
+    hint = f"stored rotated (EXIF orientation {exif}) and read as stored: try read_as=upright"
+    return replace(refusal, message=f"{refusal.message}; the photo is {hint}")
 
 
 def _summed(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:

@@ -1,7 +1,7 @@
 """A sequence of instants, answered in order as soon as each answer is final.
 
-An instant that its own images do not localize waits for its neighbours: with relative motion
-they are solved together (visloc.sequences.window), without it the gap is interpolated
+An instant that its own images do not localize waits for its neighbours. With relative motion, they
+are solved together (visloc.sequences.window); without it, the gap is interpolated
 (visloc.sequences.filling). Both look at most ``max_gap_s`` ahead and back.
 """
 
@@ -36,24 +36,24 @@ from visloc.sequences.window import WindowInstant, WindowPose, solve_window
 from visloc.timing import timed
 from visloc.types import InstantAnswer, PoseSource, Reason, Refusal, RigPose
 
-# At most so many instants wait, and as many answered ones are remembered, however long the gap
-# may be: what is further away in a fast sequence adds little and costs time.
+# At most this many instants wait, and as many answered ones are kept, whatever the gap: in a fast
+# sequence, those further away add little and cost time.
 MAX_WAITING = 30
 # Standard deviation, as a share of the way, of motion that no measured pose can contradict.
 _UNCHECKED_SHARE = 0.05
-# A window in which no instant has a pose of its own takes seconds to search; one in which nothing
-# was found is left alone until so many instants are new.
+# Searching a window in which no instant has its own pose takes seconds. After a search in vain, the
+# next one waits for this many new instants.
 _BLIND_REST = 10
 _CONTRADICTED = Refusal(
     "gate",
     Reason.CONTRADICTS_MOTION,
-    "the pose of its own images contradicts those of its neighbours and the motion between",
+    "the pose from its own images contradicts the neighbours' poses and the motion between them",
 )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenInstant:
-    """An instant, its images looked at.
+    """An instant whose images were matched.
 
     Attributes:
         timestamp: greater than that of the instant before.
@@ -75,12 +75,12 @@ class _Entry(NamedTuple):
 
 
 class SequenceSolver:
-    """Takes instants one by one and gives back answers in order, each once it is final.
+    """Takes instants one by one and returns answers in order, each when it is final.
 
     Args:
         geometry: of the map.
         metric: whether one unit of the map's world is a metre.
-        options: those that the images are looked at with.
+        options: those that the images are matched with.
         time_unit: of the timestamps.
         max_gap_s: longest time between measured instants across which gaps are filled; 0: none.
 
@@ -112,7 +112,7 @@ class SequenceSolver:
 
     @property
     def newest(self) -> RigPose | None:
-        """What its own images measured of the newest instant; None when they do not localize it."""
+        """The pose of the newest instant from its own images; None when they do not localize it."""
         return self._entries[-1].solved.answer.pose if self._entries else None
 
     def add(self, seen: SeenInstant) -> list[InstantAnswer]:
@@ -145,7 +145,7 @@ class SequenceSolver:
         return self._answer(ended=False)
 
     def finish(self) -> list[InstantAnswer]:
-        """Return the answers that waited for instants which will not come."""
+        """Return the answers that are still waiting, when no more instants come."""
         self._rest = 0
         return self._answer(ended=True)
 
@@ -165,7 +165,7 @@ class SequenceSolver:
         return answers
 
     def _is_final(self, index: int) -> bool:
-        """Whether nothing that may still come can change the answer to an instant that waits."""
+        """Whether no later instant can change the answer to an instant that waits."""
         entry, newest = self._entries[index], self._entries[-1]
         if newest.ticks - entry.ticks >= self._max_gap or len(self._entries) - index > MAX_WAITING:
             return True
@@ -207,7 +207,7 @@ class SequenceSolver:
     def _solved_jointly(
         self, motions: Sequence[RelativeMotion | None], linked: Sequence[bool]
     ) -> list[InstantAnswer]:
-        """Solve all instants with their relative motion; those without keep their own answer."""
+        """Solve all instants with their relative motion; without motion, they keep their answer."""
         cameras = [view.camera for entry in self._entries for view in entry.solved.views]
         registration = (
             registration_for(self._options, cameras) if cameras else self._options.registration
@@ -287,7 +287,7 @@ class SequenceSolver:
     def _filled(
         self, answers: Sequence[InstantAnswer], linked: Sequence[bool]
     ) -> list[InstantAnswer]:
-        """Fill instants without a pose, of which no motion is known, from those around them."""
+        """Fill instants that have no pose and no known motion from the instants around them."""
         poses: list[TracedPose | None] = [
             None
             if answer.pose is None or answer.pose.source is not PoseSource.ESTIMATED
@@ -356,8 +356,8 @@ def check_odometry(odometry: Odometry | None, *, metric: bool) -> None:
 def _window_instant(solved: Solved) -> WindowInstant:
     refusal = solved.answer.refusal
     if refusal is not None and refusal.reason in (Reason.CONTRADICTS_PRIOR, Reason.AMBIGUOUS):
-        # Matches that lying priors allowed would pass together the gate that refused each alone;
-        # those that another map explains as well are no evidence of this one.
+        # Matches under wrong priors could pass together the gate that refused each alone. Matches
+        # that another map explains as well are no evidence for this one.
         return WindowInstant((), None)
     if any(view.focal_unknown for view in solved.views):
         # A window takes cameras as they are: such pixels would fit a wrong pose.
@@ -375,8 +375,8 @@ def _way(a: WindowPose | None, b: WindowPose | None) -> tuple[float, float]:
 
 
 def _unfilled(alone: InstantAnswer) -> InstantAnswer:
-    """Say why neighbours with poses, and the motion from them, did not give this instant one."""
+    """Add to the refusal why the neighbours and the motion gave this instant no pose."""
     if alone.pose is not None or alone.refusal is None:
         return alone
-    more = "; the neighbours have poses, but the motion contradicts them or comes from too far"
+    more = "; the neighbours have poses, but the motion contradicts them or is too long"
     return replace(alone, refusal=replace(alone.refusal, message=alone.refusal.message + more))

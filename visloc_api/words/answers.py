@@ -31,8 +31,9 @@ from visloc_api.words.geopose import GeoPose, GeoPoseYpr
 MAX_RETRIEVED = 20
 # Of every stated uncertainty.
 _NOT_COVERED = (
-    "; from the scatter of the matches alone, without errors that landmarks share (depth, "
-    "calibration, poses of mapping photos): on one map from depth the error was 13 times as large"
+    "; computed from the scatter of the matches only, so errors that landmarks "
+    "share are missing (depth, calibration, poses of mapping photos): on one "
+    "map from depth the error was 13 times as large"
 )
 _COVARIANCE = (
     "6 x 6, row by row: rotation (rad), then translation, for R <- Exp(w) R and t <- t + dt of "
@@ -151,7 +152,7 @@ class RigPose(_PoseWithDigits):
 class Refusal(Answer):
     """Why there is no pose."""
 
-    stage: Annotated[str, OneOf(visloc.types.Stage), Field(description="the stage that gave up")]
+    stage: Annotated[str, OneOf(visloc.types.Stage), Field(description="the stage that refused")]
     reason: Annotated[str, OneOf(visloc.types.Reason), Field(description="a stable word")]
     message: Annotated[str, Field(description="for a person")]
 
@@ -160,7 +161,9 @@ class RetrievedImage(Answer):
     """A mapping photo that was matched against."""
 
     image: Annotated[str, Field(description="its name in the map")]
-    score: Annotated[float, Field(description="fused, comparable within one answer only")]
+    score: Annotated[
+        float, Field(description="fused similarity; comparable only within one answer")
+    ]
     similarities: Annotated[dict[str, float], Field(description="cosine by global descriptor")]
 
 
@@ -175,9 +178,9 @@ class CameraUsed(Answer):
         str,
         OneOf(visloc.types.CameraSource),
         Field(
-            description="given; given_scaled, for another size of the same aspect; exif, its "
-            "focal length; estimated, found together with the pose; or guess, 1.2 times the longer "
-            "side"
+            description="given: as sent; given_scaled: as sent, for another size of the same "
+            "aspect; exif: focal length from EXIF; estimated: focal length solved with "
+            "the pose; guess: focal length 1.2 times the longer side"
         ),
     ]
 
@@ -201,9 +204,9 @@ class CameraUsed(Answer):
 
 
 class Orientation(Answer):
-    """How the photo was turned to find features.
+    """How the photo was rotated before features were found.
 
-    Camera, keypoints and pose are those of the stored pixels, whatever this says.
+    Camera, keypoints and pose always refer to the stored pixels.
     """
 
     exif: Annotated[int, Field(description="1 to 8 as stored in the photo, 1 when absent")]
@@ -226,21 +229,27 @@ class MapRef(Answer):
 
 # In Python, keypoints are (n, 2), points (n, 3) and inliers (n,).
 class Debug(AnswerWithArrays):
-    """What the solver was given, correspondence by correspondence, and what it made of it."""
+    """The solver's input, correspondence by correspondence, and its result."""
 
     keypoints: Annotated[
         NumbersNx2,
-        Field(description="x, y of each in pixels of the photo as stored, one after the other"),
+        Field(description="x, y of each, in one flat list, in pixels of the photo as stored"),
     ]
     points: Annotated[
-        NumbersNx3, Field(description="x, y, z of each in the world, one after the other")
+        NumbersNx3, Field(description="x, y, z of each in the world, in one flat list")
     ]
     inliers: Annotated[
-        Flags, Field(description="of each: whether the best pose explains it, refused or not")
+        Flags,
+        Field(
+            description="of each: whether the best pose explains it, even if that pose was refused"
+        ),
     ]
     overlay: Annotated[
         Base64,
-        Field(description="JPEG: the photo with its matches, beside photos that it was found in"),
+        Field(
+            description="JPEG: the photo and its matches, beside the mapping photos that it was "
+            "matched with"
+        ),
     ]
 
     @model_validator(mode="after")
@@ -254,16 +263,16 @@ class Debug(AnswerWithArrays):
 _TileRef = Annotated[
     str | None,
     Field(
-        description="of a set of maps: id@version of the map in it that the answer rests on, or "
-        "that came closest; null for a map on its own"
+        description="for a set: id@version of the tile that gave the answer, or came closest; "
+        "null for a map on its own"
     ),
 ]
-_RequestId = Annotated[str, Field(description="the caller's, or made by the server")]
+_RequestId = Annotated[str, Field(description="sent by the caller, or made by the server")]
 _Inliers = Annotated[
-    int, Field(description="of them, those that agree with the best pose, refused or not")
+    int, Field(description="correspondences that agree with the best pose, even if it was refused")
 ]
 _InlierRatio = Annotated[float, Field(description="inliers / correspondences; 0 without any")]
-_Ypr = Annotated[GeoPoseYpr | None, Field(description="the same in angles, when asked for")]
+_Ypr = Annotated[GeoPoseYpr | None, Field(description="the GeoPose in angles, when asked for")]
 
 
 class LocalizeResponse(AnswerWithArrays):
@@ -287,7 +296,9 @@ class LocalizeResponse(AnswerWithArrays):
     seconds: Annotated[dict[str, float], Field(description="wall time by stage that was reached")]
     geopose: Annotated[
         GeoPose | None,
-        Field(description="of the camera; null when not localized or the map is not anchored"),
+        Field(
+            description="of the camera; null when not localized, or when the map is not anchored"
+        ),
     ] = None
     geopose_ypr: _Ypr = None
     debug: Annotated[Debug | None, Field(description="the matches, when asked for")] = None
@@ -326,11 +337,14 @@ class ImageAnswer(AnswerWithArrays):
     ]
     cam_from_world: Annotated[
         SentPose | None,
-        Field(description="when the instant has a pose, also of an image that could not be used"),
+        Field(
+            description="null when the instant has no pose; given even if the image could not be "
+            "used"
+        ),
     ]
     keypoints: Annotated[int, Field(description="found in the photo")]
     correspondences: Annotated[int, Field(description="2D-3D matches given to the solver")]
-    inliers: Annotated[int, Field(description="of them, those that agree with the rig's pose")]
+    inliers: Annotated[int, Field(description="correspondences that agree with the rig's pose")]
     retrieved: Annotated[
         tuple[RetrievedImage, ...],
         Field(description=f"the best {MAX_RETRIEVED} mapping photos matched against, best first"),
@@ -340,19 +354,19 @@ class ImageAnswer(AnswerWithArrays):
 
 
 class InstantAnswer(AnswerWithArrays):
-    """The answer to an instant: a pose and what it rests on, or the reason why there is none."""
+    """The answer to an instant: a pose and its source, or the reason why there is none."""
 
     request_id: _RequestId
     timestamp: Annotated[int | None, Field(description="as it was sent")]
     status: Annotated[
         Literal["localized", "filled", "not_localized"],
-        Field(description="filled: the pose rests on other instants"),
+        Field(description="filled: the pose comes from other instants"),
     ]
     source: Annotated[
         PoseSource | None,
         Field(
-            description="estimated, from the instant's own images; motion, interpolated or "
-            "nearest when filled; null without a pose"
+            description="estimated: from the instant's own images; motion, interpolated, nearest: "
+            "filled from other instants; null without a pose"
         ),
     ]
     pose: Annotated[RigPose | None, Field(description="null when not localized")]
@@ -371,8 +385,8 @@ class InstantAnswer(AnswerWithArrays):
     geopose: Annotated[
         GeoPose | None,
         Field(
-            description="of the rig, whose frame is read like a camera's; null without a pose, or "
-            "when the map is not anchored"
+            description="of the rig, with the axes of its frame read like a camera's; null without "
+            "a pose, or when the map is not anchored"
         ),
     ] = None
     geopose_ypr: _Ypr = None

@@ -55,17 +55,17 @@ def _array_bytes_from_base64(value: object) -> object:
 
 
 class Array(IncomingMessage):
-    """Numbers in little-endian order, the last index running fastest."""
+    """An array in little-endian, row-major order."""
 
     dtype: Annotated[str, Field(description=f"one of {', '.join(ARRAY_DTYPES)}")]
     shape: Annotated[
-        list[int], FailFast(), Field(description="rows and columns; of a single row its length")
+        list[int], FailFast(), Field(description="[rows, columns], or [length] for a single row")
     ]
     data: Annotated[
         bytes,
         BeforeValidator(_array_bytes_from_base64),
         WithJsonSchema({"type": "string", "contentEncoding": "base64"}),
-        Field(description="as many bytes as dtype and shape say"),
+        Field(description="base64 of as many bytes as dtype and shape say"),
     ]
 
     def to_core(self, field: str, ndim: int) -> NDArray[np.generic]:
@@ -126,8 +126,8 @@ class Features(IncomingMessage):
         converted(_few),
         Field(
             default_factory=dict,
-            description="by name in the map's global_features, one row each; one that is made of "
-            "local features (localvlad) may be left out",
+            description="one row for each name in the map's global_features; those made of local "
+            "features (localvlad) may be left out",
         ),
     ]
 

@@ -1,4 +1,4 @@
-"""What maps are."""
+"""Descriptions of maps and sets."""
 
 from __future__ import annotations
 
@@ -54,22 +54,24 @@ class Geodetic(Answer):
 
 
 class Anchor(Answer):
-    """What the world's position, orientation and scale rest on."""
+    """Where the world's position, orientation and scale come from."""
 
     kind: Annotated[
         str,
         Field(description="dataset, model, gnss, positions, correspondences or none"),
     ]
-    images: Annotated[int, Field(description="photos, or given points, that it rests on")]
+    images: Annotated[
+        int, Field(description="how many photos or given points it was computed from")
+    ]
     rms: Annotated[
         float | None,
-        Field(description="how far they are from where they were said to be, units of the world"),
+        Field(description="RMS distance of these from their given positions, units of the world"),
     ]
     geodetic: Annotated[Geodetic | None, Field(description="null when not anchored to the Earth")]
 
 
 class GeoCircle(Answer):
-    """A circle on Earth about the middle of a map, which holds the map."""
+    """A circle on Earth that contains a map, centred on its middle."""
 
     latitude: Annotated[float, Field(description="degrees, WGS84")]
     longitude: Annotated[float, Field(description="degrees")]
@@ -128,9 +130,7 @@ class Tile(Answer):
         ),
         Field(description="from the map's world to that of the set"),
     ]
-    extent: Annotated[
-        SentBox, Field(description="of its landmarks and photos, in the world of the set")
-    ]
+    extent: Annotated[SentBox, Field(description="of its landmarks and photos, in the set's world")]
     images: Annotated[int, Field(description="mapping photos")]
 
     @model_validator(mode="before")
@@ -172,11 +172,11 @@ class VersionInfo(Answer):
 class UseVersionRequest(IncomingMessage):
     """Which version of a map to put into use."""
 
-    version: Annotated[str, Field(description="of those that are published")]
+    version: Annotated[str, Field(description="one of the published versions")]
 
 
 class MapInfo(Answer):
-    """What a map is, or a set of maps."""
+    """A map or a set of maps."""
 
     id: str
     version: str
@@ -193,40 +193,43 @@ class MapInfo(Answer):
     landmarks: Annotated[int, Field(description="3D points")]
     observations: Annotated[
         int | None,
-        Field(description="sightings of landmarks in mapping photos; null for a set"),
+        Field(description="observations of landmarks in mapping photos; null for a set"),
     ]
     extent: SentBox
-    size_bytes: Annotated[int, Field(description="on the server's disk; of a set without its maps")]
+    size_bytes: Annotated[
+        int, Field(description="on the server's disk; for a set, without its maps")
+    ]
     down: Annotated[
         Numbers | None,
         BeforeValidator(lambda value: value or None),
         PlainSerializer(lambda down: list(down or ()), return_type=list[float]),
         Field(description="unit vector that points down in the world; empty when not known"),
     ]
-    rigs: Annotated[tuple[RigInfo, ...], Field(description="that requests may name by their ids")]
+    rigs: Annotated[tuple[RigInfo, ...], Field(description="rigs that requests may name by id")]
     anchor: Annotated[
-        Anchor | None, Field(description="null for maps of format 1.0, which do not tell")
+        Anchor | None, Field(description="null for maps of format 1.0, which do not record it")
     ] = None
     place: Annotated[GeoCircle | None, Field(description="null when not anchored to the Earth")] = (
         None
     )
     current: Annotated[bool, Field(description="whether this version is in use")]
     versions: Annotated[
-        tuple[VersionInfo, ...], Field(description="all published ones of the map, oldest first")
+        tuple[VersionInfo, ...],
+        Field(description="all published versions of the map, oldest first"),
     ]
     content_hash: Annotated[
         str,
-        Field(description="sha256 over all that localizes: equal maps have equal ones"),
+        Field(description="sha256 of all content that affects localization; equal for equal maps"),
     ]
     fusion: Annotated[
         str | None,
         BeforeValidator(lambda value: value or None),
-        Field(description="of the global features, unless a query says otherwise; null for a set"),
+        Field(description="default for the global features; null for a set"),
     ] = None
     fusion_weights: Annotated[
         dict[str, float],
         BeforeValidator(lambda value: value or {}),
-        Field(description="by global feature; empty when all count alike"),
+        Field(description="by global feature; empty when all weigh the same"),
     ] = {}  # noqa: RUF012  pydantic copies it
     kind: Annotated[
         str, OneOf(Literal["map", "set"]), Field(description="set: of several maps")

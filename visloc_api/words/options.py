@@ -17,11 +17,11 @@ from visloc_api.words.message import IncomingMessage, converted
 _MAX_WEIGHTS = 16
 _MAX_NAME = 100
 _MESSAGES = {
-    "read_as": "unknown orientation to read in",
-    "extraction": "unknown effort",
-    "fusion": "unknown way of fusing",
-    "matcher": "unknown way of matching",
-    "solver": "unknown solver",
+    "read_as": "the orientation is unknown",
+    "extraction": "the effort is unknown",
+    "fusion": "the fusion is unknown",
+    "matcher": "the matcher is unknown",
+    "solver": "the solver is unknown",
 }
 
 
@@ -71,7 +71,7 @@ def _check_names(value: object) -> object:
 
 
 class OptionsMessage(IncomingMessage):
-    """What may be chosen per query. null is the same as left out."""
+    """Options of one query. null means the same as leaving a field out."""
 
     path: ClassVar[str] = "options."
 

@@ -33,7 +33,7 @@ class PositionPrior(IncomingMessage):
 
 
 class HeightBand(IncomingMessage):
-    """The device is between two heights, measured along the world's up from its (0, 0, 0)."""
+    """The device is between two heights, measured upwards from (0, 0, 0) of the world."""
 
     min: Annotated[float, Field(description="in units of the world")]
     max: Annotated[float, Field(description="greater than min")]
@@ -48,7 +48,7 @@ class HeightBand(IncomingMessage):
 
 
 class PosePrior(IncomingMessage):
-    """The device is where it was, give or take."""
+    """The device is near a known pose, within its covariance."""
 
     device_from_world: Annotated[
         Transform, Field(description="of the camera, or of the rig when a rig is localized")
@@ -82,8 +82,8 @@ class GravityPrior(IncomingMessage):
     direction: Annotated[
         Numbers,
         Field(
-            description="x, y, z of a vector that points down, in the frame of the camera, or of "
-            "the rig when a rig is localized; of any length"
+            description="x, y, z of a vector of any length that points down, in the frame of the "
+            "camera (of the rig, when a rig is localized)"
         ),
     ]
     std_deg: Annotated[
@@ -96,8 +96,8 @@ class GravityPrior(IncomingMessage):
     world: Annotated[
         Numbers | None,
         Field(
-            description="x, y, z of down in the world, for maps that do not know it; of another "
-            "map, within 5 degrees of what it knows"
+            description="x, y, z of down in the world; required for maps that do not know it, "
+            "within 5 degrees of the map's own for others"
         ),
     ] = None
 
@@ -120,7 +120,7 @@ class GravityPrior(IncomingMessage):
 
 
 class Priors(IncomingMessage):
-    """What is known of the device. A pose that contradicts it is refused; none is bent by it."""
+    """What is known of the device. It adjusts no pose; a pose that contradicts it is refused."""
 
     path: ClassVar[str] = "priors."
 
@@ -133,8 +133,7 @@ class Priors(IncomingMessage):
         FailFast(),
         Field(
             max_length=MAX_TILES,
-            description="of a set of maps: the tiles that the device may be in, each id or "
-            "id@version",
+            description="for a set: the tiles that the device may be in, each id or id@version",
         ),
     ] = None
 

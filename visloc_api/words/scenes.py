@@ -1,4 +1,4 @@
-"""What of a map is drawn."""
+"""The parts of a map that viewers draw."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class MapCamera(Answer):
 
 
 class MapImage(Answer):
-    """A mapping photo: where it was taken, and looking which way."""
+    """A mapping photo: its position and orientation."""
 
     name: str
     camera: Annotated[str, Field(description="one of `cameras`")]
@@ -36,7 +36,5 @@ class MapImages(Answer):
     map: MapRef
     total: Annotated[int, Field(description="photos that the map has")]
     first: Annotated[int, Field(description="as asked for; 0 is the first")]
-    cameras: Annotated[
-        dict[str, MapCamera], Field(description="of these photos, by the ids that they name")
-    ]
+    cameras: Annotated[dict[str, MapCamera], Field(description="cameras of these photos, by id")]
     images: list[MapImage]

@@ -27,9 +27,12 @@ class MapNotLoaded(Answer):
 class Readiness(Answer):
     """Whether photos are accepted."""
 
-    ready: Annotated[bool, Field(description="whether the maps of the start are open and warm")]
+    ready: Annotated[bool, Field(description="whether the maps to open at start are open and warm")]
     maps: Annotated[list[str], Field(description="id@version of what is loaded")]
-    not_loaded: Annotated[list[MapNotLoaded], Field(description="they do not prevent readiness")]
+    not_loaded: Annotated[
+        list[MapNotLoaded],
+        Field(description="maps that cannot be served; the server can be ready without them"),
+    ]
 
 
 class Problem(Answer):

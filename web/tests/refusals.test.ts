@@ -76,7 +76,7 @@ describe("advice", () => {
   });
 
   test.each(["too_few_matches", "no_pose", "too_few_inliers", "low_inlier_ratio"])(
-    "for %s is to turn the photo first, if it is stored turned and was read so",
+    "for %s is to turn the photo first, if it is stored rotated and was read so",
     (reason) => {
       const { stage } = table.find((row) => row.reason === reason)!;
       const camera = { source: "guess" } as LocalizeResponse["camera"];

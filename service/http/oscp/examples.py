@@ -27,7 +27,7 @@ _RESPONSE = {
 }
 GEOPOSE_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "the GeoPose, in the kind that Accept asks for",
+        "description": "the GeoPose, in the media type that Accept asks for",
         "content": {
             "application/json": {"examples": _RESPONSE["examples"]},
             "application/vnd.oscp+json": _RESPONSE,
@@ -42,5 +42,5 @@ GEOPOSE_RESPONSES: dict[int | str, dict[str, Any]] = {
         "anchored around the position (map.none_near)",
         "content": _PROBLEM,
     },
-    406: {"description": "Accept allows no answer that is given here", "content": _PROBLEM},
+    406: {"description": "Accept allows none of the supported media types", "content": _PROBLEM},
 }

@@ -1,4 +1,4 @@
-"""Maps of photos that are stored turned (EXIF orientation)."""
+"""Maps of photos that are stored rotated (EXIF orientation)."""
 
 from __future__ import annotations
 

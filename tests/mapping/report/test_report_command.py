@@ -172,7 +172,7 @@ def test_a_folder_of_maps_that_cannot_be_written_is_told_before_the_long_work(
     status, out, err = run("room", "--maps-dir", maps_dir, "--output", tmp_path / "room.html")
     assert (status, out, computed) == (1, "", {})
     assert err.startswith("error [report.work]")
-    assert "a folder that can be written, of --maps-dir" in err
+    assert "a writable --maps-dir" in err
     assert [path.name for path in tmp_path.iterdir() if path != maps_dir] == []
 
 

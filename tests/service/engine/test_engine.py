@@ -230,7 +230,7 @@ def test_a_broken_new_version_leaves_the_one_before_in_service(
     with caplog.at_level(logging.ERROR):
         run(play())
     (record,) = caplog.records
-    assert "room@v2 cannot take over" in record.message
+    assert "room@v2 cannot be opened" in record.message
     assert "landmarks.npy" in record.message
 
 
@@ -312,7 +312,7 @@ def test_whatever_a_damaged_map_breaks_the_others_are_served(
         await engine.close()
 
     run(play())
-    assert "map room@v2 cannot take over" in caplog.text
+    assert "map room@v2 cannot be opened" in caplog.text
 
 
 def test_a_refused_version_is_named_left_alone_for_a_while_and_tried_again(

@@ -153,7 +153,7 @@ def test_init_makes_one_key_and_a_second_time_none(
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["add", "admin", "--scope", "read"], "a key has this name"),
+        (["add", "admin", "--scope", "read"], "a key with this name exists"),
         (["add", "a b", "--scope", "read"], "the name of the key is not valid"),
         (["add", "x", "--scope", "read", "--rate", "0"], "the limits of the key are out of range"),
         (

@@ -174,7 +174,9 @@ def test_tiles_of_other_features_are_refused(
     changed = incoming("attic", "attic", "v2", local_features=manifest["local_features"])
     store.publish(changed, "attic", "v2")
 
-    with pytest.raises(Conflict, match="attic@v2 has other local features") as caught:
+    with pytest.raises(
+        Conflict, match="attic@v2 and the set have different local features"
+    ) as caught:
         publish_set(store, "house", [("hall", Similarity.identity()), ("attic", SECOND)], quiet)
     assert caught.value.code == "set.features"
 

@@ -200,13 +200,15 @@ def test_what_contradicts_is_said_with_numbers(hall: Any) -> None:
 
     assert said(NO_PRIORS) == ""
     assert said(Priors(PositionPrior(world.center + np.array([2.0, 0, 0]), 1.0))) == (
-        "it lies 2.00 from the prior position, at most 1"
+        "it lies 2.00 from the prior position, but at most 1 is allowed"
     )
-    assert said(Priors(height=HeightBand(0.0, 3.0))) == "its height is 4.00, the prior says 0 to 3"
+    assert (
+        said(Priors(height=HeightBand(0.0, 3.0))) == "its height is 4.00, but the prior says 0 to 3"
+    )
     down = Rotation.from_euler("x", 20, degrees=True).apply(pose.rotation @ hall.down)
     words = said(Priors(gravity=GravityPrior(down, np.radians(2.0))))
-    assert words.startswith("its down is ")
-    assert words.endswith("degrees from the prior gravity, at most 6")
+    assert words.startswith("its down direction is ")
+    assert words.endswith("degrees from the prior gravity, but at most 6 is allowed")
     turned = Pose(np.eye(3), -world.center)
     words = said(Priors(pose=PosePrior(turned, np.diag([1e-4] * 3 + [1e14] * 3))))
     assert "degrees from the prior pose" in words

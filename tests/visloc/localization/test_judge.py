@@ -90,7 +90,7 @@ def test_places_that_nothing_ties_cannot_agree() -> None:
 
     assert isinstance(answer, Refusal)
     assert answer.reason is Reason.AMBIGUOUS
-    assert "nothing says how they lie to each other" in answer.message
+    assert "in frames without a known transform" in answer.message
 
 
 def test_poses_are_compared_in_one_frame_and_unit() -> None:

@@ -212,7 +212,7 @@ def test_a_refusal_of_a_photo_that_was_read_on_its_side_says_so(
         options = LocalizeOptions(**limits)  # type: ignore[arg-type]
         as_stored = replace(options, read_as=ReadAs.STORED)
         message = refused(localizer.localize(photo, camera, as_stored)).message
-        assert "stored turned, EXIF orientation 6" in message
+        assert "stored rotated (EXIF orientation 6)" in message
         assert "read_as=upright" in message
         assert "read_as" not in refused(localizer.localize(photo, camera, options)).message
         straight = read_photo(query.image)

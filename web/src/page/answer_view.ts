@@ -214,14 +214,14 @@ function cameraWords(answer: LocalizeResponse, actions: AnswerActions): HTMLElem
   );
 }
 
-/** Of a photo that is stored turned: how it was read. */
+/** Of a photo that is stored rotated: how it was read. */
 function orientationWords({ orientation }: LocalizeResponse): [string, string][] {
   const { exif, read_as } = orientation;
   if (exif === 1) return [];
   return [
     [
       "Orientation",
-      `stored turned (EXIF ${exif}), read ${read_as === "upright" ? read_as : "as stored"}`,
+      `stored rotated (EXIF ${exif}), read ${read_as === "upright" ? read_as : "as stored"}`,
     ],
   ];
 }

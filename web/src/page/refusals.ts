@@ -18,7 +18,7 @@ interface Advice {
 
 const ANOTHER_PLACE = "Was the photo taken in the place of this map? If not, choose another map.";
 const MORE_PHOTOS = "Under Options, raise “mapping photos to match” (top_k).";
-const TURNED = "The photo is stored turned: under Options, set “Read photo as” to upright.";
+const TURNED = "The photo is stored rotated: under Options, set “Read photo as” to upright.";
 const TURNING_HELPS = ["too_few_matches", "no_pose", "too_few_inliers", "low_inlier_ratio"];
 const DEFAULT_PRESET = "Under Options, choose the preset default instead of config1.";
 const CHECK_CAMERA = "Check the camera: model, focal length, size.";

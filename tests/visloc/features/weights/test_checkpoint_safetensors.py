@@ -89,7 +89,7 @@ def test_what_the_library_writes_is_read(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_damaged_is_refused(data: bytes, tmp_path: Path) -> None:
-    with pytest.raises(WeightsError, match="does not hold whole, plain tensors") as caught:
+    with pytest.raises(WeightsError, match="does not hold complete, plain tensors") as caught:
         read_checkpoint(_write(tmp_path, data))
     assert caught.value.code == "weights.format"
 

@@ -137,7 +137,7 @@ def test_code_in_a_file_is_refused_and_not_run(
     witness = tmp_path / "ran"
     argument = f"open({str(witness)!r}, 'w')" if function in (eval, exec) else f"touch {witness}"
     evil = pickle.dumps({"weight": _Call(function, argument)}, protocol)
-    with pytest.raises(WeightsError, match="does not hold whole, plain tensors") as caught:
+    with pytest.raises(WeightsError, match="does not hold complete, plain tensors") as caught:
         read_checkpoint(write(tmp_path / "w.pt", evil))
     assert caught.value.code == "weights.format"
     assert not witness.exists()
@@ -234,7 +234,7 @@ def test_storage_shorter_than_it_says_is_refused(tmp_path: Path) -> None:
     ):
         if path.name == "declared.pt":
             path.write_bytes(path.read_bytes()[:-4])
-        with pytest.raises(WeightsError, match="does not hold whole, plain tensors"):
+        with pytest.raises(WeightsError, match="does not hold complete, plain tensors"):
             read_checkpoint(path)
 
 
