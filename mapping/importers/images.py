@@ -130,8 +130,7 @@ def read(
     sensors = {sensor.id: sensor for sensor in cameras.values()}
     if gnss:
         sensors[_GNSS] = Sensor(_GNSS, "EXIF", "gnss", ("EPSG:4326",), None)
-    unknown = sum(photo.focal_length_px is None for photo in found)
-    if unknown:
+    if unknown := sum(photo.focal_length_px is None for photo in found):
         notes.append(f"{unknown} of {len(found)} photos do not tell their focal length")
     return ImportedModel(
         sensors=sensors,
