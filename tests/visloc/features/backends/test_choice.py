@@ -138,7 +138,7 @@ def test_what_is_named_is_what_computes(wanted: Inference) -> None:
 def test_openvino_is_loaded_without_telemetry() -> None:
     code = (
         "import sys; from visloc.features import make_local_features; "
-        "from visloc.types import Inference; make_local_features('xfeat', None, Inference.FP32); "
+        "from visloc.options import Inference; make_local_features('xfeat', None, Inference.FP32); "
         "sys.exit(any(n.startswith(('openvino_telemetry', 'openvino.tools')) "
         "for n in sys.modules))"
     )
