@@ -243,7 +243,7 @@ def test_storage_whose_numbers_are_not_there_is_refused(keys: object, tmp_path: 
     """torch would hand it out as it found the memory."""
     path = _old_file(tmp_path / "w.pt", _dict_of(_tensor()))
     path.write_bytes(path.read_bytes().replace(pickle.dumps(["7"], 2), pickle.dumps(keys, 2)))
-    with pytest.raises(WeightsError, match="does not hold whole, plain tensors"):
+    with pytest.raises(WeightsError, match="does not hold complete, plain tensors"):
         read_checkpoint(path)
 
 
