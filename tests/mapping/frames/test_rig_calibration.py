@@ -258,7 +258,7 @@ def test_cameras_that_are_no_rig_are_refused(moves: str) -> None:
             else:  # from none to four instants behind
                 late = max(START, stamp - int(rng.integers(5)))
                 poses[stamp, name] = drive.trajectories[late, name]
-    with pytest.raises(DatasetError, match="'front' and 'rear' move relative to each other") as caught:
+    with pytest.raises(DatasetError, match="'front' and 'rear' move relative") as caught:
         calibrate_rig(replace(drive, trajectories=poses))
     assert caught.value.code == "rig.not_rigid"
     assert "5 degrees" in str(caught.value)
