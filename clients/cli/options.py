@@ -54,6 +54,7 @@ def spread(command: Callable[..., T]) -> Callable[..., T]:
 
     required = inspect.Parameter.empty
     parameters.sort(key=lambda each: each.default is not required)  # first in --help
+    # Typer reads the signature. Type stubs of functions lack the attribute.
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     return run
 

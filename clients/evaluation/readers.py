@@ -34,7 +34,7 @@ class FeatureReader:
         keypoints: of the dataset.
         descriptors: of these keypoints.
         global_features: by the map's names for them.
-        origin: of the keypoints.
+        origin: where the keypoints' pixel coordinates start counting.
     """
 
     kind: str

@@ -81,7 +81,6 @@ class QueryClient:
     """A client, and what all queries of a run share.
 
     Attributes:
-        client: of the server.
         map_ref: ``id@version``.
         options: for every query.
         read: reads what is sent for a photo: its bytes or its features.
@@ -192,7 +191,7 @@ async def localize_all(
         async with asyncio.TaskGroup() as group:
             for _ in range(concurrency):
                 group.create_task(take())
-    except ExceptionGroup as failed:
+    except ExceptionGroup as failed:  # callers handle the error itself, not the group around it
         raise failed.exceptions[0] from None
 
 

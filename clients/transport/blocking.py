@@ -67,7 +67,7 @@ async def read_items(items: Iterable[T]) -> AsyncGenerator[T, None]:
             item = await run_blocking(take)
         if item is _END:
             return
-        yield item  # type: ignore[misc]
+        yield item  # type: ignore[misc]  # ``is _END`` does not narrow the type
 
 
 def _current_jobs() -> Jobs | None:

@@ -1,1 +1,1 @@
-"""What is sent and received, whatever the transport."""
+"""Requests and answers, independent of the transport."""

@@ -42,7 +42,7 @@ def _error(value: Any) -> Any:
 
 
 class ImageResult(ImageAnswer):
-    """What became of one photo of an instant.
+    """The result for one photo of an instant.
 
     Attributes:
         error: why the photo could not be used; then at most ``cam_from_world`` is known.

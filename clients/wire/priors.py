@@ -1,4 +1,4 @@
-"""What is known of a pose beforehand (``visloc.priors``), as the API has it in JSON."""
+"""Priors (``visloc.priors``) to and from the JSON of the API."""
 
 from __future__ import annotations
 

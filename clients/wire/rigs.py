@@ -1,4 +1,4 @@
-"""What is sent of rigs and sequences."""
+"""Rigs, images and instants of requests."""
 
 from __future__ import annotations
 

@@ -24,6 +24,7 @@ def from_settings(command: Callable[..., None]) -> Callable[..., None]:
     def run(**given: Any) -> None:
         _call(command, given)
 
+    # Typer reads the signature. Type stubs of functions lack the attribute.
     run.__signature__ = Signature([*options.values()])  # type: ignore[attr-defined]
     run.__annotations__ = {name: option.annotation for name, option in options.items()}
     return run

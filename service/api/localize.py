@@ -17,6 +17,12 @@ from visloc_api.words.options import GivenOptions, LocalizeOptions
 from visloc_api.words.priors import GivenPriors, priors_to_core
 
 MAX_MAPS = 16
+PhotoField = Annotated[
+    GivenImage, Field(description="the encoded photo: JPEG, PNG, WebP, TIFF or BMP")
+]
+FeaturesField = Annotated[
+    GivenFeatures, Field(description="the photo's features, instead of the photo; need a camera")
+]
 
 
 def _maps_from_text(value: object) -> object:
@@ -86,13 +92,8 @@ class LocalizeRequest(IncomingMessage):
     """A photo or its features, and the map to search."""
 
     map: Annotated[str | None, Field(description="id, or id@version")] = None
-    image: Annotated[
-        GivenImage, Field(description="the encoded photo: JPEG, PNG, WebP, TIFF or BMP")
-    ] = None
-    features: Annotated[
-        GivenFeatures,
-        Field(description="the photo's features, instead of the photo; need a camera"),
-    ] = None
+    image: PhotoField = None
+    features: FeaturesField = None
     camera: Annotated[
         GivenCamera,
         Field(

@@ -11,10 +11,10 @@ from pydantic import FailFast, Field
 import service.values
 import visloc.types
 from service.api.geopose import GivenNear, GivenYpr
-from service.api.localize import GivenMaps, where_to_core
+from service.api.localize import FeaturesField, GivenMaps, PhotoField, where_to_core
 from service.values import ONLY_SENSOR, ImageJob, RigJob
 from visloc.errors import inside, refuse
-from visloc_api.words.features import GivenFeatures, GivenImage, query_to_core
+from visloc_api.words.features import query_to_core
 from visloc_api.words.geometry import GivenCamera, Transform
 from visloc_api.words.message import IncomingMessage, converted, counted
 from visloc_api.words.options import GivenOptions, LocalizeOptions
@@ -180,13 +180,8 @@ class RigImage(IncomingMessage):
         converted(_sensor_id),
         Field(description="a camera of the rig; may be left out without a rig"),
     ] = None
-    image: Annotated[
-        GivenImage, Field(description="the encoded photo: JPEG, PNG, WebP, TIFF or BMP")
-    ] = None
-    features: Annotated[
-        GivenFeatures,
-        Field(description="the photo's features, instead of the photo; need a camera"),
-    ] = None
+    image: PhotoField = None
+    features: FeaturesField = None
     camera: Annotated[
         GivenCamera,
         Field(

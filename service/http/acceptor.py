@@ -89,7 +89,8 @@ class OpenConnections:
         """At the limit, close the longest idle connection.
 
         Returns:
-            Seconds until there is room: 0 for now, infinity when all are in use.
+            Seconds until a connection can be accepted: 0 if one can be now, infinity if all are
+            in use.
         """
         if len(self._open) < self.limit:
             return 0.0

@@ -40,7 +40,7 @@ class Observer:
 
     Args:
         metrics: counts them.
-        spans: where their spans are sent; None for nowhere.
+        spans: sends the spans of traced requests; None if tracing is off.
     """
 
     def __init__(self, metrics: Metrics, spans: Spans | None = None) -> None:
