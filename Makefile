@@ -10,7 +10,7 @@ PAGE_SOURCES := $(shell find web/src web/index.html web/*.json web/*.ts -type f)
 .DEFAULT_GOAL := help
 # Vite needs this much; without it the service has no page, and says so.
 NODE_IS_THERE = command -v npm >/dev/null && node -e 'const [a, b] = process.versions.node.split(".").map(Number); process.exit(a > 22 || (a === 22 && b >= 12) || (a === 20 && b >= 19) ? 0 : 1)'
-.PHONY: help install page check-page browser balancer demo test test-all docs-check docs-errors fuzz fuzz-api train-smoke bench bench-scale fmt lint types contracts proto proto-check check serve clean
+.PHONY: help install page check-page browser balancer demo test test-all docs-check docs-errors fuzz fuzz-api train-smoke bench bench-scale trust fmt lint types contracts proto proto-check check serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -90,6 +90,9 @@ bench: install ## seconds and accuracy beside the peer and the machine's limit, 
 bench-scale: install ## maps of 100 to 100 000 images: opening, memory, retrieval
 	$(BIN)/python -m benchmarks.scale $(ARGS)
 
+trust: install ## how far an answer can be trusted: every figure of docs/trust.md
+	$(BIN)/python -m benchmarks.trust $(ARGS)
+
 fmt: install ## format the code
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
@@ -122,4 +125,4 @@ serve: install ## serve the maps in maps/ on 127.0.0.1:8000 (HTTP) and :50051 (g
 	$(BIN)/python -m service --maps-dir maps
 
 clean: ## remove what make made
-	rm -rf $(VENV) .demo .bench web/node_modules visloc_web/built
+	rm -rf $(VENV) .demo .bench .trust web/node_modules visloc_web/built

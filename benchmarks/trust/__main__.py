@@ -1,0 +1,74 @@
+"""How far an answer can be trusted: all figures of docs/trust.md in one run (``make trust``).
+
+    python -m benchmarks.trust [--data-dir ../shared/data] [--maps-dir DIR] [--only NAME ...]
+
+Maps that the folder does not have are built first. Every answer becomes a line of JSON in
+``--answers-dir``, one file for each of the scenarios: own, focal, prints, mirrored, halves, shapes,
+floors, floor-set, night, elsewhere. Prints tables in Markdown.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+import typer
+
+from benchmarks.trust.asking import Maps, ask_floors
+from benchmarks.trust.maps import Places, make_missing
+from benchmarks.trust.outcomes import Outcome
+from benchmarks.trust.scenarios import FLOOR_SET, NEEDED, SCENARIOS, floor_set
+from benchmarks.trust.table import write_tables
+
+
+def main(
+    data_dir: Annotated[Path, typer.Option(help="The shared data sets.")] = Path("../shared/data"),
+    maps_dir: Annotated[Path, typer.Option(help="A store of maps; missing ones are built.")] = Path(
+        ".trust/maps"
+    ),
+    answers_dir: Annotated[Path, typer.Option(help="Gets a file for each scenario.")] = Path(
+        ".trust/answers"
+    ),
+    only: Annotated[list[str] | None, typer.Option(help=f"Of {', '.join(NEEDED)}.")] = None,
+    weights_dir: Path | None = None,
+) -> None:
+    """Run the scenarios, and print the tables."""
+    chosen = only or list(NEEDED)
+    unknown = set(chosen) - set(NEEDED)
+    if unknown:
+        raise typer.BadParameter(f"{', '.join(sorted(unknown))}: one of {', '.join(NEEDED)}")
+    places = Places(data_dir, maps_dir)
+    needed = set().union(*(NEEDED[name] for name in chosen))
+    make_missing(places, needed, lambda line: typer.echo(line, err=True))
+    answers_dir.mkdir(parents=True, exist_ok=True)
+    maps = Maps(places.store, weights_dir)
+    outcomes: list[Outcome] = []
+    for name in chosen:
+        started = perf_counter()
+        found = (
+            ask_floors(places.store, weights_dir, floor_set(places))
+            if name == FLOOR_SET
+            else maps.ask(SCENARIOS[name](places))
+        )
+        outcomes += kept(found, answers_dir / f"{name}.jsonl")
+        typer.echo(f"{name}: {perf_counter() - started:.0f} s", err=True)
+    for line in write_tables(outcomes):
+        typer.echo(line)
+
+
+def kept(outcomes: Iterator[Outcome], path: Path) -> list[Outcome]:
+    """Write outcomes as they come, one line of JSON each."""
+    seen = []
+    with path.open("w", encoding="utf-8") as lines:
+        for outcome in outcomes:
+            lines.write(json.dumps(asdict(outcome)) + "\n")
+            seen.append(outcome)
+    return seen
+
+
+if __name__ == "__main__":
+    typer.run(main)
