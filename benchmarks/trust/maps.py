@@ -13,6 +13,7 @@ import numpy as np
 from mapping.build.build import build_map
 from mapping.build.settings import BuildSettings
 from mapping.maps.sets import publish_set
+from mapping.methods.sfm_settings import SfmSettings
 from mapping.sample import write_sample
 from visloc.archive import MapStore
 from visloc.geometry import PixelOrigin, Similarity
@@ -75,7 +76,9 @@ SETTINGS: Mapping[str, Mapping[str, object]] = {
     # Its calibration counts pixels from the middle of the first one.
     "virtual_gallery": {"method": "sfm", "pixel_origin": PixelOrigin.CENTER},
     SAMPLE: {"method": "rgbd"},
-    **{map_id: {"method": "sfm"} for map_id in (*FLOOR_11, *VIDEOS)},
+    **{map_id: {"method": "sfm"} for map_id in FLOOR_11},
+    # Nobody measured their poses.
+    **{map_id: {"method": "sfm", "sfm": SfmSettings(poses="estimate")} for map_id in VIDEOS},
 }
 
 
