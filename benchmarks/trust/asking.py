@@ -14,7 +14,7 @@ from service.engine.engine import Engine
 from service.telemetry.metrics import Metrics
 from service.values import WorkerSettings, photo_job
 from visloc.archive import MapStore
-from visloc.errors import VislocError
+from visloc.errors import InvalidInput
 from visloc.features import LocalFeatureExtractor, make_global_descriptor, make_local_features
 from visloc.images import ImageLimits, Photo
 from visloc.localization.feature_cache import FeatureCache
@@ -40,11 +40,11 @@ class Maps:
         self.localizer = cache(self._open)
 
     def ask(self, queries: Iterable[Query]) -> Iterator[Outcome]:
-        """Ask each query's map."""
+        """Ask each query's map; a camera that does not fit its photo is an outcome too."""
         for query in queries:
             try:
                 yield outcome_of(query, self._answer(query))
-            except VislocError as error:
+            except InvalidInput as error:
                 yield refused_by_error(query, error)
 
     def _answer(self, query: Query) -> Answer | InstantAnswer:
@@ -103,7 +103,7 @@ async def _ask_engine(engine: Engine, queries: Iterator[tuple[Query, Path]]) -> 
             job = photo_job((query.map_id,), path.read_bytes(), query.photos[0].camera, OPTIONS)
             try:
                 found = await engine.localize(job)
-            except VislocError as error:
+            except InvalidInput as error:
                 outcomes.append(refused_by_error(query, error))
             else:
                 outcomes.append(outcome_of(query, found.answer, found.tile))
