@@ -4,7 +4,8 @@
 
 Maps that the folder does not have are built first. Every answer becomes a line of JSON in
 ``--answers-dir``, one file for each of the scenarios: own, focal, prints, mirrored, halves, shapes,
-floors, floor-set, night, elsewhere. Prints tables in Markdown.
+floors, floor-set, night, elsewhere. Prints tables in Markdown. With ``--beside CHECKOUT`` only
+the time of a query is measured, beside the code of another commit.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import Annotated
 import typer
 
 from benchmarks.trust.asking import Maps, ask_floors
+from benchmarks.trust.beside import time_beside
 from benchmarks.trust.maps import Places, make_missing
 from benchmarks.trust.outcomes import Outcome
 from benchmarks.trust.scenarios import FLOOR_SET, NEEDED, SCENARIOS, floor_set
@@ -34,6 +36,9 @@ def main(
         ".trust/answers"
     ),
     only: Annotated[list[str] | None, typer.Option(help=f"Of {', '.join(NEEDED)}.")] = None,
+    beside: Annotated[
+        Path | None, typer.Option(help="Only time queries beside this checkout of a commit.")
+    ] = None,
     weights_dir: Path | None = None,
 ) -> None:
     """Run the scenarios, and print the tables."""
@@ -42,6 +47,10 @@ def main(
     if unknown:
         raise typer.BadParameter(f"{', '.join(sorted(unknown))}: one of {', '.join(NEEDED)}")
     places = Places(data_dir, maps_dir)
+    if beside is not None:
+        for line in time_beside(places, beside, answers_dir / "beside"):
+            typer.echo(line)
+        return
     needed = set().union(*(NEEDED[name] for name in chosen))
     make_missing(places, needed, lambda line: typer.echo(line, err=True))
     answers_dir.mkdir(parents=True, exist_ok=True)
