@@ -84,6 +84,11 @@ class Outcome:
     tile: str | None = None
 
     @property
+    def inlier_ratio(self) -> float:
+        """Share of inliers among the correspondences, 0 when there are none."""
+        return self.inliers / self.correspondences if self.correspondences else 0.0
+
+    @property
     def distance(self) -> float:
         """Norm of the error of the position; NaN when it is not known."""
         return math.nan if self.error is None else float(np.linalg.norm(self.error))

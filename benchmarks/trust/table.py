@@ -11,6 +11,7 @@ from benchmarks.trust.maps import FLOOR_11
 from benchmarks.trust.measures import calibration_error, uncertainty
 from benchmarks.trust.outcomes import Outcome
 from benchmarks.trust.scenarios import FOCAL_FACTORS, OWN, PRINT_SHARES, RIG
+from visloc.options import PRESETS
 
 SURE = 0.99
 OWN_NAMES = [*(scenario for scenario, *_ in OWN), RIG]
@@ -55,6 +56,7 @@ def _own(by_scenario: dict[str, list[Outcome]]) -> Iterator[str]:
                 sum(each.accepted for each in outcomes),
                 sum(each.right is True for each in outcomes),
                 sum(each.right is False for each in outcomes),
+                _at_config1(outcomes),
                 medians,
             ]
         )
@@ -84,7 +86,10 @@ def _own(by_scenario: dict[str, list[Outcome]]) -> Iterator[str]:
     )
     yield from _table(
         "Photos of the mapped place",
-        ("photos of", "photos", "answered", "right", "wrong", "median error (cm: 0.01 units)"),
+        (
+            *("photos of", "photos", "answered", "right", "wrong"),
+            *(AT_CONFIG1, "median error (cm: 0.01 units)"),
+        ),
         right,
     )
 
@@ -120,7 +125,15 @@ def _places(by_scenario: dict[str, list[Outcome]]) -> Iterator[str]:
     yield from _table("Other floors, other places, and the same place at night", _COUNTS, rows)
 
 
-_COUNTS = ("what", "photos", "accepted", "right", "wrong", "refused because")
+AT_CONFIG1 = "right, wrong at a quarter of inliers"
+_COUNTS = ("what", "photos", "accepted", "right", "wrong", AT_CONFIG1, "refused because")
+
+
+def _at_config1(outcomes: Sequence[Outcome]) -> str:
+    """Count the answers whose share of inliers the preset ``config1`` would take."""
+    least = PRESETS["config1"].min_inlier_ratio
+    kept = [each.right for each in outcomes if each.accepted and each.inlier_ratio >= least]
+    return f"{kept.count(True)}, {kept.count(False)}"
 
 
 def _counts(name: str, outcomes: Sequence[Outcome]) -> list[object]:
@@ -131,6 +144,7 @@ def _counts(name: str, outcomes: Sequence[Outcome]) -> list[object]:
         sum(each.accepted for each in outcomes),
         sum(each.right is True for each in outcomes),
         sum(each.right is False for each in outcomes),
+        _at_config1(outcomes),
         ", ".join(f"{reason} {count}" for reason, count in reasons.most_common()) or "-",
     ]
 

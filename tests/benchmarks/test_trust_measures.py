@@ -122,5 +122,5 @@ def test_photos_of_the_sample_are_asked_and_tabled(sample: Path, built_maps: Pat
     assert [each.reason for each in outcomes] == [None, "camera.size_mismatch"]
     assert outcomes[0].right
     told = "\n".join(write_tables(outcomes))
-    assert "| sample | 1 | 1 | 1 | 0 |" in told
-    assert "| stretched | 1 | 0 | 0 | 0 | camera.size_mismatch 1 |" in told
+    assert "| sample | 1 | 1 | 1 | 0 | 1, 0 |" in told
+    assert "| stretched | 1 | 0 | 0 | 0 | 0, 0 | camera.size_mismatch 1 |" in told
