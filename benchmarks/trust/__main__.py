@@ -72,7 +72,7 @@ def main(
 def kept(outcomes: Iterator[Outcome], path: Path) -> list[Outcome]:
     """Write outcomes as they come, one line of JSON each."""
     seen = []
-    with path.open("w", encoding="utf-8") as lines:
+    with path.open("w", buffering=1, encoding="utf-8") as lines:
         for outcome in outcomes:
             lines.write(json.dumps(asdict(outcome)) + "\n")
             seen.append(outcome)
