@@ -48,7 +48,7 @@ def _own(by_scenario: dict[str, list[Outcome]]) -> Iterator[str]:
         medians = "-"
         if found:
             position = float(np.median([each.distance for each in found]))
-            medians = f"{100 * position:.2f} cm, {float(np.median(angles)):.3f}°"
+            medians = f"{100 * position:.2f}, {float(np.median(angles)):.3f}°"
         right.append(
             [
                 name,
@@ -88,7 +88,7 @@ def _own(by_scenario: dict[str, list[Outcome]]) -> Iterator[str]:
         "Photos of the mapped place",
         (
             *("photos of", "photos", "answered", "right", "wrong"),
-            *(AT_CONFIG1, "median error (cm: 0.01 units)"),
+            *(AT_CONFIG1, "median error, cm (gardenspoint: 0.01 units)"),
         ),
         right,
     )
