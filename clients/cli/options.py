@@ -20,12 +20,13 @@ from clients.client import DEFAULT_TIMEOUT_S, AsyncClient, Client
 from clients.evaluation.benchmark import parse_threshold
 from clients.evaluation.queries import QuerySet, read_queries
 from clients.evaluation.readers import Reader, choose_reader
-from clients.wire.types import LocalizeOptions
+from clients.wire.options import options_from_texts
 from visloc.evaluation import DEFAULT_THRESHOLDS, Threshold
 from visloc.geometry import PixelOrigin
 from visloc.options import PRESETS
 from visloc.options import LocalizeOptions as KnownOptions
 from visloc_api.words.maps import MapInfo
+from visloc_api.words.options import LocalizeOptions
 
 T = TypeVar("T")
 
@@ -152,10 +153,10 @@ class QueryOptions:
         """The options of a query.
 
         Raises:
-            InvalidInput: as ``LocalizeOptions.from_texts``.
+            InvalidInput: as ``options_from_texts``.
         """
         seed = [] if self.seed is None else [f"seed={self.seed}"]
-        return LocalizeOptions.from_texts([*(self.option or ()), *seed])
+        return options_from_texts([*(self.option or ()), *seed])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,11 +15,11 @@ from clients.evaluation.queries import Query
 from clients.evaluation.readers import Reader
 from clients.evaluation.run import Outcome, QueryClient
 from clients.wire.answers import ServerInfo
-from clients.wire.types import LocalizeOptions
+from clients.wire.options import options_from_texts
 from visloc.errors import Forbidden, Unauthenticated, Unavailable, VislocError, refuse
 from visloc.evaluation import Threshold
 from visloc_api.words.maps import MapInfo
-from visloc_api.words.options import CHOICES
+from visloc_api.words.options import CHOICES, LocalizeOptions
 
 
 class Axis(StrEnum):
@@ -322,4 +322,4 @@ def _check_words(words: Sequence[str], known: Sequence[str]) -> None:
 
 
 def _parsed(name: str, value: str) -> Mapping[str, Any]:
-    return LocalizeOptions.from_texts([f"{name}={value}"]).given()
+    return options_from_texts([f"{name}={value}"]).given()

@@ -1,29 +1,13 @@
-"""Priors (``visloc.priors``) to and from the JSON of the API."""
+"""Priors (``visloc.priors``) from the JSON of the API."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 import visloc_api.words.priors
 from visloc.errors import InvalidInput, VislocError, refuse
-from visloc.geometry import Pose
-from visloc.priors import Priors, check_covariance
-from visloc_api.words.geometry import Transform
-
-
-def priors_as_json(priors: Priors) -> dict[str, Any]:
-    """Return what is known, without what is not."""
-    return visloc_api.words.priors.Priors.from_core(priors).model_dump(exclude_none=True)
-
-
-def transform_as_json(pose: Pose) -> dict[str, Any]:
-    """Return a transform as the API has it."""
-    return Transform.from_core(pose).model_dump()
+from visloc.priors import Priors
 
 
 def priors_from_text(text: str) -> Priors:
@@ -62,24 +46,3 @@ def _named_by_prior(error: InvalidInput) -> VislocError:
         return error
     code = "request.invalid" if part == "device_from_world" else f"priors.{prior}"
     return refuse(code, field=field, expected=error.expected, got=error.got)
-
-
-def checked_covariance(given: object, field: str) -> NDArray[np.float64]:
-    """Return the covariance (6, 6) of a pose.
-
-    Raises:
-        InvalidInput: ``pose.covariance``, with the shape that came where that is wrong.
-    """
-    try:
-        covariance = np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        covariance, got = np.empty(0), given
-    else:
-        got = covariance.tolist()
-        if covariance.shape != (6, 6):
-            got = f"{covariance.size} numbers, of shape {covariance.shape}"
-    try:
-        check_covariance(covariance, field)
-    except InvalidInput as error:
-        raise refuse(error.code, field=error.field, expected=error.expected, got=got) from None
-    return covariance

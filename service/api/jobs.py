@@ -119,12 +119,9 @@ def sequence_job_of(start: SequenceStart) -> SequenceJob:
     """Return what the instants of a sequence share.
 
     Raises:
-        InvalidInput: ``request.map``, ``near...``, ``sequence.time_unit``, ``rig...``,
-            ``camera...``, ``options...``, ``priors...`` or ``pose...``.
+        InvalidInput: ``request.map``, ``near...``, ``rig...``, ``camera...``, ``options...``,
+            ``priors...`` or ``pose...``.
     """
-    units = [str(unit) for unit in TimeUnit]
-    if start.time_unit and start.time_unit not in units:
-        raise refuse("sequence.time_unit", field="time_unit", expected=units, got=start.time_unit)
     return SequenceJob(
         maps=_where(start),
         rig=None if start.rig is None else _rig(start.rig),

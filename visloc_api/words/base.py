@@ -148,9 +148,12 @@ def _from_base64(value: Any) -> Any:
     return base64.b64decode(value, validate=True) if isinstance(value, str) else value
 
 
+AS_BASE64 = PlainSerializer(
+    lambda data: base64.b64encode(data).decode(), when_used="json-unless-none"
+)
 Base64 = Annotated[
     bytes,
     BeforeValidator(_from_base64),
-    PlainSerializer(lambda data: base64.b64encode(data).decode(), when_used="json"),
+    AS_BASE64,
     WithJsonSchema({"type": "string", "contentEncoding": "base64"}),
 ]

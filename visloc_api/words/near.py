@@ -26,6 +26,10 @@ class Near(IncomingMessage):
         """
         return visloc.types.Near(self.latitude, self.longitude, self.radius)
 
+    @staticmethod
+    def from_core(near: visloc.types.Near) -> Near:
+        return Near(latitude=near.latitude, longitude=near.longitude, radius=near.radius)
+
 
 def _near_from_text(value: object) -> object:
     """Read latitude,longitude,radius, or an object in JSON, as forms have it."""

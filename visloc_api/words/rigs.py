@@ -10,7 +10,7 @@ from pydantic import FailFast, Field
 
 import visloc.types
 from visloc.errors import inside, refuse
-from visloc_api.words.geometry import GivenCamera, Transform
+from visloc_api.words.geometry import Camera, GivenCamera, Transform
 from visloc_api.words.message import IncomingMessage, converted, counted
 from visloc_api.words.near import GivenNear
 from visloc_api.words.options import GivenOptions, LocalizeOptions
@@ -85,6 +85,17 @@ class RigCalibration(IncomingMessage):
         dict[str, RigSensor], converted(_sensors_in_bounds), Field(description="by the sensor's id")
     ]
 
+    @staticmethod
+    def from_core(sensors: Mapping[str, visloc.types.RigSensor]) -> RigCalibration:
+        """Say the poses of cameras that nobody has checked yet.
+
+        Raises:
+            InvalidInput: ``rig.rotation`` or ``pose.translation``.
+        """
+        return RigCalibration(
+            sensors={name: _sensor_from_core(name, sensor) for name, sensor in sensors.items()}
+        )
+
     def to_core(self) -> Mapping[str, visloc.types.RigSensor]:
         """Return the rig, checked.
 
@@ -94,6 +105,13 @@ class RigCalibration(IncomingMessage):
         if not self.sensors:
             raise refuse("rig.empty", field="rig.sensors", got="none")
         return {name: _sensor_to_core(name, sensor) for name, sensor in self.sensors.items()}
+
+
+def _sensor_from_core(name: str, sensor: visloc.types.RigSensor) -> RigSensor:
+    camera = None if sensor.camera is None else Camera.from_core(sensor.camera)
+    field = f"rig.sensors.{name}.cam_from_rig"
+    transform = Transform.checked(sensor.cam_from_rig, field, "rig.rotation")
+    return RigSensor(cam_from_rig=transform, camera=camera)
 
 
 def _sensor_to_core(name: str, sensor: RigSensor) -> visloc.types.RigSensor:

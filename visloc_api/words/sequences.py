@@ -8,8 +8,8 @@ from pydantic import FailFast, Field
 
 import visloc.sequences.filling
 from visloc.errors import refuse
-from visloc_api.words.geometry import Numbers, Transform, covariance_to_core
-from visloc_api.words.message import IncomingMessage, counted
+from visloc_api.words.geometry import Numbers, Transform, covariance_from_core, covariance_to_core
+from visloc_api.words.message import IncomingMessage, converted, counted
 from visloc_api.words.near import GivenNear
 from visloc_api.words.options import GivenOptions, LocalizeOptions
 from visloc_api.words.photo import GivenMaps, GivenYpr
@@ -31,6 +31,21 @@ class Odometry(IncomingMessage):
             "default drift is assumed"
         ),
     ] = None
+
+    @staticmethod
+    def from_core(odometry: visloc.sequences.filling.Odometry) -> Odometry:
+        """Say the pose of a tracker that nobody has checked yet.
+
+        Raises:
+            InvalidInput: ``pose.rotation``, ``pose.translation`` or ``pose.covariance``.
+        """
+        pose, covariance = odometry.rig_from_odometry, odometry.covariance
+        return Odometry(
+            rig_from_odometry=Transform.checked(pose, "odometry.rig_from_odometry"),
+            covariance=None
+            if covariance is None
+            else covariance_from_core(covariance, "odometry.covariance"),
+        )
 
     def to_core(self) -> visloc.sequences.filling.Odometry:
         """Return the odometry, checked."""
@@ -56,6 +71,13 @@ class Instant(IncomingMessage):
     ] = None
 
 
+def _check_unit(unit: object) -> object:
+    units = [str(each) for each in visloc.sequences.filling.TimeUnit]
+    if isinstance(unit, str) and unit and unit not in units:
+        raise refuse("sequence.time_unit", field="time_unit", expected=units, got=unit)
+    return unit
+
+
 class SequenceStart(IncomingMessage):
     """What all instants of a sequence share."""
 
@@ -64,6 +86,7 @@ class SequenceStart(IncomingMessage):
     rig: GivenRig = None
     time_unit: Annotated[
         str | None,
+        converted(_check_unit),
         Field(
             description="unit of timestamps: s, ms, us or ns; if left out, inferred from their size"
         ),

@@ -21,11 +21,11 @@ from clients.cli.compare_plot import draw_comparison
 from clients.cli.main import main
 from clients.evaluation.compare import DEFAULT_VALUES, Axis, make_variants, parse_values
 from clients.wire.answers import LocalizeResult
-from clients.wire.types import LocalizeOptions
 from visloc.errors import InvalidInput, Unavailable
 from visloc.options import Extraction, Fusion, Matcher, Solver
 from visloc.options import LocalizeOptions as CoreOptions
 from visloc_api.words.maps import MapInfo
+from visloc_api.words.options import LocalizeOptions
 
 Dataset = Callable[..., Path]
 PNG = b"\x89PNG\r\n\x1a\n"

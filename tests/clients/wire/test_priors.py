@@ -7,10 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+import visloc_api.words.priors
 from clients.cli.main import main
-from clients.wire.priors import priors_as_json, priors_from_json, priors_from_text
+from clients.wire.priors import priors_from_json, priors_from_text
 from visloc.errors import InvalidInput
 from visloc.priors import NO_PRIORS, HeightBand, Priors
+
+
+def priors_as_json(priors: Priors) -> dict[str, Any]:
+    return visloc_api.words.priors.Priors.from_core(priors).as_json()
+
 
 COVARIANCE = np.diag([1e-4] * 3 + [1e-2] * 3).ravel().tolist()
 ALL: dict[str, Any] = {

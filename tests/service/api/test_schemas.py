@@ -19,7 +19,6 @@ from visloc.options import Extraction, Fusion, Matcher, ReadAs, Solver
 from visloc.options import LocalizeOptions as CoreOptions
 from visloc.priors import NO_PRIORS, HeightBand
 from visloc_api.v1 import localization_pb2 as pb2
-from visloc_api.words.options import LocalizeOptions
 from visloc_api.words.photo import LocalizeRequest
 
 CAMERA = {"model": "PINHOLE", "width": 640, "height": 480, "params": [525, 525.5, 320, 240]}
@@ -446,10 +445,6 @@ def test_all_messages_of_the_proto_have_a_model() -> None:
     assert {message.name for _, message in pairs()} == (
         set(pb2.DESCRIPTOR.message_types_by_name) - without
     )
-
-
-def test_options_are_those_of_the_core() -> None:
-    assert tuple(LocalizeOptions.model_fields) == CoreOptions.__slots__
 
 
 def test_every_number_of_an_answer_is_a_double_on_the_wire() -> None:
