@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
@@ -144,13 +144,13 @@ def make_variants(
         for names in named.values():
             _check_words(names, known)
         return [
-            Variant(value, info, replace(fixed, fusion_weights=dict.fromkeys(names, 1.0)))
+            Variant(value, info, _changed(fixed, fusion_weights=dict.fromkeys(names, 1.0)))
             for value, names in named.items()
         ]
     if axis is not Axis.TOP_K:
         _check_words(values, DEFAULT_VALUES[axis])
     return [
-        Variant(value, info, replace(fixed, **_parsed(name, value)))
+        Variant(value, info, _changed(fixed, **_parsed(name, value)))
         for value in values or DEFAULT_VALUES[axis]
     ]
 
@@ -319,6 +319,10 @@ def _check_words(words: Sequence[str], known: Sequence[str]) -> None:
                 expected=f"of {', '.join(known)}",
                 got=word,
             )
+
+
+def _changed(options: LocalizeOptions, **changes: Any) -> LocalizeOptions:
+    return LocalizeOptions(**options.given() | changes)
 
 
 def _parsed(name: str, value: str) -> Mapping[str, Any]:

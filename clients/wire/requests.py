@@ -16,7 +16,6 @@ import visloc_api.words.near
 import visloc_api.words.priors
 from clients.wire.features import Features, PhotoOrFeatures
 from clients.wire.options import checked_options
-from clients.wire.priors import priors_from_json
 from clients.wire.rigs import Instant, Rig, RigImage
 from visloc.errors import VislocError, inside, refuse
 from visloc.geometry import Camera
@@ -147,8 +146,9 @@ def checked_search(
     if chosen.given():
         words["options"] = chosen
     if priors is not None:
-        known = priors if isinstance(priors, Priors) else priors_from_json(priors)
-        said = visloc_api.words.priors.Priors.from_core(known)
+        if not isinstance(priors, Priors):
+            priors = visloc_api.words.priors.Priors.read(priors).to_core()
+        said = visloc_api.words.priors.Priors.from_core(priors)
         if said.given():
             words["priors"] = said
     if ypr:

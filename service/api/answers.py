@@ -9,7 +9,7 @@ import numpy as np
 
 import visloc.types
 from service.api.geopose import geoposes_to_words
-from service.values import Localization, MatchPicture
+from service.values import Localization
 from visloc.errors import VislocError
 from visloc.types import PoseSource
 from visloc_api.words.answers import (
@@ -40,7 +40,7 @@ def localize_response(found: Localization, request_id: str) -> LocalizeResponse:
         request_id=request_id,
         status="not_localized" if pose is None else "localized",
         pose=None if pose is None else _pose_estimate(pose),
-        refusal=None if refusal is None else _refusal(refusal),
+        refusal=None if refusal is None else Refusal.model_validate(refusal),
         keypoints=evidence.num_keypoints,
         correspondences=evidence.num_correspondences,
         inliers=evidence.num_inliers,
@@ -52,7 +52,7 @@ def localize_response(found: Localization, request_id: str) -> LocalizeResponse:
         seconds=dict(found.answer.seconds),
         geopose=geopose,
         geopose_ypr=geopose_ypr,
-        debug=None if found.debug is None else _debug(found.debug),
+        debug=None if found.debug is None else Debug.model_validate(found.debug),
         tile=found.tile,
     )
 
@@ -73,7 +73,7 @@ def instant_answer(found: Localization, request_id: str) -> InstantAnswer:
         else "filled",
         source=None if pose is None else pose.source,
         pose=None if pose is None else _rig_pose(pose),
-        refusal=None if answer.refusal is None else _refusal(answer.refusal),
+        refusal=None if answer.refusal is None else Refusal.model_validate(answer.refusal),
         images=tuple(_image_answer(image, pose) for image in answer.images),
         correspondences=correspondences,
         inliers=answer.num_inliers,
@@ -105,10 +105,6 @@ def _uncertain(measured: visloc.types.RigPose) -> dict[str, Any]:
     }
 
 
-def _refusal(refused: visloc.types.Refusal) -> Refusal:
-    return Refusal(stage=refused.stage, reason=refused.reason, message=refused.message)
-
-
 def _retrieved(images: Sequence[visloc.types.RetrievedImage]) -> tuple[RetrievedImage, ...]:
     return tuple(
         RetrievedImage(image=each.name, score=each.score, similarities=dict(each.similarities))
@@ -117,27 +113,11 @@ def _retrieved(images: Sequence[visloc.types.RetrievedImage]) -> tuple[Retrieved
 
 
 def _camera(evidence: visloc.types.Evidence) -> CameraUsed:
-    camera = evidence.camera
-    return CameraUsed(
-        model=camera.model,
-        width=camera.width,
-        height=camera.height,
-        params=camera.params,
-        source=evidence.camera_source,
-    )
+    return CameraUsed.model_validate({"camera": evidence.camera, "source": evidence.camera_source})
 
 
 def _orientation(evidence: visloc.types.Evidence) -> Orientation:
     return Orientation(exif=evidence.exif_orientation, read_as=evidence.read_as)
-
-
-def _debug(picture: MatchPicture) -> Debug:
-    return Debug(
-        keypoints=picture.keypoints,
-        points=picture.points,
-        inliers=picture.inliers,
-        overlay=picture.overlay,
-    )
 
 
 def _image_answer(

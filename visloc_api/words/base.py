@@ -27,7 +27,9 @@ class Answer(BaseModel):
     """A part of an answer. Fields that a newer server adds are passed over."""
 
     # Built when first used: importing the clients shall not take the time.
-    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, defer_build=True)
+    model_config = ConfigDict(
+        frozen=True, arbitrary_types_allowed=True, defer_build=True, from_attributes=True
+    )
 
 
 class AnswerWithArrays(Answer):
