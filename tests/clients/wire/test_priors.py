@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from clients.cli.main import main
-from clients.wire.priors import priors_from_text
+from clients.cli.options import priors_from_text
 from visloc.errors import InvalidInput
 from visloc.priors import NO_PRIORS, HeightBand, Priors
 from visloc_api.words import priors as words

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,12 +27,14 @@ from visloc.geometry import Camera, Pose
 from visloc.options import LocalizeOptions as CoreOptions
 from visloc.priors import GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
 from visloc.sequences.filling import TimeUnit
+from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.words.message import IncomingMessage
 from visloc_api.words.options import LocalizeOptions
 from visloc_api.words.photo import LocalizeRequest
 from visloc_api.words.rigs import BatchLimits, LocalizeRigRequest
 from visloc_api.words.sequences import LocalizeSequenceRequest
 
+ROOT = Path(__file__).parents[3]
 CAMERA = Camera("PINHOLE", 640, 480, (525.5, 525.0, 320.0, 240.0))
 POSE = Pose.from_quaternion([0.5, 0.5, -0.5, 0.5], [1.0, -2.0, 1 / 3])
 COVARIANCE = np.diag([1e-4] * 3 + [0.1 + 0.2] * 3)
@@ -154,3 +158,16 @@ def test_a_part_made_in_python_is_refused_with_its_place_in_the_whole() -> None:
     with pytest.raises(InvalidInput) as caught:
         LocalizeRigRequest(**raw)  # type: ignore[arg-type]
     assert caught.value.field == "images[1].camera.model"
+
+
+@pytest.mark.parametrize(
+    ("package", "own"), [("clients", {"Features", "Instant", "RigImage"}), ("service", set())]
+)
+def test_what_a_message_holds_is_told_in_the_words_only(package: str, own: set[str]) -> None:
+    classes = {
+        node.name
+        for path in (ROOT / package).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ClassDef)
+    }
+    assert classes & set(pb2.DESCRIPTOR.message_types_by_name) == own
