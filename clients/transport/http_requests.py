@@ -97,7 +97,9 @@ class _Files:
 
     def parts(self, images: Iterable[rigs.RigImage]) -> list[rigs.RigImage]:
         """Add photos, and return the images that name them instead."""
-        return [image if image.image is None else self._part(image) for image in images]
+        return [
+            image if image.image is None else self._part(image, image.image) for image in images
+        ]
 
     def form(self, body: JsonObject, headers: Mapping[str, str]) -> dict[str, Any]:
         # A part of its own type, also without photos, so that the body is a form in any case.
@@ -105,9 +107,9 @@ class _Files:
         files = {"request": (None, text, "application/json"), **self._parts}
         return {"files": files, "headers": headers}
 
-    def _part(self, image: rigs.RigImage) -> rigs.RigImage:
+    def _part(self, image: rigs.RigImage, photo: bytes) -> rigs.RigImage:
         name = f"image{len(self._parts)}"
-        self._parts[name] = ("photo", image.image or b"", "application/octet-stream")
+        self._parts[name] = ("photo", photo, "application/octet-stream")
         return image.model_copy(update={"image": None, "part": name})
 
 

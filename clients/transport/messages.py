@@ -20,7 +20,7 @@ _MESSAGES: dict[type, type[Message]] = {
 
 
 def localize_message(request: Localize | StartSequence) -> Any:
-    """Return the message that has the name of the request's words."""
+    """Return the message of the same name as the request's words."""
     values = request.words.given()
     if "rig" in values:
         # In JSON, one field; in the message, one for either kind.
