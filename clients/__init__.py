@@ -4,7 +4,6 @@ from clients.client import AsyncClient, Client
 from clients.wire.answers import ImageResult, InstantResult, LocalizeResult, ServerInfo
 from clients.wire.features import Features
 from clients.wire.rigs import Instant, Rig, RigImage
-from clients.wire.types import LocalizeOptions
 from visloc.priors import GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
 from visloc.sequences.filling import Odometry
 from visloc.types import Near, PoseSource, RigSensor
@@ -21,6 +20,7 @@ from visloc_api.words.answers import MapRef as MapVersion
 from visloc_api.words.geopose import GeoPose, GeoPoseYpr
 from visloc_api.words.maps import Anchor, GeoCircle, Geodetic, MapInfo, RigInfo, VersionInfo
 from visloc_api.words.maps import Tile as TileInfo
+from visloc_api.words.options import LocalizeOptions
 
 __all__ = [
     "Anchor",

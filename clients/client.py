@@ -36,29 +36,27 @@ from clients.wire.requests import (
     GetVersion,
     JsonObject,
     ListMaps,
+    Request,
+    StartSequence,
     UseVersion,
     Where,
+    check_time_unit,
     checked_search,
     checked_version,
     get_map_request,
-    localize_request,
+    instant_words,
+    photo_request,
     read_query,
-)
-from clients.wire.rig_requests import (
-    AnyRequest,
-    SentInstant,
-    SequenceStart,
-    check_time_unit,
     rig_request,
-    sent_instant,
     sequence_start,
 )
 from clients.wire.rigs import Instant, Rig, RigImage
-from clients.wire.types import LocalizeOptions
 from visloc.geometry import Camera
 from visloc.priors import Priors
 from visloc.types import Near
+from visloc_api.words import sequences
 from visloc_api.words.maps import MapInfo
+from visloc_api.words.options import LocalizeOptions
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -67,9 +65,9 @@ DEFAULT_TIMEOUT_S = 60.0
 
 
 class _Transport(Protocol):
-    async def send(self, request: AnyRequest) -> JsonObject: ...
+    async def send(self, request: Request) -> JsonObject: ...
     def stream(
-        self, start: SequenceStart, instants: AsyncIterable[SentInstant]
+        self, start: StartSequence, instants: AsyncIterable[sequences.Instant]
     ) -> AsyncGenerator[JsonObject, None]: ...
     async def upload(self, upload: Upload, on_progress: OnProgress) -> JsonObject: ...
     async def close(self) -> None: ...
@@ -142,7 +140,7 @@ class AsyncClient:
         search = checked_search(map, options, priors, request_id, ypr=ypr)
         if isinstance(query, str | Path):
             query = await run_blocking(partial(read_query, query))
-        request = localize_request(search, query, camera, debug=debug)
+        request = photo_request(search, query, camera, debug=debug)
         return await self._ask(request, answers.parse_result)
 
     async def localize_rig(
@@ -213,7 +211,7 @@ class AsyncClient:
         """
         search = checked_search(map, options, priors, request_id, ypr=ypr)
         start = sequence_start(search, rig, time_unit, max_gap_s)
-        return self._stream(start, instants)
+        return self._stream(start, time_unit, instants)
 
     async def maps(self, near: Near | None = None) -> list[MapInfo]:
         """List the server's maps: all, or the anchored ones that reach into a circle."""
@@ -276,13 +274,16 @@ class AsyncClient:
         """Close the connections."""
         await self._transport.close()
 
-    async def _ask(self, request: AnyRequest, parse: Callable[[JsonObject], T]) -> T:
+    async def _ask(self, request: Request, parse: Callable[[JsonObject], T]) -> T:
         return answers.parse_answer(self.server, parse, await self._transport.send(request))
 
     async def _stream(
-        self, start: SequenceStart, instants: AsyncIterable[Instant] | Iterable[Instant]
+        self,
+        start: StartSequence,
+        time_unit: str | None,
+        instants: AsyncIterable[Instant] | Iterable[Instant],
     ) -> AsyncGenerator[InstantResult, None]:
-        count = _Count(self.server, start.time_unit)
+        count = _Count(self.server, time_unit)
         if isinstance(instants, AsyncIterable):
             sent = (count.sent(instant) async for instant in instants)
         else:
@@ -387,8 +388,8 @@ class _Count:
         self._instants = 0
         self.answers = 0
 
-    def sent(self, instant: Instant) -> SentInstant:
-        sent = sent_instant(instant, self._instants)
+    def sent(self, instant: Instant) -> sequences.Instant:
+        sent = instant_words(instant, self._instants)
         if self._instants == 0:
             check_time_unit(self._time_unit, sent.timestamp)
         self._instants += 1

@@ -19,8 +19,6 @@ from visloc.sequences.filling import Odometry, TimeUnit
 from visloc.sets.choosing import TileScore
 from visloc.types import InstantAnswer, Near, QueryFeatures, RigPose, RigSensor
 
-# The longest time between two measured instants across which gaps are filled, by default.
-DEFAULT_MAX_GAP_S = 1.0
 # The sensor of a photo that comes without a rig.
 ONLY_SENSOR = "camera"
 
@@ -92,7 +90,7 @@ def photo_job(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Instant:
+class InstantJob:
     """One instant of a sequence.
 
     Attributes:
@@ -108,7 +106,7 @@ class Instant:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SequenceStart:
+class SequenceJob:
     """What all instants of a sequence share.
 
     Attributes:

@@ -26,16 +26,6 @@ import clients.cli.main
 import mapping.cli.main
 from clients.cli.options import KEY_VARIABLE
 from mapping.maps.export import export_map
-from service.api import (
-    InstantAnswer,
-    LocalizeRequest,
-    LocalizeResponse,
-    LocalizeRigRequest,
-    LocalizeSequenceRequest,
-    MapImages,
-    MapInfo,
-    Problem,
-)
 from service.errors import STATUSES
 from service.settings import CONFIG_VARIABLE, PREFIX, ServiceSettings, read_settings
 from tests import docs_check, error_docs
@@ -46,7 +36,13 @@ from visloc.geometry import Camera, Pose
 from visloc.options import PRESETS, Extraction, Fusion, LocalizeOptions, Matcher, ReadAs, Solver
 from visloc.pose.centre import position_covariance
 from visloc.types import Reason
-from visloc_api.words.answers import PoseEstimate
+from visloc_api.words.answers import InstantAnswer, LocalizeResponse, PoseEstimate
+from visloc_api.words.maps import MapInfo
+from visloc_api.words.photo import LocalizeRequest
+from visloc_api.words.rigs import LocalizeRigRequest
+from visloc_api.words.scenes import MapImages
+from visloc_api.words.sequences import LocalizeSequenceRequest
+from visloc_api.words.status import Problem
 
 ROOT = Path(__file__).resolve().parents[1]
 README, API = ROOT / "README.md", ROOT / "docs" / "api.md"

@@ -142,7 +142,13 @@ class Priors:
 
     def __post_init__(self) -> None:
         if self.maps is not None and not self.maps:
-            raise _unusable("maps", None, "tiles of the set that is searched", "none")
+            raise refuse(
+                "priors.maps",
+                "no tile is named",
+                field="priors.maps",
+                expected="tiles of the set that is searched",
+                got="none",
+            )
 
 
 NO_PRIORS = Priors()

@@ -27,11 +27,11 @@ from clients.cli.progress import run_with_progress
 from clients.client import AsyncClient
 from clients.evaluation.batch import Batch, finish_batch, open_batch, run_batch
 from clients.evaluation.benchmark import Run, known_poses, make_report
-from clients.evaluation.modes import DEFAULT_MAX_GAP_S, Arrangement, Mode, arrange, parse_modes
+from clients.evaluation.modes import Arrangement, Mode, arrange, parse_modes
 from clients.evaluation.queries import QuerySet
 from clients.evaluation.results import check_can_be_written, write_poses, write_whole
 from clients.evaluation.run import InstantOutcome, Outcome, QueryClient, localize_all
-from visloc.sequences.filling import TimeUnit
+from visloc.sequences.filling import DEFAULT_MAX_GAP_S, TimeUnit
 from visloc_api.words.answers import PoseEstimate
 from visloc_api.words.maps import MapInfo
 

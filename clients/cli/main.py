@@ -15,11 +15,10 @@ from clients.cli.compare import compare
 from clients.cli.dataset import benchmark, localize_batch
 from clients.cli.display import UNKNOWN_UNIT, print_line, print_result, unit_of
 from clients.cli.maps import maps_app
-from clients.cli.options import Connection, MapRef, QueryOptions, spread
+from clients.cli.options import Connection, MapRef, QueryOptions, priors_from_text, spread
 from clients.client import Client
 from clients.errors import not_understood
 from clients.evaluation.results import check_can_be_written, write_whole
-from clients.wire.priors import priors_from_text
 from visloc.errors import VislocError
 from visloc.geometry import Camera
 

@@ -6,6 +6,7 @@ A command takes such a class as one parameter; ``spread`` makes an option of eac
 from __future__ import annotations
 
 import inspect
+import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
@@ -16,16 +17,20 @@ from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import typer
 
+import visloc.priors
 from clients.client import DEFAULT_TIMEOUT_S, AsyncClient, Client
 from clients.evaluation.benchmark import parse_threshold
 from clients.evaluation.queries import QuerySet, read_queries
 from clients.evaluation.readers import Reader, choose_reader
-from clients.wire.types import LocalizeOptions
+from clients.wire.options import options_from_texts
+from visloc.errors import refuse
 from visloc.evaluation import DEFAULT_THRESHOLDS, Threshold
 from visloc.geometry import PixelOrigin
 from visloc.options import PRESETS
 from visloc.options import LocalizeOptions as KnownOptions
 from visloc_api.words.maps import MapInfo
+from visloc_api.words.options import LocalizeOptions
+from visloc_api.words.priors import Priors
 
 T = TypeVar("T")
 
@@ -152,10 +157,10 @@ class QueryOptions:
         """The options of a query.
 
         Raises:
-            InvalidInput: as ``LocalizeOptions.from_texts``.
+            InvalidInput: as ``options_from_texts``.
         """
         seed = [] if self.seed is None else [f"seed={self.seed}"]
-        return LocalizeOptions.from_texts([*(self.option or ()), *seed])
+        return options_from_texts([*(self.option or ()), *seed])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,3 +224,17 @@ def thresholds_of(texts: Sequence[str] | None) -> Sequence[Threshold]:
         InvalidInput: ``evaluation.threshold``.
     """
     return [parse_threshold(text) for text in texts or ()] or DEFAULT_THRESHOLDS
+
+
+def priors_from_text(text: str) -> visloc.priors.Priors:
+    """Parse priors: JSON, or the path of a file that holds it.
+
+    Raises:
+        InvalidInput: ``priors.unreadable`` for neither, ``request.unknown_field``,
+            ``request.invalid``, ``priors...`` or ``pose...``.
+    """
+    try:
+        raw = json.loads(text if text.lstrip().startswith("{") else Path(text).read_bytes())
+    except (OSError, ValueError) as error:
+        raise refuse("priors.unreadable", field="priors", got=f"{text[:80]} ({error})") from error
+    return Priors.read(raw).to_core()

@@ -21,10 +21,10 @@ from clients.evaluation.results import (
     write_whole,
 )
 from clients.evaluation.run import InstantOutcome, Outcome, localize_all
-from clients.wire.types import LocalizeOptions
 from visloc.errors import refuse
 from visloc.geometry import PixelOrigin
 from visloc.sequences.filling import TracedPose
+from visloc_api.words.options import LocalizeOptions
 
 _FORMAT = 1
 _T = TypeVar("_T")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
@@ -15,11 +15,11 @@ from clients.evaluation.queries import Query
 from clients.evaluation.readers import Reader
 from clients.evaluation.run import Outcome, QueryClient
 from clients.wire.answers import ServerInfo
-from clients.wire.types import LocalizeOptions
+from clients.wire.options import options_from_texts
 from visloc.errors import Forbidden, Unauthenticated, Unavailable, VislocError, refuse
 from visloc.evaluation import Threshold
 from visloc_api.words.maps import MapInfo
-from visloc_api.words.options import CHOICES
+from visloc_api.words.options import CHOICES, LocalizeOptions
 
 
 class Axis(StrEnum):
@@ -144,13 +144,13 @@ def make_variants(
         for names in named.values():
             _check_words(names, known)
         return [
-            Variant(value, info, replace(fixed, fusion_weights=dict.fromkeys(names, 1.0)))
+            Variant(value, info, _changed(fixed, fusion_weights=dict.fromkeys(names, 1.0)))
             for value, names in named.items()
         ]
     if axis is not Axis.TOP_K:
         _check_words(values, DEFAULT_VALUES[axis])
     return [
-        Variant(value, info, replace(fixed, **_parsed(name, value)))
+        Variant(value, info, _changed(fixed, **_parsed(name, value)))
         for value in values or DEFAULT_VALUES[axis]
     ]
 
@@ -321,5 +321,9 @@ def _check_words(words: Sequence[str], known: Sequence[str]) -> None:
             )
 
 
+def _changed(options: LocalizeOptions, **changes: Any) -> LocalizeOptions:
+    return LocalizeOptions(**options.given() | changes)
+
+
 def _parsed(name: str, value: str) -> Mapping[str, Any]:
-    return LocalizeOptions.from_texts([f"{name}={value}"]).given()
+    return options_from_texts([f"{name}={value}"]).given()

@@ -9,10 +9,15 @@ from enum import StrEnum
 from clients.evaluation.instants import QueryInstant, instants_of_dataset, instants_of_map_rig
 from clients.evaluation.queries import Query, QuerySet
 from visloc.errors import refuse
-from visloc.sequences.filling import TimeUnit, TracedPose, fill_rig, fill_sequence, guess_time_unit
+from visloc.sequences.filling import (
+    DEFAULT_MAX_GAP_S,
+    TimeUnit,
+    TracedPose,
+    fill_rig,
+    fill_sequence,
+    guess_time_unit,
+)
 from visloc_api.words.maps import MapInfo
-
-DEFAULT_MAX_GAP_S = 1.0
 
 
 class Mode(StrEnum):

@@ -16,9 +16,9 @@ from clients.evaluation.queries import Query
 from clients.evaluation.readers import Reader
 from clients.wire.answers import InstantResult, LocalizeResult, parse_answer
 from clients.wire.rigs import RigImage
-from clients.wire.types import LocalizeOptions
 from visloc.errors import InvalidInput, Overloaded, VislocError, WeightsError
 from visloc.sequences.filling import TracedPose
+from visloc_api.words.options import LocalizeOptions
 
 _T = TypeVar("_T")
 _R = TypeVar("_R")

@@ -20,7 +20,6 @@ from clients.transport.messages import (
     list_maps_message,
     localize_message,
     plain,
-    rig_message,
     version_message,
 )
 from clients.transport.retry import GRPC_OPTIONS, map_header
@@ -34,11 +33,14 @@ from clients.wire.requests import (
     JsonObject,
     ListMaps,
     Localize,
+    Request,
+    StartSequence,
     UseVersion,
 )
-from clients.wire.rig_requests import AnyRequest, LocalizeRig, SentInstant, SequenceStart
 from visloc.errors import VislocError
 from visloc_api.v1 import localization_pb2 as wire
+from visloc_api.words.rigs import LocalizeRigRequest
+from visloc_api.words.sequences import Instant
 from visloc_api.words.wire import VERSION_KEY
 
 _SERVICE = f"/{wire.DESCRIPTOR.services_by_name['Localization'].full_name}"
@@ -59,7 +61,7 @@ class GrpcTransport:
         self._connection = connection
         self._channel: grpc.aio.Channel | None = None
 
-    async def send(self, request: AnyRequest) -> JsonObject:
+    async def send(self, request: Request) -> JsonObject:
         """Return the answer as plain JSON, the same as over HTTP.
 
         Raises:
@@ -77,7 +79,7 @@ class GrpcTransport:
         return _decoded(self._server, decode, answer, received)
 
     async def stream(
-        self, start: SequenceStart, instants: AsyncIterable[SentInstant]
+        self, start: StartSequence, instants: AsyncIterable[Instant]
     ) -> AsyncGenerator[JsonObject, None]:
         """Send instants as the server takes them, and give each answer as it comes.
 
@@ -168,22 +170,21 @@ def _refuse_after_fork() -> None:
 
 
 def _metadata(
-    connection: Connection, request: AnyRequest | SequenceStart | Upload
+    connection: Connection, request: Request | StartSequence | Upload
 ) -> tuple[tuple[str, str], ...]:
     key = connection.api_key
     authorization = {} if key is None else {"authorization": f"Bearer {key}"}
     return tuple((authorization | map_header(request)).items())
 
 
-def _encode(request: AnyRequest) -> tuple[str, bytes, _Decode]:
+def _encode(request: Request) -> tuple[str, bytes, _Decode]:
     """Return the method, the message, and the function that reads the answer."""
     match request:
         case Localize():
             message = localize_message(request).SerializeToString()
+            if isinstance(request.words, LocalizeRigRequest):
+                return f"{_SERVICE}/LocalizeRig", message, _reads(wire.InstantAnswer)
             return f"{_SERVICE}/Localize", message, _reads(wire.LocalizeResponse)
-        case LocalizeRig():
-            message = rig_message(request).SerializeToString()
-            return f"{_SERVICE}/LocalizeRig", message, _reads(wire.InstantAnswer)
         case ListMaps():
             message = list_maps_message(request).SerializeToString()
             return f"{_SERVICE}/ListMaps", message, _reads(wire.ListMapsResponse)

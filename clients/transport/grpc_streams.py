@@ -13,17 +13,17 @@ from google.protobuf.message import DecodeError
 from clients import errors
 from clients.transport.grpc_errors import grpc_failure
 from clients.transport.messages import instant_message, plain, start_message
-from clients.wire.requests import JsonObject
-from clients.wire.rig_requests import SentInstant, SequenceStart
+from clients.wire.requests import JsonObject, StartSequence
 from visloc_api.v1 import localization_pb2 as wire
+from visloc_api.words.sequences import Instant
 
 
 async def stream_answers(
     make_call: Callable[[], Any],  # the stubs do not know that the messages may be written later
     server: str,
     timeout_s: float,
-    start: SequenceStart,
-    instants: AsyncIterable[SentInstant],
+    start: StartSequence,
+    instants: AsyncIterable[Instant],
 ) -> AsyncGenerator[JsonObject, None]:
     """Give the answers of a sequence as plain JSON.
 
@@ -82,7 +82,7 @@ class _Feed:
         self,
         call: Any,
         head: Iterable[wire.LocalizeSequenceRequest],
-        instants: AsyncIterable[SentInstant],
+        instants: AsyncIterable[Instant],
     ) -> None:
         try:
             for message in head:
@@ -93,7 +93,7 @@ class _Feed:
         except (grpc.aio.AioRpcError, asyncio.InvalidStateError):
             pass  # the call is over; reading from it tells why
 
-    async def _messages(self, instants: AsyncIterable[SentInstant]) -> AsyncIterator[bytes]:
+    async def _messages(self, instants: AsyncIterable[Instant]) -> AsyncIterator[bytes]:
         self.waits_since = None
         try:
             async for instant in instants:

@@ -15,9 +15,9 @@ from clients.transport.connection import Connection
 from clients.transport.http_requests import encode_request, encode_sequence, encode_upload
 from clients.transport.retry import RESEND_PAUSE_S, may_resend
 from clients.transport.uploads import OnProgress, Upload, pieces_async
-from clients.wire.requests import CheckReady, JsonObject
-from clients.wire.rig_requests import AnyRequest, SentInstant, SequenceStart
+from clients.wire.requests import CheckReady, JsonObject, Request, StartSequence
 from visloc.errors import VislocError, refuse
+from visloc_api.words.sequences import Instant
 from visloc_api.words.wire import NDJSON
 
 _CONNECT_TIMEOUT_S = 10.0
@@ -50,7 +50,7 @@ class HttpTransport:
         self._server, self._timeout_s = connection.server, connection.timeout_s
         self._http = httpx.AsyncClient(**_options(connection))
 
-    async def send(self, request: AnyRequest) -> JsonObject:
+    async def send(self, request: Request) -> JsonObject:
         """Return the answer as plain JSON.
 
         Raises:
@@ -65,7 +65,7 @@ class HttpTransport:
         return _decode(self._server, request, got)
 
     async def stream(
-        self, start: SequenceStart, instants: AsyncIterable[SentInstant]
+        self, start: StartSequence, instants: AsyncIterable[Instant]
     ) -> AsyncGenerator[JsonObject, None]:
         """Send all instants in one request, and give each answer as it comes.
 
@@ -103,7 +103,7 @@ class HttpTransport:
     async def close(self) -> None:
         await self._http.aclose()
 
-    async def _ask(self, request: AnyRequest) -> httpx.Response | httpx.HTTPError:
+    async def _ask(self, request: Request) -> httpx.Response | httpx.HTTPError:
         method, path, parts = encode_request(request, self._timeout_s)
         try:
             return await self._http.request(method, path, **parts)
@@ -145,7 +145,7 @@ def _options(connection: Connection) -> dict[str, Any]:
     }
 
 
-def _decode(server: str, request: AnyRequest | None, response: httpx.Response) -> JsonObject:
+def _decode(server: str, request: Request | None, response: httpx.Response) -> JsonObject:
     if isinstance(request, CheckReady) and response.status_code in (200, 503):
         return {"ready": response.status_code == 200}
     if response.status_code == 204:

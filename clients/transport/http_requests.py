@@ -10,8 +10,6 @@ import httpx
 
 from clients.transport.retry import map_header
 from clients.transport.uploads import Upload
-from clients.wire.features import Features
-from clients.wire.priors import priors_as_json
 from clients.wire.requests import (
     CheckReady,
     DeleteVersion,
@@ -21,44 +19,31 @@ from clients.wire.requests import (
     JsonObject,
     ListMaps,
     Localize,
-    Search,
+    Request,
+    StartSequence,
     UseVersion,
 )
-from clients.wire.rig_requests import (
-    AnyRequest,
-    LocalizeRig,
-    SentImage,
-    SentInstant,
-    SequenceStart,
-    camera_as_json,
-    odometry_as_json,
-    rig_as_json,
-    search_as_json,
-)
 from visloc.types import Near
+from visloc_api.words import rigs, sequences
+from visloc_api.words.photo import LocalizeRequest
 from visloc_api.words.wire import NDJSON, REQUEST_ID_HEADER, TIMEOUT_HEADER
 
 
-def encode_request(request: AnyRequest, timeout_s: float) -> tuple[str, str, dict[str, Any]]:
+def encode_request(request: Request, timeout_s: float) -> tuple[str, str, dict[str, Any]]:
     """Return method, path, and the parameters of httpx."""
     method, path, parts = _encode(request, timeout_s)
     return method, path, {**parts, "headers": map_header(request) | parts.get("headers", {})}
 
 
-def _encode(request: AnyRequest, timeout_s: float) -> tuple[str, str, dict[str, Any]]:
+def _encode(request: Request, timeout_s: float) -> tuple[str, str, dict[str, Any]]:
     match request:
-        case Localize():
-            headers = _headers(request.search, timeout_s)
-            fields = _fields(request)
-            parts = {"data": fields, "files": _file(request.query), "headers": headers}
-            return "POST", "/localize", parts
-        case LocalizeRig():
+        case Localize(words=words):
+            headers = _headers(request, timeout_s)
+            if isinstance(words, LocalizeRequest):
+                return "POST", "/localize", {**_photo_form(words), "headers": headers}
             files = _Files()
-            body = search_as_json(request.search) | {
-                "rig": rig_as_json(request.rig),
-                "images": files.images(request.images),
-            }
-            return "POST", "/localize/rig", files.form(body, _headers(request.search, timeout_s))
+            body = words.model_copy(update={"images": files.parts(words.images)}).as_json()
+            return "POST", "/localize/rig", files.form(body, headers)
         case ListMaps():
             return "GET", "/maps", {} if request.near is None else {"params": _near(request.near)}
         case GetMap():
@@ -81,18 +66,17 @@ def _version_path(map_id: str, version: str) -> str:
 
 
 def encode_sequence(
-    start: SequenceStart, instants: Sequence[SentInstant], timeout_s: float
+    start: StartSequence, instants: Sequence[sequences.Instant], timeout_s: float
 ) -> tuple[str, str, dict[str, Any]]:
     """Encode a sequence as ``encode_request`` does other requests."""
     files = _Files()
-    body = search_as_json(start.search) | {"instants": [files.instant(i) for i in instants]}
-    if start.rig is not None:
-        body["rig"] = rig_as_json(start.rig)
-    if start.time_unit is not None:
-        body["time_unit"] = start.time_unit
-    if start.max_gap_s is not None:
-        body["max_gap_s"] = start.max_gap_s
-    headers = _headers(start.search, timeout_s) | map_header(start) | {"Accept": NDJSON}
+    body = start.words.as_json() | {
+        "instants": [
+            each.model_copy(update={"images": files.parts(each.images)}).as_json()
+            for each in instants
+        ]
+    }
+    headers = _headers(start, timeout_s) | map_header(start) | {"Accept": NDJSON}
     return "POST", "/localize/sequence", files.form(body, headers)
 
 
@@ -111,21 +95,11 @@ class _Files:
     def __init__(self) -> None:
         self._parts: dict[str, tuple[str, bytes, str]] = {}
 
-    def images(self, images: Iterable[SentImage]) -> list[JsonObject]:
-        """Add photos, and return their descriptions."""
-        return [self._image(image) for image in images]
-
-    def instant(self, instant: SentInstant) -> JsonObject:
-        """Add the photos of an instant, and return its description."""
-        entry: JsonObject = {
-            "timestamp": instant.timestamp,
-            "images": self.images(instant.images),
-        }
-        if instant.odometry is not None:
-            entry["odometry"] = odometry_as_json(instant.odometry)
-        if instant.priors is not None:
-            entry["priors"] = priors_as_json(instant.priors)
-        return entry
+    def parts(self, images: Iterable[rigs.RigImage]) -> list[rigs.RigImage]:
+        """Add photos, and return the images that name them instead."""
+        return [
+            image if image.image is None else self._part(image, image.image) for image in images
+        ]
 
     def form(self, body: JsonObject, headers: Mapping[str, str]) -> dict[str, Any]:
         # A part of its own type, also without photos, so that the body is a form in any case.
@@ -133,32 +107,21 @@ class _Files:
         files = {"request": (None, text, "application/json"), **self._parts}
         return {"files": files, "headers": headers}
 
-    def _image(self, image: SentImage) -> JsonObject:
-        entry: JsonObject = {"sensor": image.sensor}
-        if isinstance(image.query, Features):
-            entry["features"] = image.query.as_json()
-        else:
-            name = f"image{len(self._parts)}"
-            self._parts[name] = ("photo", image.query, "application/octet-stream")
-            entry["part"] = name
-        if image.camera is not None:
-            entry["camera"] = camera_as_json(image.camera)
-        if image.timestamp is not None:
-            entry["timestamp"] = image.timestamp
-        return entry
+    def _part(self, image: rigs.RigImage, photo: bytes) -> rigs.RigImage:
+        name = f"image{len(self._parts)}"
+        self._parts[name] = ("photo", photo, "application/octet-stream")
+        return image.model_copy(update={"image": None, "part": name})
 
 
-def _fields(request: Localize) -> dict[str, str]:
-    """Return the text fields of the form for one photo."""
-    entry = search_as_json(request.search)
-    fields = {name: json.dumps(value) for name, value in entry.items() if name != "map"}
-    if "map" in entry:
-        fields["map"] = entry["map"]
-    if request.camera is not None:
-        fields["camera"] = json.dumps(camera_as_json(request.camera))
-    if request.debug:
-        fields["debug"] = "true"
-    return fields
+def _photo_form(words: LocalizeRequest) -> dict[str, Any]:
+    """Return the form for one photo: a file, and texts."""
+    rest = words.model_copy(update={"image": None, "features": None}).as_json()
+    texts = {name: value if name == "map" else json.dumps(value) for name, value in rest.items()}
+    if words.features is None:
+        file = ("photo", words.image, "application/octet-stream")
+        return {"data": texts, "files": {"image": file}}
+    text = json.dumps(words.features.as_json()).encode()
+    return {"data": texts, "files": {"features": ("features.json", text, "application/json")}}
 
 
 def _near(near: Near) -> dict[str, str]:
@@ -166,16 +129,9 @@ def _near(near: Near) -> dict[str, str]:
     return {"near": f"{float(near.latitude)!r},{float(near.longitude)!r},{float(near.radius)!r}"}
 
 
-def _headers(search: Search, timeout_s: float) -> dict[str, str]:
+def _headers(request: Localize | StartSequence, timeout_s: float) -> dict[str, str]:
     # So that the server does not work for a caller that no longer waits.
     headers = {TIMEOUT_HEADER: f"{timeout_s:g}"}
-    if search.request_id is not None:
-        headers[REQUEST_ID_HEADER] = search.request_id
+    if request.request_id is not None:
+        headers[REQUEST_ID_HEADER] = request.request_id
     return headers
-
-
-def _file(query: bytes | Features) -> dict[str, tuple[str, bytes, str]]:
-    if isinstance(query, Features):
-        text = json.dumps(query.as_json()).encode()
-        return {"features": ("features.json", text, "application/json")}
-    return {"image": ("photo", query, "application/octet-stream")}

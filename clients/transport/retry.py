@@ -7,9 +7,15 @@ import json
 import httpx
 
 from clients.transport.uploads import Upload
-from clients.wire.requests import DeleteVersion, GetMap, GetVersion, Localize, UseVersion
-from clients.wire.rig_requests import AnyRequest, LocalizeRig, SequenceStart
-from visloc.types import Near
+from clients.wire.requests import (
+    DeleteVersion,
+    GetMap,
+    GetVersion,
+    Localize,
+    Request,
+    StartSequence,
+    UseVersion,
+)
 
 # Header of HTTP and metadata of gRPC. A balancer that routes by it finds the map already open.
 MAP_HEADER = "x-visloc-map"
@@ -45,14 +51,13 @@ GRPC_OPTIONS = (
 )
 
 
-def map_header(request: AnyRequest | SequenceStart | Upload) -> dict[str, str]:
+def map_header(request: Request | StartSequence | Upload) -> dict[str, str]:
     """Return the header that names the map of a request, or its first map, without version."""
     match request:
-        case Localize() | LocalizeRig() | SequenceStart():
-            maps = request.search.maps
-            if isinstance(maps, Near):
+        case Localize(words=words) | StartSequence(words=words):
+            if words.near is not None:
                 return {}
-            name = maps[0]
+            name = words.map or (words.maps or [""])[0]
         case GetMap():
             name = request.map
         case GetVersion() | UseVersion() | DeleteVersion() | Upload():
@@ -62,7 +67,7 @@ def map_header(request: AnyRequest | SequenceStart | Upload) -> dict[str, str]:
     return {MAP_HEADER: name.partition("@")[0]}
 
 
-def may_resend(request: AnyRequest, got: httpx.Response | httpx.HTTPError) -> bool:
+def may_resend(request: Request, got: httpx.Response | httpx.HTTPError) -> bool:
     """Return whether a request is sent again over HTTP.
 
     Only a request that changes nothing on the server, and only when another server may answer:

@@ -2,42 +2,31 @@
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+import visloc_api.words.features
 from visloc.errors import VislocError, refuse
+from visloc.types import QueryFeatures
 from visloc_api.words.wire import ARRAY_DTYPES
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Features:
+class Features(QueryFeatures):
     """What was found in one photo, for a map of the same kind of features.
 
     Arrays of float32, float16, uint8 and int8 are sent as they are, float64 as float32. Rows may
-    have any length: the server normalizes descriptors.
-
-    Attributes:
-        kind: the map's ``local_features``.
-        keypoints: (N, 2), (x, y) in pixels; the centre of the top-left pixel is (0.5, 0.5).
-        descriptors: (N, D).
-        global_descriptors: (D,) by name in the map's ``global_features``. One that is made of
-            local features, ``localvlad``, may be left out.
+    have any length: the server normalizes descriptors. A global descriptor that is made of local
+    features, ``localvlad``, may be left out.
 
     Raises:
         InvalidInput: ``features.keypoints``, ``features.descriptors`` or
             ``features.global_descriptors`` for a wrong shape, ``features.dtype``.
     """
-
-    kind: str
-    keypoints: NDArray[Any]
-    descriptors: NDArray[Any]
-    global_descriptors: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         keypoints = _array("keypoints", self.keypoints)
@@ -59,14 +48,7 @@ class Features:
 
     def as_json(self) -> dict[str, Any]:
         """Return the features as the API has them in JSON, with arrays in base64."""
-        return {
-            "kind": self.kind,
-            "keypoints": _array_as_json(self.keypoints),
-            "descriptors": _array_as_json(self.descriptors),
-            "global_descriptors": {
-                name: _array_as_json(row) for name, row in self.global_descriptors.items()
-            },
-        }
+        return visloc_api.words.features.Features.from_core(self).as_json()
 
 
 # The encoded photo, the path of the file that holds it, or what was found in it.
@@ -85,11 +67,6 @@ def _array(part: str, values: ArrayLike, name: str | None = None) -> NDArray[Any
             got=array.dtype.name,
         )
     return np.ascontiguousarray(array, dtype=ARRAY_DTYPES[dtype])
-
-
-def _array_as_json(array: NDArray[Any]) -> dict[str, Any]:
-    data = base64.b64encode(array.tobytes()).decode("ascii")
-    return {"dtype": array.dtype.name, "shape": list(array.shape), "data": data}
 
 
 def _wrong_shape(

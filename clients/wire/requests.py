@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import httpx
 
+import visloc_api.words.features
+import visloc_api.words.near
+import visloc_api.words.priors
 from clients.wire.features import Features, PhotoOrFeatures
-from clients.wire.priors import priors_from_json
-from clients.wire.types import LocalizeOptions
-from visloc.errors import refuse
+from clients.wire.options import checked_options
+from clients.wire.rigs import Instant, Rig, RigImage
+from visloc.errors import VislocError, inside, refuse
 from visloc.geometry import Camera
-from visloc.priors import NO_PRIORS, Priors
-from visloc.types import Near
+from visloc.priors import Priors
+from visloc.sequences.filling import TimeUnit, guess_time_unit
+from visloc.types import Near, RigSensor
+from visloc_api.words import geometry, rigs, sequences
+from visloc_api.words.options import LocalizeOptions
+from visloc_api.words.photo import LocalizeRequest
 from visloc_api.words.wire import REQUEST_ID
 
 JsonObject = dict[str, Any]
 # A map, several, or the anchored ones around a place.
 Where = str | Sequence[str] | Near
+
+_A_RIG = "the id of a rig that the map knows, or its cameras as RigSensor by name"
 
 # The first character keeps ``.`` and ``..`` out of the path of a URL; the server has the rest.
 _MAP = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]*")
@@ -35,23 +45,31 @@ _SERVER = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Where to search, and how; see ``checked_search``."""
+    """Where to search, and how.
 
-    maps: tuple[str, ...] | Near
-    options: LocalizeOptions
-    priors: Priors
+    Attributes:
+        words: the fields that all requests that localize share.
+        request_id: names the request in the server's logs.
+    """
+
+    words: Mapping[str, Any]
     request_id: str | None
-    ypr: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Localize:
-    """Localize one photo, or its features; see ``localize_request``."""
+    """Localize one photo, or the photos of a rig."""
 
-    search: Search
-    query: bytes | Features
-    camera: Camera | None
-    debug: bool = False
+    words: LocalizeRequest | rigs.LocalizeRigRequest
+    request_id: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class StartSequence:
+    """Localize the instants that follow; the words are what they share."""
+
+    words: sequences.SequenceStart
+    request_id: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,17 +125,6 @@ Request = (
 )
 
 
-def localize_request(
-    search: Search, query: PhotoOrFeatures, camera: Camera | None, *, debug: bool = False
-) -> Localize:
-    """Complete what ``localize`` was called with; a path is read here.
-
-    Raises:
-        InvalidInput: ``image.unreadable``.
-    """
-    return Localize(search, read_query(query), camera, debug)
-
-
 def checked_search(
     where: Where,
     options: LocalizeOptions | Mapping[str, Any] | None,
@@ -134,18 +141,156 @@ def checked_search(
     """
     if request_id is not None and not REQUEST_ID.fullmatch(request_id):
         raise refuse("request.id", field="request_id", got=request_id)
-    if not isinstance(options, LocalizeOptions):
-        options = LocalizeOptions.from_mapping(options or {})
-    if not isinstance(priors, Priors):
-        priors = NO_PRIORS if priors is None else priors_from_json(priors)
+    words = _where(where)
+    chosen = checked_options(options or {})
+    if chosen.given():
+        words["options"] = chosen
+    if priors is not None:
+        if not isinstance(priors, Priors):
+            priors = visloc_api.words.priors.Priors.read(priors).to_core()
+        said = visloc_api.words.priors.Priors.from_core(priors)
+        if said.given():
+            words["priors"] = said
+    if ypr:
+        words["ypr"] = True
+    return Search(words, request_id)
+
+
+def _where(where: Where) -> dict[str, Any]:
     if isinstance(where, Near):
-        return Search(where, options, priors, request_id, ypr)
-    maps = (where,) if isinstance(where, str) else tuple(where)
+        return {"near": visloc_api.words.near.Near.from_core(where)}
+    maps = [where] if isinstance(where, str) else list(where)
     if not maps:
         raise refuse(
             "request.map", "there is no map to search", field="map", expected="a map, or several"
         )
-    return Search(tuple(map(_checked, maps)), options, priors, request_id, ypr)
+    for each in maps:
+        _check_map(each)
+    return {"map": maps[0]} if len(maps) == 1 else {"maps": maps}
+
+
+def photo_request(
+    search: Search, query: PhotoOrFeatures, camera: Camera | None, *, debug: bool = False
+) -> Localize:
+    """Complete what ``localize`` was called with; a path is read here.
+
+    Raises:
+        InvalidInput: ``image.unreadable``.
+    """
+    photo = _photo(query, camera)
+    words = LocalizeRequest(**search.words, **photo, debug=debug or None)
+    return Localize(words, search.request_id)
+
+
+def rig_request(search: Search, rig: Rig, images: Iterable[RigImage]) -> Localize:
+    """Check and complete what ``localize_rig`` was called with; paths are read here.
+
+    Raises:
+        InvalidInput: ``request.missing_field`` or ``request.invalid`` for what is no rig or are
+            no photos, ``rig.rotation``, ``pose.translation`` or ``image.unreadable``.
+    """
+    if rig is None:  # from callers without a type checker
+        raise refuse("request.missing_field", field="rig", expected=_A_RIG)
+    words = rigs.LocalizeRigRequest(**search.words, rig=_rig(rig), images=_images(images, "images"))
+    return Localize(words, search.request_id)
+
+
+def sequence_start(
+    search: Search, rig: Rig | None, time_unit: str | None, max_gap_s: float | None
+) -> StartSequence:
+    """Check what ``localize_sequence`` was called with.
+
+    Raises:
+        InvalidInput: ``request.invalid`` for what is no rig, ``rig.rotation``,
+            ``pose.translation``, ``sequence.time_unit`` or ``sequence.max_gap``.
+    """
+    if max_gap_s is not None and not (math.isfinite(max_gap_s) and max_gap_s >= 0):
+        raise refuse(
+            "sequence.max_gap", field="max_gap_s", expected="seconds, 0 or more", got=max_gap_s
+        )
+    words = sequences.SequenceStart(
+        **search.words,
+        rig=None if rig is None else _rig(rig),
+        time_unit=time_unit,
+        max_gap_s=max_gap_s,
+    )
+    return StartSequence(words, search.request_id)
+
+
+def instant_words(instant: Instant, index: int) -> sequences.Instant:
+    """Check an instant of a sequence and read its photos.
+
+    Args:
+        instant: to send.
+        index: of it in the sequence, for errors.
+
+    Raises:
+        InvalidInput: ``pose.rotation``, ``pose.translation``, ``pose.covariance``,
+            ``request.invalid`` for another timestamp than a whole number and for what are no
+            photos, or ``image.unreadable``.
+    """
+    odometry, priors = instant.odometry, instant.priors
+    images = _images(instant.images, f"instants[{index}].images")
+    with inside(f"instants[{index}]"):
+        return sequences.Instant(
+            timestamp=instant.timestamp,
+            images=images,
+            odometry=None if odometry is None else sequences.Odometry.from_core(odometry),
+            priors=None if priors is None else visloc_api.words.priors.Priors.from_core(priors),
+        )
+
+
+def check_time_unit(time_unit: str | None, first_timestamp: int) -> None:
+    """Refuse a sequence whose unit of time is neither said nor told by its first timestamp.
+
+    Raises:
+        InvalidInput: ``sequence.time_unit``, as the server raises it.
+    """
+    if time_unit is None and guess_time_unit([first_timestamp]) is None:
+        raise refuse(
+            "sequence.time_unit",
+            "the size of the timestamps does not reveal their unit",
+            field="time_unit",
+            expected=TimeUnit,
+        )
+
+
+def _rig(rig: Rig) -> str | rigs.RigCalibration:
+    if isinstance(rig, str):
+        return rig
+    if not isinstance(rig, Mapping):
+        raise _unusable("rig", _A_RIG, rig)
+    for name, sensor in rig.items():
+        if not isinstance(sensor, RigSensor):
+            raise _unusable(f"rig.sensors.{name}", "a RigSensor", sensor)
+    return rigs.RigCalibration.from_core(rig)
+
+
+def _images(images: Iterable[RigImage], field: str) -> list[rigs.RigImage]:
+    if isinstance(images, Mapping) or not isinstance(images, Iterable):
+        raise _unusable(field, "a list of RigImage", images)
+    return [_image(image, f"{field}[{number}]") for number, image in enumerate(images)]
+
+
+def _image(image: RigImage, field: str) -> rigs.RigImage:
+    if not isinstance(image, RigImage):
+        raise _unusable(field, "a RigImage", image)
+    photo = _photo(image.query, image.camera)
+    with inside(field):
+        return rigs.RigImage(sensor=image.sensor, **photo, timestamp=image.timestamp)
+
+
+def _photo(query: PhotoOrFeatures, camera: Camera | None) -> dict[str, Any]:
+    """Return the fields that say a photo or its features, and its camera."""
+    content = read_query(query)
+    said = {"camera": None if camera is None else geometry.Camera.from_core(camera)}
+    if isinstance(content, Features):
+        return said | {"features": visloc_api.words.features.Features.from_core(content)}
+    return said | {"image": content}
+
+
+def _unusable(field: str, expected: str, got: object) -> VislocError:
+    return refuse("request.invalid", field=field, expected=expected, got=type(got).__name__)
 
 
 def get_map_request(map_ref: str) -> GetMap:
@@ -154,7 +299,8 @@ def get_map_request(map_ref: str) -> GetMap:
     Raises:
         InvalidInput: ``map.id``.
     """
-    return GetMap(_checked(map_ref))
+    _check_map(map_ref)
+    return GetMap(map_ref)
 
 
 def checked_version(map_id: str, version: str) -> tuple[str, str]:
@@ -217,7 +363,7 @@ def _is_url(text: str) -> bool:
         return False
 
 
-def _checked(map_ref: str) -> str:
+def _check_map(map_ref: str) -> None:
     if not _MAP.fullmatch(map_ref):
         raise refuse(
             "map.id",
@@ -225,4 +371,3 @@ def _checked(map_ref: str) -> str:
             expected="id or id@version, of letters, digits, '.', '_' and '-'",
             got=map_ref,
         )
-    return map_ref

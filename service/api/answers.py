@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 import visloc.types
-from service.api.geopose import geoposes_to_words
-from service.values import Localization, MatchPicture
+from service.values import Localization
+from visloc.archive import Geodetic
 from visloc.errors import VislocError
+from visloc.geometry import Pose
+from visloc.geopose import geopose_of
 from visloc.types import PoseSource
 from visloc_api.words.answers import (
     MAX_RETRIEVED,
@@ -27,6 +29,7 @@ from visloc_api.words.answers import (
     RetrievedImage,
     RigPose,
 )
+from visloc_api.words.geopose import GeoAngles, GeoPose, GeoPoseYpr, GeoPosition, GeoQuaternion
 
 
 def localize_response(found: Localization, request_id: str) -> LocalizeResponse:
@@ -40,7 +43,7 @@ def localize_response(found: Localization, request_id: str) -> LocalizeResponse:
         request_id=request_id,
         status="not_localized" if pose is None else "localized",
         pose=None if pose is None else _pose_estimate(pose),
-        refusal=None if refusal is None else _refusal(refusal),
+        refusal=None if refusal is None else Refusal.model_validate(refusal),
         keypoints=evidence.num_keypoints,
         correspondences=evidence.num_correspondences,
         inliers=evidence.num_inliers,
@@ -52,7 +55,7 @@ def localize_response(found: Localization, request_id: str) -> LocalizeResponse:
         seconds=dict(found.answer.seconds),
         geopose=geopose,
         geopose_ypr=geopose_ypr,
-        debug=None if found.debug is None else _debug(found.debug),
+        debug=None if found.debug is None else Debug.model_validate(found.debug),
         tile=found.tile,
     )
 
@@ -73,7 +76,7 @@ def instant_answer(found: Localization, request_id: str) -> InstantAnswer:
         else "filled",
         source=None if pose is None else pose.source,
         pose=None if pose is None else _rig_pose(pose),
-        refusal=None if answer.refusal is None else _refusal(answer.refusal),
+        refusal=None if answer.refusal is None else Refusal.model_validate(answer.refusal),
         images=tuple(_image_answer(image, pose) for image in answer.images),
         correspondences=correspondences,
         inliers=answer.num_inliers,
@@ -105,10 +108,6 @@ def _uncertain(measured: visloc.types.RigPose) -> dict[str, Any]:
     }
 
 
-def _refusal(refused: visloc.types.Refusal) -> Refusal:
-    return Refusal(stage=refused.stage, reason=refused.reason, message=refused.message)
-
-
 def _retrieved(images: Sequence[visloc.types.RetrievedImage]) -> tuple[RetrievedImage, ...]:
     return tuple(
         RetrievedImage(image=each.name, score=each.score, similarities=dict(each.similarities))
@@ -117,27 +116,11 @@ def _retrieved(images: Sequence[visloc.types.RetrievedImage]) -> tuple[Retrieved
 
 
 def _camera(evidence: visloc.types.Evidence) -> CameraUsed:
-    camera = evidence.camera
-    return CameraUsed(
-        model=camera.model,
-        width=camera.width,
-        height=camera.height,
-        params=camera.params,
-        source=evidence.camera_source,
-    )
+    return CameraUsed.model_validate({"camera": evidence.camera, "source": evidence.camera_source})
 
 
 def _orientation(evidence: visloc.types.Evidence) -> Orientation:
     return Orientation(exif=evidence.exif_orientation, read_as=evidence.read_as)
-
-
-def _debug(picture: MatchPicture) -> Debug:
-    return Debug(
-        keypoints=picture.keypoints,
-        points=picture.points,
-        inliers=picture.inliers,
-        overlay=picture.overlay,
-    )
 
 
 def _image_answer(
@@ -159,3 +142,23 @@ def _image_answer(
 
 def _image_error(error: VislocError) -> ImageError:
     return ImageError(kind=type(error).__name__, code=error.code, message=str(error))
+
+
+def geoposes_to_words(
+    device_from_world: Pose | None, geodetic: Geodetic | None, *, ypr: bool
+) -> tuple[GeoPose | None, GeoPoseYpr | None]:
+    """Say a pose as GeoPoses: in a quaternion, and in angles where they are wanted.
+
+    Both are None without a pose, and in a map that is not anchored to the Earth.
+    """
+    if device_from_world is None or geodetic is None:
+        return None, None
+    geopose = geopose_of(device_from_world, geodetic)
+    position = GeoPosition(lat=geopose.latitude, lon=geopose.longitude, h=geopose.height)
+    w, x, y, z = geopose.quaternion_wxyz.tolist()
+    yaw, pitch, roll = geopose.angles_deg
+    angles = GeoAngles(yaw=yaw, pitch=pitch, roll=roll)
+    return (
+        GeoPose(position=position, quaternion=GeoQuaternion(x=x, y=y, z=z, w=w)),
+        GeoPoseYpr(position=position, angles=angles) if ypr else None,
+    )

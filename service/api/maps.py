@@ -97,14 +97,6 @@ def map_images(outline: MapOutline, photos: MappingPhotos, first: int, count: in
         map=MapRef(id=outline.manifest.id, version=outline.manifest.version),
         total=len(photos.images),
         first=first,
-        cameras={
-            id_: MapCamera(
-                model=camera.model,
-                width=camera.width,
-                height=camera.height,
-                params=list(camera.params),
-            )
-            for id_, camera in cameras.items()
-        },
+        cameras={id_: MapCamera.model_validate(camera) for id_, camera in cameras.items()},
         images=images,
     )

@@ -18,7 +18,7 @@ from service.engine.stores import Store
 from service.engine.uploads import Uploads
 from service.errors import stopping_error
 from service.telemetry.metrics import Metrics
-from service.values import Instant, Localization, RigJob, SequenceStart, ServedMap, WorkerSettings
+from service.values import InstantJob, Localization, RigJob, SequenceJob, ServedMap, WorkerSettings
 from service.workers.judging import judged
 from service.workers.pool import Workers
 from visloc.errors import VislocError, refuse
@@ -221,7 +221,7 @@ class Engine:
             return judged(await answers_of(searches), job.priors)[1]
 
     async def localize_sequence(
-        self, start: SequenceStart, instants: AsyncIterator[Instant] | Sequence[Instant]
+        self, start: SequenceJob, instants: AsyncIterator[InstantJob] | Sequence[InstantJob]
     ) -> AsyncGenerator[Localization]:
         """Answer the instants of a sequence in order, each as soon as its answer is final.
 

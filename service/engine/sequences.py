@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from service.engine.instant_tasks import look, without_photos
 from service.engine.sets import check_no_tiles
-from service.values import Instant, Localization, MapFolder, SequenceStart
+from service.values import InstantJob, Localization, MapFolder, SequenceJob
 from service.workers.pool import Workers
 from service.workers.tasks import Vision
 from visloc.errors import VislocError
@@ -16,8 +16,8 @@ from visloc.priors import NO_PRIORS
 
 async def answers_in_maps(
     workers: Workers,
-    start: SequenceStart,
-    instants: AsyncIterator[Instant] | Sequence[Instant],
+    start: SequenceJob,
+    instants: AsyncIterator[InstantJob] | Sequence[InstantJob],
     maps: tuple[MapFolder, ...],
 ) -> AsyncGenerator[Localization]:
     """Answer instants in order, each as soon as its answer is final.
@@ -55,11 +55,13 @@ async def answers_in_maps(
         yield answer
 
 
-def in_turn(instants: AsyncIterator[Instant] | Sequence[Instant]) -> AsyncIterator[Instant]:
+def in_turn(
+    instants: AsyncIterator[InstantJob] | Sequence[InstantJob],
+) -> AsyncIterator[InstantJob]:
     """Return instants one by one, whether all are there or not."""
     return _one_by_one(instants) if isinstance(instants, Sequence) else instants
 
 
-async def _one_by_one(instants: Sequence[Instant]) -> AsyncGenerator[Instant]:
+async def _one_by_one(instants: Sequence[InstantJob]) -> AsyncGenerator[InstantJob]:
     for instant in instants:
         yield instant

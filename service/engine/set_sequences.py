@@ -28,14 +28,14 @@ from service.engine.sets import (
     with_queries,
 )
 from service.values import (
-    Instant,
+    InstantJob,
     Localization,
     MapFolder,
     PackedLooks,
     PackedSequence,
     Query,
     RigJob,
-    SequenceStart,
+    SequenceJob,
     SequenceStep,
     check_order,
 )
@@ -57,7 +57,7 @@ class _Leg:
 
     row: int
     folder: MapFolder
-    start: SequenceStart
+    start: SequenceJob
     sequence: PackedSequence
 
 
@@ -71,7 +71,7 @@ class _Pending:
     """
 
     leg: _Leg
-    instant: Instant
+    instant: InstantJob
     looks: list[PackedLooks]
     priors: Priors
 
@@ -84,7 +84,7 @@ class SetSequence:
         search: SetSearch,
         catalog: Catalog,
         workers: Workers,
-        start: SequenceStart,
+        start: SequenceJob,
         map_set: MapFolder,
     ) -> None:
         self._search, self._catalog, self._workers = search, catalog, workers
@@ -95,7 +95,7 @@ class SetSequence:
         self._track: Track | None = None
         self._held = AsyncExitStack()  # holds the tile of the leg
 
-    def check(self, instants: Sequence[Instant]) -> None:
+    def check(self, instants: Sequence[InstantJob]) -> None:
         """Refuse instants that no tile can take, before any work."""
         for index, (before, instant) in enumerate(pairwise(instants), start=1):
             with inside(f"instants[{index}]"):
@@ -103,7 +103,7 @@ class SetSequence:
         for index, instant in enumerate(instants):
             self._check_names(index, instant)
 
-    async def answers(self, instants: AsyncIterator[Instant]) -> AsyncGenerator[Localization]:
+    async def answers(self, instants: AsyncIterator[InstantJob]) -> AsyncGenerator[Localization]:
         """Answer instants in order, each as soon as its answer is final.
 
         Errors are those of ``Engine.localize_sequence`` and ``SetSearch.search``.
@@ -134,7 +134,7 @@ class SetSequence:
         finally:
             await self._held.aclose()
 
-    async def _add(self, index: int, instant: Instant) -> AsyncGenerator[Localization]:
+    async def _add(self, index: int, instant: InstantJob) -> AsyncGenerator[Localization]:
         """Take the next instant; give the answers that are final now."""
         if self._track is not None:
             self._track = self._track.moved(instant.odometry)
@@ -166,7 +166,7 @@ class SetSequence:
             for answer in self._in_set(leg, added.answers):
                 yield answer
 
-    def _check_names(self, index: int, instant: Instant) -> None:
+    def _check_names(self, index: int, instant: InstantJob) -> None:
         """Refuse names of tiles that the set does not have, also within a leg."""
         if instant.priors is not None:
             with inside(f"instants[{index}]"):
@@ -182,7 +182,7 @@ class SetSequence:
         return replace(moved, maps=priors.maps)
 
     async def _anywhere(
-        self, index: int, instant: Instant, photos: SetPhotos
+        self, index: int, instant: InstantJob, photos: SetPhotos
     ) -> _Pending | Localization:
         """Search all tiles for the first instant of a leg; return the refusal if none has it."""
         priors = self._start.priors if instant.priors is None else instant.priors
@@ -198,7 +198,7 @@ class SetSequence:
         return found if found.answer.pose is None else pending
 
     async def _elsewhere(
-        self, index: int, instant: Instant, photos: SetPhotos, leg: _Leg
+        self, index: int, instant: InstantJob, photos: SetPhotos, leg: _Leg
     ) -> _Pending | None:
         """Search an instant that the leg's tile does not localize in the other tiles.
 
@@ -243,7 +243,7 @@ class SetSequence:
         return None
 
     async def _searched(
-        self, index: int, instant: Instant, photos: SetPhotos, choice: Choice
+        self, index: int, instant: InstantJob, photos: SetPhotos, choice: Choice
     ) -> tuple[_Pending, Localization]:
         """Search an instant in tiles; return it in the best one, with the answer."""
         pending: dict[int, _Pending] = {}
@@ -265,7 +265,7 @@ class SetSequence:
         row, found = await self._search.search(self._outline, choice, photos, ask)
         return pending[row], found
 
-    def _seconds_since(self, track: Track | None, instant: Instant) -> float:
+    def _seconds_since(self, track: Track | None, instant: InstantJob) -> float:
         """Return the time since the last measured pose; infinite without one."""
         if track is None:
             return math.inf
@@ -273,7 +273,7 @@ class SetSequence:
         assert unit is not None  # the leg has begun
         return (instant.timestamp - track.timestamp) * unit.seconds
 
-    def _follow(self, leg: _Leg, instant: Instant, measured: RigPose) -> None:
+    def _follow(self, leg: _Leg, instant: InstantJob, measured: RigPose) -> None:
         """Update the track with a measured pose, unless the known motion contradicts it."""
         tile = self._outline.tiles[leg.row]
         moved = tile.set_from_tile.similarity
@@ -296,7 +296,7 @@ class SetSequence:
         sequence = await self._workers.run(Vision.open_sequence, start, (folder,))
         return _Leg(row, folder, start, sequence)
 
-    async def _look(self, index: int, instant: Instant, leg: _Leg) -> _Pending:
+    async def _look(self, index: int, instant: InstantJob, leg: _Leg) -> _Pending:
         """Look at the images of an instant in the tile of a leg."""
         bare = replace(instant, images=without_photos(instant.images))
         if bare.priors is not None:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Any, TypeVar
+from typing import Any
 
 import grpc
 from google.protobuf.any_pb2 import Any as AnyMessage
-from google.protobuf.message import Message
 from google.rpc.error_details_pb2 import ErrorInfo
 from google.rpc.status_pb2 import Status
 from pydantic import BaseModel
@@ -21,6 +20,7 @@ from service.telemetry.logs import RequestRecord
 from service.telemetry.observer import Observer
 from service.telemetry.tracing import traceparent_of
 from visloc.errors import VislocError
+from visloc_api.messages import MessageT, filled
 from visloc_api.words.wire import ERROR_DOMAIN, VERSION_KEY
 
 logger = logging.getLogger(__name__)
@@ -29,36 +29,11 @@ logger = logging.getLogger(__name__)
 _MAX_DETAIL = 1000
 
 Context = grpc.aio.ServicerContext[Any, Any]
-MessageT = TypeVar("MessageT", bound=Message)
 
 
 def message_of(answer: BaseModel, message: MessageT) -> MessageT:
     """Fill a message from the model with the same fields, so that HTTP and gRPC answer the same."""
-    _fill(message, answer.model_dump())
-    return message
-
-
-def _fill(message: Message, values: Mapping[str, Any]) -> None:
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            part = getattr(message, name)
-            if isinstance(part, Message):
-                part.SetInParent()  # present even if empty
-                _fill(part, value)
-            else:
-                part.update(value)
-        elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
-            _fill_list(getattr(message, name), value)
-        elif value is not None:
-            setattr(message, name, value)
-
-
-def _fill_list(entries: Any, values: Sequence[Any]) -> None:
-    if values and isinstance(values[0], Mapping):
-        for value in values:
-            _fill(entries.add(), value)
-    else:
-        entries.extend(values)
+    return filled(message, answer.model_dump())
 
 
 class Envelope:

@@ -6,7 +6,6 @@ import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing
 
-from service.api import BatchLimits, ListMapsResponse
 from service.api.answers import instant_answer, localize_response
 from service.api.deadlines import within
 from service.api.maps import map_info
@@ -22,9 +21,11 @@ from service.grpc.messages import (
 )
 from service.settings import ServiceSettings
 from service.telemetry.observer import Observer
-from service.values import Instant, SequenceStart
+from service.values import InstantJob, SequenceJob
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.v1 import localization_pb2_grpc as pb2_grpc
+from visloc_api.words.maps import ListMapsResponse
+from visloc_api.words.rigs import BatchLimits
 
 
 class LocalizationServicer(pb2_grpc.LocalizationServicer):
@@ -90,8 +91,8 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
                             await context.write(message_of(answer, pb2.InstantAnswer()))
 
     async def _instants(
-        self, messages: AsyncIterator[pb2.LocalizeSequenceRequest], start: SequenceStart
-    ) -> AsyncGenerator[Instant]:
+        self, messages: AsyncIterator[pb2.LocalizeSequenceRequest], start: SequenceJob
+    ) -> AsyncGenerator[InstantJob]:
         number, has_rig = 0, start.rig is not None
         async for message in messages:
             yield await asyncio.to_thread(

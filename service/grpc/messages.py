@@ -7,20 +7,15 @@ from typing import Any
 
 from google.protobuf.message import Message
 
-from service.api import (
-    BatchLimits,
-    LocalizeRequest,
-    LocalizeRigRequest,
-    Parts,
-)
-from service.api import Instant as InstantWords
-from service.api import SequenceStart as SequenceStartWords
-from service.api.geopose import Near as NearWords
-from service.values import Instant, RigJob, SequenceStart
+from service.api import jobs
+from service.values import InstantJob, RigJob, SequenceJob
 from visloc.errors import VislocError, inside, refuse
 from visloc.types import Near
 from visloc_api.v1 import localization_pb2 as pb2
+from visloc_api.words import near, sequences
 from visloc_api.words.message import MAX_INSTANT_VALUES, check_num_values
+from visloc_api.words.photo import LocalizeRequest
+from visloc_api.words.rigs import BatchLimits, LocalizeRigRequest
 
 # A rig has one name in JSON.
 _RIG_NAMES = {"rig_id": "rig", "calibration": "rig"}
@@ -42,7 +37,7 @@ def near_of(request: pb2.ListMapsRequest) -> Near | None:
     Raises:
         InvalidInput: ``near...``.
     """
-    return NearWords.read(_plain(request.near)).to_core() if request.HasField("near") else None
+    return near.Near.read(_plain(request.near)).to_core() if request.HasField("near") else None
 
 
 def localize_job_of(request: pb2.LocalizeRequest, max_bytes: int) -> RigJob:
@@ -57,7 +52,7 @@ def localize_job_of(request: pb2.LocalizeRequest, max_bytes: int) -> RigJob:
         raise refuse(
             "request.too_large", expected=f"at most {max_bytes} bytes", got=f"{size} bytes"
         )
-    return LocalizeRequest.read(_plain(request)).to_job()
+    return jobs.photo_job_of(LocalizeRequest.read(_plain(request)))
 
 
 def rig_job_of(request: pb2.LocalizeRigRequest, limits: BatchLimits) -> RigJob:
@@ -66,10 +61,10 @@ def rig_job_of(request: pb2.LocalizeRigRequest, limits: BatchLimits) -> RigJob:
     Raises:
         InvalidInput: as ``LocalizeRigRequest`` raises.
     """
-    return LocalizeRigRequest.read(_plain(request), limits).to_job()
+    return jobs.rig_job_of(LocalizeRigRequest.read(_plain(request), limits))
 
 
-def sequence_start_of(message: pb2.LocalizeSequenceRequest | None) -> SequenceStart:
+def sequence_start_of(message: pb2.LocalizeSequenceRequest | None) -> SequenceJob:
     """Return the start of a sequence.
 
     Args:
@@ -81,12 +76,12 @@ def sequence_start_of(message: pb2.LocalizeSequenceRequest | None) -> SequenceSt
     kind = None if message is None else message.WhichOneof("message")
     if message is None or kind != "start":
         raise _wrong_message("the first message", "start", kind)
-    return SequenceStartWords.read(_plain(message.start)).to_core()
+    return jobs.sequence_job_of(sequences.SequenceStart.read(_plain(message.start)))
 
 
 def instant_of(
     message: pb2.LocalizeSequenceRequest, limits: BatchLimits, number: int, *, has_rig: bool
-) -> Instant:
+) -> InstantJob:
     """Return an instant of a sequence.
 
     Args:
@@ -102,8 +97,8 @@ def instant_of(
     if kind != "instant":
         raise _wrong_message(f"message {number + 2}", "instant", kind)
     with inside(f"instants[{number}]"):
-        words = InstantWords.read(_plain(message.instant), limits)
-        return words.to_core(Parts({}), has_rig=has_rig)
+        words = sequences.Instant.read(_plain(message.instant), limits)
+        return jobs.instant_job_of(words, jobs.Parts({}), has_rig=has_rig)
 
 
 def _wrong_message(name: str, expected: str, got: str | None) -> VislocError:

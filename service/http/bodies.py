@@ -10,19 +10,17 @@ from typing import TypeVar
 
 from starlette.requests import Request
 
-from service.api import (
-    BatchLimits,
-    LocalizeRequest,
-    LocalizeRigRequest,
-    LocalizeSequenceRequest,
-    UseVersionRequest,
-)
+from service.api import jobs
 from service.http.backend import backend_of
 from service.http.forms import Form, FormLimits, parse_form
 from service.settings import REQUEST_OVERHEAD_BYTES, ServiceSettings
-from service.values import Instant, RigJob, SequenceStart
+from service.values import InstantJob, RigJob, SequenceJob
 from visloc.errors import VislocError, refuse
+from visloc_api.words.maps import UseVersionRequest
 from visloc_api.words.message import MAX_INSTANT_VALUES
+from visloc_api.words.photo import LocalizeRequest
+from visloc_api.words.rigs import BatchLimits, LocalizeRigRequest
+from visloc_api.words.sequences import LocalizeSequenceRequest
 
 # The parts of the form of one photo that are files, and the file names in curl's examples.
 _FILES = {"image": "photo.jpg", "features": "photo.json"}
@@ -88,10 +86,10 @@ async def read_localize_job(request: Request) -> RigJob:
             expected="a form with a file image or features, and texts map, camera, options...",
         )
         _check_kinds(form)
-        return LocalizeRequest.read({**form.texts, **form.files}).to_job()
+        return jobs.photo_job_of(LocalizeRequest.read({**form.texts, **form.files}))
 
     def from_json(body: bytes) -> RigJob:
-        return LocalizeRequest.read_json(body).to_job()
+        return jobs.photo_job_of(LocalizeRequest.read_json(body))
 
     parse, limit = from_json, backend.settings.max_json_bytes
     if checked_media_type(request, (_FORM, _JSON)) == _FORM:
@@ -112,12 +110,14 @@ async def read_rig_job(request: Request) -> RigJob:
     limits = BatchLimits(settings.max_rig_images, settings.max_instants)
 
     def to_job(text: str | bytes, files: Mapping[str, bytes]) -> RigJob:
-        return LocalizeRigRequest.read_json(text, limits, MAX_INSTANT_VALUES).to_job(files)
+        return jobs.rig_job_of(
+            LocalizeRigRequest.read_json(text, limits, MAX_INSTANT_VALUES), files
+        )
 
     return await _read_batch(request, to_job, max_files=settings.max_rig_images)
 
 
-async def read_sequence_jobs(request: Request) -> tuple[SequenceStart, list[Instant]]:
+async def read_sequence_jobs(request: Request) -> tuple[SequenceJob, list[InstantJob]]:
     """Read the body of ``POST /localize/sequence``, a form or JSON.
 
     Raises:
@@ -131,8 +131,10 @@ async def read_sequence_jobs(request: Request) -> tuple[SequenceStart, list[Inst
 
     def to_jobs(
         text: str | bytes, files: Mapping[str, bytes]
-    ) -> tuple[SequenceStart, list[Instant]]:
-        return LocalizeSequenceRequest.read_json(text, limits, max_values).to_jobs(files)
+    ) -> tuple[SequenceJob, list[InstantJob]]:
+        return jobs.sequence_jobs_of(
+            LocalizeSequenceRequest.read_json(text, limits, max_values), files
+        )
 
     max_files = settings.max_rig_images * settings.max_instants
     return await _read_batch(request, to_jobs, max_files=max_files)

@@ -10,9 +10,9 @@ from starlette.applications import Starlette
 from starlette.routing import Route
 
 import visloc
-from service.api import Health, MapNotLoaded, Readiness
 from service.http.backend import Backend, backend_of
 from service.http.responses import json_response
+from visloc_api.words.status import Health, MapNotLoaded, Readiness
 
 
 def add_health_routes(app: FastAPI) -> None:

@@ -9,7 +9,6 @@ from functools import partial
 
 from fastapi import FastAPI, Request, Response
 
-from service.api import InstantAnswer, LocalizeResponse, LocalizeSequenceResponse
 from service.api.answers import instant_answer, localize_response
 from service.api.deadlines import each_within, within
 from service.engine.engine import Engine
@@ -19,7 +18,8 @@ from service.http.openapi.app import problems
 from service.http.openapi.request_bodies import LOCALIZE_BODY, RIG_BODY, SEQUENCE_BODY
 from service.http.responses import Lines, json_response, while_connected
 from service.telemetry.observer import Observer
-from service.values import Instant, Localization, SequenceStart
+from service.values import InstantJob, Localization, SequenceJob
+from visloc_api.words.answers import InstantAnswer, LocalizeResponse, LocalizeSequenceResponse
 from visloc_api.words.wire import NDJSON
 
 
@@ -115,7 +115,7 @@ def _wants_lines(request: Request) -> bool:
 
 
 async def _admitted(
-    engine: Engine, start: SequenceStart, instants: Sequence[Instant]
+    engine: Engine, start: SequenceJob, instants: Sequence[InstantJob]
 ) -> AsyncGenerator[Localization]:
     with engine.admit_batch():
         async with aclosing(engine.localize_sequence(start, instants)) as answers:

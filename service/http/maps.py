@@ -8,14 +8,14 @@ from typing import Annotated, Any
 
 from fastapi import FastAPI, Query, Request, Response
 
-from service.api import ListMapsResponse, MapInfo
-from service.api.geopose import near_from_text
 from service.api.maps import map_info
 from service.http.backend import backend_of
 from service.http.bodies import checked_media_type, read_use_version
 from service.http.openapi.app import problems
 from service.http.responses import json_response
 from visloc.errors import refuse
+from visloc_api.words.maps import ListMapsResponse, MapInfo
+from visloc_api.words.near import near_from_text
 
 _PACKED = ("application/zip", "application/octet-stream")
 _PACKED_BODY: dict[str, Any] = {

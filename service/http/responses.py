@@ -14,9 +14,9 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
-from service.api import Problem
 from service.errors import RETRY_AFTER_S, internal_error, statuses_of
 from visloc.errors import Unavailable, VislocError
+from visloc_api.words.status import Problem
 from visloc_api.words.wire import NDJSON
 
 logger = logging.getLogger(__name__)

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 from fastapi import FastAPI, Query, Request, Response
 
-from service.api import MapImages
 from service.api.deadlines import within
 from service.api.maps import map_images
 from service.engine.engine import Engine
@@ -23,6 +22,7 @@ from service.http.openapi.app import problems
 from visloc.archive import MapOutline, SetOutline
 from visloc.archive.checks import is_set
 from visloc.errors import NotFound
+from visloc_api.words.scenes import MapImages
 
 MAX_POINTS, MAX_IMAGES = 262_144, 10_000
 

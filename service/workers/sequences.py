@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from service.values import Instant, Localization, SequenceStart, check_order
+from service.values import InstantJob, Localization, SequenceJob, check_order
 from service.workers.instants import Target, check_images, check_options, check_priors
 from service.workers.judging import judged
 from visloc.errors import inside, refuse
@@ -24,7 +24,7 @@ class SequenceRun:
     """
 
     def __init__(
-        self, start: SequenceStart, targets: Sequence[Target], max_images: int, max_instants: int
+        self, start: SequenceJob, targets: Sequence[Target], max_images: int, max_instants: int
     ) -> None:
         check_max_gap(start.max_gap_s)
         check_options(targets, start.options)
@@ -37,7 +37,7 @@ class SequenceRun:
         self._solvers: list[SequenceSolver] = []
         self._held: list[list[InstantAnswer]] = [[] for _ in targets]
 
-    def check(self, index: int, instant: Instant) -> Priors:
+    def check(self, index: int, instant: InstantJob) -> Priors:
         """Refuse an instant that cannot be solved, and return its priors.
 
         Instants are checked in order, which may begin again with the first.
@@ -63,7 +63,7 @@ class SequenceRun:
             return instant.priors
 
     def add(
-        self, instant: Instant, images: Sequence[tuple[SeenImage, ...]], priors: Priors
+        self, instant: InstantJob, images: Sequence[tuple[SeenImage, ...]], priors: Priors
     ) -> list[InstantAnswer]:
         """Solve an instant, given its images by target; return the answers that are final now."""
         if not self._solvers:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from service.values import (
     ImageJob,
-    Instant,
+    InstantJob,
     Localization,
     MapFolder,
     MatchPicture,
@@ -30,7 +30,7 @@ from service.values import (
     RankedTiles,
     Rig,
     RigJob,
-    SequenceStart,
+    SequenceJob,
     SequenceStep,
     WorkerSettings,
 )
@@ -201,7 +201,7 @@ class Vision:
         scores = ranker.rank(decoded, options, allowed)
         return RankedTiles(pack(decoded), scores)
 
-    def open_sequence(self, start: SequenceStart, maps: Sequence[MapFolder]) -> PackedSequence:
+    def open_sequence(self, start: SequenceJob, maps: Sequence[MapFolder]) -> PackedSequence:
         settings = self._settings
         targets = self._targets(maps, start.rig)
         return _packed(SequenceRun(start, targets, settings.max_images, settings.max_instants))
@@ -211,7 +211,7 @@ class Vision:
         sequence: PackedSequence,
         maps: Sequence[MapFolder],
         first: int,
-        instants: Sequence[Instant],
+        instants: Sequence[InstantJob],
     ) -> tuple[PackedSequence, list[Priors]]:
         """Refuse instants, without their photos, that cannot be solved; return their priors."""
         run = self._sequence(sequence, maps)
@@ -222,7 +222,7 @@ class Vision:
         self,
         sequence: PackedSequence,
         maps: Sequence[MapFolder],
-        instant: Instant,
+        instant: InstantJob,
         looks: Sequence[PackedLooks],
         priors: Priors,
     ) -> SequenceStep:

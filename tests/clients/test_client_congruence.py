@@ -179,7 +179,12 @@ def test_readiness(is_ready: bool, http_url: str, grpc_url: str, service: Any) -
         ),
         (lambda c: c.localize(b"", "room", None, {"seed": -1}), InvalidInput, "options.seed"),
         (lambda c: c.localize(b"", "room", None, {"seed": 2**32}), InvalidInput, "options.seed"),
-        (lambda c: c.localize(b"", "room", None, {"top_k": True}), InvalidInput, "options.top_k"),
+        (lambda c: c.localize(b"", "room", None, {"top_k": True}), InvalidInput, "request.invalid"),
+        (
+            lambda c: c.localize(b"", "room", None, LocalizeOptions(fusion_weights={})),
+            InvalidInput,
+            "options.fusion_weights",
+        ),
         (
             lambda c: c.localize(b"", "room", None, {"max_error_px": float("nan")}),
             InvalidInput,

@@ -20,7 +20,7 @@ TARGETS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "features": (
         "tests.fuzz.features",
         "Features",
-        ("visloc_api.words.message", "service.api", "service.grpc.messages", "visloc"),
+        ("visloc_api.words", "service.api", "service.grpc.messages", "visloc"),
     ),
 }
 MAX_SECONDS = 10  # of one input

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from service.api import BatchLimits, LocalizeRequest, LocalizeRigRequest
+from service.api import jobs
 from service.grpc.messages import localize_job_of, rig_job_of
 from service.values import RigJob
 from tests.fuzz.target import holds, refusal
@@ -24,6 +24,8 @@ from visloc.geometry import Camera
 from visloc.localization.query_features import checked_global_descriptors, checked_local_features
 from visloc.types import QueryFeatures
 from visloc_api.v1 import localization_pb2 as pb2
+from visloc_api.words.photo import LocalizeRequest
+from visloc_api.words.rigs import BatchLimits, LocalizeRigRequest
 
 _JSON, _PROTOBUF, _RIG_JSON, _RIG_PROTOBUF, _ARRAYS = range(5)
 _LIMITS = BatchLimits(max_images=8, max_instants=20)
@@ -131,11 +133,11 @@ def _check_unit(rows: np.ndarray) -> None:
 
 def _read(kind: int, data: bytes) -> RigJob:
     if kind == _JSON:
-        return LocalizeRequest.read_json(data).to_job()
+        return jobs.photo_job_of(LocalizeRequest.read_json(data))
     if kind == _PROTOBUF:
         return localize_job_of(pb2.LocalizeRequest.FromString(data), 2**20)
     if kind == _RIG_JSON:
-        return LocalizeRigRequest.read_json(data, _LIMITS).to_job()
+        return jobs.rig_job_of(LocalizeRigRequest.read_json(data, _LIMITS))
     if kind == _RIG_PROTOBUF:
         return rig_job_of(pb2.LocalizeRigRequest.FromString(data), _LIMITS)
     return localize_job_of(_as_protobuf(_arrays(data)), 2**20)

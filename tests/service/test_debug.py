@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.api import LocalizeRequest, LocalizeResponse
+from service.api import jobs
 from service.api.answers import localize_response
 from service.grpc.envelope import message_of
 from service.values import Localization, MatchPicture
@@ -16,6 +16,8 @@ from visloc.geometry import Camera, Pose
 from visloc.options import ReadAs
 from visloc.types import CameraSource, Evidence, ImageAnswer, InstantAnswer, Reason, Refusal
 from visloc_api.v1 import localization_pb2 as pb2
+from visloc_api.words.answers import LocalizeResponse
+from visloc_api.words.photo import LocalizeRequest
 
 PHOTO = base64.b64encode(b"photo").decode()
 ARRAY = {"dtype": "int8", "shape": [0, 2], "data": ""}
@@ -23,7 +25,7 @@ FEATURES = {"kind": "sift", "keypoints": ARRAY, "descriptors": ARRAY, "global_de
 
 
 def job(**fields: Any) -> Any:
-    return LocalizeRequest.read_json(json.dumps({"map": "room"} | fields)).to_job()
+    return jobs.photo_job_of(LocalizeRequest.read_json(json.dumps({"map": "room"} | fields)))
 
 
 def answer(debug: MatchPicture | None) -> LocalizeResponse:

@@ -18,7 +18,7 @@ from google.rpc.error_details_pb2 import ErrorInfo
 from grpc_status import rpc_status
 from numpy.typing import NDArray
 
-from service.api import Array, LocalizeRequest
+from service.api import jobs
 from service.http.openapi import example
 from visloc.archive import Map, MapStore
 from visloc.features import make_global_descriptor, make_local_features
@@ -27,6 +27,8 @@ from visloc.geometry import Camera, Pose, rotation_angle
 from visloc.images import read_photo
 from visloc.types import QueryFeatures
 from visloc_api.v1 import localization_pb2 as pb2
+from visloc_api.words.features import Array
+from visloc_api.words.photo import LocalizeRequest
 
 # Times of each stage and the request's own id differ from answer to answer.
 NOT_COMPARED = ("seconds", "request_id")
@@ -371,7 +373,7 @@ def test_an_array_is_read_without_a_copy_of_its_bytes() -> None:
 
 
 def test_features_become_the_job_that_they_say() -> None:
-    job = LocalizeRequest.read_json(json.dumps(example("features_request"))).to_job()
+    job = jobs.photo_job_of(LocalizeRequest.read_json(json.dumps(example("features_request"))))
     query = job.images[0].query
     assert isinstance(query, QueryFeatures)
     assert query.kind == "xfeat"

@@ -49,7 +49,8 @@ _UNKNOWN_SPEED = 10.0  # m/s
 # The spread of an angle that nothing is known about: uniform between -pi and pi.
 _UNKNOWN_ANGLE_STD = math.pi / math.sqrt(3.0)
 
-# The longest gap between measured instants that may be asked to be filled, seconds.
+# The longest gap between measured instants that is filled, seconds: by default, and at most.
+DEFAULT_MAX_GAP_S = 1.0
 MAX_GAP_S = 60.0
 
 

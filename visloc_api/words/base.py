@@ -27,7 +27,9 @@ class Answer(BaseModel):
     """A part of an answer. Fields that a newer server adds are passed over."""
 
     # Built when first used: importing the clients shall not take the time.
-    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, defer_build=True)
+    model_config = ConfigDict(
+        frozen=True, arbitrary_types_allowed=True, defer_build=True, from_attributes=True
+    )
 
 
 class AnswerWithArrays(Answer):
@@ -148,9 +150,12 @@ def _from_base64(value: Any) -> Any:
     return base64.b64decode(value, validate=True) if isinstance(value, str) else value
 
 
+AS_BASE64 = PlainSerializer(
+    lambda data: base64.b64encode(data).decode(), when_used="json-unless-none"
+)
 Base64 = Annotated[
     bytes,
     BeforeValidator(_from_base64),
-    PlainSerializer(lambda data: base64.b64encode(data).decode(), when_used="json"),
+    AS_BASE64,
     WithJsonSchema({"type": "string", "contentEncoding": "base64"}),
 ]

@@ -15,6 +15,7 @@ from pydantic_core import PydanticCustomError
 
 import visloc.types
 from visloc.errors import refuse
+from visloc_api.words.base import AS_BASE64
 from visloc_api.words.message import IncomingMessage, converted
 from visloc_api.words.wire import ARRAY_DTYPES
 
@@ -41,6 +42,7 @@ def _bytes_from_base64(value: object) -> object:
 GivenImage = Annotated[
     bytes | None,
     converted(_bytes_from_base64),
+    AS_BASE64,
     WithJsonSchema({"type": "string", "contentEncoding": "base64"}),
 ]
 
@@ -64,9 +66,14 @@ class Array(IncomingMessage):
     data: Annotated[
         bytes,
         BeforeValidator(_array_bytes_from_base64),
+        AS_BASE64,
         WithJsonSchema({"type": "string", "contentEncoding": "base64"}),
         Field(description="base64 of as many bytes as dtype and shape say"),
     ]
+
+    @staticmethod
+    def from_core(array: NDArray[np.generic]) -> Array:
+        return Array(dtype=array.dtype.name, shape=list(array.shape), data=array.tobytes())
 
     def to_core(self, field: str, ndim: int) -> NDArray[np.generic]:
         """Return the array, without copying its bytes.
@@ -145,6 +152,16 @@ class Features(IncomingMessage):
                 name: row.to_core(f"features.global_descriptors.{name[:100]}", 1)
                 for name, row in self.global_descriptors.items()
             },
+        )
+
+    @staticmethod
+    def from_core(features: visloc.types.QueryFeatures) -> Features:
+        rows = features.global_descriptors
+        return Features(
+            kind=features.kind,
+            keypoints=Array.from_core(features.keypoints),
+            descriptors=Array.from_core(features.descriptors),
+            global_descriptors={name: Array.from_core(row) for name, row in rows.items()},
         )
 
 

@@ -6,18 +6,20 @@ import math
 from typing import Annotated, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from pydantic.json_schema import WithJsonSchema
 
 import visloc.geometry
 import visloc.priors
-from visloc.errors import refuse
+from visloc.errors import InvalidInput, refuse
 from visloc_api.words.message import IncomingMessage, converted
 
 _CAMERA_TEXT = "PINHOLE,640,480,525,525,320,240"
 # How far the length of a quaternion may be from 1: it was written with three digits at least.
 _MAX_QUATERNION_ERROR = 1e-3
+# The same of a matrix times its transpose.
+_MAX_SCALE_ERROR = 1e-3
 # Further than any place; its square is still a number.
 _MAX_TRANSLATION = 1e15
 
@@ -41,19 +43,22 @@ class Camera(IncomingMessage):
         """Return the camera, checked."""
         return visloc.geometry.Camera(self.model, self.width, self.height, tuple(self.params))
 
+    @staticmethod
+    def from_core(camera: visloc.geometry.Camera) -> Camera:
+        return Camera(
+            model=camera.model,
+            width=camera.width,
+            height=camera.height,
+            params=list(camera.params),
+        )
+
 
 def _camera_from_text(value: object) -> object:
     if not isinstance(value, str):
         return value
     if value.lstrip().startswith("{"):
         return Camera.read_json(value)
-    camera = visloc.geometry.Camera.from_text(value)
-    return Camera(
-        model=camera.model,
-        width=camera.width,
-        height=camera.height,
-        params=list(camera.params),
-    )
+    return Camera.from_core(visloc.geometry.Camera.from_text(value))
 
 
 # A camera in any of the forms that it may be sent in.
@@ -83,6 +88,28 @@ class Transform(IncomingMessage):
         return Transform(
             rotation_wxyz=pose.rotation_wxyz.tolist(), translation=pose.translation.tolist()
         )
+
+    @staticmethod
+    def checked(
+        pose: visloc.geometry.Pose, field: str, rotation_code: str = "pose.rotation"
+    ) -> Transform:
+        """Say a pose that nobody has checked yet.
+
+        Raises:
+            InvalidInput: as ``to_core``; for a matrix with a scale too, which the quaternion hides.
+        """
+        error = np.abs(pose.rotation @ pose.rotation.T - np.eye(3)).max()
+        if not (error <= _MAX_SCALE_ERROR and np.linalg.det(pose.rotation) > 0):  # NaN fails too
+            raise refuse(
+                rotation_code,
+                "the rotation is scaled, sheared or mirrored",
+                field=field,
+                expected="a rotation matrix",
+                got=pose.rotation.tolist(),
+            )
+        transform = Transform.from_core(pose)
+        transform.to_core(field, rotation_code)
+        return transform
 
     def to_core(self, field: str, rotation_code: str = "pose.rotation") -> visloc.geometry.Pose:
         """Return the transform, checked.
@@ -130,3 +157,22 @@ def covariance_to_core(numbers: list[float], field: str) -> NDArray[np.float64]:
         covariance = covariance.reshape(6, 6)
     visloc.priors.check_covariance(covariance, field)
     return covariance
+
+
+def covariance_from_core(covariance: ArrayLike, field: str) -> list[float]:
+    """Say the covariance (6, 6) of a pose that nobody has checked yet.
+
+    Raises:
+        InvalidInput: ``pose.covariance``, with the shape that came where that is wrong.
+    """
+    try:
+        array = np.asarray(covariance, dtype=np.float64)
+        visloc.priors.check_covariance(array, field)
+    except (TypeError, ValueError):  # no numbers, or rows of different lengths
+        raise refuse("pose.covariance", field=field, got=covariance) from None
+    except InvalidInput as error:
+        is_6_by_6 = array.shape == (6, 6)
+        got = array.tolist() if is_6_by_6 else f"{array.size} numbers, of shape {array.shape}"
+        raise refuse(error.code, field=field, expected=error.expected, got=got) from None
+    numbers: list[float] = array.ravel().tolist()
+    return numbers

@@ -1,9 +1,12 @@
-"""Incoming messages: names and types are checked; errors have the codes of this API."""
+"""Requests, for the service that checks them and the clients that write them.
+
+Names and types are checked; errors have the codes of this API.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 from pydantic import (
     BaseModel,
@@ -17,6 +20,8 @@ from pydantic_core import PydanticCustomError
 
 from visloc.errors import InvalidInput, VislocError, placed, refuse
 
+T = TypeVar("T")
+
 _NOT_AN_OBJECT, _UNKNOWN_FIELD, _REFUSED = "not_an_object", "unknown_field", "refused"
 _MAX_NAME = 100  # characters of a name from outside
 # A message of many small values takes many times its size, and its time, when it is parsed: so they
@@ -27,11 +32,20 @@ MAX_INSTANT_VALUES = 100_000
 
 
 class IncomingMessage(BaseModel):
-    """An incoming message. Unknown fields are refused by name."""
+    """A request, or a part of one. Unknown fields are refused by name."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, defer_build=True)
     # Where this message sits in the request, for errors of what is read on its own.
     path: ClassVar[str] = ""
+
+    if not TYPE_CHECKING:  # a type checker shall see the fields
+
+        def __init__(self, **given: Any) -> None:
+            """Make a message in Python; raises as ``read``."""
+            self._checked(lambda: BaseModel.__init__(self, **given))
+
+        # Else pydantic calls it for messages within messages too, and loses their place and limits.
+        __init__.__pydantic_base_init__ = True
 
     @model_validator(mode="before")
     @classmethod
@@ -80,8 +94,16 @@ class IncomingMessage(BaseModel):
         check_json_values(text, max_values, cls.path.rstrip("."))
         return cls._checked(lambda: cls.model_validate_json(text, context=limits))
 
+    def given(self) -> dict[str, Any]:
+        """Return the fields that were given, as JSON has them, but bytes as they are."""
+        return self.model_dump(exclude_unset=True, exclude_none=True)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields that were given as JSON has them, bytes in base64."""
+        return self.model_dump(mode="json", exclude_unset=True, exclude_none=True)
+
     @classmethod
-    def _checked(cls, validate: Callable[[], Self]) -> Self:
+    def _checked(cls, validate: Callable[[], T]) -> T:
         try:
             return validate()
         except ValidationError as refused:

@@ -1,12 +1,12 @@
-"""What may be chosen per query, made from ``visloc.options.LocalizeOptions`` field by field."""
+"""What may be chosen per query; ``visloc.options.LocalizeOptions`` says what each option is."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_args, get_type_hints
+from typing import Annotated, Any, ClassVar, get_args, get_type_hints
 
-from pydantic import Field, create_model
+from pydantic import Field
 
 import visloc.options
 import visloc.types
@@ -70,10 +70,42 @@ def _check_names(value: object) -> object:
     return value
 
 
-class OptionsMessage(IncomingMessage):
+def describe(name: str) -> str:
+    """Tell callers what an option is: its values, its default, and what else there is to know."""
+    option = visloc.options.LocalizeOptions.__dataclass_fields__[name]
+    facts = option.metadata
+    text = facts["description"]
+    if name in CHOICES:
+        text += f": {', '.join(CHOICES[name])}"
+    elif facts["range"] is not None:
+        text += ": {:g} to {:.10g}".format(*facts["range"])
+    text += f"; by default {facts['default']}"
+    return f"{text}. {facts['details']}" if facts["details"] else text
+
+
+def _option(name: str) -> Any:
+    return Field(description=describe(name))
+
+
+class LocalizeOptions(IncomingMessage):
     """Options of one query. null means the same as leaving a field out."""
 
     path: ClassVar[str] = "options."
+
+    preset: Annotated[str | None, _option("preset")] = None
+    top_k: Annotated[int | None, _option("top_k")] = None
+    max_error_px: Annotated[float | None, _option("max_error_px")] = None
+    min_inliers: Annotated[int | None, _option("min_inliers")] = None
+    min_inlier_ratio: Annotated[float | None, _option("min_inlier_ratio")] = None
+    read_as: Annotated[str | None, _option("read_as")] = None
+    extraction: Annotated[str | None, _option("extraction")] = None
+    fusion: Annotated[str | None, _option("fusion")] = None
+    fusion_weights: Annotated[
+        dict[str, float] | None, converted(_check_names), _option("fusion_weights")
+    ] = None
+    matcher: Annotated[str | None, _option("matcher")] = None
+    solver: Annotated[str | None, _option("solver")] = None
+    seed: Annotated[int | None, _option("seed")] = None
 
     def to_core(self) -> visloc.options.LocalizeOptions:
         """Return the options, checked."""
@@ -89,38 +121,6 @@ class OptionsMessage(IncomingMessage):
                 )
             given[name] = KINDS[name](given[name])
         return visloc.options.LocalizeOptions(**given)
-
-
-def describe(name: str) -> str:
-    """Tell callers what an option is: its values, its default, and what else there is to know."""
-    option = visloc.options.LocalizeOptions.__dataclass_fields__[name]
-    facts = option.metadata
-    text = facts["description"]
-    if name in CHOICES:
-        text += f": {', '.join(CHOICES[name])}"
-    elif facts["range"] is not None:
-        text += ": {:g} to {:.10g}".format(*facts["range"])
-    text += f"; by default {facts['default']}"
-    return f"{text}. {facts['details']}" if facts["details"] else text
-
-
-def _field(name: str, kind: type) -> Any:
-    described = Field(description=describe(name))
-    if kind is Mapping:
-        return Annotated[dict[str, float] | None, converted(_check_names), described]
-    return Annotated[(str if issubclass(kind, StrEnum) else kind) | None, described]
-
-
-if TYPE_CHECKING:
-    LocalizeOptions = OptionsMessage
-else:
-    LocalizeOptions = create_model(
-        "LocalizeOptions",
-        __base__=OptionsMessage,
-        __doc__=OptionsMessage.__doc__,
-        __module__=__name__,
-        **{name: (_field(name, kind), None) for name, kind in KINDS.items()},
-    )
 
 
 def _options_from_text(value: object) -> object:

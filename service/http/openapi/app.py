@@ -7,16 +7,13 @@ from typing import Any
 from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
-from service.api import (
-    Camera,
-    LocalizeRequest,
-    LocalizeRigRequest,
-    LocalizeSequenceRequest,
-    Problem,
-    RigCalibration,
-    UseVersionRequest,
-)
 from service.http.openapi import example
+from visloc_api.words.geometry import Camera
+from visloc_api.words.maps import UseVersionRequest
+from visloc_api.words.photo import LocalizeRequest
+from visloc_api.words.rigs import LocalizeRigRequest, RigCalibration
+from visloc_api.words.sequences import LocalizeSequenceRequest
+from visloc_api.words.status import Problem
 from visloc_api.words.wire import NDJSON
 
 _REF = "#/components/schemas/{model}"

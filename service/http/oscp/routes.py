@@ -11,8 +11,8 @@ from fastapi import FastAPI, Request
 from numpy.typing import NDArray
 from starlette.responses import Response
 
+from service.api.answers import geoposes_to_words
 from service.api.deadlines import within
-from service.api.geopose import geoposes_to_words
 from service.api.oscp import GeoPoseAccuracy, GeoPoseRequest, GeoPoseResponse, GeoPoseStatus
 from service.http.backend import Backend, backend_of, timeout_s_of
 from service.http.bodies import checked_media_type

@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 
 from clients.cli.main import app
 from clients.cli.options import Connection, Photos, QueryOptions, spread
-from clients.wire.types import LocalizeOptions
 from visloc.options import LocalizeOptions as KnownOptions
 from visloc.options import Matcher, Solver
 
@@ -67,7 +66,7 @@ def test_the_help_names_every_option_of_a_query_and_its_words() -> None:
     (option,) = (each for each in commands()["image"].params if each.name == "option")
 
     assert option.help.startswith("Can be repeated. Names: preset (default, config1, config2); ")
-    for each in fields(LocalizeOptions):
+    for each in fields(KnownOptions):
         assert (
             f"{each.name};" in option.help
             or f"{each.name} (" in option.help
@@ -75,9 +74,3 @@ def test_the_help_names_every_option_of_a_query_and_its_words() -> None:
         )
     assert f"solver ({', '.join(Solver)})" in option.help
     assert f"matcher ({', '.join(Matcher)})" in option.help
-
-
-def test_the_clients_send_the_options_that_the_server_knows() -> None:
-    assert [each.name for each in fields(LocalizeOptions)] == [
-        each.name for each in fields(KnownOptions)
-    ]

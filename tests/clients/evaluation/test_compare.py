@@ -7,7 +7,6 @@ import shlex
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +20,11 @@ from clients.cli.compare_plot import draw_comparison
 from clients.cli.main import main
 from clients.evaluation.compare import DEFAULT_VALUES, Axis, make_variants, parse_values
 from clients.wire.answers import LocalizeResult
-from clients.wire.types import LocalizeOptions
 from visloc.errors import InvalidInput, Unavailable
 from visloc.options import Extraction, Fusion, Matcher, Solver
 from visloc.options import LocalizeOptions as CoreOptions
 from visloc_api.words.maps import MapInfo
+from visloc_api.words.options import LocalizeOptions
 
 Dataset = Callable[..., Path]
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -108,7 +107,9 @@ def test_only_the_option_of_the_axis_varies() -> None:
     variants = make_variants(Axis.SOLVER, ["poselib", "pycolmap"], [ROOM], fixed)
 
     assert [variant.value for variant in variants] == ["poselib", "pycolmap"]
-    assert [v.options for v in variants] == [replace(fixed, solver=v.value) for v in variants]
+    assert [v.options for v in variants] == [
+        fixed.model_copy(update={"solver": v.value}) for v in variants
+    ]
     top_k = make_variants(Axis.TOP_K, (), [ROOM], LocalizeOptions())
     assert [variant.options.top_k for variant in top_k] == [1, 5, 10, 20, 50]
 

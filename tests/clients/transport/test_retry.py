@@ -15,7 +15,14 @@ import pytest
 
 from clients import AsyncClient, Client, Near
 from clients.transport.retry import GRPC_OPTIONS, map_header
-from clients.wire.requests import GetMap, ListMaps, Localize, UseVersion, checked_search
+from clients.wire.requests import (
+    GetMap,
+    ListMaps,
+    Localize,
+    UseVersion,
+    checked_search,
+    photo_request,
+)
 from visloc.errors import Unavailable, VislocError
 from visloc_api.v1 import localization_pb2 as pb2
 
@@ -238,7 +245,7 @@ def test_the_map_is_named_without_its_version(over_http: Callable[[Replies], str
 
 def test_requests_of_no_one_map_go_to_any_server() -> None:
     def localize(where: Any) -> Localize:
-        return Localize(checked_search(where, None, None, None), b"", None)
+        return photo_request(checked_search(where, None, None, None), b"", None)
 
     assert map_header(ListMaps()) == {}
     assert map_header(localize(Near(47.0, 8.0, 100.0))) == {}

@@ -1,13 +1,13 @@
 from __future__ import annotations
 
+import base64
 from typing import Any
 
 import pytest
 
 from clients import GeoPose, GeoPoseYpr, Near
-from clients.transport.messages import localize_message, plain, rig_message, start_message
-from clients.wire.requests import checked_search, localize_request
-from clients.wire.rig_requests import rig_request, search_as_json, sequence_start
+from clients.transport.messages import localize_message, plain, start_message
+from clients.wire.requests import checked_search, photo_request, rig_request, sequence_start
 from visloc.errors import InvalidInput
 
 POSITION = {"lat": 48.25, "lon": -122.1, "h": 90.5}
@@ -17,10 +17,11 @@ PLACE = Near(48.25, -122, 150)
 def test_a_place_is_sent_instead_of_maps_and_angles_are_asked_for() -> None:
     search = checked_search(PLACE, None, None, None, ypr=True)
     said = {"near": {"latitude": 48.25, "longitude": -122.0, "radius": 150.0}, "ypr": True}
-    assert search_as_json(search) == said
+    photo = photo_request(search, b"photo", None)
+    assert photo.words.as_json() == said | {"image": base64.b64encode(b"photo").decode()}
     messages: list[Any] = [
-        localize_message(localize_request(search, b"photo", None)),
-        rig_message(rig_request(search, "rig", ())),
+        localize_message(photo),
+        localize_message(rig_request(search, "rig", ())),
         start_message(sequence_start(search, None, None, None)).start,
     ]
     for message in messages:
@@ -31,8 +32,9 @@ def test_a_place_is_sent_instead_of_maps_and_angles_are_asked_for() -> None:
 
 def test_without_them_nothing_is_said_of_either() -> None:
     search = checked_search("room", None, None, None)
-    assert search_as_json(search) == {"map": "room"}
-    sent = plain(localize_message(localize_request(search, b"photo", None)))
+    photo = photo_request(search, b"photo", None)
+    assert photo.words.given() == {"map": "room", "image": b"photo"}
+    sent = plain(localize_message(photo))
     assert (sent["near"], sent["ypr"]) == (None, None)
 
 

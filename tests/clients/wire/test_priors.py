@@ -8,9 +8,19 @@ import numpy as np
 import pytest
 
 from clients.cli.main import main
-from clients.wire.priors import priors_as_json, priors_from_json, priors_from_text
+from clients.cli.options import priors_from_text
 from visloc.errors import InvalidInput
 from visloc.priors import NO_PRIORS, HeightBand, Priors
+from visloc_api.words import priors as words
+
+
+def priors_from_json(raw: object) -> Priors:
+    return words.Priors.read(raw).to_core()
+
+
+def priors_as_json(priors: Priors) -> dict[str, Any]:
+    return words.Priors.from_core(priors).as_json()
+
 
 COVARIANCE = np.diag([1e-4] * 3 + [1e-2] * 3).ravel().tolist()
 ALL: dict[str, Any] = {
@@ -63,10 +73,11 @@ def test_priors_are_json_or_a_file(tmp_path: Path) -> None:
         ([], "request.invalid", "priors"),
         ({"floor": 2}, "request.unknown_field", "priors.floor"),
         ({"height": 2}, "request.invalid", "priors.height"),
-        ({"height": {"min": 0}}, "priors.height", "priors.height.max"),
+        ({"height": {"min": 0}}, "request.missing_field", "priors.height.max"),
         ({"height": {"min": 3, "max": 1}}, "priors.height", "priors.height"),
-        ({"height": {"min": 0, "max": True}}, "priors.height", "priors.height.max"),
-        ({"height": {"min": 0, "max": 10**400}}, "priors.height", "priors.height.max"),
+        ({"maps": []}, "priors.maps", "priors.maps"),
+        ({"height": {"min": 0, "max": True}}, "request.invalid", "priors.height.max"),
+        ({"height": {"min": 0, "max": 10**400}}, "request.invalid", "priors.height.max"),
         ({"height": {"min": 0, "maximum": 1}}, "request.unknown_field", "priors.height.maximum"),
         (
             {"position": {"position": [1, 2], "radius": 1}},
@@ -75,8 +86,8 @@ def test_priors_are_json_or_a_file(tmp_path: Path) -> None:
         ),
         (
             {"position": {"position": [1, 2, "3"], "radius": 1}},
-            "priors.position",
-            "priors.position.position",
+            "request.invalid",
+            "priors.position.position[2]",
         ),
         (
             {"position": {"position": [1, 2, 3], "radius": float("inf")}},
@@ -89,7 +100,11 @@ def test_priors_are_json_or_a_file(tmp_path: Path) -> None:
             "priors.gravity",
             "priors.gravity.std_deg",
         ),
-        ({"pose": {"covariance": COVARIANCE}}, "request.invalid", "priors.pose.device_from_world"),
+        (
+            {"pose": {"covariance": COVARIANCE}},
+            "request.missing_field",
+            "priors.pose.device_from_world",
+        ),
         (
             {"pose": ALL["pose"] | {"covariance": [0.0] * 36}},
             "pose.covariance",

@@ -9,12 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.api import (
-    MAX_SENSORS,
-    BatchLimits,
-    LocalizeRigRequest,
-    LocalizeSequenceRequest,
-)
+from service.api import jobs
 from service.api.answers import instant_answer
 from service.grpc.messages import instant_of, rig_job_of, sequence_start_of
 from service.http.bodies import max_sequence_values
@@ -36,6 +31,8 @@ from visloc.types import (
 )
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.words.message import MAX_INSTANT_VALUES, IncomingMessage
+from visloc_api.words.rigs import MAX_SENSORS, BatchLimits, LocalizeRigRequest
+from visloc_api.words.sequences import LocalizeSequenceRequest
 
 NAN = float("nan")
 LONG = "x" * 101
@@ -68,11 +65,13 @@ def sequence_request(**changes: object) -> dict[str, Any]:
 
 
 def read_rig(message: object, files: dict[str, bytes] | None = None) -> RigJob:
-    return LocalizeRigRequest.read_json(json.dumps(message), LIMITS).to_job(files or {})
+    return jobs.rig_job_of(LocalizeRigRequest.read_json(json.dumps(message), LIMITS), files or {})
 
 
 def read_sequence(message: object, files: dict[str, bytes] | None = None) -> Any:
-    return LocalizeSequenceRequest.read_json(json.dumps(message), LIMITS).to_jobs(files or {})
+    return jobs.sequence_jobs_of(
+        LocalizeSequenceRequest.read_json(json.dumps(message), LIMITS), files or {}
+    )
 
 
 def refused(read: Any, message: object, files: dict[str, bytes] | None = None) -> InvalidInput:

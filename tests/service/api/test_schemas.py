@@ -12,14 +12,14 @@ import pytest
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from pydantic import BaseModel
 
-import service.api
 import visloc_api.words
-from service.api import LocalizeOptions, LocalizeRequest
+from service.api import jobs
 from visloc.errors import InvalidInput, TooLarge
 from visloc.options import Extraction, Fusion, Matcher, ReadAs, Solver
 from visloc.options import LocalizeOptions as CoreOptions
 from visloc.priors import NO_PRIORS, HeightBand
 from visloc_api.v1 import localization_pb2 as pb2
+from visloc_api.words.photo import LocalizeRequest
 
 CAMERA = {"model": "PINHOLE", "width": 640, "height": 480, "params": [525, 525.5, 320, 240]}
 
@@ -33,7 +33,7 @@ def request(**fields: object) -> dict[str, Any]:
 
 def refusal(message: object) -> InvalidInput:
     with pytest.raises(InvalidInput) as caught:
-        LocalizeRequest.read_json(json.dumps(message)).to_job()
+        jobs.photo_job_of(LocalizeRequest.read_json(json.dumps(message)))
     return caught.value
 
 
@@ -53,7 +53,9 @@ def test_a_full_request_becomes_the_job_that_it_says() -> None:
         "seed": 9,
     }
 
-    job = LocalizeRequest.read_json(json.dumps(request(camera=CAMERA, options=options))).to_job()
+    job = jobs.photo_job_of(
+        LocalizeRequest.read_json(json.dumps(request(camera=CAMERA, options=options)))
+    )
 
     assert (job.maps, job.images[0].query) == (("room",), b"photo")
     assert job.images[0].camera is not None
@@ -69,7 +71,7 @@ def test_a_full_request_becomes_the_job_that_it_says() -> None:
 
 def test_what_is_left_out_or_null_takes_the_default() -> None:
     for message in (request(), request(camera=None, options={"top_k": None})):
-        job = LocalizeRequest.read_json(json.dumps(message)).to_job()
+        job = jobs.photo_job_of(LocalizeRequest.read_json(json.dumps(message)))
         assert job.images[0].camera is None
         assert job.options == CoreOptions()
 
@@ -77,8 +79,8 @@ def test_what_is_left_out_or_null_takes_the_default() -> None:
 @pytest.mark.parametrize("text", ["PINHOLE,640,480,525,525.5,320,240", json.dumps(CAMERA)])
 def test_a_camera_may_be_text(text: str) -> None:
     assert (
-        LocalizeRequest.read(request(camera=text)).to_job().images[0].camera
-        == LocalizeRequest.read(request(camera=CAMERA)).to_job().images[0].camera
+        jobs.photo_job_of(LocalizeRequest.read(request(camera=text))).images[0].camera
+        == jobs.photo_job_of(LocalizeRequest.read(request(camera=CAMERA))).images[0].camera
     )
 
 
@@ -215,7 +217,7 @@ def test_integers_with_thousands_of_digits_are_refused() -> None:
     text = '{"map": "room", "image": "", "options": {"seed": ' + "9" * 20_000 + "}}"
 
     with pytest.raises(InvalidInput):
-        LocalizeRequest.read_json(text).to_job()
+        jobs.photo_job_of(LocalizeRequest.read_json(text))
 
 
 def test_a_refusal_never_echoes_a_large_value() -> None:
@@ -245,7 +247,7 @@ PRIORS = {
 
 
 def test_priors_become_those_of_the_core() -> None:
-    priors = LocalizeRequest.read_json(json.dumps(request(priors=PRIORS))).to_job().priors
+    priors = jobs.photo_job_of(LocalizeRequest.read_json(json.dumps(request(priors=PRIORS)))).priors
 
     assert priors.position is not None
     assert priors.position.position.tolist() == [1, 2, 3]
@@ -263,19 +265,19 @@ def test_priors_become_those_of_the_core() -> None:
 
 def test_priors_may_be_text_and_parts_of_them_left_out() -> None:
     text = json.dumps({"gravity": {"direction": [0, 1, 0]}})
-    priors = LocalizeRequest.read(request(priors=text)).to_job().priors
+    priors = jobs.photo_job_of(LocalizeRequest.read(request(priors=text))).priors
 
     assert priors.position is priors.height is priors.pose is None
     assert priors.gravity is not None
     assert (priors.gravity.std, priors.gravity.world) == (math.radians(1), None)
-    assert LocalizeRequest.read(request(priors=None)).to_job().priors is NO_PRIORS
+    assert jobs.photo_job_of(LocalizeRequest.read(request(priors=None))).priors is NO_PRIORS
 
 
 @pytest.mark.parametrize("given", [["a", "b@1"], "a,b@1", " a , b@1", '["a", "b@1"]'])
 def test_several_maps_may_be_a_list_or_text(given: object) -> None:
     message = {"maps": given, "image": request()["image"]}
 
-    assert LocalizeRequest.read(message).to_job().maps == ("a", "b@1")
+    assert jobs.photo_job_of(LocalizeRequest.read(message)).maps == ("a", "b@1")
 
 
 NAN = float("nan")
@@ -401,9 +403,8 @@ def fields_of(message: Descriptor) -> list[str]:
 def models() -> dict[str, type[BaseModel]]:
     """The models of the words, by name."""
     modules = [
-        importlib.import_module(f"{package.__name__}.{module.name}")
-        for package in (service.api, visloc_api.words)
-        for module in pkgutil.iter_modules(package.__path__)
+        importlib.import_module(f"visloc_api.words.{module.name}")
+        for module in pkgutil.iter_modules(visloc_api.words.__path__)
     ]
     return {
         name: value
@@ -444,10 +445,6 @@ def test_all_messages_of_the_proto_have_a_model() -> None:
     assert {message.name for _, message in pairs()} == (
         set(pb2.DESCRIPTOR.message_types_by_name) - without
     )
-
-
-def test_options_are_those_of_the_core() -> None:
-    assert tuple(LocalizeOptions.model_fields) == CoreOptions.__slots__
 
 
 def test_every_number_of_an_answer_is_a_double_on_the_wire() -> None:

@@ -21,10 +21,10 @@ from service.engine.engine import Engine
 from service.telemetry.metrics import Metrics
 from service.values import (
     ImageJob,
-    Instant,
+    InstantJob,
     Localization,
     RigJob,
-    SequenceStart,
+    SequenceJob,
     WorkerSettings,
     photo_job,
 )
@@ -771,22 +771,22 @@ def test_a_rig_that_does_not_fit_is_refused_before_any_photo_is_read(
 
 def instants_of(
     photos: Sequence[bytes], camera: Camera, *, start: int = 1_700_000_000_000
-) -> list[Instant]:
+) -> list[InstantJob]:
     return [
-        Instant(start + 100 * i, (ImageJob("camera", photo, camera),), None, None)
+        InstantJob(start + 100 * i, (ImageJob("camera", photo, camera),), None, None)
         for i, photo in enumerate(photos)
     ]
 
 
-START = SequenceStart(("room",), None, None, 1.0, FAST)
+START = SequenceJob(("room",), None, None, 1.0, FAST)
 
 
 async def answers_of(
-    engine: Engine, start: SequenceStart, instants: Sequence[Instant]
+    engine: Engine, start: SequenceJob, instants: Sequence[InstantJob]
 ) -> list[Localization]:
     """Sent one by one, as a stream is."""
 
-    async def sent() -> AsyncIterator[Instant]:
+    async def sent() -> AsyncIterator[InstantJob]:
         for instant in instants:
             yield instant
 
@@ -823,7 +823,7 @@ def test_a_sequence_is_answered_as_it_comes(with_engine: WithEngine, query: Quer
     first, second, third = instants_of([query.image, blank(), query.image], query.camera)
     taken: list[int] = []
 
-    async def sent() -> AsyncIterator[Instant]:
+    async def sent() -> AsyncIterator[InstantJob]:
         for instant in (first, second, third):
             taken.append(instant.timestamp)
             yield instant
@@ -885,7 +885,7 @@ def odometry() -> Odometry:
     ],
 )
 def test_a_sequence_that_cannot_be_is_refused_by_name(
-    change: Callable[[list[Instant]], list[Instant]],
+    change: Callable[[list[InstantJob]], list[InstantJob]],
     start: dict[str, Any],
     kind: type[Exception],
     code: str,

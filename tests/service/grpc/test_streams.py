@@ -22,11 +22,11 @@ import pytest
 from google.rpc.error_details_pb2 import ErrorInfo
 from grpc_status import rpc_status
 
-from service.api import LocalizeSequenceResponse
-from service.values import Instant, Localization, SequenceStart
+from service.values import InstantJob, Localization, SequenceJob
 from visloc.errors import InvalidInput
 from visloc.types import InstantAnswer, Reason, Refusal
 from visloc_api.v1 import localization_pb2 as pb2
+from visloc_api.words.answers import LocalizeSequenceResponse
 
 LINES = {"Accept": "application/x-ndjson"}
 
@@ -51,7 +51,7 @@ class Pretender:
     ended: threading.Event = field(default_factory=threading.Event)
 
     async def localize_sequence(
-        self, start: SequenceStart, instants: AsyncIterator[Instant] | Sequence[Instant]
+        self, start: SequenceJob, instants: AsyncIterator[InstantJob] | Sequence[InstantJob]
     ) -> AsyncIterator[Localization]:
         """Stand in for the engine's."""
         try:
@@ -69,8 +69,8 @@ class Pretender:
 
 
 async def one_by_one(
-    instants: AsyncIterator[Instant] | Sequence[Instant],
-) -> AsyncIterator[Instant]:
+    instants: AsyncIterator[InstantJob] | Sequence[InstantJob],
+) -> AsyncIterator[InstantJob]:
     if isinstance(instants, Sequence):
         for instant in instants:
             yield instant

@@ -19,7 +19,6 @@ import pytest
 from starlette.responses import Response
 
 import service.engine.scenes
-from service.api import MapImages
 from service.engine.scenes import Scenes, _Kept
 from service.http.scenes import _of_version
 from service.security.key_file import Scope, edited_keys, new_key
@@ -30,6 +29,7 @@ from visloc.drawing.detail_levels import detail_order
 from visloc.drawing.point_bytes import packed_points
 from visloc.errors import MapCorrupt, NotFound
 from visloc.geometry import Pose
+from visloc_api.words.scenes import MapImages
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from service.values import (
     ImageJob,
     MapFolder,
     RigJob,
-    SequenceStart,
+    SequenceJob,
     WorkerSettings,
     photo_job,
 )
@@ -117,7 +117,7 @@ def ask_rig(process: Vision, maps: Sequence[MapFolder], options: LocalizeOptions
 
 
 def ask_sequence(process: Vision, maps: Sequence[MapFolder], options: LocalizeOptions) -> object:
-    return process.open_sequence(SequenceStart((), "rig", None, 1.0, options), maps)
+    return process.open_sequence(SequenceJob((), "rig", None, 1.0, options), maps)
 
 
 @pytest.mark.parametrize("ask", [ask_photo, ask_rig, ask_sequence])
@@ -169,7 +169,7 @@ def test_registration_takes_a_sequence_of_one_camera(
 ) -> None:
     process, maps = open_maps
     options = LocalizeOptions(solver=Solver.REGISTRATION)
-    assert process.open_sequence(SequenceStart((), None, None, 1.0, options), maps)
+    assert process.open_sequence(SequenceJob((), None, None, 1.0, options), maps)
     with pytest.raises(InvalidInput) as caught:
         ask_sequence(process, maps, options)
     assert caught.value.code == "options.solver"

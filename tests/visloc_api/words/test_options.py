@@ -1,18 +1,21 @@
 from __future__ import annotations
 
-from dataclasses import fields
+from collections.abc import Mapping
+from typing import get_args, get_origin
 
 import pytest
 
-import clients
-from visloc.options import LocalizeOptions, Solver
+from visloc.options import Solver
 from visloc_api.words import options
 
 
-def test_words_and_clients_have_the_options_of_the_core() -> None:
-    names = [option.name for option in fields(LocalizeOptions)]
-    assert list(options.LocalizeOptions.model_fields) == names
-    assert [option.name for option in fields(clients.LocalizeOptions)] == names
+def test_words_have_the_options_of_the_core() -> None:
+    for name, kind in options.KINDS.items():
+        field = options.LocalizeOptions.model_fields[name]
+        (hint,) = (each for each in get_args(field.annotation) if each is not type(None))
+        said = get_origin(hint) or hint
+        assert issubclass(kind, said) or (kind, said) == (Mapping, dict)
+    assert list(options.LocalizeOptions.model_fields) == list(options.KINDS)
 
 
 @pytest.mark.parametrize("name", options.KINDS)

@@ -1,4 +1,4 @@
-"""The request for one photo."""
+"""The request for one photo, and what all requests that localize share."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ from typing import Annotated
 
 from pydantic import FailFast, Field
 
-from service.api.geopose import GivenNear, GivenYpr, Near, flag_from_text
-from service.values import RigJob, Where, photo_job
 from visloc.errors import refuse
-from visloc_api.words.features import GivenFeatures, GivenImage, query_to_core
+from visloc_api.words.features import GivenFeatures, GivenImage
 from visloc_api.words.geometry import GivenCamera
 from visloc_api.words.message import IncomingMessage, converted
+from visloc_api.words.near import GivenNear
 from visloc_api.words.options import GivenOptions, LocalizeOptions
-from visloc_api.words.priors import GivenPriors, priors_to_core
+from visloc_api.words.priors import GivenPriors
 
 MAX_MAPS = 16
 PhotoField = Annotated[
@@ -51,41 +50,21 @@ GivenMaps = Annotated[
 ]
 
 
+def flag_from_text(value: object) -> object:
+    """Read true or false, as forms have them."""
+    return {"true": True, "false": False}.get(value, value) if isinstance(value, str) else value
+
+
+GivenYpr = Annotated[
+    bool | None,
+    converted(flag_from_text),
+    Field(description="also say the GeoPose in yaw, pitch and roll"),
+]
 GivenDebug = Annotated[
     bool | None,
     converted(flag_from_text),
     Field(description="also return the matches and a picture of them; needs a photo"),
 ]
-
-
-def where_to_core(map_ref: str | None, maps: list[str] | None, near: Near | None) -> Where:
-    """Return where to search.
-
-    Raises:
-        InvalidInput: ``request.map`` for none or several of the three, for one map twice, and for
-            too many; ``near...``.
-    """
-    given = [
-        name
-        for name, value in (("map", map_ref), ("maps", maps or None), ("near", near))
-        if value is not None
-    ]
-    if len(given) != 1 or maps == []:
-        raise refuse("request.map", field="map", got=" and ".join(given) or "none of them")
-    if near is not None:
-        return near.to_core()
-    if maps is None:
-        assert map_ref is not None
-        return (map_ref,)
-    if len(maps) > MAX_MAPS or len(set(maps)) != len(maps):
-        raise refuse(
-            "request.map",
-            "there are too many maps" if len(maps) > MAX_MAPS else "a map is named twice",
-            field="maps",
-            expected=f"at most {MAX_MAPS} different ones",
-            got=len(maps) if len(maps) > MAX_MAPS else ", ".join(maps),
-        )
-    return tuple(maps)
 
 
 class LocalizeRequest(IncomingMessage):
@@ -108,22 +87,3 @@ class LocalizeRequest(IncomingMessage):
     near: GivenNear = None
     ypr: GivenYpr = None
     debug: GivenDebug = None
-
-    def to_job(self) -> RigJob:
-        """Return the work to do.
-
-        Raises:
-            InvalidInput: ``request.query``, ``request.map``, ``near...``, ``features...``,
-                ``camera...``, ``options...``, ``priors...``, ``pose...`` or ``debug.needs_photo``.
-        """
-        if self.debug and self.features is not None:
-            raise refuse("debug.needs_photo", field="debug", got="true")
-        return photo_job(
-            where_to_core(self.map, self.maps, self.near),
-            query_to_core(self.image, self.features),
-            None if self.camera is None else self.camera.to_core(),
-            self.options.to_core(),
-            priors_to_core(self.priors),
-            ypr=bool(self.ypr),
-            debug=bool(self.debug),
-        )

@@ -8,17 +8,14 @@ from typing import Annotated, ClassVar
 
 from pydantic import FailFast, Field
 
-import service.values
 import visloc.types
-from service.api.geopose import GivenNear, GivenYpr
-from service.api.localize import FeaturesField, GivenMaps, PhotoField, where_to_core
-from service.values import ONLY_SENSOR, ImageJob, RigJob
 from visloc.errors import inside, refuse
-from visloc_api.words.features import query_to_core
-from visloc_api.words.geometry import GivenCamera, Transform
+from visloc_api.words.geometry import Camera, GivenCamera, Transform
 from visloc_api.words.message import IncomingMessage, converted, counted
+from visloc_api.words.near import GivenNear
 from visloc_api.words.options import GivenOptions, LocalizeOptions
-from visloc_api.words.priors import GivenPriors, priors_to_core
+from visloc_api.words.photo import FeaturesField, GivenMaps, GivenYpr, PhotoField
+from visloc_api.words.priors import GivenPriors
 
 # More than any rig has: it bounds what a request can make the server look at.
 MAX_SENSORS = 256
@@ -38,51 +35,6 @@ class BatchLimits:
 
     max_images: int
     max_instants: int
-
-
-class Parts:
-    """The files of a form, each of which is one image."""
-
-    def __init__(self, files: Mapping[str, bytes]) -> None:
-        self._names = tuple(files)
-        self._left = dict(files)
-
-    def take(self, name: str) -> bytes:
-        """Return the file of an image.
-
-        Raises:
-            InvalidInput: ``request.part`` when it was not sent, or is another image's already.
-        """
-        if name not in self._left:
-            raise refuse(
-                "request.part",
-                "another image already uses this part"
-                if name in self._names
-                else "no file part of this name was sent",
-                field="part",
-                expected=f"one of the file parts: {', '.join(self._left) or 'none is left'}"[:500],
-                got=name,
-            )
-        return self._left.pop(name)
-
-    def check_all_taken(self) -> None:
-        """Refuse a file that no image names.
-
-        Raises:
-            InvalidInput: ``request.part``.
-        """
-        if self._left:
-            name = next(iter(self._left))
-            raise refuse(
-                "request.part",
-                "no image of the request names this part",
-                field=name[:100],
-                expected='an image with "part": NAME for every file',
-                got=name,
-            )
-
-
-NO_PARTS: Mapping[str, bytes] = {}
 
 
 class RigSensor(IncomingMessage):
@@ -133,6 +85,17 @@ class RigCalibration(IncomingMessage):
         dict[str, RigSensor], converted(_sensors_in_bounds), Field(description="by the sensor's id")
     ]
 
+    @staticmethod
+    def from_core(sensors: Mapping[str, visloc.types.RigSensor]) -> RigCalibration:
+        """Say the poses of cameras that nobody has checked yet.
+
+        Raises:
+            InvalidInput: ``rig.rotation`` or ``pose.translation``.
+        """
+        return RigCalibration(
+            sensors={name: _sensor_from_core(name, sensor) for name, sensor in sensors.items()}
+        )
+
     def to_core(self) -> Mapping[str, visloc.types.RigSensor]:
         """Return the rig, checked.
 
@@ -142,6 +105,13 @@ class RigCalibration(IncomingMessage):
         if not self.sensors:
             raise refuse("rig.empty", field="rig.sensors", got="none")
         return {name: _sensor_to_core(name, sensor) for name, sensor in self.sensors.items()}
+
+
+def _sensor_from_core(name: str, sensor: visloc.types.RigSensor) -> RigSensor:
+    camera = None if sensor.camera is None else Camera.from_core(sensor.camera)
+    field = f"rig.sensors.{name}.cam_from_rig"
+    transform = Transform.checked(sensor.cam_from_rig, field, "rig.rotation")
+    return RigSensor(cam_from_rig=transform, camera=camera)
 
 
 def _sensor_to_core(name: str, sensor: RigSensor) -> visloc.types.RigSensor:
@@ -165,11 +135,6 @@ GivenRig = Annotated[
     converted(_rig_from_object),
     Field(description="the id of a rig that the map knows, or the rig's sensors"),
 ]
-
-
-def rig_to_core(rig: str | RigCalibration) -> service.values.Rig:
-    """Return the rig, checked."""
-    return rig if isinstance(rig, str) else rig.to_core()
 
 
 class RigImage(IncomingMessage):
@@ -197,32 +162,6 @@ class RigImage(IncomingMessage):
         str | None, Field(description="in a form, instead of image: the name of the file's part")
     ] = None
 
-    def to_core(self, parts: Parts, *, has_rig: bool) -> ImageJob:
-        """Return the image, not decoded.
-
-        Raises:
-            InvalidInput: ``request.missing_field``, ``request.query``, ``request.part``,
-                ``features...`` or ``camera...``.
-        """
-        if has_rig and not self.sensor:
-            raise refuse("request.missing_field", field="sensor")
-        image = self.image
-        if self.part is not None:
-            if image is not None or self.features is not None:
-                raise refuse(
-                    "request.query",
-                    "an image must be given in exactly one way",
-                    field="image",
-                    expected="one of image, features, part",
-                    got="part and another",
-                )
-            image = parts.take(self.part)
-        return ImageJob(
-            self.sensor or ONLY_SENSOR,
-            query_to_core(image, self.features),
-            None if self.camera is None else self.camera.to_core(),
-        )
-
 
 def _few_images(images: object, limits: object) -> None:
     if (
@@ -246,29 +185,6 @@ Images = Annotated[
 ]
 
 
-def images_to_core(
-    images: list[RigImage], timestamp: int | None, parts: Parts, *, has_rig: bool
-) -> tuple[tuple[ImageJob, ...], int | None]:
-    """Return the images of an instant, and its timestamp where one is known.
-
-    Raises:
-        InvalidInput: ``rig.timestamps`` for images of different instants, or a code of an image.
-    """
-    jobs = []
-    for number, image in enumerate(images):
-        with inside(f"images[{number}]"):
-            if image.timestamp is not None and timestamp not in (None, image.timestamp):
-                raise refuse(
-                    "rig.timestamps",
-                    field="timestamp",
-                    expected=f"{timestamp}, as of the others",
-                    got=image.timestamp,
-                )
-            timestamp = timestamp if image.timestamp is None else image.timestamp
-            jobs.append(image.to_core(parts, has_rig=has_rig))
-    return tuple(jobs), timestamp
-
-
 class LocalizeRigRequest(IncomingMessage):
     """The images of a rig at one instant, and the map to search."""
 
@@ -280,29 +196,3 @@ class LocalizeRigRequest(IncomingMessage):
     priors: GivenPriors = None
     near: GivenNear = None
     ypr: GivenYpr = None
-
-    def to_job(self, files: Mapping[str, bytes] = NO_PARTS) -> RigJob:
-        """Return the work to do.
-
-        Args:
-            files: the files of a form by the names of their parts.
-
-        Raises:
-            InvalidInput: ``request...``, ``near...``, ``rig...``, ``features...``,
-                ``camera...``, ``options...``, ``priors...`` or ``pose...``.
-        """
-        where = where_to_core(self.map, self.maps, self.near)
-        if self.rig is None:
-            raise refuse("request.missing_field", field="rig")
-        rig, parts = rig_to_core(self.rig), Parts(files)
-        images, timestamp = images_to_core(self.images, None, parts, has_rig=True)
-        parts.check_all_taken()
-        return RigJob(
-            where,
-            rig,
-            images,
-            timestamp,
-            self.options.to_core(),
-            priors_to_core(self.priors),
-            ypr=bool(self.ypr),
-        )
