@@ -104,8 +104,21 @@ def describe(name: str) -> str:
     return f"{text}. {facts['details']}" if facts["details"] else text
 
 
+def _schema(name: str) -> dict[str, Any]:
+    """Return what the JSON schema of an option says beside its type and its description."""
+    option = visloc.options.LocalizeOptions.__dataclass_fields__[name]
+    facts: dict[str, Any] = {"title": option.metadata["description"]}
+    if name in CHOICES:
+        facts["enum"] = [*CHOICES[name], None]
+    elif option.metadata["range"] is not None:
+        facts["minimum"], facts["maximum"] = option.metadata["range"]
+    if option.default is not None:
+        facts["default"] = option.default
+    return facts
+
+
 def _field(name: str, kind: type) -> Any:
-    described = Field(description=describe(name))
+    described = Field(description=describe(name), json_schema_extra=_schema(name))
     if kind is Mapping:
         return Annotated[dict[str, float] | None, converted(_check_names), described]
     return Annotated[(str if issubclass(kind, StrEnum) else kind) | None, described]

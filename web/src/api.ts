@@ -141,6 +141,17 @@ export interface LocalizeCall {
   debug?: boolean;
 }
 
+/** An option of a query, as /openapi.json describes it. */
+export interface OptionSchema {
+  title: string;
+  /** Null, which stands for the default, is among them. */
+  enum?: (string | null)[];
+  minimum?: number;
+  maximum?: number;
+  /** Null where the map or the preset has one of its own. */
+  default: string | number | null;
+}
+
 /** Every method throws ServiceError, or what `signal` was aborted with. */
 export interface Service {
   maps(signal?: AbortSignal): Promise<MapInfo[]>;
@@ -149,6 +160,8 @@ export interface Service {
   points(ref: string, first: number, count: number, signal?: AbortSignal): Promise<ArrayBuffer>;
   images(ref: string, first: number, count: number, signal?: AbortSignal): Promise<MapImages>;
   localize(request: LocalizeCall, signal?: AbortSignal): Promise<LocalizeResponse>;
+  /** The options of a query, by name. */
+  options(): Promise<Record<string, OptionSchema>>;
 }
 
 /** `MODEL,width,height,params...`, as the service, the command line and curl take a camera. */
@@ -239,6 +252,14 @@ export function connect(base: URL, key: () => string | null): Service {
         ["status", "camera", "orientation", "retrieved", "map", "seconds"],
         { ...withSignal(signal), method: "POST", body: localizeForm(call) },
       ),
+    async options() {
+      type Described = { components: { schemas?: Record<string, { properties?: unknown }> } };
+      const what = "the description of the API";
+      const said = await readJson<Described>("openapi.json", what, ["components"], {});
+      const options = said.components.schemas?.["LocalizeOptions"]?.properties;
+      if (options == null) throw noAnswer("server.answer", `this is not ${what}`, "");
+      return options as Record<string, OptionSchema>;
+    },
   };
 }
 
