@@ -28,6 +28,8 @@ ONLY_SENSOR = "camera"
 # Where to search: maps, each ``id`` (its current version) or ``id@version``; or the anchored maps
 # that reach into a circle.
 Where = tuple[str, ...] | Near
+# Most maps that one request may search.
+MAX_MAPS = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,7 +6,6 @@ from service.api.geopose import (
     Near,
 )
 from service.api.localize import (
-    MAX_MAPS,
     LocalizeRequest,
 )
 from service.api.rigs import (
@@ -57,7 +56,6 @@ from visloc_api.words.status import (
 
 __all__ = [
     "MAX_GLOBAL_DESCRIPTORS",
-    "MAX_MAPS",
     "MAX_SENSORS",
     "Array",
     "BatchLimits",

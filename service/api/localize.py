@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import FailFast, Field
 
 from service.api.geopose import GivenNear, GivenYpr, Near, flag_from_text
-from service.values import RigJob, Where, photo_job
+from service.values import MAX_MAPS, RigJob, Where, photo_job
 from visloc.errors import refuse
 from visloc_api.words.features import GivenFeatures, GivenImage, query_to_core
 from visloc_api.words.geometry import GivenCamera
@@ -16,7 +16,6 @@ from visloc_api.words.message import IncomingMessage, converted
 from visloc_api.words.options import GivenOptions, LocalizeOptions
 from visloc_api.words.priors import GivenPriors, priors_to_core
 
-MAX_MAPS = 16
 PhotoField = Annotated[
     GivenImage, Field(description="the encoded photo: JPEG, PNG, WebP, TIFF or BMP")
 ]

@@ -13,11 +13,10 @@ from typing import Any
 
 from service.engine.fetching import Fetcher
 from service.engine.listing import Listing
-from service.engine.stores import Store
 from service.values import MapFolder, Where
 from service.workers.pool import Workers
 from service.workers.tasks import Vision
-from visloc.archive import SetOutline, read_any_outline
+from visloc.archive import MapStore, SetOutline, read_any_outline
 from visloc.archive.set_rules import refuse_if_tile
 from visloc.archive.version_rules import version_in_use
 from visloc.errors import MapCorrupt, NotFound, Unavailable, VislocError, refuse
@@ -87,7 +86,7 @@ class Catalog:
     and warm; until then, and when it cannot be opened, the previous one stays in service.
     """
 
-    def __init__(self, store: Store, workers: Workers) -> None:
+    def __init__(self, store: MapStore, workers: Workers) -> None:
         self._store, self._workers = store, workers
         self.fetcher = Fetcher(store)
         self.listing = Listing(store, self._served_ref)

@@ -14,13 +14,13 @@ from service.engine.scenes import Scenes
 from service.engine.sequences import answers_in_maps, in_turn
 from service.engine.set_sequences import SetSequence
 from service.engine.sets import SetSearch, answers_of, parted
-from service.engine.stores import Store
 from service.engine.uploads import Uploads
 from service.errors import stopping_error
 from service.telemetry.metrics import Metrics
 from service.values import Instant, Localization, RigJob, SequenceStart, ServedMap, WorkerSettings
 from service.workers.judging import judged
 from service.workers.pool import Workers
+from visloc.archive import MapStore
 from visloc.errors import VislocError, refuse
 from visloc.types import Near
 
@@ -62,7 +62,7 @@ class Engine:
 
     def __init__(
         self,
-        store: Store,
+        store: MapStore,
         settings: WorkerSettings,
         *,
         workers: int = 1,
