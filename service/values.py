@@ -196,8 +196,8 @@ class ServedMap:
     """A version of a map, or of a set of maps.
 
     Attributes:
-        current: whether it is the version in use.
-        versions: all published versions of the map, oldest first, and whether each is in use.
+        current: whether this version is the current one.
+        versions: all published versions of the map, oldest first, and whether each is current.
     """
 
     outline: MapOutline | SetOutline

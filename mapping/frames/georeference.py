@@ -252,7 +252,7 @@ def publish_anchored(opened: Map, found: Georeference, maps_dir: Path, *, force:
 
     Raises:
         Conflict: ``map.anchored`` without ``force``, when it has a place already; ``map.outdated``
-            when another version is in use; ``build.running``.
+            when another version is current; ``build.running``.
     """
     if opened.geodetic is not None and not force:
         raise refuse("map.anchored", field="MAP", ref=opened.ref)

@@ -97,7 +97,7 @@ def publish_set(
         model: of a coarse index whose tiles had the same local features; None to learn one.
 
     Returns:
-        The folder of the version; of the one in use when that is the same set already.
+        The folder of the version; of the current one when that is the same set already.
 
     Raises:
         InvalidInput: ``map.is_set`` for a tile that is a set, ``set.tiles`` without any, or for one

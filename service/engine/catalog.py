@@ -171,7 +171,7 @@ class Catalog:
             self._release(ref)
 
     async def activate(self, map_id: str, version: str) -> None:
-        """Put a version into use, once a worker process has it open and warm.
+        """Make a version current once a worker process has it open and warm.
 
         Raises:
             VislocError: as in ``using``; then nothing has changed.
@@ -181,14 +181,14 @@ class Catalog:
         self._serve(map_id, opened)
 
     async def delete(self, map_id: str, version: str, limit_s: float) -> None:
-        """Delete a version that is not in use; wait at most ``limit_s`` for requests that use it.
+        """Delete a version that is not current; wait at most ``limit_s`` for requests that use it.
 
         Raises:
             NotFound: ``map.unknown``, ``map.version``.
             Conflict: ``map.version_in_use``, ``map.in_set``.
         """
         ref = f"{map_id}@{version}"
-        # A version that answers because the current one cannot be opened is in use too.
+        # A version that answers because the current one cannot be opened is current too.
         others = set(await asyncio.to_thread(self._store.versions, map_id)) - {version}
         if others and self._is_served(ref):
             raise version_in_use(map_id, version, sorted(others))

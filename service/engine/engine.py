@@ -273,7 +273,7 @@ class Engine:
         return await asyncio.to_thread(self._catalog.listing.describe, ref)
 
     async def upload(self, map_id: str, version: str, chunks: AsyncIterator[bytes]) -> ServedMap:
-        """Publish a packed map, verified byte by byte, without putting it into use.
+        """Publish a packed map, verified byte by byte, without making it current.
 
         Raises:
             VislocError: errors of ``Uploads.publish``.
@@ -290,12 +290,12 @@ class Engine:
         return await self.map(f"{map_id}@{version}")
 
     async def set_current(self, map_id: str, version: str) -> ServedMap:
-        """Put a version into use, once a worker process has it open and warm.
+        """Make a version current once a worker process has it open and warm.
 
         Raises:
             NotFound: ``map.unknown``, ``map.version``.
             Conflict: ``map.features`` when its features are not installed.
-            VislocError: errors of the store; then the previous version stays in use.
+            VislocError: errors of the store; then the previous version stays current.
         """
         self._check_ready()
         with self._noted("activate"):
@@ -303,7 +303,7 @@ class Engine:
         return await self.map(f"{map_id}@{version}")
 
     async def delete(self, map_id: str, version: str) -> None:
-        """Delete a version that is not in use.
+        """Delete a version that is not current.
 
         Raises:
             NotFound: ``map.unknown``, ``map.version``.

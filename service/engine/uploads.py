@@ -34,7 +34,7 @@ class Uploads:
         self._running: set[str] = set()
 
     async def publish(self, map_id: str, version: str, chunks: AsyncIterator[bytes]) -> None:
-        """Publish a packed map, verified byte by byte, without putting it into use.
+        """Publish a packed map, verified byte by byte, without making it current.
 
         Nothing is read of a map that cannot be published. In the end, even if cancelled, temporary
         files are deleted, and the version is published whole or not at all.

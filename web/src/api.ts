@@ -24,7 +24,7 @@ export interface MapInfo {
   size_bytes: number;
   /** Unit vector; empty when not known. */
   down: number[];
-  /** Whether this version is in use. */
+  /** Whether this version is current. */
   current: boolean;
   /** All published ones, oldest first. */
   versions: { version: string; current: boolean }[];
@@ -169,7 +169,7 @@ export function cameraText(camera: Camera): string {
   return [camera.model, camera.width, camera.height, ...camera.params].join(",");
 }
 
-/** As people name it: with the version only where that is not the one in use. */
+/** As people name it: with the version only where that is not the current one. */
 export function shortRef(map: { id: string; version: string; current: boolean }): string {
   return map.current ? map.id : mapRef(map);
 }

@@ -46,7 +46,7 @@ def prune_map(
 
     Args:
         store: with the map.
-        map_ref: ``id``, or ``id@version`` of the version in use.
+        map_ref: ``id``, or ``id@version`` of the current version.
         max_bytes: most that its files take, manifest aside; or None.
         max_landmarks: most landmarks; or None.
         measure: compares the accuracy of both versions; None: by photos of the map.
