@@ -55,6 +55,8 @@ Global___Camera: _TypeAlias = Camera  # noqa: Y015
 
 @_typing.final
 class LocalizeOptions(_message.Message):
+    """docs/api.md lists the words, ranges and defaults of the options."""
+
     DESCRIPTOR: _descriptor.Descriptor
 
     @_typing.final
@@ -90,7 +92,7 @@ class LocalizeOptions(_message.Message):
     SOLVER_FIELD_NUMBER: _builtins.int
     SEED_FIELD_NUMBER: _builtins.int
     preset: _builtins.str
-    """default, config1 or config2"""
+    """thresholds to start from"""
     top_k: _builtins.int
     """mapping photos to match against"""
     max_error_px: _builtins.float
@@ -100,19 +102,17 @@ class LocalizeOptions(_message.Message):
     min_inlier_ratio: _builtins.float
     """0 to 1"""
     read_as: _builtins.str
-    """upright (default): features are found in the photo rotated by its EXIF orientation; or stored.
-    Camera, keypoints and pose refer to the stored pixels either way.
+    """Orientation in which features are found: the photo's as stored, or rotated by its EXIF
+    orientation. Camera, keypoints and pose refer to the stored pixels either way.
     """
     extraction: _builtins.str
-    """effort to find features: fast, default or accurate"""
+    """effort to find features"""
     fusion: _builtins.str
-    """How similarities under several global descriptors become one ranking: gharm, mean, power, min,
-    max, mean_and_power, min_and_max, mean_and_min, harmonic or round_robin; the map's by default.
-    """
+    """How similarities under several global descriptors become one ranking."""
     matcher: _builtins.str
-    """of keypoints: mutual (default), ratio or lightglue"""
+    """of keypoints"""
     solver: _builtins.str
-    """of the pose: pycolmap (default), poselib, registration"""
+    """of the pose"""
     seed: _builtins.int
     """of RANSAC"""
     @_builtins.property
