@@ -23,7 +23,7 @@ _SQLITE = b"SQLite format 3\0"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DatabaseImage:
-    """What a database holds of one image."""
+    """One image of a database."""
 
     camera: int
     frame: tuple[str, int]
@@ -34,7 +34,7 @@ class DatabaseImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Database:
-    """What is read of a database; descriptors of other kinds than SIFT are left out."""
+    """The content of a database. Descriptors that are not SIFT are left out."""
 
     path: Path
     cameras: Mapping[int, pycolmap.Camera]

@@ -71,7 +71,7 @@ def content_of(opened: Map) -> MapContent:
             GlobalFeatures(
                 record.fingerprint,
                 opened.global_descriptors[record.fingerprint.name][:],
-                # As stored: its scales would not all come back the same.
+                # Taken as stored, because converting would not give back all of its scales exactly.
                 read_npz(opened.path / f"global/{record.fingerprint.file_stem}.model.npz"),
             )
             for record in manifest.global_features

@@ -44,10 +44,10 @@ from visloc.sets.coarse import CoarseModel, DescribedTile, coarse_index, describ
 
 # Metric maps of one set have one unit, as far as a fit to positions can tell.
 _MAX_SCALE_DIFFERENCE = 0.02
-# Down as two maps know it, turned into the frame of the set, differs by no more than this.
+# The down directions of two maps, rotated into the set's frame, differ by at most this.
 _MAX_DOWN_DIFFERENCE = math.radians(5.0)
-# By their own anchors, maps lie no further from where the set has them than this. Satellites tell
-# a place among houses to 10 m or so.
+# A map's own anchor and its pose in the set differ by at most this. Among houses, satellites locate
+# a receiver to about 10 m.
 _MAX_PLACE_DIFFERENCE_M, _MAX_PLACE_SHARE = 20.0, 0.05
 _BLOCK_ROWS = 2**20
 

@@ -142,7 +142,7 @@ def _compare(
 
 
 def _factor(comparisons: Sequence[_Comparison], expected: float) -> float:
-    """By how much the motion's covariance is too small for a median chi-square as expected."""
+    """Return the factor on the motion's covariance that makes the median chi-square expected."""
     factor = 1.0
     while comparisons and factor < _MAX_FACTOR:
         if np.median([comparison.chi2(factor) for comparison in comparisons]) <= expected:

@@ -54,7 +54,7 @@ MAX_GAP_S = 60.0
 
 
 class TimeUnit(StrEnum):
-    """What one step of a timestamp is."""
+    """The unit of a timestamp."""
 
     S = "s"
     MS = "ms"
@@ -63,13 +63,13 @@ class TimeUnit(StrEnum):
 
     @property
     def seconds(self) -> float:
-        """How long it is."""
+        """The length of the unit in seconds."""
         return {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[self.value]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Odometry:
-    """Where a tracker has the rig, in a world of its own.
+    """The pose of a rig according to a tracker, in the tracker's own world.
 
     Attributes:
         rig_from_odometry: the pose, metres.

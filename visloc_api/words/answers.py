@@ -29,7 +29,7 @@ from visloc_api.words.geopose import GeoPose, GeoPoseYpr
 
 # A sequence has thousands of images, and each may have been matched against a thousand photos.
 MAX_RETRIEVED = 20
-# Of every stated uncertainty.
+# Appended to the description of every stated uncertainty.
 _NOT_COVERED = (
     "; computed from the scatter of the matches only, so errors that landmarks "
     "share are missing (depth, calibration, poses of mapping photos): on one "
@@ -199,7 +199,7 @@ class CameraUsed(Answer):
 
     @property
     def camera(self) -> Camera:
-        """As a camera of the core."""
+        """The intrinsics as a ``Camera``."""
         return Camera(self.model, self.width, self.height, self.params)
 
 

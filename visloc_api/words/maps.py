@@ -153,7 +153,7 @@ class Tile(Answer):
 
     @property
     def translation(self) -> Numbers:
-        """In the set's world."""
+        """Translation of ``x_set = scale R x + translation``, in the unit of the set's world."""
         return self.set_from_tile.sent.translation
 
     @property

@@ -189,7 +189,9 @@ def _joined(
 def _global_features(
     first: MapContent, second: MapContent, described: GlobalFeatures
 ) -> tuple[tuple[GlobalFeatures, ...], list[str]]:
-    """Those that both maps have with one model; else the one that was learned of both.
+    """Join the global features that both maps computed with the same model.
+
+    If there are none, return those that were learned from both maps together.
 
     Returns:
         The features of all photos, and the names of those that are left out.
