@@ -76,8 +76,6 @@ def check_fusion_weights(weights: Mapping[str, float], code: str, field: str | N
     """Make sure that weights of global descriptors mean something.
 
     Args:
-        weights: by name.
-        code: of the error.
         field: what the weights are called where they were given; None for what the code says.
 
     Raises:
@@ -152,7 +150,6 @@ def _option(
         high: greatest value.
         unset: whose value is taken when the default is None.
         details: sentences to add.
-        more: for ``dataclasses.field``.
     """
     metadata = {
         "description": description,

@@ -67,8 +67,6 @@ class Georeference:
     """Where a map lies, and how well what was known agrees with it.
 
     Attributes:
-        anchor: for the manifest.
-        names: of what was compared.
         residuals_m: (n, 3) metres east, north and up, from where each was said to be to where
             the anchor puts it.
         agrees: (n,) which of them the anchor rests on.

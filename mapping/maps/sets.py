@@ -59,7 +59,6 @@ class _Placed:
     """A map as a tile.
 
     Attributes:
-        record: for the manifest.
         features: its local features.
         metric: whether its own unit is a metre.
         down: (3,) in the set's frame; None where the map does not know it.

@@ -50,8 +50,6 @@ class Engine:
     Used from one event loop.
 
     Args:
-        store: of the maps.
-        settings: of the worker processes.
         workers: number of processes.
         max_queue: photos that may wait; one more is refused with ``server.busy``.
         max_batches: rigs and sequences that are served at once.

@@ -47,7 +47,6 @@ def needed_over_http(method: str, path: str, *, page: bool = False) -> Needed:
     """Return what an HTTP request needs.
 
     Args:
-        method: of the request.
         path: with %-escapes decoded.
         page: whether the server has the page, whose files need no key.
     """
@@ -161,7 +160,6 @@ class Access:
 
         Args:
             tokens: the keys that were sent.
-            needed: by the request.
 
         Raises:
             Unauthenticated: ``access.key_missing``, ``access.key_unknown``.

@@ -31,7 +31,6 @@ class Merged:
     """What became of two maps.
 
     Attributes:
-        folder: of the new version.
         a: the map whose frame it has.
         b: the other one.
         registration: how B lies in A.

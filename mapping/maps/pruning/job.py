@@ -45,7 +45,6 @@ def prune_map(
     """Publish a version of a map that is as large as it may be; the one before stays.
 
     Args:
-        store: with the map.
         map_ref: ``id``, or ``id@version`` of the current version.
         max_bytes: most that its files take, manifest aside; or None.
         max_landmarks: most landmarks; or None.
