@@ -28,7 +28,7 @@ MIN_PHOTOS = 3
 _NUM_TRIALS = 200
 # Matches of each photo that judge a proposal, and that refine what was chosen.
 _JUDGING, _REFINING = 32, 256
-# What one photo or two say is a few times as inexact as what all of them say.
+# An alignment from one or two photos is a few times less exact than one from all of them.
 _COARSE = 4.0
 # Poses of mapping photos are not exact either: those of redkitchen shift what a photo sees by 20
 # pixels. What was localized elsewhere is off by hundreds.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from visloc.errors import refuse
 
-# What pycolmap raises on files that it cannot read; seen by damaging them.
+# pycolmap raises these on files that it cannot read, as damaging files showed.
 REFUSALS = (ValueError, RuntimeError, IndexError, KeyError, MemoryError, OSError)
 _SQLITE = b"SQLite format 3\0"
 

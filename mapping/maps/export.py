@@ -42,8 +42,8 @@ def export_map(opened: Map, output: Path, format_name: str) -> tuple[str, ...]:
     Coordinates are those of the world, with the map's origin added, and names of photos are those
     of the map. Points keep their order, also those that no photo sees. Photos are not in a map.
 
-    A map of an imported reconstruction whose photos were matched anew gives the reconstruction
-    back: its points and who sees them, not the landmarks made since.
+    If a map was made from an imported reconstruction whose photos were matched again, the
+    reconstruction is exported: its points and their observations, not the landmarks made since.
 
     Args:
         opened: the map.

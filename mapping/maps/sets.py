@@ -178,7 +178,7 @@ def _publish_changed(store: MapStore, set_id: str, content: SetContent) -> Path:
 
 
 def same_content(a: Path, b: Path) -> bool:
-    """Tell whether two folders hold the same map or set, but for its name and version."""
+    """Tell whether two folders hold the same map or set, apart from name and version."""
     return read_any_manifest(a).content_hash == read_any_manifest(b).content_hash
 
 

@@ -17,8 +17,8 @@ from service.telemetry.logs import note_key
 from visloc.errors import InvalidInput, refuse
 from visloc_api.v1 import localization_pb2 as pb2
 
-# What a request needs: a key with these scopes, or no key at all. Unknown paths and methods need
-# ANY_KEY, so that only callers with a key learn what exists.
+# The scopes that the key of a request must have; None when it needs no key. Unknown paths and
+# methods need ANY_KEY, so that only callers with a key learn what exists.
 Needed = frozenset[Scope] | None
 NOTHING: Needed = None
 ANY_KEY: Needed = frozenset()

@@ -95,8 +95,8 @@ def join_as_set(
 ) -> Merged:
     """Publish a set of two maps that overlap, in the frame of the first.
 
-    Arguments and errors as of ``merge_maps``, but that photos of one name are no matter; and what
-    ``publish_set`` raises.
+    Arguments and errors are those of ``merge_maps``, except that photos may have equal names. Also
+    raises the errors of ``publish_set``.
     """
     _refuse_name(store, set_id)
     a, b = _opened(store, a_ref, b_ref, min_overlap)

@@ -87,7 +87,7 @@ def prune_map(
 
 
 def keep_within(opened: Map, max_bytes: int | None, max_landmarks: int | None) -> Kept:
-    """Choose what stays of a map; errors as of ``prune_map``."""
+    """Choose what stays of a map; see ``prune_map`` for errors."""
     size, count = opened.size_bytes, len(opened.landmarks)
     if (max_bytes is None or size <= max_bytes) and (
         max_landmarks is None or count <= max_landmarks
