@@ -34,8 +34,7 @@ _COARSE = 4.0
 # pixels. What was localized elsewhere is off by hundreds.
 _AGREES = 2.0
 _ROUNDS = 3
-# Photos of two frames in one unit may suggest a scale between them. It may differ from 1 by this,
-# which is how far the scale of a map may be off.
+# Largest error of the scale between two frames of one unit, which that of a map may have.
 _MAX_OTHER_UNIT = 0.02
 # Depths in the two frames may differ by this share. On redkitchen, errors of the depth camera and
 # of the poses together make 1 % at most.
@@ -326,10 +325,7 @@ def _points(view: _View) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _proposed(views: Sequence[_View], *, rigid: bool, seed: int) -> Similarity:
-    """Return the similarity, made from two photos, that most other photos agree with.
-
-    Of two with equally many, the one with the smaller errors wins.
-    """
+    """Return the similarity of two photos that most photos agree with; ties go by errors."""
     random = np.random.default_rng(seed)
     judging = [view.thinned(_JUDGING) for view in views]
     limits = np.array([_COARSE * view.max_error_px for view in judging])
