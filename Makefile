@@ -10,7 +10,7 @@ PAGE_SOURCES := $(shell find web/src web/index.html web/*.json web/*.ts -type f)
 .DEFAULT_GOAL := help
 # Vite needs this much; without it the service has no page, and says so.
 NODE_IS_THERE = command -v npm >/dev/null && node -e 'const [a, b] = process.versions.node.split(".").map(Number); process.exit(a > 22 || (a === 22 && b >= 12) || (a === 20 && b >= 19) ? 0 : 1)'
-.PHONY: help install page check-page browser balancer demo test test-all docs-check docs-errors fuzz fuzz-api train-smoke bench bench-scale trust fmt lint types contracts proto proto-check check serve clean
+.PHONY: help install page check-page browser balancer demo test test-all docs-check docs-errors docs-options fuzz fuzz-api train-smoke bench bench-scale trust fmt lint types contracts proto proto-check check serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -73,6 +73,9 @@ docs-check: install ## run the commands that the docs print, or parse those that
 
 docs-errors: install ## write the tables of error codes from visloc/error_codes.toml
 	$(BIN)/python -m tests.error_docs
+
+docs-options: install ## write the table of options from visloc/options.py
+	$(BIN)/python -m tests.option_docs
 
 fuzz: install ## fuzz what reads strangers' bytes: RUNS inputs for each target
 	$(BIN)/python -m tests.fuzz --runs $(or $(RUNS),100000)

@@ -222,7 +222,7 @@ class AsyncClient:
         return await self._ask(get_map_request(map), answers.parse_map)
 
     async def map_version(self, map_id: str, version: str) -> MapInfo:
-        """Describe a version of a map, in use or not."""
+        """Describe a version of a map, current or not."""
         return await self._ask(GetVersion(*checked_version(map_id, version)), answers.parse_map)
 
     async def upload_map(
@@ -233,7 +233,7 @@ class AsyncClient:
         *,
         on_progress: OnProgress | None = None,
     ) -> MapInfo:
-        """Publish a version of a map; it is not in use until ``use_version`` names it.
+        """Publish a version of a map; it is not current until ``use_version`` names it.
 
         The server reads and checks every byte before anyone can see the version. An upload that is
         stopped or fails leaves nothing there. When the answer is lost, ``map_version`` tells
@@ -251,7 +251,7 @@ class AsyncClient:
         return answers.parse_answer(self.server, answers.parse_map, raw)
 
     async def use_version(self, map_id: str, version: str) -> MapInfo:
-        """Put a version of a map into use, a newer or an older one.
+        """Make a version of a map current, a newer or an older one.
 
         Returns once the server answers with it. Requests that are under way are answered by the
         version that they began with.
@@ -259,7 +259,7 @@ class AsyncClient:
         return await self._ask(UseVersion(*checked_version(map_id, version)), answers.parse_map)
 
     async def delete_version(self, map_id: str, version: str) -> None:
-        """Delete a version of a map that is not in use, or the last one there is."""
+        """Delete a version of a map that is not current, or the last one there is."""
         await self._transport.send(DeleteVersion(*checked_version(map_id, version)))
 
     async def server_info(self) -> ServerInfo:

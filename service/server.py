@@ -15,7 +15,7 @@ from starlette.applications import Starlette
 
 from service.descriptors import METRICS_CONNECTIONS
 from service.engine.engine import Engine
-from service.engine.stores import Store, open_store
+from service.engine.stores import open_store
 from service.grpc.server import GrpcServer
 from service.http.acceptor import Acceptor, OpenConnections
 from service.http.app import create_app
@@ -30,6 +30,7 @@ from service.telemetry.metrics import Metrics, ServiceState
 from service.telemetry.observer import Observer
 from service.telemetry.tracing import open_spans
 from service.values import WorkerSettings
+from visloc.archive import MapStore
 from visloc.options import Inference
 
 # When the server stops: the time in which requests that are already on their way over open
@@ -148,7 +149,7 @@ class Server:
         )
 
 
-def _make_engine(settings: ServiceSettings, store: Store, observer: Observer) -> Engine:
+def _make_engine(settings: ServiceSettings, store: MapStore, observer: Observer) -> Engine:
     worker = WorkerSettings(
         weights_dir=settings.weights_dir,
         inference=Inference(settings.inference),
@@ -246,7 +247,7 @@ def _listen(host: str, port: int) -> socket.socket:
     return listener
 
 
-def _open_store(settings: ServiceSettings) -> Store:
+def _open_store(settings: ServiceSettings) -> MapStore:
     try:
         return open_store(settings.maps_dir, settings.cache_dir, settings.max_cache_bytes)
     except ValueError as error:

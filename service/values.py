@@ -192,8 +192,8 @@ class ServedMap:
     """A version of a map, or of a set of maps.
 
     Attributes:
-        current: whether it is the version in use.
-        versions: all published versions of the map, oldest first, and whether each is in use.
+        current: whether this version is the current one.
+        versions: all published versions of the map, oldest first, and whether each is current.
     """
 
     outline: MapOutline | SetOutline
@@ -255,10 +255,10 @@ class RankedTiles(NamedTuple):
     scores: tuple[TileScore, ...] = ()
 
 
-# What an image shows of the maps, by map. Pickled: only worker processes read it.
+# Matches of an image with each map. Pickled, because only worker processes read it.
 PackedLooks = bytes
-# A sequence between two of its instants. Pickled: it lives in the main process, so that any worker
-# can take its next step, and one that dies loses no more than that step.
+# A sequence between two of its instants. The main process keeps it pickled, so that any worker can
+# take its next step, and a worker that dies loses only that step.
 PackedSequence = bytes
 
 

@@ -11,7 +11,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import Field, asdict, dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -28,12 +28,12 @@ from clients.cli.options import KEY_VARIABLE
 from mapping.maps.export import export_map
 from service.errors import STATUSES
 from service.settings import CONFIG_VARIABLE, PREFIX, ServiceSettings, read_settings
-from tests import docs_check, error_docs
+from tests import docs_check, error_docs, option_docs
 from tests.docs_check import commands_of
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput, catalogue
 from visloc.geometry import Camera, Pose
-from visloc.options import PRESETS, Extraction, Fusion, LocalizeOptions, Matcher, ReadAs, Solver
+from visloc.options import PRESETS, LocalizeOptions
 from visloc.pose.centre import position_covariance
 from visloc.types import Reason
 from visloc_api.words.answers import InstantAnswer, LocalizeResponse, PoseEstimate
@@ -447,33 +447,25 @@ def test_the_fields_of_the_request_and_the_answer_are_listed() -> None:
             assert re.search(rf"`({name}|{name}\[\].*)`", text), name
 
 
-WORDS_OF_OPTIONS = {
-    "read_as": ReadAs,
-    "extraction": Extraction,
-    "fusion": Fusion,
-    "matcher": Matcher,
-    "solver": Solver,
-}
-
-
 def test_the_options_have_the_defaults_and_ranges_that_are_listed() -> None:
-    rows = table("option")
-    defaults = asdict(LocalizeOptions())
-    assert [words(row[0])[0] for row in rows] == list(defaults)
-    for name_cell, default, span, _ in rows:
-        (name,) = words(name_cell)
-        value = defaults[name]
-        of_none = "the map's" if name.startswith("fusion") else "the preset's"
-        assert default == (of_none if value is None else str(value))
-        if name in WORDS_OF_OPTIONS:
-            assert span.split(", ") == list(WORDS_OF_OPTIONS[name])
-        if " to " in span:
-            low, high = (json.loads(end) for end in span.split(" to "))
-            LocalizeOptions(**{name: low})
-            LocalizeOptions(**{name: high})
-            for outside in (low - 0.01, high + 1):
-                with pytest.raises(InvalidInput):
-                    LocalizeOptions(**{name: outside})
+    text = API.read_text()
+
+    assert option_docs.with_table(text) == text, "run make docs-options"
+    assert [words(row[0])[0] for row in table("option")] == list(asdict(LocalizeOptions()))
+
+
+@pytest.mark.parametrize(
+    "option",
+    [each for each in fields(LocalizeOptions) if each.metadata["range"]],
+    ids=lambda option: option.name,
+)
+def test_options_out_of_range_are_refused(option: Field[object]) -> None:
+    low, high = option.metadata["range"]
+    LocalizeOptions(**{option.name: low})
+    LocalizeOptions(**{option.name: high})
+    for outside in (low - 0.01, high + 1):
+        with pytest.raises(InvalidInput):
+            LocalizeOptions(**{option.name: outside})
 
 
 def test_the_presets_are_those_of_the_code() -> None:

@@ -8,8 +8,8 @@
     +- NotFound          a map, a file or a record that was named does not exist
     +- Conflict          it exists already, or does not fit what exists
     +- MapCorrupt        a map on disk is not what its manifest says
-    +- Unauthenticated   the server wants to know who asks, and cannot tell
-    +- Forbidden         whoever asks may not do this
+    +- Unauthenticated   the server needs to know the caller, and cannot
+    +- Forbidden         the caller may not do this
     +- Unavailable       the server cannot answer now; trying again later may help
        +- Overloaded     ... because too many requests are waiting
        +- TimedOut       ... because the time that was given to it is over
@@ -105,7 +105,7 @@ class Unauthenticated(VislocError):
 
 
 class Forbidden(VislocError):
-    """Whoever asks may not do this."""
+    """The caller may not do this."""
 
 
 class Unavailable(VislocError):

@@ -75,7 +75,13 @@ def recall(
     Raises:
         InvalidInput: ``evaluation.num_queries`` if there are none, or fewer than errors.
     """
-    _check_count(errors, num_queries)
+    if not 0 < num_queries >= len(errors):
+        raise refuse(
+            "evaluation.num_queries",
+            field="num_queries",
+            expected=f"at least one, and not fewer than the {len(errors)} localized",
+            got=num_queries,
+        )
     return [
         sum(
             position <= threshold.max_position_error_m
@@ -95,19 +101,6 @@ def median_errors_localized(errors: Sequence[tuple[float, float]]) -> tuple[floa
     return float(position), float(orientation)
 
 
-def median_errors_all(
-    errors: Sequence[tuple[float, float]], num_queries: int
-) -> tuple[float, float]:
-    """Return the medians (metres, degrees) over all queries, infinite for those without an error.
-
-    Raises:
-        InvalidInput: as ``recall``.
-    """
-    _check_count(errors, num_queries)
-    failures = [(math.inf, math.inf)] * (num_queries - len(errors))
-    return median_errors_localized([*errors, *failures])
-
-
 def percentile(values: Sequence[float], percent: float) -> float:
     """Return the smallest value that at least ``percent`` % of the values do not exceed.
 
@@ -117,13 +110,3 @@ def percentile(values: Sequence[float], percent: float) -> float:
     if not values:
         return math.nan
     return float(np.percentile(values, percent, method="inverted_cdf"))
-
-
-def _check_count(errors: Sequence[tuple[float, float]], num_queries: int) -> None:
-    if not 0 < num_queries >= len(errors):
-        raise refuse(
-            "evaluation.num_queries",
-            field="num_queries",
-            expected=f"at least one, and not fewer than the {len(errors)} localized",
-            got=num_queries,
-        )

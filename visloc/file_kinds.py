@@ -9,7 +9,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-# As many bytes as ``file_kind`` looks at.
+# ``file_kind`` needs this many bytes of a file.
 HEAD_BYTES = 4096
 
 
@@ -34,7 +34,7 @@ class FileKind:
 
     @property
     def refusal(self) -> str:
-        """What errors and notes say of a kind that is not read."""
+        """The sentence for errors and notes about a kind that is not read."""
         return f"{self.plural} are not read here; {self.advice}"
 
 

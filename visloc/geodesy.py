@@ -70,7 +70,7 @@ def ground_distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 def ground_distances(positions: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """As ``ground_distance``, from each of some positions (n, 3) to one (3,): (n,) metres."""
+    """Return ``ground_distance`` from each of n positions (n, 3) to b (3,): (n,) metres."""
     ground = np.array([1.0, 1.0, 0.0])
     points = ecef_from_geodetic(positions * ground) - ecef_from_geodetic((b * ground)[None])
     half = np.linalg.norm(points, axis=1) / (2 * _MEAN_RADIUS_M)

@@ -76,8 +76,6 @@ def check_fusion_weights(weights: Mapping[str, float], code: str, field: str | N
     """Make sure that weights of global descriptors mean something.
 
     Args:
-        weights: by name.
-        code: of the error.
         field: what the weights are called where they were given; None for what the code says.
 
     Raises:
@@ -118,6 +116,9 @@ class RegistrationPreset:
     min_inlier_ratio: float
 
 
+# Most maps that one query may name.
+MAX_MAPS = 16
+
 DEFAULT_PRESET = "default"
 
 # config1 and config2: table 2 of Humenberger et al. 2020 (abs_pose_max_error,
@@ -152,7 +153,6 @@ def _option(
         high: greatest value.
         unset: whose value is taken when the default is None.
         details: sentences to add.
-        more: for ``dataclasses.field``.
     """
     metadata = {
         "description": description,

@@ -27,12 +27,12 @@ REACH = 2.0
 HEIGHT_REACH = 0.25
 # An area of so many standard deviations around a pose prior is searched.
 POSE_PRIOR_STDS = 3.0
-# Of a set of maps. Its manifest lists them; with so many it has about 12 MB.
+# Most tiles of a set of maps. The manifest lists them, which takes about 12 MB for so many.
 MAX_TILES = 10_000
-# Further than any place, wider than any doubt; squares and products of it are still numbers.
+# Limit on positions and uncertainties. It exceeds any real value, and its squares stay finite.
 _MOST = 1e15
-# Of a covariance without units. That of a pose 5000 km from the origin is within a hair of singular
-# there, where t moves by kilometres with the rotation.
+# Smallest eigenvalue of a covariance scaled to unit variances. Covariances of poses 5000 km from
+# the origin come close to singular, because t moves by kilometres with the rotation.
 _LEAST_EIGENVALUE = 1e-15
 
 

@@ -331,10 +331,10 @@ class InstantAnswer:
 
     @property
     def num_correspondences(self) -> int:
-        """2D-3D correspondences of all images."""
+        """The number of 2D-3D correspondences of all images together."""
         return sum(i.evidence.num_correspondences for i in self.images if i.evidence is not None)
 
     @property
     def num_inliers(self) -> int:
-        """Those that agree with the pose (of the best pose, when it was refused)."""
+        """The number of them that agree with the pose, or with the best one when it was refused."""
         return sum(i.evidence.num_inliers for i in self.images if i.evidence is not None)

@@ -48,7 +48,7 @@ def list_maps(
     ] = None,
     connection: Connection,
 ) -> None:
-    """List the maps, each in the version that is in use."""
+    """List the maps, each in the current version."""
     circle = None if near is None else _near(near)
     with connection.client() as client:
         print_maps(_out, client.maps(circle))
@@ -73,7 +73,7 @@ def push(
 ) -> None:
     """Publish a version of a map, under the names that it was built with.
 
-    The server verifies it byte by byte before anyone can see it. It is not in use until localize
+    The server verifies it byte by byte before anyone can see it. It is not current until localize
     maps use names it. When this command is stopped, nothing is published.
     """
     with (
@@ -99,19 +99,19 @@ def push(
 @maps_app.command()
 @spread
 def use(version: Version, connection: Connection) -> None:
-    """Put a version into use, a newer or an older one, without dropping a request.
+    """Make a version current, a newer or an older one, without dropping a request.
 
     Returns when the service answers with it.
     """
     with connection.client() as client:
         info = client.use_version(*_names(version))
-    print_line(_out, "in use", info.ref, "bold green")
+    print_line(_out, "current", info.ref, "bold green")
 
 
 @maps_app.command()
 @spread
 def remove(version: Version, connection: Connection) -> None:
-    """Delete a version that is not in use, or the last one of a map."""
+    """Delete a version that is not current, or the last one of a map."""
     map_id, name = _names(version)
     with connection.client() as client:
         client.delete_version(map_id, name)

@@ -33,7 +33,7 @@ def print_map(console: Console, info: MapInfo) -> None:
     low, high = info.extent
     sides = " x ".join(f"{b - a:.2f}" for a, b in zip(low, high, strict=True))
     print_line(console, "map", info.ref, "bold green" if info.current else "bold")
-    print_line(console, "in use", "yes" if info.current else "no")
+    print_line(console, "current", "yes" if info.current else "no")
     by = "" if info.method is None else f", by {info.method}"
     print_line(console, "created", f"{info.created}{by}")
     print_line(console, "features", _features(info))
@@ -56,7 +56,7 @@ def print_map(console: Console, info: MapInfo) -> None:
     if len(info.tiles) > _NUM_TILES_SHOWN:
         print_line(console, "", f"and {len(info.tiles) - _NUM_TILES_SHOWN} more")
     for number, version in enumerate(info.versions):
-        used = "  in use" if version.current else ""
+        used = "  current" if version.current else ""
         print_line(console, "" if number else "versions", f"{version.version}{used}")
     print_line(console, "content hash", info.content_hash)
 

@@ -25,7 +25,6 @@ def run_with_progress(
     """Run ``work`` in an event loop, with a progress bar.
 
     Args:
-        console: for the bar.
         work: takes the function that advances the bar by one.
         what: the things that are counted.
         total: their number.

@@ -41,7 +41,6 @@ class Batch:
         features_dir: of the photos' features, when they are not in the dataset.
         pixel_origin: of the dataset's cameras and keypoints.
         map_ref: ``id@version``, so that all results are of one map.
-        options: for every photo.
         mode: how poses are filled.
         arranged: further options of the mode, for the description.
     """

@@ -105,7 +105,6 @@ def make_report(
     Args:
         runs: by mode, in the order of the table; the first one's figures are also at the top.
         poses: of all photos, filled as the mode does.
-        thresholds: of the recall.
         server: that answered.
         map_info: the map that was searched.
     """

@@ -172,12 +172,9 @@ async def ask_each(
     the server refuses is marked and not tried again.
 
     Args:
-        client: of the server.
         variants: the values.
         queries: the photos.
-        readers: by ``MapInfo.ref``.
         repeats: how often each photo is sent with each value.
-        seed: of the order.
         advance: called once for each photo, repetition and value.
 
     Raises:
@@ -215,7 +212,6 @@ def make_comparison(
     Args:
         axis: the axis.
         asked: the results with each value.
-        thresholds: of the recall.
         queries: the photos.
         server: that answered.
         told: further entries: how the comparison was called.

@@ -31,8 +31,6 @@ class FeatureReader:
 
     Attributes:
         kind: the map's name for the local features.
-        keypoints: of the dataset.
-        descriptors: of these keypoints.
         global_features: by the map's names for them.
         origin: where the keypoints' pixel coordinates start counting.
     """

@@ -30,10 +30,8 @@ class StoredResult:
     """One line of ``results.jsonl``.
 
     Attributes:
-        name: of the photo.
         status: localized, not_localized or error; for a filled photo, its status before filling.
         pose: when localized.
-        num_inliers: of the pose.
         filled: the pose from other photos, when the line has one.
         is_final: False for errors of the server: the photo is sent again.
         offset: of the line in the file, bytes.

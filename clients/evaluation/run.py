@@ -82,7 +82,6 @@ class QueryClient:
 
     Attributes:
         map_ref: ``id@version``.
-        options: for every query.
         read: reads what is sent for a photo: its bytes or its features.
     """
 

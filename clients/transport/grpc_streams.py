@@ -31,8 +31,6 @@ async def stream_answers(
     server makes of a sequence that ends there.
 
     Args:
-        make_call: of LocalizeSequence.
-        server: for errors.
         timeout_s: longest time without an answer while the server has an instant to work on.
         start: the first message.
         instants: the first one is taken before anything is sent.

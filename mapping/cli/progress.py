@@ -29,7 +29,6 @@ class StageProgress:
     """A ``mapping.progress.Progress`` that prints.
 
     Args:
-        console: to print to.
         if_stopped: told to the user after Ctrl-C.
     """
 

@@ -28,16 +28,16 @@ MIN_PHOTOS = 3
 _NUM_TRIALS = 200
 # Matches of each photo that judge a proposal, and that refine what was chosen.
 _JUDGING, _REFINING = 32, 256
-# What one photo or two say is a few times as inexact as what all of them say.
+# An alignment from one or two photos is a few times less exact than one from all of them.
 _COARSE = 4.0
 # Poses of mapping photos are not exact either: those of redkitchen shift what a photo sees by 20
 # pixels. What was localized elsewhere is off by hundreds.
 _AGREES = 2.0
 _ROUNDS = 3
-# Of two frames with one unit, how much of another scale photos may tell: what a map may be off.
+# Largest error of the scale between two frames of one unit, which that of a map may have.
 _MAX_OTHER_UNIT = 0.02
-# How much further or nearer depth may put things in the one frame than in the other. What a depth
-# camera is off, and poses of photos, comes to 1 % at most on redkitchen.
+# Depths in the two frames may differ by this share. On redkitchen, errors of the depth camera and
+# of the poses together make 1 % at most.
 MAX_DEPTH_OFF = 0.03
 # After so many the weights of points change no more.
 _POINT_ROUNDS = 50
@@ -297,7 +297,7 @@ class _View:
 
     @property
     def max_error_px(self) -> float:
-        """That of an inlier when it was localized."""
+        """The largest reprojection error of an inlier when the photo was localized."""
         return registration_for(LocalizeOptions(), [self.seen.camera]).max_error_px
 
 
@@ -318,14 +318,14 @@ def _refined_by_depth(views: Sequence[_View], start: Similarity, *, rigid: bool)
 
 
 def _points(view: _View) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What a photo sees, in this frame and in the other, where depth tells."""
+    """Return the points (n, 3) that a photo sees, in this frame and in the other, by depth."""
     own, other = view.seen.own_points, view.seen.points
     assert own is not None
     return (own, other) if view.forward else (other, own)
 
 
 def _proposed(views: Sequence[_View], *, rigid: bool, seed: int) -> Similarity:
-    """What two photos say that most agree with; of equally many, with the smaller errors."""
+    """Return the similarity of two photos that most photos agree with; ties go by errors."""
     random = np.random.default_rng(seed)
     judging = [view.thinned(_JUDGING) for view in views]
     limits = np.array([_COARSE * view.max_error_px for view in judging])

@@ -67,8 +67,6 @@ class Georeference:
     """Where a map lies, and how well what was known agrees with it.
 
     Attributes:
-        anchor: for the manifest.
-        names: of what was compared.
         residuals_m: (n, 3) metres east, north and up, from where each was said to be to where
             the anchor puts it.
         agrees: (n,) which of them the anchor rests on.
@@ -252,7 +250,7 @@ def publish_anchored(opened: Map, found: Georeference, maps_dir: Path, *, force:
 
     Raises:
         Conflict: ``map.anchored`` without ``force``, when it has a place already; ``map.outdated``
-            when another version is in use; ``build.running``.
+            when another version is current; ``build.running``.
     """
     if opened.geodetic is not None and not force:
         raise refuse("map.anchored", field="MAP", ref=opened.ref)

@@ -247,10 +247,11 @@ def _shared_instants(poses: Mapping[str, Mapping[int, Pose]]) -> NDArray[np.int6
 def _links(
     names: Sequence[str], shared: NDArray[np.int64], reference: str
 ) -> dict[str, str | None]:
-    """Which camera each camera is compared with, nearest to the reference first.
+    """Return which camera each camera is compared with, nearest to the reference first.
 
-    The variance of an average over n instants goes with 1 / n, and those of a chain add up: the
-    tree of shortest paths from the reference, where a link has the length 1 / n.
+    The variance of an average over n instants is proportional to 1 / n, and variances add up along
+    a chain. So the links are the tree of shortest paths from the reference, where a link between
+    two cameras with n shared instants has the length 1 / n.
     """
     links: dict[str, str | None] = {}
     queue: list[tuple[float, str, str | None]] = [(0.0, reference, None)]
@@ -303,7 +304,7 @@ def _relative_pose(others: Mapping[int, Pose], cams: Mapping[int, Pose]) -> Rela
 
 def _median_rotation(samples: Rotation) -> Rotation:
     """The rotation whose summed angle to all samples is smallest."""
-    # From the best of the samples: far from a minimum, angles are not convex.
+    # Start at the best of the samples, because far from a minimum the sum of angles is not convex.
     some = np.unique(np.linspace(0, len(samples) - 1, _MAX_CANDIDATES).astype(int))
     sums = [np.linalg.norm(_turns(samples[row], samples), axis=1).sum() for row in some]
     rotation = samples[some[int(np.argmin(sums))]]
@@ -364,7 +365,7 @@ def _spread(deviations: NDArray[np.float64]) -> Spread:
 
 
 def _round_off(poses: Mapping[int, Pose]) -> float:
-    """What is lost in differences between coordinates as large as these."""
+    """Return the rounding error of a difference between coordinates as large as these."""
     return _ROUND_OFF_PART * max(float(np.abs(pose.center).max()) for pose in poses.values())
 
 

@@ -67,7 +67,6 @@ def solve_stored(
         source: the map that keeps the photo.
         image: its row there.
         target: the map that is asked.
-        geometry: of it.
         matched: what ``match_stored`` found.
         options: thresholds and the seed.
     """

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 from visloc.errors import refuse
 
-# What pycolmap raises on files that it cannot read; seen by damaging them.
+# pycolmap raises these on files that it cannot read, as damaging files showed.
 REFUSALS = (ValueError, RuntimeError, IndexError, KeyError, MemoryError, OSError)
 _SQLITE = b"SQLite format 3\0"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DatabaseImage:
-    """What a database holds of one image."""
+    """One image of a database."""
 
     camera: int
     frame: tuple[str, int]
@@ -34,7 +34,7 @@ class DatabaseImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Database:
-    """What is read of a database; descriptors of other kinds than SIFT are left out."""
+    """The content of a database. Descriptors that are not SIFT are left out."""
 
     path: Path
     cameras: Mapping[int, pycolmap.Camera]

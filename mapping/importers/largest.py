@@ -1,4 +1,4 @@
-"""Of several models that do not connect, the largest is imported, and the others are told."""
+"""Chooses the largest of several unconnected models, and notes the others."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class ModelSize:
-    """How large one of several models is.
+    """The size of one of several models.
 
     Attributes:
         name: what the note calls it.

@@ -73,7 +73,6 @@ def with_features(
     """Give the images their features, or else what was observed of them.
 
     Args:
-        path: of the scene.
         stems: of each image, the name of its feature files.
         images: the photos.
         measurements: their observations, in our pixels.

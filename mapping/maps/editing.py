@@ -29,11 +29,11 @@ _NAMED = 3
 
 
 def content_of(opened: Map) -> MapContent:
-    """Return a map as content. Written again, it is byte for byte the same.
+    """Return a map as content that, when written, gives the same bytes.
 
-    Large arrays stay mapped from its files, but for keypoints, which become float32: the files must
-    stay as long as the content is used. What lies beside the arrays
-    (``mapping.stages.publishing.photo_files``, pairs, imported points) is not part of it.
+    Large arrays stay memory-mapped, so the map's files must exist as long as the content is used;
+    keypoints are converted to float32. Files beside the arrays (photos, pairs, imported points) are
+    not part of the content.
     """
     manifest = opened.manifest
     local, scale = manifest.local_features, manifest.local_features.descriptor_scale
@@ -71,7 +71,7 @@ def content_of(opened: Map) -> MapContent:
             GlobalFeatures(
                 record.fingerprint,
                 opened.global_descriptors[record.fingerprint.name][:],
-                # As stored: its scales would not all come back the same.
+                # Taken as stored, because converting would not give back all of its scales exactly.
                 read_npz(opened.path / f"global/{record.fingerprint.file_stem}.model.npz"),
             )
             for record in manifest.global_features

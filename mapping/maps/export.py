@@ -42,8 +42,8 @@ def export_map(opened: Map, output: Path, format_name: str) -> tuple[str, ...]:
     Coordinates are those of the world, with the map's origin added, and names of photos are those
     of the map. Points keep their order, also those that no photo sees. Photos are not in a map.
 
-    A map of an imported reconstruction whose photos were matched anew gives the reconstruction
-    back: its points and who sees them, not the landmarks made since.
+    If a map was made from an imported reconstruction whose photos were matched again, the
+    reconstruction is exported: its points and their observations, not the landmarks made since.
 
     Args:
         opened: the map.
@@ -69,7 +69,7 @@ def export_map(opened: Map, output: Path, format_name: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Model:
-    """What is exported: the map's landmarks, or the reconstruction that it was imported from.
+    """A model to export: the map's landmarks, or the reconstruction that the map was imported from.
 
     Attributes:
         points: (P, 3) float64 in the world.
@@ -219,7 +219,7 @@ def _export_kapture(opened: Map, output: Path) -> tuple[str, ...]:
 
 
 def _timestamps(images: Sequence[ImageRecord]) -> list[int]:
-    """When photos were taken, so that a camera takes one at a time, as kapture has it.
+    """Return a timestamp per photo; as kapture requires, no camera takes two photos at one time.
 
     Captures whose clocks began anew come one after the other: the second photo of a camera and time
     is later by more than all photos span, the third by twice that. Photos of a rig stay together.

@@ -44,10 +44,10 @@ from visloc.sets.coarse import CoarseModel, DescribedTile, coarse_index, describ
 
 # Metric maps of one set have one unit, as far as a fit to positions can tell.
 _MAX_SCALE_DIFFERENCE = 0.02
-# Down as two maps know it, turned into the frame of the set, differs by no more than this.
+# The down directions of two maps, rotated into the set's frame, differ by at most this.
 _MAX_DOWN_DIFFERENCE = math.radians(5.0)
-# By their own anchors, maps lie no further from where the set has them than this. Satellites tell
-# a place among houses to 10 m or so.
+# A map's own anchor and its pose in the set differ by at most this. Among houses, satellites locate
+# a receiver to about 10 m.
 _MAX_PLACE_DIFFERENCE_M, _MAX_PLACE_SHARE = 20.0, 0.05
 _BLOCK_ROWS = 2**20
 
@@ -59,7 +59,6 @@ class _Placed:
     """A map as a tile.
 
     Attributes:
-        record: for the manifest.
         features: its local features.
         metric: whether its own unit is a metre.
         down: (3,) in the set's frame; None where the map does not know it.
@@ -97,7 +96,7 @@ def publish_set(
         model: of a coarse index whose tiles had the same local features; None to learn one.
 
     Returns:
-        The folder of the version; of the one in use when that is the same set already.
+        The folder of the version; of the current one when that is the same set already.
 
     Raises:
         InvalidInput: ``map.is_set`` for a tile that is a set, ``set.tiles`` without any, or for one
@@ -179,7 +178,7 @@ def _publish_changed(store: MapStore, set_id: str, content: SetContent) -> Path:
 
 
 def same_content(a: Path, b: Path) -> bool:
-    """Tell whether two folders hold the same map or set, but for its name and version."""
+    """Tell whether two folders hold the same map or set, apart from name and version."""
     return read_any_manifest(a).content_hash == read_any_manifest(b).content_hash
 
 

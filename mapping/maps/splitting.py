@@ -186,7 +186,7 @@ def _publish_tile(
 ) -> str:
     """Publish a tile unless a version of it is the same already; return ``id@version``.
 
-    A version in use of the same version of the map stays so: it may have been made from the tile
+    A current version of the same version of the map stays so: it may have been made from the tile
     since, as by an update.
     """
     stays = _is_in_use(store, tile_id, source)
@@ -208,7 +208,7 @@ def _publish_tile(
 
 
 def _is_in_use(store: MapStore, tile_id: str, source: str) -> bool:
-    """Whether a version of a tile is in use that was cut from this version of a map."""
+    """Whether a version of a tile is current that was cut from this version of a map."""
     with suppress(NotFound, MapCorrupt):
         return source in read_any_manifest(store.folder(tile_id)).notes
     return False

@@ -54,7 +54,6 @@ class DepthMatch:
     """The depth map of a photo.
 
     Attributes:
-        camera: of the depth map.
         cam_from_depth: from its frame to the frame of the photo's camera.
     """
 

@@ -37,7 +37,7 @@ def publish_edited(
         The folder of the new version.
 
     Raises:
-        Conflict: ``map.outdated`` when ``based_on`` is no longer the version in use.
+        Conflict: ``map.outdated`` when ``based_on`` is no longer the current version.
     """
     if photos and len(photos) != len(content.images):
         raise AssertionError(f"{len(photos)} pictures of {len(content.images)} photos")

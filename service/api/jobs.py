@@ -15,9 +15,10 @@ from service.values import (
     photo_job,
 )
 from visloc.errors import inside, refuse
+from visloc.options import MAX_MAPS
 from visloc.sequences.filling import DEFAULT_MAX_GAP_S, TimeUnit
 from visloc_api.words.features import query_to_core
-from visloc_api.words.photo import MAX_MAPS, LocalizeRequest
+from visloc_api.words.photo import LocalizeRequest
 from visloc_api.words.priors import priors_to_core
 from visloc_api.words.rigs import LocalizeRigRequest, RigCalibration, RigImage
 from visloc_api.words.sequences import Instant, LocalizeSequenceRequest, SequenceStart

@@ -13,11 +13,10 @@ from typing import Any
 
 from service.engine.fetching import Fetcher
 from service.engine.listing import Listing
-from service.engine.stores import Store
 from service.values import MapFolder, Where
 from service.workers.pool import Workers
 from service.workers.tasks import Vision
-from visloc.archive import SetOutline, read_any_outline
+from visloc.archive import MapStore, SetOutline, read_any_outline
 from visloc.archive.set_rules import refuse_if_tile
 from visloc.archive.version_rules import version_in_use
 from visloc.errors import MapCorrupt, NotFound, Unavailable, VislocError, refuse
@@ -87,7 +86,7 @@ class Catalog:
     and warm; until then, and when it cannot be opened, the previous one stays in service.
     """
 
-    def __init__(self, store: Store, workers: Workers) -> None:
+    def __init__(self, store: MapStore, workers: Workers) -> None:
         self._store, self._workers = store, workers
         self.fetcher = Fetcher(store)
         self.listing = Listing(store, self._served_ref)
@@ -172,7 +171,7 @@ class Catalog:
             self._release(ref)
 
     async def activate(self, map_id: str, version: str) -> None:
-        """Put a version into use, once a worker process has it open and warm.
+        """Make a version current once a worker process has it open and warm.
 
         Raises:
             VislocError: as in ``using``; then nothing has changed.
@@ -182,14 +181,14 @@ class Catalog:
         self._serve(map_id, opened)
 
     async def delete(self, map_id: str, version: str, limit_s: float) -> None:
-        """Delete a version that is not in use; wait at most ``limit_s`` for requests that use it.
+        """Delete a version that is not current; wait at most ``limit_s`` for requests that use it.
 
         Raises:
             NotFound: ``map.unknown``, ``map.version``.
             Conflict: ``map.version_in_use``, ``map.in_set``.
         """
         ref = f"{map_id}@{version}"
-        # A version that answers because the current one cannot be opened is in use too.
+        # A version that answers because the current one cannot be opened is current too.
         others = set(await asyncio.to_thread(self._store.versions, map_id)) - {version}
         if others and self._is_served(ref):
             raise version_in_use(map_id, version, sorted(others))

@@ -14,13 +14,13 @@ from service.engine.scenes import Scenes
 from service.engine.sequences import answers_in_maps, in_turn
 from service.engine.set_sequences import SetSequence
 from service.engine.sets import SetSearch, answers_of, parted
-from service.engine.stores import Store
 from service.engine.uploads import Uploads
 from service.errors import stopping_error
 from service.telemetry.metrics import Metrics
 from service.values import InstantJob, Localization, RigJob, SequenceJob, ServedMap, WorkerSettings
 from service.workers.judging import judged
 from service.workers.pool import Workers
+from visloc.archive import MapStore
 from visloc.errors import VislocError, refuse
 from visloc.types import Near
 
@@ -50,8 +50,6 @@ class Engine:
     Used from one event loop.
 
     Args:
-        store: of the maps.
-        settings: of the worker processes.
         workers: number of processes.
         max_queue: photos that may wait; one more is refused with ``server.busy``.
         max_batches: rigs and sequences that are served at once.
@@ -62,7 +60,7 @@ class Engine:
 
     def __init__(
         self,
-        store: Store,
+        store: MapStore,
         settings: WorkerSettings,
         *,
         workers: int = 1,
@@ -273,7 +271,7 @@ class Engine:
         return await asyncio.to_thread(self._catalog.listing.describe, ref)
 
     async def upload(self, map_id: str, version: str, chunks: AsyncIterator[bytes]) -> ServedMap:
-        """Publish a packed map, verified byte by byte, without putting it into use.
+        """Publish a packed map, verified byte by byte, without making it current.
 
         Raises:
             VislocError: errors of ``Uploads.publish``.
@@ -290,12 +288,12 @@ class Engine:
         return await self.map(f"{map_id}@{version}")
 
     async def set_current(self, map_id: str, version: str) -> ServedMap:
-        """Put a version into use, once a worker process has it open and warm.
+        """Make a version current once a worker process has it open and warm.
 
         Raises:
             NotFound: ``map.unknown``, ``map.version``.
             Conflict: ``map.features`` when its features are not installed.
-            VislocError: errors of the store; then the previous version stays in use.
+            VislocError: errors of the store; then the previous version stays current.
         """
         self._check_ready()
         with self._noted("activate"):
@@ -303,7 +301,7 @@ class Engine:
         return await self.map(f"{map_id}@{version}")
 
     async def delete(self, map_id: str, version: str) -> None:
-        """Delete a version that is not in use.
+        """Delete a version that is not current.
 
         Raises:
             NotFound: ``map.unknown``, ``map.version``.

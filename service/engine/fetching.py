@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from service.engine.gather import together
-from service.engine.stores import Store
+from visloc.archive import MapStore
 from visloc.errors import VislocError
 
 # Maps that are fetched at once.
@@ -18,7 +18,7 @@ _MAX_FETCHES = 4
 class Fetcher:
     """Fetches versions of maps, each once for all who wait for it. Used from one event loop."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: MapStore) -> None:
         self._store = store
         # A fetch may take minutes; other work has threads of its own meanwhile.
         self._threads = ThreadPoolExecutor(_MAX_FETCHES, thread_name_prefix="fetch")

@@ -6,18 +6,16 @@ import logging
 from collections.abc import Callable
 from contextlib import suppress
 
-from service.engine.stores import Store
 from service.values import ServedMap
-from visloc.archive import MapOutline, SetOutline
+from visloc.archive import MapOutline, MapStore, SetOutline
 from visloc.errors import MapCorrupt, NotFound, VislocError, refuse
+from visloc.options import MAX_MAPS
 from visloc.priors import MAX_TILES
 from visloc.sets.choosing import tiles_near
 from visloc.types import Near
 
 logger = logging.getLogger(__name__)
 
-# Most maps that one request may search.
-MAX_MAPS = 16
 # Descriptions that stay in memory, about 20 kB each; their arrays stay on disk. All tiles of a set
 # are listed repeatedly.
 _MAX_DESCRIBED = MAX_TILES + 1000
@@ -33,7 +31,7 @@ class Listing:
         served_ref: returns ``id@version`` of what is served of a map; None for nothing.
     """
 
-    def __init__(self, store: Store, served_ref: Callable[[str], str | None]) -> None:
+    def __init__(self, store: MapStore, served_ref: Callable[[str], str | None]) -> None:
         self._store, self._served_ref = store, served_ref
         self._described: dict[str, MapOutline | SetOutline] = {}  # by id@version
         self._set_ids = set[str]()  # of the maps that were described as sets

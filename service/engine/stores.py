@@ -3,77 +3,14 @@
 from __future__ import annotations
 
 import logging
-from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Protocol
 
-from visloc.archive import MapOutline, MapStore, SetOutline
+from visloc.archive import MapStore
 
 logger = logging.getLogger(__name__)
 
 
-class Store(Protocol):
-    """A store of maps. All methods block, and are safe in several threads.
-
-    ``visloc.archive.MapStore`` documents the errors. A remote store also raises Unavailable
-    ``maps.storage_away``.
-    """
-
-    @property
-    def reachable(self) -> bool:
-        """Whether the store answered the last request."""
-        ...
-
-    def ids(self) -> list[str]:
-        """Ids of the maps that have a current version, sorted."""
-        ...
-
-    def versions(self, map_id: str) -> list[str]:
-        """Published versions of a map, oldest first."""
-        ...
-
-    def current_version(self, map_id: str) -> str: ...
-
-    def outline(self, ref: str) -> MapOutline | SetOutline:
-        """The description of ``id`` or ``id@version``; quick, also in a remote store."""
-        ...
-
-    def at_hand(self, ref: str) -> Path | None:
-        """The folder of ``id@version``; None when it must be fetched first."""
-        ...
-
-    def folder(self, ref: str) -> Path:
-        """The local folder ``.../<id>/<version>`` of ``id`` or ``id@version``.
-
-        A remote store fetches it first, which can take minutes.
-        """
-        ...
-
-    def publish(
-        self, incoming: Path, map_id: str, version: str, *, make_current: bool = True
-    ) -> Path:
-        """Verify every byte of a map, move it into the store, and return its local folder.
-
-        ``incoming`` is a folder within the one that ``incoming()`` gave.
-        """
-        ...
-
-    def set_current(self, map_id: str, version: str) -> None: ...
-
-    def remove(self, map_id: str, version: str) -> None:
-        """Remove a version; with the last one, the map."""
-        ...
-
-    def incoming(self) -> AbstractContextManager[Path]:
-        """Give an empty folder to receive a map in; it is deleted in the end."""
-        ...
-
-    def sweep(self) -> None:
-        """Delete what uploads of killed processes left behind; for the start."""
-        ...
-
-
-def open_store(maps_dir: str, cache_dir: Path, max_cache_bytes: int) -> Store:
+def open_store(maps_dir: str, cache_dir: Path, max_cache_bytes: int) -> MapStore:
     """Return the store in a folder or at a URL; the cache is for a URL.
 
     Raises:

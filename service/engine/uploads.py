@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
-from service.engine.stores import Store
+from visloc.archive import MapStore
 from visloc.archive.packed import unpack_map
 from visloc.archive.version_rules import checked_name
 from visloc.errors import InvalidInput, MapCorrupt, refuse
@@ -27,14 +27,14 @@ T = TypeVar("T")
 class Uploads:
     """Publishes uploaded maps of at most ``max_bytes``. Used from one event loop."""
 
-    def __init__(self, store: Store, max_bytes: int) -> None:
+    def __init__(self, store: MapStore, max_bytes: int) -> None:
         self._store, self._max_bytes = store, max_bytes
         # Verifying gigabytes takes minutes; other work has threads of its own meanwhile.
         self._threads = ThreadPoolExecutor(MAX_UPLOADS, thread_name_prefix="upload")
         self._running: set[str] = set()
 
     async def publish(self, map_id: str, version: str, chunks: AsyncIterator[bytes]) -> None:
-        """Publish a packed map, verified byte by byte, without putting it into use.
+        """Publish a packed map, verified byte by byte, without making it current.
 
         Nothing is read of a map that cannot be published. In the end, even if cancelled, temporary
         files are deleted, and the version is published whole or not at all.

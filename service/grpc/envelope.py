@@ -53,8 +53,6 @@ class Envelope:
 
         Args:
             method: its name.
-            id_: of the request.
-            context: of the call.
             streams: whether the block writes answers to the context.
         """
         caller = dict(context.invocation_metadata() or ()).get("traceparent")

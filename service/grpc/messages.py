@@ -86,7 +86,6 @@ def instant_of(
 
     Args:
         message: any but the first of the stream.
-        limits: on its images.
         number: how many came before, for errors.
         has_rig: whether the start named a rig.
 

@@ -133,7 +133,6 @@ class Acceptor:
 
     Args:
         listener: the listening socket.
-        connections: of this port.
         make: makes the protocol of a new connection.
         context: of TLS; None for plain HTTP.
         handshake_s: the longest TLS handshake.

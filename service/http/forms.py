@@ -34,8 +34,6 @@ def parse_form(content_type: str, body: bytes, limits: FormLimits, expected: str
 
     Args:
         content_type: the header, with the boundary.
-        body: of the request.
-        limits: on the parts.
         expected: which parts the form should have, for errors.
 
     Raises:

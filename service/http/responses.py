@@ -89,7 +89,6 @@ class Lines(Response):
         first: computed before, so that an error up to here is an ordinary problem.
         others: the answers after it; closed at the end.
         message: converts an answer to the words of the API.
-        id_: of the request.
         patience_s: the longest that the client may take for a line.
     """
 

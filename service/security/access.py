@@ -17,8 +17,8 @@ from service.telemetry.logs import note_key
 from visloc.errors import InvalidInput, refuse
 from visloc_api.v1 import localization_pb2 as pb2
 
-# What a request needs: a key with these scopes, or no key at all. Unknown paths and methods need
-# ANY_KEY, so that only callers with a key learn what exists.
+# The scopes that the key of a request must have; None when it needs no key. Unknown paths and
+# methods need ANY_KEY, so that only callers with a key learn what exists.
 Needed = frozenset[Scope] | None
 NOTHING: Needed = None
 ANY_KEY: Needed = frozenset()
@@ -47,7 +47,6 @@ def needed_over_http(method: str, path: str, *, page: bool = False) -> Needed:
     """Return what an HTTP request needs.
 
     Args:
-        method: of the request.
         path: with %-escapes decoded.
         page: whether the server has the page, whose files need no key.
     """
@@ -161,7 +160,6 @@ class Access:
 
         Args:
             tokens: the keys that were sent.
-            needed: by the request.
 
         Raises:
             Unauthenticated: ``access.key_missing``, ``access.key_unknown``.

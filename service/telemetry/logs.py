@@ -43,7 +43,6 @@ class RequestRecord:
         localized: how many of these were localized.
         code: of the error that was answered.
         failed: whether that error was the server's fault.
-        stages: of the work for a photo.
     """
 
     door: str

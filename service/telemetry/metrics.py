@@ -172,7 +172,6 @@ class Metrics:
             map_id: the map that gave it; it exists.
             reason: why there is no pose, a ``visloc.types.Reason``; None when there is one.
             inliers: of the best pose, accepted or not.
-            seconds: by stage.
         """
         if map_id not in self._maps:
             if len(self._maps) < MAX_MAPS:

@@ -27,7 +27,6 @@ def judged(found: Sequence[Localization], priors: Priors = NO_PRIORS) -> tuple[i
     Args:
         found: at least one, of maps, of sets, or of the tiles of one set. When one map gave several
             poses, by itself and as a tile, the first counts.
-        priors: of the query.
 
     Returns:
         The row and the answer. A refusal carries the evidence of the place with the most inliers.

@@ -61,7 +61,6 @@ class Workers:
 
     Args:
         count: processes.
-        settings: of each process.
         limit_s: longest time that one task may take; a process that exceeds it is replaced.
         warm: the maps that may be open; a new process opens those that its predecessor had open.
         on_death: called for every process that died.

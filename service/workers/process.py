@@ -24,7 +24,6 @@ def start(settings: WorkerSettings, abandoned: ctypes.c_bool) -> None:
     """Initialize the process.
 
     Args:
-        settings: for ``Vision``.
         abandoned: shared with the main process, which sets it when nobody waits for the task.
     """
     global _vision

@@ -62,7 +62,6 @@ class Vision:
     what they return.
 
     Args:
-        settings: of the process.
         abandoned: set when nobody waits for the task any more.
     """
 

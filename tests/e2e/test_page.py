@@ -25,6 +25,7 @@ from mapping.cli.report import write_report
 from visloc.archive import MapStore
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
+from visloc.options import Solver
 
 ROOT = Path(__file__).resolve().parents[2]
 BUILT = ROOT / "visloc_web" / "built"
@@ -229,6 +230,11 @@ def test_the_view_flies_behind_the_photo(photos: dict[str, Any], queries: list[Q
         ahead = truth.rotation[2]  # of the photo's camera, in the world
         assert np.linalg.norm(position - truth.center) < 2
         assert ahead @ (target - position) > 0.9 * np.linalg.norm(target - position)
+
+
+def test_the_options_are_those_of_the_service(photos: dict[str, Any]) -> None:
+    assert photos["solvers"] == ["(pycolmap)", *Solver]
+    assert '"solver":"poselib"' in photos["copied"]["curl"]
 
 
 def test_the_copied_lines_ask_the_same(

@@ -550,7 +550,7 @@ def test_the_commands_publish_switch_and_remove(
     assert f"{map_id}@v1" in localize("use", f"{map_id}@v1")
     assert map_id in localize("list")
     shown = localize("show", map_id)
-    assert "v1  in use" in shown
+    assert "v1  current" in shown
     assert "8 photos" in shown
     assert f"{map_id}@v1" in localize("remove", f"{map_id}@v1")
     assert map_id not in localize("list")

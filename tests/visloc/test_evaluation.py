@@ -9,7 +9,6 @@ from visloc.errors import InvalidInput
 from visloc.evaluation import (
     DEFAULT_THRESHOLDS,
     Threshold,
-    median_errors_all,
     median_errors_localized,
     percentile,
     pose_error,
@@ -61,10 +60,9 @@ def test_an_error_that_is_not_a_number_is_a_failure() -> None:
 def test_a_wrong_number_of_queries_is_refused(
     errors: list[tuple[float, float]], num_queries: int
 ) -> None:
-    for function in (recall, median_errors_all):
-        with pytest.raises(InvalidInput) as caught:
-            function(errors, num_queries)
-        assert caught.value.code == "evaluation.num_queries"
+    with pytest.raises(InvalidInput) as caught:
+        recall(errors, num_queries)
+    assert caught.value.code == "evaluation.num_queries"
 
 
 @pytest.mark.parametrize("bounds", [(-0.1, 1.0), (1.0, -1.0), (math.nan, 1.0), (1.0, math.nan)])
@@ -74,13 +72,9 @@ def test_a_threshold_that_cannot_be_is_refused(bounds: tuple[float, float]) -> N
     assert caught.value.code == "evaluation.threshold"
 
 
-def test_medians_say_whose_they_are() -> None:
+def test_medians_are_those_of_the_localized() -> None:
     errors = [(0.1, 3.0), (0.3, 1.0), (0.2, 2.0)]
     assert median_errors_localized(errors) == (0.2, 2.0)
-    assert median_errors_all(errors, 3) == (0.2, 2.0)
-    assert median_errors_all(errors, 5) == (0.3, 3.0)
-    assert median_errors_all(errors, 6) == (math.inf, math.inf)
-    assert median_errors_all([], 1) == (math.inf, math.inf)
     assert all(math.isnan(value) for value in median_errors_localized([]))
 
 

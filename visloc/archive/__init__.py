@@ -5,7 +5,7 @@ from __future__ import annotations
 from visloc.archive.anchoring import write_anchored
 from visloc.archive.checks import sha256_of
 from visloc.archive.places import GeoCircle, circle_of, down_of
-from visloc.archive.reader import Map, MapOutline, open_map, read_outline, verify_map
+from visloc.archive.reader import Map, MapOutline, open_map, verify_map
 from visloc.archive.schema import (
     Anchor,
     FingerprintRecord,
@@ -58,7 +58,6 @@ __all__ = [
     "open_set",
     "pose_row",
     "read_any_outline",
-    "read_outline",
     "read_set_outline",
     "sha256_of",
     "verify_any",

@@ -32,8 +32,8 @@ from visloc.errors import VislocError, refuse
 
 MAX_ENTRIES = 100_000
 _MAX_DIRECTORY_BYTES = 16 * 2**20
-# Of a map's manifest, which lists the files and tells how the map was made. That of a set, which
-# lists its tiles too, may be as large as any.
+# Limits on the manifest of a map, which lists the files and how the map was made. The manifest of a
+# set also lists its tiles and may be as large as any manifest.
 _MAX_MAP_MANIFEST_BYTES, _MAX_MANIFEST_BYTES_PER_FILE = 2**20, 512
 _BLOCK_BYTES = 2**20
 _EARLIEST = (1980, 1, 1, 0, 0, 0)

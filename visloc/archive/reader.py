@@ -154,15 +154,6 @@ class Map(MapOutline):
         return (self.path / name).read_bytes() if name in self.manifest.files else None
 
 
-def read_outline(folder: Path) -> MapOutline:
-    """Read the small files of a map; its arrays need not be there.
-
-    Raises:
-        MapCorrupt: with the file that is wrong.
-    """
-    return outline_of(folder, read_manifest(folder))
-
-
 def outline_of(folder: Path, manifest: Manifest) -> MapOutline:
     """Read the cameras of a map whose manifest was read; raises ``map.cameras``."""
     cameras = read_record(folder, "cameras.json", CamerasFile)

@@ -69,12 +69,12 @@ def refuse_other_features(ref: str, found: FingerprintRecord, expected: Fingerpr
 
 
 def refuse_if_tile(map_id: str, version: str, current: Iterable[tuple[str, AnyManifest]]) -> None:
-    """Refuse to remove a version that a set in use names.
+    """Refuse to remove a version that a current set names.
 
     Args:
         map_id: the map.
         version: the version that is to be removed.
-        current: references and manifests of the versions in use.
+        current: references and manifests of the current versions.
 
     Raises:
         Conflict: ``map.in_set``.
@@ -92,10 +92,10 @@ def refuse_if_tile(map_id: str, version: str, current: Iterable[tuple[str, AnyMa
 
 
 def unreadable_set(ref: str, error: MapCorrupt) -> VislocError:
-    """``map.in_set``, because a set in use cannot be read."""
+    """``map.in_set``, because a current set cannot be read."""
     return refuse(
         "map.in_set",
-        f"{ref} is a set in use that cannot be read, so its tiles are unknown; first "
+        f"{ref} is a current set that cannot be read, so its tiles are unknown; first "
         "publish it again or remove it",
         field="map",
         expected="sets that can be read",

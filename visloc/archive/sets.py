@@ -71,7 +71,6 @@ class CoarseIndex:
     """A code of a few bytes for every photo, and a few rows for every tile.
 
     Attributes:
-        fingerprint: of the global descriptor.
         model: its arrays, and ``planes`` (D, bits): bit b of a photo's code says on which side of
             plane b its descriptor lies.
         codes: (N, bits / 64) uint64, the codes of all photos, tile by tile.

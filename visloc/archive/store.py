@@ -61,7 +61,7 @@ class MapStore:
         return self.backend.versions(checked_name(map_id, "map"))
 
     def current_version(self, map_id: str) -> str:
-        """The version in use.
+        """The current version.
 
         Raises:
             NotFound: ``map.unknown``, ``map.none_in_use``.
@@ -116,16 +116,16 @@ class MapStore:
 
         Every byte is verified first. A reader sees the old map or the new one, never a mixture. If
         the process is killed before ``current`` is switched, the new version exists but the
-        previous one stays in use.
+        previous one stays current.
 
         Args:
             incoming: the map, within a folder that ``incoming()`` gave.
             map_id: the map's id.
             version: the version's name.
-            make_current: whether it takes over from the version in use. A map without a current
+            make_current: whether it takes over from the current version. A map without a current
                 version is not among ``ids``.
-            based_on: the version that it was made from, if any. It must still be the one in use;
-                otherwise the changes that came into use meanwhile would be lost.
+            based_on: the version that it was made from, if any. It must still be the current one;
+                otherwise the changes that became current meanwhile would be lost.
 
         Returns:
             The local folder of the published version.
@@ -155,7 +155,7 @@ class MapStore:
             )
 
     def set_current(self, map_id: str, version: str) -> None:
-        """Make a published version the one in use, atomically.
+        """Make a published version current, atomically.
 
         Raises:
             NotFound: ``map.unknown`` or ``map.version``; ``set.tile``, and
@@ -175,7 +175,7 @@ class MapStore:
         Raises:
             NotFound: ``map.unknown`` or ``map.version``.
             Conflict: ``map.version_in_use`` for the current version of a map that has others;
-                ``map.in_set`` for a version that a set in use names.
+                ``map.in_set`` for a version that a current set names.
             MapCorrupt: ``map.current`` when nothing says which of several versions is current.
         """
         with self.backend.changing():
@@ -261,7 +261,7 @@ class MapStore:
         return has_poses and not self.backend.has_file(map_id, version, SET_CODES)
 
     def _sets_in_use(self, leaving: tuple[str, str]) -> Iterator[tuple[str, AnyManifest]]:
-        """The sets in use except ``leaving``; every version of an id whose ``current`` is damaged.
+        """The current sets except ``leaving``; every version of an id whose ``current`` is damaged.
 
         Maps may be among them.
 

@@ -92,7 +92,6 @@ class _Shown:
     """A photo of the map on the canvas, with its keypoints.
 
     Attributes:
-        color: of its lines.
         left: where its caption begins.
         panel: in pixels of its camera.
         preview: (H, W, 3) RGB; None if the map keeps no photos.

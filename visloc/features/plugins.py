@@ -19,9 +19,9 @@ from visloc.types import Fingerprint
 
 LOCAL_FEATURES_GROUP = "visloc.local_features"
 GLOBAL_FEATURES_GROUP = "visloc.global_features"
-# What a map can name, in its manifest and in file names.
+# Names that can stand in a manifest and in file names of a map.
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]{0,63}")
-# What a plug-in must have; ``vars`` of a protocol holds what the protocol lists.
+# The members that a plug-in must have: those that its protocol lists, which ``vars`` returns.
 _MEMBERS = {
     group: sorted(name for name in vars(protocol) if not name.startswith("_"))
     for group, protocol in (

@@ -49,7 +49,7 @@ def mutual_nearest_neighbours(
     """Pair the rows of a (n, D) and b (m, D) that are each other's most similar.
 
     Args:
-        a: unit rows but for the rounding.
+        a: unit rows except for rounding.
         b: as a.
         max_ratio: pairs are left out unless their distance is below this part of the distance of
             the row of a to the second nearest row of b (Lowe 2004, section 7.1); None keeps all.
@@ -108,7 +108,7 @@ def match_landmarks(
         query: (n, D) descriptors of the query.
         photos: of each mapping photo, most similar first, the landmarks (m,) that it observes
             and their descriptors (m, D).
-        max_ratio: of each photo's nearest neighbours, as of ``mutual_nearest_neighbours``.
+        max_ratio: for each photo's nearest neighbours, see ``mutual_nearest_neighbours``.
         rematch: a better and slower way to match the query with a photo, given its position in
             ``photos``: keypoints, landmarks and similarities. What it says of the photos with the
             most pairs replaces those.

@@ -29,7 +29,7 @@ class EightBitRows:
 
     Attributes:
         rows: (n, D) int8.
-        scale: what a step of them is; ``rows * scale`` are unit rows but for the rounding.
+        scale: of one step; ``rows * scale`` are unit rows except for rounding.
     """
 
     rows: NDArray[np.int8]
@@ -169,6 +169,6 @@ def _start_single_threads(count: int) -> ThreadPoolExecutor:
         started.abort()
         raise
     finally:
-        # What a thread sets for itself is also what new threads begin with.
+        # A count that one thread sets for itself is also the count of threads started later.
         torch.set_num_threads(count)
     return pool

@@ -99,7 +99,7 @@ def agreeing_pieces(
     for (a, b), comparison in zip(itertools.pairwise(anchors), comparisons, strict=True):
         if comparison.chi2(common) > _CHI2_99:
             factors[a:b] = _factor([comparison], 1.0)
-    # What is wrong between measured poses may be wrong beyond them.
+    # Odometry that is wrong between measured poses may be as wrong before and after them.
     worst = factors.max(initial=1.0)
     factors[: anchors[0]] = factors[anchors[-1] :] = worst
     scaled = [link.scaled(factor) for link, factor in zip(links, factors, strict=True)]
@@ -142,7 +142,7 @@ def _compare(
 
 
 def _factor(comparisons: Sequence[_Comparison], expected: float) -> float:
-    """By how much the motion's covariance is too small for a median chi-square as expected."""
+    """Return the factor on the motion's covariance that makes the median chi-square expected."""
     factor = 1.0
     while comparisons and factor < _MAX_FACTOR:
         if np.median([comparison.chi2(factor) for comparison in comparisons]) <= expected:

@@ -27,16 +27,16 @@ from visloc.geometry import (
 )
 from visloc.types import PoseSource
 
-# Unix times of 2001-01-01 and of 2100-01-01, seconds: which timestamps can be told by their size.
+# Unix times of 2001-01-01 and 2100-01-01 in seconds. Between them the unit follows from the size.
 _FIRST_UNIX_S, _LAST_UNIX_S = 978_307_200, 4_102_444_800
 
-# What a rig's calibration may be wrong by, as standard deviations about and along each axis.
+# Errors of a rig's calibration, as standard deviations about and along each axis.
 _RIG_ORIENTATION_STD = math.radians(0.2)
 _RIG_POSITION_STD_M = 0.005
 _RIG_POSITION_STD_PER_M = 0.01  # of the distance between the two cameras
 
-# What a device does unseen, as standard deviations about and along each axis. A car through a bend
-# in town (KITTI) accelerates by 2.2 m/s^2 and 0.2 rad/s^2 per axis (root mean square), mostly
+# Unobserved motion of a device, as standard deviations about and along each axis. A car through a
+# bend in town (KITTI) accelerates by 2.2 m/s^2 and 0.2 rad/s^2 per axis (root mean square), mostly
 # towards the inside of the bend; a hand-held camera (7-Scenes) by 0.2 m/s^2 and 0.3 rad/s^2; a
 # walking person's head by about 3 m/s^2 with each step, but only by centimetres.
 _ACCELERATION = 2.0  # m/s^2
@@ -55,7 +55,7 @@ MAX_GAP_S = 60.0
 
 
 class TimeUnit(StrEnum):
-    """What one step of a timestamp is."""
+    """The unit of a timestamp."""
 
     S = "s"
     MS = "ms"
@@ -64,13 +64,13 @@ class TimeUnit(StrEnum):
 
     @property
     def seconds(self) -> float:
-        """How long it is."""
+        """The length of the unit in seconds."""
         return {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[self.value]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Odometry:
-    """Where a tracker has the rig, in a world of its own.
+    """The pose of a rig according to a tracker, in the tracker's own world.
 
     Attributes:
         rig_from_odometry: the pose, metres.

@@ -78,10 +78,8 @@ class SequenceSolver:
     """Takes instants one by one and returns answers in order, each when it is final.
 
     Args:
-        geometry: of the map.
         metric: whether one unit of the map's world is a metre.
         options: those that the images are matched with.
-        time_unit: of the timestamps.
         max_gap_s: longest time between measured instants across which gaps are filled; 0: none.
 
     Raises:

@@ -73,8 +73,8 @@ class LocalizationServicer:
         raise NotImplementedError('Method not implemented!')
 
     def LocalizeRig(self, request, context):
-        """Estimates one pose from the photos that the cameras of a rig took at one instant. Its message
-        is read, however large, before it is known whether there is a place for it.
+        """Estimates one pose from the photos that the cameras of a rig took at one instant. The server
+        reads the whole message, however large, before it decides whether it has room for the request.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -84,14 +84,19 @@ class LocalizationServicer:
         """Takes the instants of a sequence one by one and answers each as soon as its answer is final, in
         order. The first message is a start, all others are instants.
 
-        Without odometry, an instant that its photos localize is answered at once, together with those
-        that waited for it. With odometry it waits until instants max_gap_s later, or 30 more, have
-        come, also when its own photos localize it, because its neighbours may contradict it. One that
-        is not localized waits as long for an instant that is; with several maps, all wait for the
-        first that one map alone explains. So a client that waits for each answer before it sends the next instant must
-        send max_gap_s 0, and one map.
+        Without odometry, an instant that its own photos localize is answered at once, together with
+        the earlier ones that waited for it. An instant that they do not localize waits for the next
+        one that is localized, until max_gap_s have passed or 30 more instants have come.
 
-        When an instant is refused, those before it are answered first; then the status comes.
+        With odometry every instant waits that long, also when its own photos localize it, because its
+        neighbours may contradict it.
+
+        With several maps, all instants wait for the first one that only one of the maps explains.
+
+        So a client that waits for each answer before it sends the next instant must send max_gap_s 0
+        and one map.
+
+        When an instant is refused, the instants before it are answered first; then the status comes.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -285,7 +290,8 @@ class Localization:
 
 
 class MapsStub:
-    """Maps as versioned data. Needs the scope manage where keys are needed; GetVersion the scope read.
+    """Maps as versioned data. If the server requires API keys, GetVersion needs one with the scope read,
+    the other methods one with the scope manage.
     """
 
     def __init__(self, channel):
@@ -317,11 +323,12 @@ class MapsStub:
 
 
 class MapsServicer:
-    """Maps as versioned data. Needs the scope manage where keys are needed; GetVersion the scope read.
+    """Maps as versioned data. If the server requires API keys, GetVersion needs one with the scope read,
+    the other methods one with the scope manage.
     """
 
     def GetVersion(self, request, context):
-        """Describes one version, published but not necessarily in use.
+        """Describes one version, published but not necessarily current.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -329,22 +336,22 @@ class MapsServicer:
 
     def PutVersion(self, request_iterator, context):
         """Publishes a version from its packed file (mapping pack). It is verified byte by byte before
-        anyone can see it, and is not in use until SetCurrent names it.
+        anyone can see it, and is not current until SetCurrent names it.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def DeleteVersion(self, request, context):
-        """Deletes a version that is not in use.
+        """Deletes a version that is not current.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def SetCurrent(self, request, context):
-        """Puts a version into use, a newer or an older one, once the server has it open and warm.
-        Requests that are under way are answered by the version that they began with.
+        """Makes a version current, newer or older, once the server has it open and warm.
+        Requests that have begun are answered by the version that they began with.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -382,7 +389,8 @@ def add_MapsServicer_to_server(servicer, server):
 
  # This class is part of an EXPERIMENTAL API.
 class Maps:
-    """Maps as versioned data. Needs the scope manage where keys are needed; GetVersion the scope read.
+    """Maps as versioned data. If the server requires API keys, GetVersion needs one with the scope read,
+    the other methods one with the scope manage.
     """
 
     @staticmethod

@@ -29,7 +29,7 @@ from visloc_api.words.geopose import GeoPose, GeoPoseYpr
 
 # A sequence has thousands of images, and each may have been matched against a thousand photos.
 MAX_RETRIEVED = 20
-# Of every stated uncertainty.
+# Appended to the description of every stated uncertainty.
 _NOT_COVERED = (
     "; computed from the scatter of the matches only, so errors that landmarks "
     "share are missing (depth, calibration, poses of mapping photos): on one "
@@ -38,6 +38,17 @@ _NOT_COVERED = (
 _COVARIANCE = (
     "6 x 6, row by row: rotation (rad), then translation, for R <- Exp(w) R and t <- t + dt of "
 )
+_ABOUT = "standard deviations about the {}'s x, y and z axes, degrees"
+
+
+def _stated(description: str) -> Any:
+    """Describe a field with an uncertainty, and what it leaves out."""
+    return Field(description=description + _NOT_COVERED)
+
+
+_PositionStd = Annotated[
+    Numbers3, _stated("standard deviations of the position along the world's axes")
+]
 
 
 class _ReceivedPose(Pose):
@@ -102,22 +113,9 @@ class PoseEstimate(_PoseWithDigits):
         Field(description="camera centre in the world, metres when the map is metric"),
     ]
     orientation: Annotated[Numbers4, Field(description="rotation of world_from_cam as w, x, y, z")]
-    covariance: Annotated[
-        Covariance, Field(description=f"{_COVARIANCE}cam_from_world{_NOT_COVERED}")
-    ]
-    position_std: Annotated[
-        Numbers3,
-        Field(
-            description=f"standard deviations of the position along the world's axes{_NOT_COVERED}"
-        ),
-    ]
-    orientation_std_deg: Annotated[
-        Numbers3,
-        Field(
-            description="standard deviations about the camera's x, y and z axes, degrees"
-            + _NOT_COVERED
-        ),
-    ]
+    covariance: Annotated[Covariance, _stated(f"{_COVARIANCE}cam_from_world")]
+    position_std: _PositionStd
+    orientation_std_deg: Annotated[Numbers3, _stated(_ABOUT.format("camera"))]
 
 
 class RigPose(_PoseWithDigits):
@@ -131,22 +129,9 @@ class RigPose(_PoseWithDigits):
         Field(description="the rig's origin in the world, metres when the map is metric"),
     ]
     orientation: Annotated[Numbers4, Field(description="rotation of world_from_rig as w, x, y, z")]
-    covariance: Annotated[
-        Covariance, Field(description=f"{_COVARIANCE}rig_from_world{_NOT_COVERED}")
-    ]
-    position_std: Annotated[
-        Numbers3,
-        Field(
-            description=f"standard deviations of the position along the world's axes{_NOT_COVERED}"
-        ),
-    ]
-    orientation_std_deg: Annotated[
-        Numbers3,
-        Field(
-            description="standard deviations about the rig's x, y and z axes, degrees"
-            + _NOT_COVERED
-        ),
-    ]
+    covariance: Annotated[Covariance, _stated(f"{_COVARIANCE}rig_from_world")]
+    position_std: _PositionStd
+    orientation_std_deg: Annotated[Numbers3, _stated(_ABOUT.format("rig"))]
 
 
 class Refusal(Answer):
@@ -199,7 +184,7 @@ class CameraUsed(Answer):
 
     @property
     def camera(self) -> Camera:
-        """As a camera of the core."""
+        """The intrinsics as a ``Camera``."""
         return Camera(self.model, self.width, self.height, self.params)
 
 

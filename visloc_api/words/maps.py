@@ -153,7 +153,7 @@ class Tile(Answer):
 
     @property
     def translation(self) -> Numbers:
-        """In the set's world."""
+        """Translation of ``x_set = scale R x + translation``, in the unit of the set's world."""
         return self.set_from_tile.sent.translation
 
     @property
@@ -166,11 +166,11 @@ class VersionInfo(Answer):
     """A published version of a map."""
 
     version: str
-    current: Annotated[bool, Field(description="whether it is in use")]
+    current: Annotated[bool, Field(description="whether this version is the current one")]
 
 
 class UseVersionRequest(IncomingMessage):
-    """Which version of a map to put into use."""
+    """Which version of a map to make current."""
 
     version: Annotated[str, Field(description="one of the published versions")]
 
@@ -212,7 +212,7 @@ class MapInfo(Answer):
     place: Annotated[GeoCircle | None, Field(description="null when not anchored to the Earth")] = (
         None
     )
-    current: Annotated[bool, Field(description="whether this version is in use")]
+    current: Annotated[bool, Field(description="whether this version is the current one")]
     versions: Annotated[
         tuple[VersionInfo, ...],
         Field(description="all published versions of the map, oldest first"),

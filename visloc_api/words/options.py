@@ -83,8 +83,21 @@ def describe(name: str) -> str:
     return f"{text}. {facts['details']}" if facts["details"] else text
 
 
+def _schema(name: str) -> dict[str, Any]:
+    """Return what the JSON schema of an option says beside its type and its description."""
+    option = visloc.options.LocalizeOptions.__dataclass_fields__[name]
+    facts: dict[str, Any] = {"title": option.metadata["description"]}
+    if name in CHOICES:
+        facts["enum"] = [*CHOICES[name], None]
+    elif option.metadata["range"] is not None:
+        facts["minimum"], facts["maximum"] = option.metadata["range"]
+    if option.default is not None:
+        facts["default"] = option.default
+    return facts
+
+
 def _option(name: str) -> Any:
-    return Field(description=describe(name))
+    return Field(description=describe(name), json_schema_extra=_schema(name))
 
 
 class LocalizeOptions(IncomingMessage):

@@ -8,6 +8,7 @@ from typing import Annotated
 from pydantic import FailFast, Field
 
 from visloc.errors import refuse
+from visloc.options import MAX_MAPS
 from visloc_api.words.features import GivenFeatures, GivenImage
 from visloc_api.words.geometry import GivenCamera
 from visloc_api.words.message import IncomingMessage, converted
@@ -15,7 +16,6 @@ from visloc_api.words.near import GivenNear
 from visloc_api.words.options import GivenOptions, LocalizeOptions
 from visloc_api.words.priors import GivenPriors
 
-MAX_MAPS = 16
 PhotoField = Annotated[
     GivenImage, Field(description="the encoded photo: JPEG, PNG, WebP, TIFF or BMP")
 ]

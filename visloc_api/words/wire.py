@@ -16,9 +16,9 @@ TIMEOUT_HEADER = "X-Request-Timeout"
 NDJSON = "application/x-ndjson"
 # The server's version goes with every answer over gRPC, as a header.
 VERSION_KEY = "visloc-version"
-# Of the ErrorInfo that an error over gRPC carries.
+# The domain of the ErrorInfo that an error over gRPC carries.
 ERROR_DOMAIN = "visloc"
-# What an array may be made of, little-endian where it has more than one byte.
+# Types of arrays; little-endian, where they have more than one byte.
 ARRAY_DTYPES: Mapping[str, np.dtype[Any]] = {
     "float32": np.dtype("<f4"),
     "float16": np.dtype("<f2"),

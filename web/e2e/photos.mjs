@@ -5,13 +5,24 @@ export default async function ({ browser, url, camera, photos }) {
   const { context, page, seen } = await openMap(browser, url, "room");
   await context.grantPermissions(["clipboard-read", "clipboard-write"]);
   await typeCamera(page, camera);
+  await page.locator("#panel-photo summary", { hasText: "Options" }).click();
+  const solver = page.locator("#option-solver");
+  await solver.selectOption("poselib");
+  const solvers = await solver.locator("option").allInnerTexts();
   const results = [];
   for (const photo of photos) {
     const { answer, problem } = await localize(page, photo);
     results.push({ answer, problem, view: await page.evaluate(() => visloc.view) });
   }
   const shown = await page.getByRole("tabpanel", { name: "Photo" }).innerText();
-  return { ...seen, results, shown, marked: await marked(page), copied: await copied(page) };
+  return {
+    ...seen,
+    results,
+    shown,
+    solvers,
+    marked: await marked(page),
+    copied: await copied(page),
+  };
 }
 
 /** Pixels of the photo's picture in the green of inliers. */

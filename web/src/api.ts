@@ -24,7 +24,7 @@ export interface MapInfo {
   size_bytes: number;
   /** Unit vector; empty when not known. */
   down: number[];
-  /** Whether this version is in use. */
+  /** Whether this version is current. */
   current: boolean;
   /** All published ones, oldest first. */
   versions: { version: string; current: boolean }[];
@@ -141,6 +141,17 @@ export interface LocalizeCall {
   debug?: boolean;
 }
 
+/** An option of a query, as /openapi.json describes it. */
+export interface OptionSchema {
+  title: string;
+  /** Null, which stands for the default, is among them. */
+  enum?: (string | null)[];
+  minimum?: number;
+  maximum?: number;
+  /** Null where the map or the preset has one of its own. */
+  default: string | number | null;
+}
+
 /** Every method throws ServiceError, or what `signal` was aborted with. */
 export interface Service {
   maps(signal?: AbortSignal): Promise<MapInfo[]>;
@@ -149,6 +160,8 @@ export interface Service {
   points(ref: string, first: number, count: number, signal?: AbortSignal): Promise<ArrayBuffer>;
   images(ref: string, first: number, count: number, signal?: AbortSignal): Promise<MapImages>;
   localize(request: LocalizeCall, signal?: AbortSignal): Promise<LocalizeResponse>;
+  /** The options of a query, by name. */
+  options(): Promise<Record<string, OptionSchema>>;
 }
 
 /** `MODEL,width,height,params...`, as the service, the command line and curl take a camera. */
@@ -156,7 +169,7 @@ export function cameraText(camera: Camera): string {
   return [camera.model, camera.width, camera.height, ...camera.params].join(",");
 }
 
-/** As people name it: with the version only where that is not the one in use. */
+/** As people name it: with the version only where that is not the current one. */
 export function shortRef(map: { id: string; version: string; current: boolean }): string {
   return map.current ? map.id : mapRef(map);
 }
@@ -239,6 +252,14 @@ export function connect(base: URL, key: () => string | null): Service {
         ["status", "camera", "orientation", "retrieved", "map", "seconds"],
         { ...withSignal(signal), method: "POST", body: localizeForm(call) },
       ),
+    async options() {
+      type Described = { components: { schemas?: Record<string, { properties?: unknown }> } };
+      const what = "the description of the API";
+      const said = await readJson<Described>("openapi.json", what, ["components"], {});
+      const options = said.components.schemas?.["LocalizeOptions"]?.properties;
+      if (options == null) throw noAnswer("server.answer", `this is not ${what}`, "");
+      return options as Record<string, OptionSchema>;
+    },
   };
 }
 

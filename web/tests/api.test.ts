@@ -104,6 +104,22 @@ describe("the form of a photo", () => {
   });
 });
 
+describe("the options of a query", () => {
+  test("are read from the description of the API", async () => {
+    const solver = { title: "pose solver", enum: ["pycolmap", null], default: "pycolmap" };
+    const schemas = { LocalizeOptions: { properties: { solver } } };
+    const asked = answering(() => json({ components: { schemas } }));
+    expect(await connect(BASE, () => null).options()).toEqual({ solver });
+    expect(asked[0]!.url).toBe("https://maps.example.org/visloc/openapi.json");
+  });
+
+  test("are no options where something else answers", async () => {
+    answering(() => json({ components: {} }));
+    const { problem } = await failure(connect(BASE, () => null).options());
+    expect(problem.code).toBe("server.answer");
+  });
+});
+
 describe("errors", () => {
   test("are the service's problem details", async () => {
     const problem = {

@@ -1,4 +1,4 @@
-"""What Bundler and NVM share: sizes known from the photos only, measurements from their centres."""
+"""Shared by Bundler and NVM: photo sizes from the files, measurements from the photo's centre."""
 
 from __future__ import annotations
 

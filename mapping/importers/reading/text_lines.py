@@ -15,7 +15,7 @@ class TextLines:
     """Reads a file line by line, as a context manager.
 
     Attributes:
-        number: of the line at hand, from 1.
+        number: of the current line, from 1.
     """
 
     def __init__(self, path: Path) -> None:
@@ -100,7 +100,7 @@ class TextLines:
     def error(
         self, message: str, *, expected: str | None = None, got: object = None
     ) -> VislocError:
-        """Make an error about the line at hand."""
+        """Make an error about the current line."""
         return refuse(
             "import.line", message, field=f"{self.path}:{self.number}", expected=expected, got=got
         )

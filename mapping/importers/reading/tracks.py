@@ -1,4 +1,4 @@
-"""What points and photos have in common: measurements, and where they should be."""
+"""Measurements of points in photos, and checks against where the points project."""
 
 from __future__ import annotations
 

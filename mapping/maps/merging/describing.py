@@ -45,7 +45,7 @@ def describe_together(maps: Sequence[Map]) -> GlobalFeatures:
 
 
 def _stored(opened: Map, image: int) -> LocalFeatures:
-    """What a map keeps of a photo's features; strengths and sizes are not kept."""
+    """Return a photo's features as the map keeps them, without scores and scales."""
     step = np.float32(opened.manifest.local_features.descriptor_scale)
     keypoints = opened.keypoints(image)
     unknown = np.zeros(len(keypoints), np.float32)

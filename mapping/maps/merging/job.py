@@ -31,7 +31,6 @@ class Merged:
     """What became of two maps.
 
     Attributes:
-        folder: of the new version.
         a: the map whose frame it has.
         b: the other one.
         registration: how B lies in A.
@@ -96,8 +95,8 @@ def join_as_set(
 ) -> Merged:
     """Publish a set of two maps that overlap, in the frame of the first.
 
-    Arguments and errors as of ``merge_maps``, but that photos of one name are no matter; and what
-    ``publish_set`` raises.
+    Arguments and errors are those of ``merge_maps``, except that photos may have equal names. Also
+    raises the errors of ``publish_set``.
     """
     _refuse_name(store, set_id)
     a, b = _opened(store, a_ref, b_ref, min_overlap)
@@ -189,7 +188,9 @@ def _joined(
 def _global_features(
     first: MapContent, second: MapContent, described: GlobalFeatures
 ) -> tuple[tuple[GlobalFeatures, ...], list[str]]:
-    """Those that both maps have with one model; else the one that was learned of both.
+    """Join the global features that both maps computed with the same model.
+
+    If there are none, return those that were learned from both maps together.
 
     Returns:
         The features of all photos, and the names of those that are left out.

@@ -80,7 +80,7 @@ def register(a: Map, b: Map, min_overlap: float, progress: Progress) -> Registra
 
 
 def updates_of(settings: Mapping[str, JsonValue]) -> list[JsonValue]:
-    """What the settings of a map's method tell of its updates; they may be of any software."""
+    """Return the updates in the settings of a map's method, which any software may have written."""
     updates = settings.get("updates")
     return updates if isinstance(updates, list) else []
 

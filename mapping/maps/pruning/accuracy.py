@@ -27,9 +27,9 @@ from visloc.options import LocalizeOptions
 from visloc.retrieval.index import retrieve
 from visloc.types import Localized
 
-# As in docs/results.md.
+# The bins of docs/results.md.
 BINS = (Threshold(0.05, 5.0), Threshold(0.25, 2.0), Threshold(0.5, 5.0))
-# Photos that are localized without themselves; of larger maps evenly many.
+# Photos that are localized in the map without themselves. In larger maps every n-th photo is.
 _MAX_HELD_OUT = 100
 
 Progress = Callable[[int, int], None]
@@ -48,7 +48,7 @@ class Accuracy:
     errors: tuple[tuple[float, float], ...]
 
     def within(self, threshold: Threshold) -> int:
-        """Queries within a bin."""
+        """Return how many queries are within a bin."""
         return sum(
             position <= threshold.max_position_error_m
             and angle <= threshold.max_orientation_error_deg
@@ -57,7 +57,7 @@ class Accuracy:
 
     @property
     def medians(self) -> tuple[float, float]:
-        """Of those that were localized; NaN without any."""
+        """The median errors of the localized queries; NaN if there are none."""
         return median_errors_localized(self.errors)
 
 

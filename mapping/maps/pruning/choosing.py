@@ -1,10 +1,11 @@
-"""What to keep of a map: of each photo as many observations, spread over it, then of fewer photos.
+"""Chooses which observations and photos of a map to keep.
 
-Every photo keeps the same number, K, of observations: what covers every photo K times lets a query
-near any of them be localized (Li et al. 2010, Cao and Snavely 2014). They are taken from cells of
-the photo in turn, so that they lie everywhere in it. Within a cell chance decides, after this: a
-landmark that others have kept twice comes last. To prefer landmarks that many photos see lost
-queries: they lie close together, and a query matches each of them once (docs/living-maps.md).
+Every photo keeps the same number, K, of observations: landmarks that cover every photo K times let
+a query near any photo be localized (Li et al. 2010, Cao and Snavely 2014). Observations are taken
+from the cells of a photo in turn, so that they are spread over it. Within a cell the choice is
+random, except that landmarks that two other photos have kept already come last. Preferring
+landmarks that many photos see lost queries, because those lie close together and a query matches
+each of them only once (docs/living-maps.md).
 """
 
 from __future__ import annotations

@@ -45,8 +45,7 @@ def prune_map(
     """Publish a version of a map that is as large as it may be; the one before stays.
 
     Args:
-        store: with the map.
-        map_ref: ``id``, or ``id@version`` of the version in use.
+        map_ref: ``id``, or ``id@version`` of the current version.
         max_bytes: most that its files take, manifest aside; or None.
         max_landmarks: most landmarks; or None.
         measure: compares the accuracy of both versions; None: by photos of the map.
@@ -88,7 +87,7 @@ def prune_map(
 
 
 def keep_within(opened: Map, max_bytes: int | None, max_landmarks: int | None) -> Kept:
-    """Choose what stays of a map; errors as of ``prune_map``."""
+    """Choose what stays of a map; see ``prune_map`` for errors."""
     size, count = opened.size_bytes, len(opened.landmarks)
     if (max_bytes is None or size <= max_bytes) and (
         max_landmarks is None or count <= max_landmarks

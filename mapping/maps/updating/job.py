@@ -103,7 +103,6 @@ class Updated:
     """The result of an update.
 
     Attributes:
-        folder: of the new version.
         record: as in its manifest.
         notes: on photos that were left out, one sentence each.
     """

@@ -26,7 +26,7 @@ from visloc.types import Localized, QueryFeatures
 
 # Raised when the code of the stage changes what comes out.
 _REVISION = 1
-# Strongest keypoints of a photo that are used: as many as of a query.
+# Only the strongest keypoints of a photo are used, as many as a query has.
 _MAX_KEYPOINTS = 2500
 
 

@@ -1,4 +1,4 @@
-"""Where a new capture lies in the map that it joins, and whether it fits at all."""
+"""Finds where a new capture lies in the map that it joins, and checks that it fits."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _GOOD_DEPTH = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placement:
-    """Where a capture lies in a map.
+    """The pose of a capture in a map, and how well photos agree with it.
 
     Attributes:
         tried: photos that were to be localized.

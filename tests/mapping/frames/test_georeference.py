@@ -282,7 +282,7 @@ def test_an_anchored_map_is_a_new_version_of_the_same_files(room: Map, maps_dir:
     with pytest.raises(Conflict) as caught:
         publish_anchored(opened, found, maps_dir, force=False)
     assert caught.value.code == "map.anchored"
-    # The one before is not in use any more: what came since would be lost.
+    # The one before is not current any more: what came since would be lost.
     with pytest.raises(Conflict) as caught:
         publish_anchored(room, found, maps_dir, force=True)
     assert caught.value.code == "map.outdated"

@@ -184,12 +184,12 @@ def test_tiles_of_other_features_are_refused(
 def test_a_tile_of_a_set_in_use_stays(store: MapStore, incoming: Callable[..., Path]) -> None:
     store.publish(incoming("hall", "hall", "v2"), "hall", "v2")
 
-    with pytest.raises(Conflict, match="tile of a set in use") as caught:
+    with pytest.raises(Conflict, match="tile of a current set") as caught:
         store.remove("hall", "v1")
     assert caught.value.code == "map.in_set"
     assert store.folder("hall@v1").is_dir()
 
-    # Once the set in use is one without it, it may go; and the old version does not come back.
+    # Once the current set is one without it, it may go; and the old version does not come back.
     old = store.current_version("house")
     publish_set(store, "house", [("hall", Similarity.identity()), ("attic", SECOND)], quiet)
     store.remove("hall", "v1")
@@ -232,7 +232,7 @@ def test_a_url_keeps_the_same_rules(incoming: Callable[..., Path], tmp_path: Pat
     publish("house", "house", "v2")
     with pytest.raises(Conflict, match="has this id"):
         publish("hall", "house", "v3")
-    with pytest.raises(Conflict, match="tile of a set in use"):
+    with pytest.raises(Conflict, match="tile of a current set"):
         server.remove("hall", "v1")
 
     # Another server, without copies: the outline needs no tile, the set no other file.
@@ -268,7 +268,7 @@ def test_a_damaged_copy_of_a_set_does_not_free_its_tiles(store: MapStore, tmp_pa
     (copy,) = (tmp_path / "cache").glob("*/house/*/manifest.json")
     copy.write_bytes(copy.read_bytes()[:-30])
 
-    with pytest.raises(Conflict, match="tile of a set in use"):
+    with pytest.raises(Conflict, match="tile of a current set"):
         server.remove("hall", "v1")
 
     (damaged,) = bucket.glob("house/*/manifest.json")
@@ -332,7 +332,7 @@ def test_what_is_a_set_its_manifest_says(store: MapStore, tmp_path: Path) -> Non
             if lost:
                 (folder / "coarse/codes.npy").unlink()
             for tile in ("hall", "attic"):
-                with pytest.raises(Conflict, match="tile of a set in use"):
+                with pytest.raises(Conflict, match="tile of a current set"):
                     one.remove(tile, "v1")
         one.remove("house", house.name)
         one.remove("attic", "v1")

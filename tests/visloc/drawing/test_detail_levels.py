@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from visloc.archive import Map, MapOutline, MapStore, checks, open_map, read_outline
+from visloc.archive import Map, MapOutline, MapStore, checks, open_map, read_any_outline
 from visloc.archive.photos import read_photos
 from visloc.drawing.detail_levels import _LEVELS, _cells, detail_order, read_landmarks
 from visloc.drawing.point_bytes import HEADER_BYTES, ROW_BYTES, packed_points, read_points
@@ -187,7 +187,9 @@ def folder(maps_dir: Path) -> Path:
 
 @pytest.fixture
 def outline(folder: Path) -> MapOutline:
-    return read_outline(folder)
+    read = read_any_outline(folder)
+    assert isinstance(read, MapOutline)
+    return read
 
 
 @pytest.mark.parametrize("block", [1, 7, 1000, 10**6])

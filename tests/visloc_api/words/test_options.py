@@ -25,5 +25,15 @@ def test_every_option_is_described(name: str) -> None:
     assert all(choice in text for choice in options.CHOICES.get(name, ()))
 
 
+def test_the_schema_lists_words_bounds_and_defaults() -> None:
+    schema = options.LocalizeOptions.model_json_schema()["properties"]
+    assert schema["solver"]["enum"] == [*Solver, None]
+    assert schema["solver"]["default"] == "pycolmap"
+    assert schema["fusion"]["default"] is None  # the map's
+    top_k = schema["top_k"]
+    assert (top_k["minimum"], top_k["maximum"], top_k["default"]) == (1, 1000, 20)
+    assert all(option["title"] for option in schema.values())
+
+
 def test_a_solver_is_named_in_one_place() -> None:
     assert options.CHOICES["solver"] == tuple(solver.value for solver in Solver)

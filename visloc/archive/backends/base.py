@@ -75,7 +75,7 @@ class Backend(Protocol):
         """Take in a verified version and return its local folder. Only within ``changing``.
 
         A reader finds all of the version or nothing. Killed before ``current`` is switched, the
-        version is there and the one before it stays in use.
+        version is there and the one before it stays current.
 
         Args:
             incoming: the version, within the folder that ``incoming`` gave.

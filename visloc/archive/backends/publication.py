@@ -77,12 +77,12 @@ class Publisher:
                 self._fs.rm_file(f"{place}/{name}")
 
     def write_current(self, map_id: str, version: str, based_on: str | None = None) -> None:
-        """Make a version the one in use.
+        """Make a version current.
 
         Args:
             map_id: the map's id.
             version: the version's name.
-            based_on: the version that must still be in use; None for any.
+            based_on: the version that must still be current; None for any.
 
         Raises:
             Conflict: ``map.outdated``.

@@ -56,7 +56,6 @@ def measure(
     """Return the extremes of each picture, averaged: outliers of one picture are cut off.
 
     Args:
-        names: of the convolutions.
         graph: from the network's input to the smallest and largest value of what enters each
             convolution, in the order of the names.
         make_input: makes the network's input of RGB (H, W, 3).

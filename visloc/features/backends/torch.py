@@ -56,7 +56,6 @@ def load_strictly(
     Args:
         network: without values.
         checkpoint: with exactly the network's tensors.
-        network_name: for the message.
         held: what the file seems to hold instead, for the message.
 
     Raises:

@@ -8,8 +8,8 @@ The authors publish TensorFlow models only. The layout understood here is that o
 implementation github.com/feymanpriv/DELG: under the key ``model_state``, ``globalmodel.stem``,
 ``.s1`` to ``.s4``, ``.head.pool.p`` (the exponent, which it learns) and ``.head.fc``, whose rows
 say how long the vector is. Its network sees blue, green, red. The local features (``localmodel``)
-and the classifiers of the training (``desc_cls``, ``att_cls``) are left out. As no published
-weights were at hand, the architecture is proven against its definition, and its accuracy is not
+and the classifiers of the training (``desc_cls``, ``att_cls``) are left out. No published
+weights were available: tests compare the architecture with its definition, and its accuracy is not
 measured.
 """
 

@@ -65,7 +65,7 @@ def aggregate(words: NDArray[np.float32], centres: NDArray[np.float32]) -> NDArr
         return np.zeros(centres.size, np.float32)
     sums, counts = _sum_by_nearest(words, centres)
     residuals: NDArray[np.float32] = sums - counts[:, None] * centres
-    # What words right at their centre leave is rounding, not a direction.
+    # Words that lie exactly at their centre leave only rounding errors, which are no direction.
     floor = np.float32(1e-5) * np.linalg.norm(sums, axis=1, keepdims=True)
     return unit_rows(unit_rows(residuals, floor).ravel())
 
@@ -112,7 +112,7 @@ class VladDescriptor(WhitenedDescriptor):
         return aggregate(self.words(rgb, local), vocabulary["vocabulary"])
 
 
-# What every VLAD descriptor's fingerprint holds.
+# The part of the fingerprint that all VLAD descriptors share.
 VLAD_PARAMETERS: Mapping[str, int | float | str] = {
     "vocabulary_size": VOCABULARY_SIZE,
     "kmeans_iterations": KMEANS_ITERATIONS,

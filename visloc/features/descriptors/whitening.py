@@ -16,7 +16,7 @@ from visloc.types import LocalFeatures
 WHITENING_EXPONENT = 0.25
 WHITENING_MAX_DIMS = 1024
 WHITENING_MAX_PHOTOS = 2048
-# What the fingerprint of every descriptor holds that is whitened so.
+# The part of the fingerprint that all descriptors whitened in this way share.
 WHITENING_PARAMETERS: Mapping[str, int | float | str] = {
     "whitening_exponent": WHITENING_EXPONENT,
     "whitening_max_dims": WHITENING_MAX_DIMS,

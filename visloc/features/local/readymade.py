@@ -1,4 +1,4 @@
-"""Features that a dataset, or whoever asks, brings along: ``kapture:TYPE``.
+"""Features that come with a dataset or a query: ``kapture:TYPE``.
 
 Rows are compared by their dot product after scaling to unit length, which ranks as the cosine
 does, and as the L2 distance of rows that had unit length before (R2D2, D2-Net, AP-GeM).
@@ -46,8 +46,8 @@ def ready_made_type(name: str) -> str:
 def ready_made_fingerprint(features: FeatureSet) -> Fingerprint:
     """Identify ready-made descriptors, local or global.
 
-    Nothing in the files tells weights or settings: that two extractions under one type are
-    comparable is the word of whoever made them.
+    The files do not say with which weights or settings they were made. Two extractions of one type
+    are taken to be comparable.
 
     Raises:
         InvalidInput: ``features.metric`` when they are not compared as this system compares.

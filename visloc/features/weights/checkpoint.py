@@ -83,7 +83,7 @@ _STAND_INS: Mapping[str, Any] = {
 _NAMES = _NAMES_OF_TORCH | _STAND_INS.keys() | {"__builtin__.list"}
 _TORCH_LOAD = threading.Lock()  # the names that torch knows are those of the whole process
 
-# What damaged files raise, according to the documentation of ``pickle`` and trial.
+# Damaged files raise these, according to the documentation of ``pickle`` and to experiments.
 _MALFORMED = (
     SafetensorError,
     pickle.UnpicklingError,

@@ -129,7 +129,6 @@ def find_weights(
         package: Python name of the package, which is located but never imported.
         folder: of the file inside the package.
         missing: message of the error.
-        field: of the error.
 
     Raises:
         WeightsError: ``weights.missing``.
@@ -155,7 +154,6 @@ def check_shapes(checkpoint: Checkpoint, expected: Shapes, *, network: str, held
     """Check that a checkpoint has exactly the tensors of a network, all of them finite.
 
     Args:
-        checkpoint: to check.
         expected: the shape of every tensor by name.
         network: the expected network, for the message.
         held: the network that the file seems to hold, for the message.

@@ -66,7 +66,7 @@ export function createMapChoice(
     onChoice(choice);
   }
 
-  // Described anew: another version may be in use since the list came.
+  // Described anew: another version may be current since the list came.
   const choose = (ref: string): Promise<void> =>
     attempt(async (signal) => ({ kind: "map", map: await service.map(ref, signal) }));
 

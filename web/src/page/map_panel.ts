@@ -175,7 +175,7 @@ function mapFacts(map: MapInfo): HTMLElement {
     ...(map.method === null ? [] : [["Method", map.method] as [string, string]]),
     ["Features", [map.local_features, ...map.global_features].join(", ")],
     ["Created", instantText(map.created)],
-    ["Version", map.current ? map.version : `${map.version}, not in use`],
+    ["Version", map.current ? map.version : `${map.version}, not current`],
     ["Size", bytesText(map.size_bytes)],
   );
   return facts(rows);

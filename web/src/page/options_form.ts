@@ -1,49 +1,10 @@
 // What may be chosen per photo. What is left alone is not sent: the service has its defaults.
-import { ownError } from "../api";
+import { ownError, ServiceError, type OptionSchema, type Service } from "../api";
 import { button, element, field } from "../dom";
+import { sentence } from "./problem_view";
 
-// Words and defaults as in the tables of docs/api.md.
-const CHOICES: { name: string; label: string; unset: string; words: string[] }[] = [
-  {
-    name: "preset",
-    label: "Preset of thresholds",
-    unset: "default",
-    words: ["default", "config1", "config2"],
-  },
-  {
-    name: "extraction",
-    label: "Effort for the photo’s features",
-    unset: "default",
-    words: ["fast", "default", "accurate"],
-  },
-  {
-    name: "read_as",
-    label: "Read photo as",
-    unset: "as its EXIF says",
-    words: ["stored", "upright"],
-  },
-  {
-    name: "fusion",
-    label: "Fusion of similarities",
-    unset: "the map’s",
-    words: [
-      ...["gharm", "mean", "power", "min", "max", "mean_and_power", "min_and_max"],
-      ...["mean_and_min", "harmonic", "round_robin"],
-    ],
-  },
-  {
-    name: "matcher",
-    label: "Matcher",
-    unset: "mutual",
-    words: ["mutual", "ratio", "lightglue"],
-  },
-  {
-    name: "solver",
-    label: "Solver",
-    unset: "pycolmap",
-    words: ["pycolmap", "poselib", "registration"],
-  },
-];
+// Numbers that the form offers; every option that has a list of words is offered too.
+const NUMBERS = ["top_k"];
 
 export interface OptionsForm {
   readonly element: HTMLElement;
@@ -52,47 +13,43 @@ export interface OptionsForm {
   open(): void;
 }
 
-export function createOptionsForm(): OptionsForm {
-  const selects = CHOICES.map(({ name, label, unset, words }) => {
-    const id = `option-${name}`;
-    const select = element("select", { id, name }, element("option", { value: "" }, `(${unset})`));
-    select.append(...words.map((word) => element("option", { value: word }, word)));
-    return { name, select, field: field(label, select) };
-  });
-  const topK = element("input", {
-    ...{ id: "option-top_k", name: "top_k", type: "number", min: 1, max: 1000, step: 1 },
-    placeholder: "(20)",
-  });
+/** Which options there are, and their words, the service says once the form is opened. */
+export function createOptionsForm(service: Pick<Service, "options">): OptionsForm {
+  let controls: Control[] = [];
+  let asked = false;
+  const fields = element("div", { class: "fields wide" });
   const summary = element("span", { class: "quiet" });
   const reset = button("Back to the defaults", () => {
-    for (const { select } of selects) select.value = "";
-    topK.value = "";
+    for (const { input } of controls) input.value = "";
     changed();
   });
   const details = element(
     "details",
     {},
     element("summary", {}, "Options", summary),
-    element(
-      "div",
-      { class: "stack inset" },
-      element(
-        "div",
-        { class: "fields wide" },
-        field("Mapping photos to match (top_k)", topK),
-        ...selects.map((one) => one.field),
-      ),
-      element("div", { class: "row" }, reset),
-    ),
+    element("div", { class: "stack inset" }, fields, element("div", { class: "row" }, reset)),
   );
 
+  async function fill(): Promise<void> {
+    if (asked) return;
+    asked = true;
+    try {
+      controls = controlsOf(await service.options());
+      fields.replaceChildren(...controls.map(({ label, input }) => field(label, input)));
+    } catch (error) {
+      if (!(error instanceof ServiceError)) throw error;
+      asked = false; // opened again, it is asked again
+      fields.replaceChildren(element("p", {}, sentence(error.problem.detail)));
+    }
+  }
+
   function options(): Record<string, string | number> {
-    // A field that holds no number says that it holds nothing.
-    if (topK.validity.badInput) {
-      const detail = "the number of mapping photos to match (top_k) is no number";
-      throw ownError("options.top_k", "An option is wrong", detail, {
-        field: "options.top_k",
-        expected: "a whole number, 1 to 1000",
+    for (const { name, input, schema } of controls) {
+      // A field that holds no number says that it holds nothing.
+      if (!input.validity.badInput) continue;
+      throw ownError(`options.${name}`, "An option is wrong", `${name} is no number`, {
+        field: `options.${name}`,
+        expected: `a number, ${schema.minimum} to ${schema.maximum}`,
       });
     }
     return chosen();
@@ -100,24 +57,26 @@ export function createOptionsForm(): OptionsForm {
 
   function chosen(): Record<string, string | number> {
     const given: Record<string, string | number> = {};
-    // Of other numbers the service says what it expects.
-    if (topK.value !== "") given["top_k"] = Number(topK.value);
-    for (const { name, select } of selects) {
-      if (select.value !== "") given[name] = select.value;
+    for (const { name, input, schema } of controls) {
+      // Of numbers out of range the service says what it expects.
+      if (input.value !== "") given[name] = schema.enum ? input.value : Number(input.value);
     }
     return given;
   }
 
   function changed(): void {
-    const wrong = topK.validity.badInput;
-    topK.setAttribute("aria-invalid", String(wrong));
     const words = Object.entries(chosen()).map(([name, value]) => `${name} ${value}`);
-    if (wrong) words.unshift("top_k is no number");
+    for (const { name, input } of controls) {
+      const wrong = input.validity.badInput;
+      input.setAttribute("aria-invalid", String(wrong));
+      if (wrong) words.unshift(`${name} is no number`);
+    }
     summary.textContent = words.length === 0 ? "the service’s defaults" : words.join(", ");
     reset.disabled = words.length === 0;
   }
 
   details.addEventListener("input", changed);
+  details.addEventListener("toggle", () => void (details.open && fill()));
   changed();
   return {
     element: details,
@@ -126,4 +85,43 @@ export function createOptionsForm(): OptionsForm {
       details.open = true;
     },
   };
+}
+
+interface Control {
+  name: string;
+  label: string;
+  input: HTMLSelectElement | HTMLInputElement;
+  schema: OptionSchema;
+}
+
+function controlsOf(schemas: Record<string, OptionSchema>): Control[] {
+  return Object.entries(schemas)
+    .filter(([name, schema]) => schema.enum !== undefined || NUMBERS.includes(name))
+    .map(([name, schema]) => {
+      const unset = `(${schema.default ?? "default"})`;
+      const { title } = schema;
+      const label = `${title.charAt(0).toUpperCase()}${title.slice(1)} (${name})`;
+      const id = `option-${name}`;
+      const input = schema.enum
+        ? selectOf(schema.enum, unset, { id, name })
+        : element("input", {
+            ...{ id, name, type: "number", step: 1, placeholder: unset },
+            ...{ min: schema.minimum ?? "", max: schema.maximum ?? "" },
+          });
+      return { name, label, input, schema };
+    });
+}
+
+function selectOf(
+  words: (string | null)[],
+  unset: string,
+  attributes: Record<string, string>,
+): HTMLSelectElement {
+  const named = words.filter((word) => word !== null);
+  return element(
+    "select",
+    attributes,
+    element("option", { value: "" }, unset),
+    ...named.map((word) => element("option", { value: word }, word)),
+  );
 }

@@ -56,7 +56,7 @@ export interface PhotoPanel {
 export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): PhotoPanel {
   const { viewer, announce } = parts;
   const camera = createCameraForm();
-  const options = createOptionsForm();
+  const options = createOptionsForm(parts.service);
   const list = element("ul", { class: "photos" });
   const listHead = element("h2", { class: "small" });
   const listing = element("section", { class: "stack near", hidden: true });

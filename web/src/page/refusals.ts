@@ -1,14 +1,14 @@
-// What to try when the map does not know, in plain words: the table of docs/api.md, "When there is
-// no pose", for someone who looks at a page.
+// Why there is no pose, and what to try next: the table of docs/api.md, "When there is no pose", in
+// the words of the page.
 import type { LocalizeResponse } from "../api";
 
 /** The stages of an answer, in their order; each can give up. */
 export const STAGES = [
-  ["features", "Features", "what the photo shows is found"],
-  ["retrieval", "Retrieval", "photos of the map that look alike"],
-  ["matching", "Matching", "points of the photo with landmarks"],
-  ["pose", "Pose", "a camera that explains the matches"],
-  ["gate", "Gate", "whether the pose can be relied on"],
+  ["features", "Features", "find keypoints in the photo"],
+  ["retrieval", "Retrieval", "find mapping photos that look like it"],
+  ["matching", "Matching", "match keypoints with landmarks"],
+  ["pose", "Pose", "solve for a pose that explains the matches"],
+  ["gate", "Gate", "check that the pose is reliable"],
 ] as const;
 
 interface Advice {
@@ -17,8 +17,8 @@ interface Advice {
 }
 
 const ANOTHER_PLACE = "Was the photo taken in the place of this map? If not, choose another map.";
-const MORE_PHOTOS = "Under Options, raise “mapping photos to match” (top_k).";
-const TURNED = "The photo is stored rotated: under Options, set “Read photo as” to upright.";
+const MORE_PHOTOS = "Under Options, raise “Mapping photos to match against” (top_k).";
+const TURNED = "The photo is stored rotated: under Options, set read_as to upright.";
 const TURNING_HELPS = ["too_few_matches", "no_pose", "too_few_inliers", "low_inlier_ratio"];
 const DEFAULT_PRESET = "Under Options, choose the preset default instead of config1.";
 const CHECK_CAMERA = "Check the camera: model, focal length, size.";
@@ -27,25 +27,25 @@ const SHARPER = "Try a sharper, brighter or larger photo.";
 /** By reason; a test holds them against docs/api.md. */
 export const ADVICE: Readonly<Record<string, Advice>> = {
   no_keypoints: {
-    meaning: "The photo shows nothing to hold on to: it is dark, blurred, or of a bare surface.",
-    tries: [SHARPER, "Point the camera at something with structure."],
+    meaning: "The photo has no usable keypoints: it is dark, blurred, or shows a bare surface.",
+    tries: [SHARPER, "Point the camera at something with texture."],
   },
   no_photo_near: {
-    meaning: "The map has no photo where this one is said to have been taken.",
-    tries: ["Check what is known before (the priors), its frame and its unit.", "Leave it out."],
+    meaning: "The map has no photos near the place that the priors give.",
+    tries: ["Check the priors, their frame and their unit.", "Send no priors."],
   },
   too_few_matches: {
-    meaning: "Too little of the photo was found among the map’s landmarks to look for a pose.",
+    meaning: "Too few keypoints of the photo match landmarks of the map to search for a pose.",
     tries: [ANOTHER_PLACE, "Take in more of the scene.", MORE_PHOTOS],
   },
   no_pose: {
-    meaning: "There are matches, but no camera sees them where they lie in the photo.",
+    meaning: "There are matches, but no camera pose explains them.",
     tries: [CHECK_CAMERA, MORE_PHOTOS, ANOTHER_PLACE],
   },
   too_few_inliers: {
     meaning:
-      "The best pose explains too few matches: as a rule of another place, or with wrong " +
-      "camera parameters.",
+      "The best pose explains too few matches. Usually the photo shows another place, or the " +
+      "camera parameters are wrong.",
     tries: [ANOTHER_PLACE, CHECK_CAMERA],
   },
   low_inlier_ratio: {
@@ -54,28 +54,29 @@ export const ADVICE: Readonly<Record<string, Advice>> = {
   },
   uncertain_pose: {
     meaning:
-      "What was matched leaves the pose open: it lies in a line or a spot, halves of it " +
-      "contradict each other, or the camera’s focal length cannot be told.",
+      "The matches do not determine the pose. They lie on a line or in one spot, two halves of " +
+      "them contradict each other, or the focal length cannot be estimated.",
     tries: [
       "Type the camera’s parameters.",
-      "Step back, or choose a photo in which near and far things are seen.",
+      "Step back, or choose a photo that shows both near and far things.",
       SHARPER,
     ],
   },
   contradicts_prior: {
-    meaning: "The best pose is not where the camera is said to be.",
-    tries: ["Check what is known before (the priors).", "Leave it out."],
+    meaning: "The best pose contradicts the priors.",
+    tries: ["Check the priors.", "Send no priors."],
   },
   ambiguous: {
     meaning: "Two places explain the photo about equally well.",
     tries: [
-      "Say where the camera is (the priors), or ask the right map alone.",
+      "Send priors that say where the camera is, or search only the right map.",
       "Choose a photo that shows more of the scene.",
     ],
   },
   contradicts_motion: {
-    meaning: "The photo says one thing, its neighbours in time and the motion another.",
-    tries: ["Check the odometry.", "Ask about the photo alone."],
+    meaning:
+      "The pose of this photo contradicts the photos before and after it and the motion between.",
+    tries: ["Check the odometry.", "Localize the photo on its own."],
   },
   no_usable_image: {
     meaning: "None of the photos could be read.",
@@ -83,11 +84,11 @@ export const ADVICE: Readonly<Record<string, Advice>> = {
   },
 };
 
-/** What to try for this answer to what was asked: what may not apply to it is left out. */
+/** What this answer means and what to try; advice that does not apply to it is left out. */
 export function advice(answer: LocalizeResponse, options: Record<string, string | number>): Advice {
   const reason = answer.refusal?.reason ?? "";
   const known = (Object.hasOwn(ADVICE, reason) && ADVICE[reason]) || {
-    meaning: "This page does not know the reason; the message is the service's.",
+    meaning: "This page does not know the reason. The message is the service’s.",
     tries: ["Reload the page: the service may be newer."],
   };
   const guessed = answer.camera.source === "guess" || answer.camera.source === "estimated";

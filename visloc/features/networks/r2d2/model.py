@@ -58,9 +58,7 @@ class Architecture:
     """A network without its weights.
 
     Attributes:
-        name: of the feature.
         published: its published weights.
-        layers: of the trunk.
         pool_after: how many layers come before the pooling; 0 for no pooling.
     """
 
