@@ -88,7 +88,7 @@ class GetMap:
 
 @dataclass(frozen=True, slots=True)
 class GetVersion:
-    """Describe a version of a map, in use or not; see ``checked_version``."""
+    """Describe a version of a map, current or not; see ``checked_version``."""
 
     map_id: str
     version: str
@@ -104,7 +104,7 @@ class UseVersion:
 
 @dataclass(frozen=True, slots=True)
 class DeleteVersion:
-    """Delete a version of a map that is not in use."""
+    """Delete a version of a map that is not the current one."""
 
     map_id: str
     version: str
