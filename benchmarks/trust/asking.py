@@ -89,10 +89,10 @@ def ask_floors(
     )
     engine = Engine(store, settings, metrics=Metrics())
     for outcome in asyncio.run(_ask_engine(engine, queries)):
-        if outcome.tile is None:
-            yield outcome
-        else:
+        if outcome.accepted and outcome.tile is not None:
             yield replace(outcome, right=floor_of(outcome.tile) == floor_of(outcome.photo))
+        else:  # a refusal may name a tile as well
+            yield outcome
 
 
 async def _ask_engine(engine: Engine, queries: Iterator[tuple[Query, Path]]) -> list[Outcome]:
