@@ -233,7 +233,7 @@ def cameras_agree(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
 
 
 GATES: tuple[Gate, ...] = (enough_inliers, enough_of_the_matches, determined, within_the_priors)
-CONFIRMATIONS: tuple[Gate, ...] = (not_better_without_gravity, halves_agree, cameras_agree)
+CONFIRMATIONS: tuple[Gate, ...] = (not_better_without_gravity, cameras_agree, halves_agree)
 
 
 def not_better_elsewhere(elsewhere: Problem, pose: GeneralizedPose | None) -> Refusal | None:

@@ -121,10 +121,11 @@ def find_intrinsics(
     if all(_promised_gain(start, max_error_px, width) < _MIN_PROMISED_GAIN for width in _WIDTHS):
         return None
     start = replace(start, jacobian=start.jacobian[:, :, :6])
-    given = _minimized(view, (), start, max_error_px, _WIDTHS[-1:])
-    focal = given and _improved(view, (FOCAL,), given, max_error_px, _WIDTHS)
+    # Other cameras of a rig may have found the pose, where this one has hardly an inlier.
+    given = _minimized(view, (), start, max_error_px, _WIDTHS[-1:]) or start
+    focal = _improved(view, (FOCAL,), given, max_error_px, _WIDTHS)
     whole = focal and _improved(view, _ALL, focal, max_error_px, _WIDTHS[1:])
-    if given is None or focal is None or whole is None:
+    if focal is None or whole is None:
         return None
     given_loss = _loss(given, max_error_px)
     of_focal = _found((FOCAL,), focal, given_loss, max_error_px)
@@ -134,6 +135,8 @@ def find_intrinsics(
 
 def _near(view: MatchedView, rig_from_world: Pose, max_error_px: float) -> MatchedView:
     """The matches that a changed camera may explain; of many, every so many."""
+    finite = np.isfinite(np.hstack([view.pixels, view.points])).all(axis=1)
+    view = view.selected(np.asarray(finite))
     errors = reprojection_errors(view, rig_from_world)
     rows = np.flatnonzero(errors <= _WIDTHS[0] * max_error_px)
     num_inliers = int(np.count_nonzero(errors <= max_error_px))
