@@ -154,6 +154,7 @@ class Reason(StrEnum):
     TOO_FEW_INLIERS = "too_few_inliers"
     LOW_INLIER_RATIO = "low_inlier_ratio"
     UNCERTAIN_POSE = "uncertain_pose"
+    CAMERA_CONTRADICTED = "camera_contradicted"  # the photo speaks for other intrinsics
     NO_PHOTO_NEAR = "no_photo_near"  # the map has no photo where the priors allow the device
     CONTRADICTS_PRIOR = "contradicts_prior"
     CONTRADICTS_MOTION = "contradicts_motion"  # the images of its neighbours, and how it moved

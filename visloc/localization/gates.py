@@ -2,7 +2,8 @@
 
 A gate takes the problem and its best pose and returns a refusal, or None to accept. ``GATES`` look
 at the pose; ``CONFIRMATIONS`` solve again, so they come last. The reasons behind them:
-docs/decisions/0002-refuse-instead-of-guess.md and 0012-halves-must-agree.md.
+docs/decisions/0002-refuse-instead-of-guess.md, 0012-halves-must-agree.md and
+0027-a-camera-that-is-checked.md.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.geometry import Camera, Pose
+from visloc.localization.camera_check import camera_contradiction
 from visloc.localization.constraints import Constraints
-from visloc.options import DEFAULT_PRESET, LocalizeOptions, RegistrationPreset
+from visloc.options import DEFAULT_PRESET, PRESETS, LocalizeOptions, RegistrationPreset
 from visloc.pose.distance import mahalanobis2
 from visloc.pose.generalized import (
     GeneralizedPose,
@@ -23,7 +25,7 @@ from visloc.pose.generalized import (
     refine_generalized_pose,
 )
 from visloc.pose.views import MatchedView
-from visloc.types import Reason, Refusal
+from visloc.types import CameraSource, Reason, Refusal
 
 # The default max_error_px applies to photos whose longer side has at least this many pixels, and
 # shrinks with smaller ones. In a photo of 256 px, 12 px let wrong poses explain up to 10 % of the
@@ -44,9 +46,11 @@ class Problem:
 
     Attributes:
         views: of the images, relative to the map's origin.
+        sources: where the camera of each view came from.
     """
 
     views: tuple[MatchedView, ...]
+    sources: tuple[CameraSource, ...]
     options: LocalizeOptions
     constraints: Constraints
 
@@ -179,10 +183,11 @@ def halves_agree(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
     such a pose needs more inliers instead.
     """
     options = problem.options
+    by_default = PRESETS[DEFAULT_PRESET].min_inliers
     if (
         pose.num_inliers >= _SURE_INLIERS
         or options.preset != DEFAULT_PRESET
-        or options.min_inliers is not None
+        or options.registration.min_inliers < by_default  # the caller asked for weak poses
     ):
         return None
     if pose.camera is not None:
@@ -212,8 +217,23 @@ def halves_agree(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
     )
 
 
+def cameras_agree(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
+    """Refuse a pose when the matches of a camera speak for other intrinsics.
+
+    Each camera is looked at on its own, so that wrong ``cam_from_rig`` accuse no camera.
+    """
+    max_error_px = problem.registration.max_error_px
+    for view, source in zip(problem.views, problem.sources, strict=True):
+        if pose.camera is not None:
+            view, source = replace(view, camera=pose.camera), CameraSource.ESTIMATED
+        contradiction = camera_contradiction(view, source, pose.rig_from_world, max_error_px)
+        if contradiction is not None:
+            return _refused(Reason.CAMERA_CONTRADICTED, contradiction)
+    return None
+
+
 GATES: tuple[Gate, ...] = (enough_inliers, enough_of_the_matches, determined, within_the_priors)
-CONFIRMATIONS: tuple[Gate, ...] = (not_better_without_gravity, halves_agree)
+CONFIRMATIONS: tuple[Gate, ...] = (not_better_without_gravity, cameras_agree, halves_agree)
 
 
 def not_better_elsewhere(elsewhere: Problem, pose: GeneralizedPose | None) -> Refusal | None:

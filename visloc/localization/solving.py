@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from visloc.errors import VislocError, refuse
 from visloc.geometry import Camera, Pose
+from visloc.localization.camera_check import only_focal_length_contradicts
 from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.gates import Problem, accepted, not_better_elsewhere
 from visloc.options import LocalizeOptions, ReadAs, Solver
@@ -148,12 +149,12 @@ def solve_instant(
     views = _views_of(images, [look.matches for look in looks], options)
     seconds = _summed([look.evidence.seconds for look in looks])
     with timed(seconds, "pose"):
-        found, refusal = _find_pose(images, Problem(views, options, constraints))
+        problem, found, refusal = _find_pose(
+            images, Problem(views, _sources_of(images), options, constraints)
+        )
         if refusal is None or refusal.reason is not Reason.CONTRADICTS_PRIOR:
             elsewhere = _views_of(images, [look.elsewhere for look in looks], options)
-            refusal = (
-                not_better_elsewhere(Problem(elsewhere, options, constraints), found) or refusal
-            )
+            refusal = not_better_elsewhere(problem.of(elsewhere), found) or refusal
         refusal = refusal and _with_turned_photos(refusal, looks)
     pose = None
     if refusal is None and found is not None and found.covariance is not None:
@@ -162,7 +163,7 @@ def solve_instant(
     camera = None if refusal is not None or found is None else found.camera
     shown = with_inliers([_shown(image, camera) for image in images], inliers)
     answer = InstantAnswer(timestamp, shown, pose, refusal, seconds)
-    views = tuple(replace(view, camera=camera or view.camera) for view in views)
+    views = tuple(replace(view, camera=camera or view.camera) for view in problem.views)
     return Solved(answer, views, found if refusal is None else None, inliers)
 
 
@@ -204,6 +205,11 @@ def _views_of(
             )
         )
     return tuple(views)
+
+
+def _sources_of(images: Sequence[SeenImage]) -> tuple[CameraSource, ...]:
+    """Where the cameras of the images that could be used came from."""
+    return tuple(image.look.evidence.camera_source for image in images if image.look is not None)
 
 
 def _shown(image: SeenImage, found: Camera | None) -> ImageAnswer:
@@ -252,25 +258,63 @@ def rig_pose(
 
 def _find_pose(
     images: Sequence[SeenImage], problem: Problem
-) -> tuple[GeneralizedPose | None, Refusal | None]:
-    """Return the best pose or None, and the reason to refuse it or None."""
+) -> tuple[Problem, GeneralizedPose | None, Refusal | None]:
+    """Return the search, its best pose or None, and the reason to refuse it or None.
+
+    Where a photo on its own contradicts the focal length of its EXIF, the search is the one that
+    finds the focal length with the pose. A camera that was given is a statement; one from EXIF is a
+    hint, which editing and zooming leave behind.
+    """
+    refusal = _nothing_to_solve(images, problem)
+    if refusal is not None:
+        return problem, None, refusal
+    best, refusal = _judged(problem)
+    if refusal is not None and refusal.reason is Reason.CAMERA_CONTRADICTED and best is not None:
+        as_guess = _without_exif(problem, best)
+        if as_guess is not None:
+            return as_guess, *_judged(as_guess)
+    return problem, best, refusal
+
+
+def _without_exif(problem: Problem, pose: GeneralizedPose) -> Problem | None:
+    """Take the focal length of EXIF for a guess, where nothing else contradicts the photo."""
+    if problem.sources != (CameraSource.EXIF,) or problem.options.solver is Solver.REGISTRATION:
+        return None
+    (view,) = problem.views
+    if not only_focal_length_contradicts(
+        view, CameraSource.EXIF, pose.rig_from_world, problem.registration.max_error_px
+    ):
+        return None
+    views = (replace(view, focal_unknown=True),)
+    return replace(problem, views=views, sources=(CameraSource.GUESS,))
+
+
+def _judged(problem: Problem) -> tuple[GeneralizedPose | None, Refusal | None]:
+    best = problem.solve()
+    if best is None:
+        return None, Refusal("pose", Reason.NO_POSE, "no camera pose explains the matches")
+    return accepted(problem, best)
+
+
+def _nothing_to_solve(images: Sequence[SeenImage], problem: Problem) -> Refusal | None:
+    """Why there are too few matches to look for a pose."""
     looks = [image.look for image in images if image.look is not None]
     if not looks:
         why = "none of the images could be used" if images else "there is no image"
-        return None, Refusal("features", Reason.NO_USABLE_IMAGE, why)
+        return Refusal("features", Reason.NO_USABLE_IMAGE, why)
     refusals = [look.refusal for look in looks if look.refusal is not None]
     if len(refusals) == len(looks):
-        return None, refusals[0]
+        return refusals[0]
     needed, num_counted = problem.registration.min_inliers, problem.num_matches
     num_matches = sum(len(look.matches.pixels) for look in looks)
     if num_matches < needed:
-        return None, Refusal(
+        return Refusal(
             "matching",
             Reason.TOO_FEW_MATCHES,
             f"only {num_matches} keypoints match the map, but {needed} are needed",
         )
     if num_counted < needed:
-        return None, Refusal(
+        return Refusal(
             "gate",
             Reason.UNCERTAIN_POSE,
             f"{num_matches - num_counted} of {num_matches} matches do not count, "
@@ -278,10 +322,7 @@ def _find_pose(
             "a photo on its own can do without, and only with a solver other than "
             f"{Solver.REGISTRATION}",
         )
-    best = problem.solve()
-    if best is None:
-        return None, Refusal("pose", Reason.NO_POSE, "no camera pose explains the matches")
-    return accepted(problem, best)
+    return None
 
 
 def _with_turned_photos(refusal: Refusal, looks: Sequence[Look]) -> Refusal:

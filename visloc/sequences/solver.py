@@ -44,6 +44,7 @@ _UNCHECKED_SHARE = 0.05
 # Searching a window in which no instant has its own pose takes seconds. After a search in vain, the
 # next one waits for this many new instants.
 _BLIND_REST = 10
+_NO_EVIDENCE = (Reason.CONTRADICTS_PRIOR, Reason.AMBIGUOUS, Reason.CAMERA_CONTRADICTED)
 _CONTRADICTED = Refusal(
     "gate",
     Reason.CONTRADICTS_MOTION,
@@ -353,9 +354,10 @@ def check_odometry(odometry: Odometry | None, *, metric: bool) -> None:
 
 def _window_instant(solved: Solved) -> WindowInstant:
     refusal = solved.answer.refusal
-    if refusal is not None and refusal.reason in (Reason.CONTRADICTS_PRIOR, Reason.AMBIGUOUS):
+    if refusal is not None and refusal.reason in _NO_EVIDENCE:
         # Matches under wrong priors could pass together the gate that refused each alone. Matches
-        # that another map explains as well are no evidence for this one.
+        # that another map explains as well are no evidence for this one. Pixels of a wrong camera
+        # fit a wrong pose.
         return WindowInstant((), None)
     if any(view.focal_unknown for view in solved.views):
         # A window takes cameras as they are: such pixels would fit a wrong pose.

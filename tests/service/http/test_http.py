@@ -119,6 +119,20 @@ def test_a_blank_photo_is_an_answer_without_a_pose(doors: Any) -> None:
     assert answer["camera"]["source"] == "guess"
 
 
+def test_a_camera_that_the_photo_contradicts_is_refused_with_both_numbers(
+    doors: Any, query: Any
+) -> None:
+    wrong = query.camera.focal_length * 1.3
+    camera = f"SIMPLE_PINHOLE,{query.camera.width},{query.camera.height},{wrong},"
+    camera += f"{query.camera.width / 2},{query.camera.height / 2}"
+    answer = comparable(post(doors, query.image, camera=camera))
+
+    assert (answer["status"], answer["pose"]) == ("not_localized", None)
+    assert answer["refusal"]["stage"] == "gate"
+    assert answer["refusal"]["reason"] == "camera_contradicted"
+    assert f"a focal length of {wrong:.0f} px, but the photo says" in answer["refusal"]["message"]
+
+
 @pytest.mark.parametrize("mode", ["L", "RGBA", "P", "I;16"])
 def test_grey_transparent_palette_and_16_bit_photos_are_localized(
     mode: str, doors: Any, query: Any

@@ -647,7 +647,7 @@ def test_of_blurred_photos_a_pose_that_halves_do_not_confirm_is_refused(place: A
     for seed in range(12):
         images = [place.image(street(place, seed, noise=6.0))]
         solved = solve(images, place)
-        insisted = solve(images, place, min_inliers=30)
+        insisted = solve(images, place, min_inliers=29)
         if solved.answer.pose is None:
             assert reason(solved) is Reason.UNCERTAIN_POSE
             refused += 1
@@ -655,6 +655,15 @@ def test_of_blurred_photos_a_pose_that_halves_do_not_confirm_is_refused(place: A
                 worst = max(worst, error_of(insisted, place, Pose.identity())[0])
     assert refused >= 4
     assert worst > 1.0
+
+
+def test_only_who_asks_for_fewer_inliers_than_the_default_does_without_the_halves(
+    place: Any,
+) -> None:
+    for seed in range(4):
+        images = [place.image(street(place, seed, noise=6.0))]
+        assert reason(solve(images, place, min_inliers=30)) is reason(solve(images, place))
+        assert reason(solve(images, place, min_inliers=29)) is not Reason.UNCERTAIN_POSE
 
 
 def test_of_sharp_photos_the_same_few_inliers_are_enough(place: Any) -> None:

@@ -62,6 +62,14 @@ export const ADVICE: Readonly<Record<string, Advice>> = {
       SHARPER,
     ],
   },
+  camera_contradicted: {
+    meaning: "The photo speaks for other camera parameters than those it came with.",
+    tries: [
+      CHECK_CAMERA,
+      "Leave the camera out, if the photo is as it was taken.",
+      "Of a photo that was cropped, stretched or turned, choose the original.",
+    ],
+  },
   contradicts_prior: {
     meaning: "The best pose contradicts the priors.",
     tries: ["Check the priors.", "Send no priors."],

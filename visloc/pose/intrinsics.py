@@ -1,0 +1,277 @@
+"""The intrinsics that a photo's own matches speak for, beside those that were given.
+
+Every camera model multiplies by the focal length at last, then adds the principal point. A change
+of both is therefore an affine map of the given camera's pixels, whatever the model:
+``u = c + L d + Z (u_given - c)`` with the principal point c, the longer side L and
+``Z = diag(exp(a + b / 2), exp(a - b / 2))``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.geometry import Pose
+from visloc.pose.motion import moved
+from visloc.pose.refinement import LOSS_SCALE_PX
+from visloc.pose.reprojection import has_derivative, linearized, reprojection_errors
+from visloc.pose.views import MatchedView
+
+# Places in a change of the intrinsics.
+FOCAL, SHIFT_X, SHIFT_Y, ASPECT = range(4)
+_ALL = (FOCAL, SHIFT_X, SHIFT_Y, ASPECT)
+# Landmarks share errors: of depth, of poses of mapping photos, of the shutter. However many matches
+# there are, they tell no more than this many independent ones
+# (docs/decisions/0027-a-camera-that-is-checked.md).
+_INDEPENDENT_MATCHES = 16.0
+# For that reason, more inliers change little. Of few, none may be missed: wrong matches within the
+# widest threshold outnumber them.
+_MAX_INLIERS, _MAX_MATCHES = 200, 1000
+_MIN_MATCHES = 10  # as many as there are parameters
+# Thresholds and loss scales in units of the last: under a camera that is wrong by a factor of two,
+# most matches lie farther away than an inlier may.
+_WIDTHS = (4.0, 2.0, 1.0)
+_MAX_STEPS = (6, 6, 20)
+_MAX_CHANGE = 0.5  # in one step
+_MIN_DAMPING, _REJECTED_DAMPING, _MAX_DAMPING = 1e-6, 1e-2, 1e4
+_CONVERGED = 0.02  # of chi-square
+# Where the first step promises less, it is not worth taking: most photos with a right camera.
+_MIN_PROMISED_GAIN = 2.0
+_MIN_VARIANCE_PX2 = 1e-12
+_MIN_INFORMATION = 1e-12  # least eigenvalue, with a diagonal of 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundIntrinsics:
+    """A change of a camera under which it explains its matches better.
+
+    Attributes:
+        change: (4,) float64: log of the factor of the focal length; shift of the principal point to
+            the right and down, in longer sides of the photo; log of the factor of fx / fy. Zero
+            where it was held.
+        covariance: (4, 4) float64 of ``change``, with the errors that landmarks share; zero where
+            it was held.
+        gain: how much less the given camera explains: difference of the losses of both best poses,
+            in units of chi-square, with the same errors.
+        num_inliers: of the matches that were looked at.
+    """
+
+    change: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    gain: float
+    num_inliers: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    """A pose and a change of the camera.
+
+    Attributes:
+        errors: (n, 2) pixels, NaN behind the camera.
+        jacobian: (n, 2, 6 + k) by the pose and what is free of the change.
+    """
+
+    rig_from_world: Pose
+    change: NDArray[np.float64]
+    errors: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Normal:
+    """Normal equations of a state's inliers.
+
+    Attributes:
+        information: (6 + k, 6 + k) for errors of one pixel.
+        gradient: (6 + k,)
+        variance: px^2 of one coordinate of an error, with what landmarks share of it.
+        num_inliers: of the state.
+    """
+
+    information: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    variance: float
+    num_inliers: int
+
+
+def find_intrinsics(
+    view: MatchedView, rig_from_world: Pose, *, max_error_px: float
+) -> tuple[FoundIntrinsics, FoundIntrinsics] | None:
+    """Estimate the intrinsics of a camera together with its pose.
+
+    The loss is the one of ``visloc.pose.refinement``. Inliers are chosen anew in every step, at
+    first with a wider threshold.
+
+    Args:
+        view: the camera as given, with all its matches.
+        rig_from_world: the best pose with the given camera.
+        max_error_px: largest reprojection error of an inlier.
+
+    Returns:
+        With the focal length free, then with the principal point and the aspect free as well. None
+        where the given camera explains the matches about as well, or these are too few.
+    """
+    view = _near(replace(view, focal_unknown=False), rig_from_world, max_error_px)
+    if len(view) < _MIN_MATCHES:
+        return None
+    start = _state(view, _ALL, rig_from_world, np.zeros(len(_ALL)))
+    if all(_promised_gain(start, max_error_px, width) < _MIN_PROMISED_GAIN for width in _WIDTHS):
+        return None
+    start = replace(start, jacobian=start.jacobian[:, :, :6])
+    # Other cameras of a rig may have found the pose, where this one has hardly an inlier.
+    given = _minimized(view, (), start, max_error_px, _WIDTHS[-1:]) or start
+    focal = _improved(view, (FOCAL,), given, max_error_px, _WIDTHS)
+    whole = focal and _improved(view, _ALL, focal, max_error_px, _WIDTHS[1:])
+    if focal is None or whole is None:
+        return None
+    given_loss = _loss(given, max_error_px)
+    of_focal = _found((FOCAL,), focal, given_loss, max_error_px)
+    of_all = _found(_ALL, whole, given_loss, max_error_px)
+    return None if of_focal is None or of_all is None else (of_focal, of_all)
+
+
+def _near(view: MatchedView, rig_from_world: Pose, max_error_px: float) -> MatchedView:
+    """The matches that a changed camera may explain; of many, every so many."""
+    finite = np.isfinite(np.hstack([view.pixels, view.points])).all(axis=1)
+    view = view.selected(np.asarray(finite))
+    errors = reprojection_errors(view, rig_from_world)
+    rows = np.flatnonzero(errors <= _WIDTHS[0] * max_error_px)
+    num_inliers = int(np.count_nonzero(errors <= max_error_px))
+    step = max(num_inliers // _MAX_INLIERS, -(-len(rows) // _MAX_MATCHES), 1)
+    return view.selected(rows[::step])
+
+
+def _promised_gain(state: _State, max_error_px: float, width: float) -> float:
+    """What ``gain`` would be if the loss were quadratic; 0 when the matches are too few."""
+    normal = _normal_equations(state, max_error_px, width)
+    if normal is None:
+        return 0.0
+    units = np.sqrt(np.diag(normal.information))
+    damped = normal.information / np.outer(units, units) + _MIN_DAMPING * np.eye(len(units))
+    scaled = normal.gradient / units
+    return float(scaled @ np.linalg.solve(damped, scaled)) / normal.variance
+
+
+def _improved(
+    view: MatchedView,
+    free: Sequence[int],
+    start: _State,
+    max_error_px: float,
+    widths: Sequence[float],
+) -> _State | None:
+    """The best state near the start with more parameters free."""
+    start = _state(view, free, start.rig_from_world, start.change)
+    found = _minimized(view, free, start, max_error_px, widths)
+    if found is None or _loss(found, max_error_px) > _loss(start, max_error_px):
+        # Under the wider threshold, wrong matches led astray.
+        found = _minimized(view, free, start, max_error_px, _WIDTHS[-1:])
+    return found
+
+
+def _minimized(
+    view: MatchedView,
+    free: Sequence[int],
+    state: _State,
+    max_error_px: float,
+    widths: Sequence[float],
+) -> _State | None:
+    """Levenberg-Marquardt over the pose and what is free, with one threshold after the other."""
+    for width, max_steps in zip(widths, _MAX_STEPS[-len(widths) :], strict=True):
+        damping = _MIN_DAMPING
+        normal = _normal_equations(state, max_error_px, width)
+        for _ in range(max_steps):
+            if normal is None:
+                return None
+            units = np.sqrt(np.diag(normal.information))
+            damped = normal.information / np.outer(units, units) + damping * np.eye(len(units))
+            step = -np.linalg.solve(damped, normal.gradient / units) / units
+            change = state.change.copy()
+            change[list(free)] += np.clip(step[6:], -_MAX_CHANGE, _MAX_CHANGE)
+            tried = _state(view, free, moved(state.rig_from_world, step[:6]), change)
+            enough = _CONVERGED * normal.variance
+            gain = -0.5 * float(normal.gradient @ step)
+            if _loss(tried, max_error_px, width) <= _loss(state, max_error_px, width):
+                state, damping = tried, max(damping / 10.0, _MIN_DAMPING)
+                normal = _normal_equations(state, max_error_px, width)
+            else:
+                damping = max(10.0 * damping, _REJECTED_DAMPING)
+            if gain <= enough or damping > _MAX_DAMPING:
+                break
+    return state
+
+
+def _state(
+    view: MatchedView, free: Sequence[int], rig_from_world: Pose, change: NDArray[np.float64]
+) -> _State:
+    errors, by_pose = linearized([view], rig_from_world, about=np.zeros(3))
+    longer_side, centre = max(view.camera.width, view.camera.height), view.principal_point
+    half = np.array([0.5, -0.5])
+    zoom = np.exp(change[FOCAL] + change[ASPECT] * half)
+    from_centre = (errors + view.pixels - centre) * zoom
+    by_change = np.zeros((len(view), 2, len(_ALL)))
+    by_change[:, :, FOCAL] = from_centre
+    by_change[:, 0, SHIFT_X] = by_change[:, 1, SHIFT_Y] = longer_side
+    by_change[:, :, ASPECT] = from_centre * half
+    return _State(
+        rig_from_world,
+        change,
+        from_centre + centre + longer_side * change[[SHIFT_X, SHIFT_Y]] - view.pixels,
+        np.concatenate([by_pose * zoom[:, None], by_change[:, :, list(free)]], axis=2),
+    )
+
+
+def _loss(state: _State, max_error_px: float, width: float = 1.0) -> float:
+    """Of all matches, px^2; constant beyond the threshold and behind the camera."""
+    squared = np.sum(state.errors**2, axis=1)
+    largest, scale2 = (width * max_error_px) ** 2, (width * LOSS_SCALE_PX) ** 2
+    squared = np.where(squared <= largest, squared, largest)  # NaN too
+    return float(0.5 * scale2 * np.log1p(squared / scale2).sum())
+
+
+def _normal_equations(state: _State, max_error_px: float, width: float = 1.0) -> _Normal | None:
+    """None when fewer matches than parameters are inliers, or say nothing of one of these."""
+    squared = np.sum(state.errors**2, axis=1)
+    inliers = (squared <= (width * max_error_px) ** 2) & has_derivative(
+        state.errors, state.jacobian
+    )
+    errors, jacobian = state.errors[inliers], state.jacobian[inliers]
+    num_parameters = jacobian.shape[2]
+    if len(errors) < num_parameters:
+        return None
+    weight = 1.0 / (1.0 + squared[inliers] / (width * LOSS_SCALE_PX) ** 2)
+    root = np.sqrt(weight)[:, None, None]
+    # One row per parameter. einsum, as in ``visloc.pose.refinement``: the bits of a product of
+    # matrices depend on the number of threads.
+    columns = np.ascontiguousarray((root * jacobian).reshape(-1, num_parameters).T)
+    weighted = (root[:, :, 0] * errors).ravel()
+    information = np.einsum("in,jn->ij", columns, columns)
+    if not (np.diag(information) > 0).all():
+        return None
+    total = float(weight.sum())
+    of_one = float(weighted @ weighted) / (2.0 * total)
+    return _Normal(
+        information,
+        np.einsum("in,n->i", columns, weighted),
+        max(of_one, _MIN_VARIANCE_PX2) * (1.0 + total / _INDEPENDENT_MATCHES),
+        len(errors),
+    )
+
+
+def _found(
+    free: Sequence[int], found: _State, given_loss: float, max_error_px: float
+) -> FoundIntrinsics | None:
+    normal = _normal_equations(found, max_error_px)
+    if normal is None:
+        return None
+    units = np.sqrt(np.diag(normal.information))
+    scaled = normal.information / np.outer(units, units)
+    if np.linalg.eigvalsh(scaled)[0] < _MIN_INFORMATION:
+        return None
+    inverse = np.linalg.inv(scaled) / np.outer(units, units)
+    covariance = np.zeros((len(_ALL), len(_ALL)))
+    covariance[np.ix_(free, free)] = normal.variance * inverse[6:, 6:]
+    gain = 2.0 * (given_loss - _loss(found, max_error_px)) / normal.variance
+    return FoundIntrinsics(found.change, covariance, gain, normal.num_inliers)
