@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from visloc.errors import VislocError, refuse
 from visloc.geometry import Camera, Pose
 from visloc.localization.constraints import Constraints, MapGeometry
+from visloc.localization.evidence import Shown
 from visloc.localization.gates import Problem, accepted, not_better_elsewhere
 from visloc.options import LocalizeOptions, ReadAs, Solver
 from visloc.pose.centre import position_covariance, with_origin
@@ -66,6 +67,7 @@ class Look:
         elsewhere: with landmarks of photos that look more like the query but that the priors
             exclude; usually none.
         refusal: why there is nothing to solve; None otherwise.
+        shown: all that was found in the image; None when a pose shall not be compared with it.
     """
 
     evidence: Evidence
@@ -73,6 +75,7 @@ class Look:
     landmarks: NDArray[np.int64]
     elsewhere: Matches
     refusal: Refusal | None = None
+    shown: Shown | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,7 +151,8 @@ def solve_instant(
     views = _views_of(images, [look.matches for look in looks], options)
     seconds = _summed([look.evidence.seconds for look in looks])
     with timed(seconds, "pose"):
-        found, refusal = _find_pose(images, Problem(views, options, constraints))
+        problem = Problem(views, options, constraints, _shown_in(images, options))
+        found, refusal = _find_pose(images, problem)
         if refusal is None or refusal.reason is not Reason.CONTRADICTS_PRIOR:
             elsewhere = _views_of(images, [look.elsewhere for look in looks], options)
             refusal = (
@@ -158,6 +162,7 @@ def solve_instant(
     pose = None
     if refusal is None and found is not None and found.covariance is not None:
         pose = rig_pose(found.rig_from_world, found.covariance, geometry, PoseSource.ESTIMATED)
+        pose = replace(pose, probability=found.probability)
     inliers = () if found is None else tuple(found.inliers)
     camera = None if refusal is not None or found is None else found.camera
     shown = with_inliers([_shown(image, camera) for image in images], inliers)
@@ -189,10 +194,10 @@ def _views_of(
     A view whose camera is a guess is empty, unless its focal length will be estimated.
     """
     usable = [(image.cam_from_rig, image.look) for image in images if image.look is not None]
-    finds_focal = len(usable) == 1 and options.solver is not Solver.REGISTRATION
+    finds_focal = _finds_focal(images, options)
     views = []
     for (cam_from_rig, look), of_image in zip(usable, matches, strict=True):
-        guessed = look.evidence.camera_source is CameraSource.GUESS
+        guessed = _is_guessed(look)
         counted = of_image if finds_focal or not guessed else Matches.none()
         views.append(
             MatchedView(
@@ -204,6 +209,22 @@ def _views_of(
             )
         )
     return tuple(views)
+
+
+def _shown_in(images: Sequence[SeenImage], options: LocalizeOptions) -> tuple[Shown | None, ...]:
+    """What each view of ``_views_of`` shows; None for those whose camera is not known."""
+    finds_focal = _finds_focal(images, options)
+    looks = [image.look for image in images if image.look is not None]
+    return tuple(look.shown if finds_focal or not _is_guessed(look) else None for look in looks)
+
+
+def _finds_focal(images: Sequence[SeenImage], options: LocalizeOptions) -> bool:
+    num_usable = sum(image.look is not None for image in images)
+    return num_usable == 1 and options.solver is not Solver.REGISTRATION
+
+
+def _is_guessed(look: Look) -> bool:
+    return look.evidence.camera_source is CameraSource.GUESS
 
 
 def _shown(image: SeenImage, found: Camera | None) -> ImageAnswer:

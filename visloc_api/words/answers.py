@@ -38,6 +38,10 @@ _NOT_COVERED = (
 _COVARIANCE = (
     "6 x 6, row by row: rotation (rad), then translation, for R <- Exp(w) R and t <- t + dt of "
 )
+# Of a pose. Older services do not state it.
+_PROBABILITY = (
+    "that the pose is right, 0 to 1, judged by what the photo shows of all that the map has there; "
+)
 
 
 class _ReceivedPose(Pose):
@@ -118,6 +122,9 @@ class PoseEstimate(_PoseWithDigits):
             + _NOT_COVERED
         ),
     ]
+    probability: Annotated[
+        float | None, Field(ge=0, le=1, description=f"{_PROBABILITY}null when it was not judged")
+    ] = None
 
 
 class RigPose(_PoseWithDigits):
@@ -147,6 +154,14 @@ class RigPose(_PoseWithDigits):
             + _NOT_COVERED
         ),
     ]
+    probability: Annotated[
+        float | None,
+        Field(
+            ge=0,
+            le=1,
+            description=f"{_PROBABILITY}null when the instant's own images did not measure it",
+        ),
+    ] = None
 
 
 class Refusal(Answer):

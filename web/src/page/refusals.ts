@@ -66,6 +66,12 @@ export const ADVICE: Readonly<Record<string, Advice>> = {
     meaning: "The best pose is not where the camera is said to be.",
     tries: ["Check what is known before (the priors).", "Leave it out."],
   },
+  unlikely_pose: {
+    meaning:
+      "A pose was found, but the map has other things there than the photo shows: this may be " +
+      "a print, a screen, a mirror, or another place that looks alike.",
+    tries: [ANOTHER_PLACE, CHECK_CAMERA],
+  },
   ambiguous: {
     meaning: "Two places explain the photo about equally well.",
     tries: [
