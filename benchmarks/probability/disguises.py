@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -62,7 +63,7 @@ def resembling(image: Image, foreign: Image, rng: np.random.Generator) -> Image:
 
 
 def _blurred(image: Image, camera: Camera, _: Image, rng: np.random.Generator) -> Taken:
-    return cv2.GaussianBlur(image, (0, 0), rng.uniform(1, 4) * camera.width / 640), camera
+    return _bytes(cv2.GaussianBlur(image, (0, 0), rng.uniform(1, 4) * camera.width / 640)), camera
 
 
 def _dark(image: Image, camera: Camera, _: Image, rng: np.random.Generator) -> Taken:
@@ -106,7 +107,7 @@ def _small(image: Image, camera: Camera, _: Image, rng: np.random.Generator) -> 
     names = CAMERA_MODELS[camera.model]
     params = tuple(v * of.get(n, 1.0) for n, v in zip(names, camera.params, strict=True))
     smaller = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    return smaller, Camera(camera.model, width, height, params)
+    return _bytes(smaller), Camera(camera.model, width, height, params)
 
 
 def _cropped(image: Image, camera: Camera, _: Image, rng: np.random.Generator) -> Taken:
@@ -160,5 +161,5 @@ def _patches(
     return mask
 
 
-def _bytes(values: NDArray[np.floating]) -> Image:
-    return np.clip(values, 0, 255).astype(np.uint8)
+def _bytes(values: NDArray[Any]) -> Image:
+    return np.asarray(np.clip(values, 0, 255), dtype=np.uint8)

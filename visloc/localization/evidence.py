@@ -164,7 +164,7 @@ def evidence_of(
     values = (
         _log_odds(num_inliers, num_matches),
         np.log((num_inliers + 1.0) / (num_keypoints + 1.0)),
-        _share(np.sum(errors <= _TIGHT_SHARE * max_error_px), num_inliers),
+        _share(int(np.sum(errors <= _TIGHT_SHARE * max_error_px)), num_inliers),
         _coherence(explaining, rig_from_world),
         np.log(np.sqrt(max(variance, 0.0)) / max(geometry.reach, _LEAST) + 1e-4),
         np.log(min(each.apart for each in compared) + 0.05),
@@ -205,7 +205,7 @@ def _cover_features(compared: Sequence[_Compared]) -> tuple[float, ...]:
     )
     rich = keypoints >= np.maximum(_MIN_KEYPOINTS, _RICH * keypoints.mean())
     return (
-        _share(np.sum(inliers[rich] >= _MIN_INLIERS), rich.sum()),
+        _share(int(np.sum(inliers[rich] >= _MIN_INLIERS)), int(rich.sum())),
         _share(keypoints[inliers == 0].sum(), keypoints.sum()),
         _share(expected[inliers == 0].sum(), expected.sum()),
     )
@@ -224,8 +224,8 @@ def _coherence(explaining: Sequence[MatchedView], rig_from_world: Pose) -> float
         some = view.selected(np.arange(0, len(view), max(1, -(-len(view) // _MAX_COHERENT))))
         in_cam = (some.cam_from_rig @ rig_from_world).apply(some.points)
         errors = project(some.camera, in_cam) - some.pixels
-        _, near = KDTree(some.pixels).query(some.pixels, k=_NUM_NEIGHBOURS + 1)
-        along += float(np.sum(errors * errors[near[:, 1:]].mean(axis=1)))
+        _, near = KDTree(some.pixels).query(some.pixels, k=range(2, _NUM_NEIGHBOURS + 2))
+        along += float(np.sum(errors * errors[np.asarray(near)].mean(axis=1)))
         total += float(np.sum(errors * errors))
     return along / total
 
@@ -247,7 +247,7 @@ def _compare(
             distance_upper_bound=_NEAR_SHARE * max_error_px,
         )
         there = np.isfinite(distances)
-        comparable = there.any(axis=1)
+        comparable = np.asarray(there.any(axis=1), dtype=np.bool_).reshape(num)
         near, there = np.where(there, near, 0)[comparable], there[comparable]
         theirs = shown.descriptors.rows[near].astype(np.float32)
         ours = expected.descriptors[comparable].astype(np.float32)
