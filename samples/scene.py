@@ -6,6 +6,7 @@ the long side of the room.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import cv2
@@ -64,16 +65,26 @@ class _Board:
     paint: Paint
 
 
-def make_room(seed: int) -> Scene:
-    """Build the room; its furniture stands still, every picture in it depends on the seed."""
-    boards = [*_shell(), *_furniture(), *_wall_pictures()]
+def make_room(
+    seed: int, repainted: Collection[int] = (), repainted_seed: int | None = None
+) -> Scene:
+    """Build the room; its furniture stands still, every picture in it depends on the seed.
+
+    Args:
+        seed: of the pictures.
+        repainted: numbers of surfaces, below ``NUM_SURFACES``, whose pictures depend on another
+            seed: they make rooms that resemble each other.
+        repainted_seed: that seed.
+    """
+    boards = _boards()
     painted = []
     for index, board in enumerate(boards):
         size = [
             round(float(np.linalg.norm(e)) * surfaces.TEXELS_PER_M)
             for e in (board.edge_u, board.edge_v)
         ]
-        rng = np.random.default_rng([seed, index])
+        of = repainted_seed if index in repainted and repainted_seed is not None else seed
+        rng = np.random.default_rng([of, index])
         painted.append(board.paint(rng, max(size[1], 8), max(size[0], 8)))
     lit = light(painted, [(b.corner, b.edge_u, b.edge_v) for b in boards], ROOM_SIZE_M)
     return Scene(
@@ -94,6 +105,10 @@ def picture_levels(image: Image) -> tuple[Image, ...]:
         image = np.asarray(halved, dtype=np.uint8)
         levels.append(image)
     return tuple(levels)
+
+
+def _boards() -> list[_Board]:
+    return [*_shell(), *_furniture(), *_wall_pictures()]
 
 
 def _board(
@@ -229,3 +244,6 @@ def _table(
 def _axes(yaw: float) -> tuple[Vector, Vector]:
     cos, sin = np.cos(yaw), np.sin(yaw)
     return np.array([cos, sin, 0.0]), np.array([-sin, cos, 0.0])
+
+
+NUM_SURFACES = len(_boards())

@@ -158,6 +158,7 @@ class Reason(StrEnum):
     NO_PHOTO_NEAR = "no_photo_near"  # the map has no photo where the priors allow the device
     CONTRADICTS_PRIOR = "contradicts_prior"
     CONTRADICTS_MOTION = "contradicts_motion"  # the images of its neighbours, and how it moved
+    UNLIKELY_POSE = "unlikely_pose"  # what the map has there speaks against it
     AMBIGUOUS = "ambiguous"  # two of several places explain the images about equally well
     NO_USABLE_IMAGE = "no_usable_image"  # none of an instant's images could be read
 
@@ -227,6 +228,8 @@ class Localized:
         orientation_std: (3,) standard deviations of w (rad), about the camera's x, y, z.
         inlier_keypoints: (N, 2) float32 pixels of the photo as stored.
         inlier_points: (N, 3) float64 in the world.
+        probability: that the pose is right, 0 to 1 (docs/decisions/0029-evidence-against.md); None
+            when the photo's features were not compared with the map around the pose.
     """
 
     evidence: Evidence
@@ -236,6 +239,7 @@ class Localized:
     orientation_std: NDArray[np.float64]
     inlier_keypoints: NDArray[np.float32]
     inlier_points: NDArray[np.float64]
+    probability: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -284,6 +288,8 @@ class RigPose:
         position_std: (3,) standard deviations of the rig's origin along the world's axes.
         orientation_std: (3,) standard deviations of w (rad), about the rig's x, y, z.
         source: ESTIMATED when the instant's own images measured it.
+        probability: that the pose is right, 0 to 1, judged by the instant's own images; None when
+            they did not measure it.
     """
 
     rig_from_world: Pose
@@ -291,6 +297,7 @@ class RigPose:
     position_std: NDArray[np.float64]
     orientation_std: NDArray[np.float64]
     source: PoseSource
+    probability: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

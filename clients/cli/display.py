@@ -152,6 +152,8 @@ def _print_pose(console: Console, pose: PoseEstimate, unit: str) -> None:
         f"{_numbers(pose.orientation, 6)} (w x y z, world_from_cam), "
         f"std {_numbers(pose.orientation_std_deg, 3)} degrees",
     )
+    if pose.probability is not None:
+        print_line(console, "probability", f"{pose.probability:.3f} that the pose is right")
 
 
 def _poses(modes: Mapping[str, Mapping[str, Any]], num_with_truth: int, unit: str) -> Table:

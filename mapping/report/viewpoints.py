@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from visloc.archive import Map
 from visloc.geometry import Pose
 from visloc.localization.constraints import MapGeometry
+from visloc.pose.distance import viewpoints_apart
 
 _LEAST_REACH = 1e-9  # of a map whose photos see nothing
 
@@ -46,13 +47,5 @@ class Viewpoints:
         return Pose(rotation, -rotation @ self.centers[image])
 
     def apart_from(self, pose: Pose) -> NDArray[np.float64]:
-        """How far each photo (n,) is from a pose, in radians.
-
-        The sum of two angles by which what is seen moves: that of the turn, and that under which
-        the way between both is seen from where the map's photos look.
-        """
-        traces = np.einsum("nij,ij->n", self.rotations, pose.rotation)
-        cosines = (traces - 1.0) / 2.0
-        angles = np.arccos(np.clip(cosines, -1.0, 1.0))
-        moved = np.linalg.norm(self.centers - pose.center, axis=1)
-        return np.asarray(angles + moved / self.reach)
+        """How far each photo (n,) is from a pose, in radians, as ``viewpoints_apart``."""
+        return viewpoints_apart(self.rotations, self.centers, pose, self.reach)

@@ -105,6 +105,7 @@ def _uncertain(measured: visloc.types.RigPose) -> dict[str, Any]:
         "covariance": measured.covariance,
         "position_std": measured.position_std,
         "orientation_std_deg": np.degrees(measured.orientation_std),
+        "probability": measured.probability,
     }
 
 

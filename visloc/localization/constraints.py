@@ -19,7 +19,7 @@ from visloc.errors import refuse
 from visloc.geometry import Pose
 from visloc.pose.centre import largest_std, with_origin
 from visloc.pose.colmap import normalized_rays
-from visloc.pose.distance import mahalanobis2
+from visloc.pose.distance import mahalanobis2, viewpoints_apart
 from visloc.pose.generalized import MAX_FOCAL, MIN_FOCAL
 from visloc.pose.gravity import KnownGravity, gravity_deviation
 from visloc.pose.views import MatchedView
@@ -44,34 +44,45 @@ class MapGeometry:
     """
 
     def __init__(self, opened: Map) -> None:
-        self._map = opened
+        self.opened = opened
         self.origin = np.array(opened.manifest.world.origin)
         self.down = opened.gravity
 
     @property
     def ref(self) -> str:
         """The map, ``id@version``."""
-        return self._map.ref
+        return self.opened.ref
 
     @cached_property
     def centers(self) -> NDArray[np.float64]:
         """(n, 3) camera centres of the photos, relative to the origin."""
-        poses = self._map.image_poses
+        poses = self.opened.image_poses
         rotations = Rotation.from_quat(poses[:, :4], scalar_first=True)
         return np.asarray(-rotations.inv().apply(poses[:, 4:]) - self.origin)
+
+    @cached_property
+    def rotations(self) -> NDArray[np.float64]:
+        """(n, 3, 3) ``cam_from_world`` of the photos."""
+        quaternions = self.opened.image_poses[:, :4]
+        return np.asarray(Rotation.from_quat(quaternions, scalar_first=True).as_matrix())
+
+    def apart_from(self, cam_from_local: Pose) -> NDArray[np.float64]:
+        """How far each photo (n,) is from a pose, radians, as ``viewpoints_apart``."""
+        reach = max(self.reach, _LEAST_REACH)
+        return viewpoints_apart(self.rotations, self.centers, cam_from_local, reach)
 
     @cached_property
     def reach(self) -> float:
         """Median distance from photos to the landmarks that they see, in units of the world."""
         num_photos = len(self.centers)
         distances = []
-        offsets = self._map.observation_offsets
+        offsets = self.opened.observation_offsets
         for photo in range(0, num_photos, max(1, num_photos // _NUM_REACH_PHOTOS)):
             start, stop = int(offsets[photo]), int(offsets[photo + 1])
             step = max(1, (stop - start) // _NUM_REACH_LANDMARKS)
-            seen = self._map.observation_landmarks[start:stop:step]
+            seen = self.opened.observation_landmarks[start:stop:step]
             if len(seen):
-                away = self._map.landmarks[seen].astype(np.float64) - self.centers[photo]
+                away = self.opened.landmarks[seen].astype(np.float64) - self.centers[photo]
                 distances.append(float(np.median(np.linalg.norm(away, axis=1))))
         return float(np.median(distances)) if distances else 0.0
 
@@ -89,7 +100,7 @@ class Constraints:
     """
 
     def __init__(self, geometry: MapGeometry, priors: Priors) -> None:
-        self._geometry = geometry
+        self.geometry = geometry
         self._priors = priors
         gravity = priors.gravity
         down = geometry.down
@@ -137,21 +148,21 @@ class Constraints:
         spheres = []
         if self._priors.position is not None:
             prior = self._priors.position
-            spheres.append((prior.position - self._geometry.origin, prior.radius))
+            spheres.append((prior.position - self.geometry.origin, prior.radius))
         if self._pose is not None:
             spheres.append((self._pose[0].center, POSE_PRIOR_STDS * largest_std(*self._pose)))
         if not spheres and self._priors.height is None:
             return None
-        centers = self._geometry.centers
+        centers = self.geometry.centers
         weights = np.ones(len(centers))
-        reach = max(self._geometry.reach, _LEAST_REACH)
+        reach = max(self.geometry.reach, _LEAST_REACH)
         for center, radius in spheres:
             beyond = (np.linalg.norm(centers - center, axis=1) - radius) / reach
             weights *= np.where(beyond <= REACH, np.exp(-0.5 * np.maximum(beyond, 0.0) ** 2), 0.0)
         band = self._priors.height
         if band is not None and self._up is not None:
             slack = HEIGHT_REACH * (band.max - band.min)
-            heights = (centers + self._geometry.origin) @ self._up
+            heights = (centers + self.geometry.origin) @ self._up
             weights[(heights < band.min - slack) | (heights > band.max + slack)] = 0.0
         return weights
 
@@ -163,7 +174,7 @@ class Constraints:
             covariance: (6, 6) of it.
         """
         own = _OWN_STDS * largest_std(pose, covariance)
-        center = pose.center + self._geometry.origin
+        center = pose.center + self.geometry.origin
         position = self._priors.position
         if position is not None:
             away = float(np.linalg.norm(center - position.position))

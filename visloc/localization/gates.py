@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from visloc.geometry import Camera, Pose
 from visloc.localization.camera_check import camera_contradiction
 from visloc.localization.constraints import Constraints
+from visloc.localization.evidence import SeenView, Shown, evidence_of
+from visloc.localization.probability import against, shipped_model
 from visloc.options import DEFAULT_PRESET, PRESETS, LocalizeOptions, RegistrationPreset
 from visloc.pose.distance import mahalanobis2
 from visloc.pose.generalized import (
@@ -38,6 +40,9 @@ _AMBIGUOUS_SHARE = 0.7
 # chi-square with six degrees of freedom: above the limit once in a thousand times.
 _SURE_INLIERS = 100
 _MAX_HALVES_MAHALANOBIS2 = 22.46
+# A pose that is nine times as likely wrong as right is no answer. Above that, the answer says how
+# likely it is, and the caller decides.
+_LEAST_PROBABILITY = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,12 +52,14 @@ class Problem:
     Attributes:
         views: of the images, relative to the map's origin.
         sources: where the camera of each view came from.
+        shown: all that each image shows; () or None where a pose shall not be compared with it.
     """
 
     views: tuple[MatchedView, ...]
     sources: tuple[CameraSource, ...]
     options: LocalizeOptions
     constraints: Constraints
+    shown: tuple[Shown | None, ...] = ()
 
     @property
     def registration(self) -> RegistrationPreset:
@@ -105,7 +112,9 @@ def accepted(problem: Problem, best: GeneralizedPose) -> tuple[GeneralizedPose, 
         other = _near_pose_prior(problem, best)
         if other is not None and first_refusal(GATES, problem, other) is None:
             best, refusal = other, None
-    return best, refusal or first_refusal(CONFIRMATIONS, problem, best)
+    refusal = refusal or first_refusal(CONFIRMATIONS, problem, best)
+    # Last: a wrong camera makes a pose unlikely too, and its own refusal says what to mend.
+    return (best, refusal) if refusal is not None else likely(problem, best)
 
 
 def first_refusal(gates: Sequence[Gate], problem: Problem, pose: GeneralizedPose) -> Refusal | None:
@@ -230,6 +239,40 @@ def cameras_agree(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
         if contradiction is not None:
             return _refused(Reason.CAMERA_CONTRADICTED, contradiction)
     return None
+
+
+def likely(problem: Problem, pose: GeneralizedPose) -> tuple[GeneralizedPose, Refusal | None]:
+    """Add the probability that a pose is right, and refuse one that is probably wrong.
+
+    Who names thresholds of their own gets what they ask for, with the probability beside it. A
+    pose has none when no image may be compared with the map.
+    """
+    seen = [
+        (view if pose.camera is None else replace(view, camera=pose.camera), shown, inliers)
+        for view, shown, inliers in zip(problem.views, problem.shown, pose.inliers, strict=False)
+        if shown is not None
+    ]
+    if not seen or pose.covariance is None:
+        return pose, None
+    features = evidence_of(
+        problem.constraints.geometry,
+        [SeenView(*each) for each in seen],
+        pose.rig_from_world,
+        pose.covariance,
+        problem.registration.max_error_px,
+    )
+    probability = float(shipped_model().probability(features))
+    pose = replace(pose, probability=probability)
+    options = problem.options
+    has_own_thresholds = options.preset != DEFAULT_PRESET or options.min_inliers is not None
+    if probability >= _LEAST_PROBABILITY or has_own_thresholds:
+        return pose, None
+    return pose, _refused(
+        Reason.UNLIKELY_POSE,
+        f"the best pose explains {pose.num_inliers} matches, but is right with a probability of "
+        f"{probability:.2f} only: {against(features)}. Is this a print, a screen or a mirror, or "
+        "another place that looks alike?",
+    )
 
 
 GATES: tuple[Gate, ...] = (enough_inliers, enough_of_the_matches, determined, within_the_priors)

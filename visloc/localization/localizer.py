@@ -21,6 +21,7 @@ from visloc.features.networks.lightglue.load import make_lightglue
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo
 from visloc.localization.constraints import Constraints, MapGeometry
+from visloc.localization.evidence import Shown
 from visloc.localization.feature_cache import FeatureCache, find_features
 from visloc.localization.fingerprints import check_fingerprint
 from visloc.localization.query_camera import resolve_camera
@@ -306,6 +307,7 @@ class Localizer:
             orientation_std=pose.orientation_std,
             inlier_keypoints=look.matches.pixels[inliers].astype(np.float32),
             inlier_points=look.matches.points[inliers] + self.geometry.origin,
+            probability=pose.probability,
         )
         return localized, inliers
 
@@ -348,14 +350,15 @@ class Localizer:
             )
         evidence = replace(evidence, retrieved=tuple(self._describe_retrieved(retrieved)))
         with timed(seconds, "matching"):
-            matches, landmarks = self._match_photos(local, retrieved.images, options, rematching)
-            others, _ = self._match_photos(local, elsewhere, options, rematching)
+            shown = Shown(local.keypoints, round_descriptors(local.descriptors))
+            matches, landmarks = self._match_photos(shown, retrieved.images, options, rematching)
+            others, _ = self._match_photos(shown, elsewhere, options, rematching)
         evidence = replace(evidence, num_correspondences=len(matches.pixels))
-        return Look(evidence, matches, landmarks, others)
+        return Look(evidence, matches, landmarks, others, shown=shown)
 
     def _match_photos(
         self,
-        local: LocalFeatures,
+        shown: Shown,
         photos: NDArray[np.int64],
         options: LocalizeOptions,
         rematching: Rematching | None,
@@ -364,13 +367,13 @@ class Localizer:
         scale = self.map.manifest.local_features.descriptor_scale
         observed = (self.map.observations(int(photo)) for photo in photos)
         pairs = match_landmarks(
-            round_descriptors(local.descriptors),
+            shown.descriptors,
             ((landmarks, EightBitRows(rows, scale)) for landmarks, rows in observed),
             CLEAR_RATIO if options.matcher is Matcher.RATIO else None,
             None if rematching is None else lambda rank: rematching.match(int(photos[rank])),
         )
         matches = Matches(
-            local.keypoints[pairs.keypoints].astype(np.float64),
+            shown.keypoints[pairs.keypoints].astype(np.float64),
             self.map.landmarks[pairs.landmarks].astype(np.float64),
         )
         return matches, pairs.landmarks

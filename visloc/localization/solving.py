@@ -12,6 +12,7 @@ from visloc.errors import VislocError, refuse
 from visloc.geometry import Camera, Pose
 from visloc.localization.camera_check import only_focal_length_contradicts
 from visloc.localization.constraints import Constraints, MapGeometry
+from visloc.localization.evidence import Shown
 from visloc.localization.gates import Problem, accepted, not_better_elsewhere
 from visloc.options import LocalizeOptions, ReadAs, Solver
 from visloc.pose.centre import position_covariance, with_origin
@@ -67,6 +68,7 @@ class Look:
         elsewhere: with landmarks of photos that look more like the query but that the priors
             exclude; usually none.
         refusal: why there is nothing to solve; None otherwise.
+        shown: all that was found in the image; None when a pose shall not be compared with it.
     """
 
     evidence: Evidence
@@ -74,6 +76,7 @@ class Look:
     landmarks: NDArray[np.int64]
     elsewhere: Matches
     refusal: Refusal | None = None
+    shown: Shown | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,7 +153,8 @@ def solve_instant(
     seconds = _summed([look.evidence.seconds for look in looks])
     with timed(seconds, "pose"):
         problem, found, refusal = _find_pose(
-            images, Problem(views, _sources_of(images), options, constraints)
+            images,
+            Problem(views, _sources_of(images), options, constraints, _shown_in(images, options)),
         )
         if refusal is None or refusal.reason is not Reason.CONTRADICTS_PRIOR:
             elsewhere = _views_of(images, [look.elsewhere for look in looks], options)
@@ -159,6 +163,7 @@ def solve_instant(
     pose = None
     if refusal is None and found is not None and found.covariance is not None:
         pose = rig_pose(found.rig_from_world, found.covariance, geometry, PoseSource.ESTIMATED)
+        pose = replace(pose, probability=found.probability)
     inliers = () if found is None else tuple(found.inliers)
     camera = None if refusal is not None or found is None else found.camera
     shown = with_inliers([_shown(image, camera) for image in images], inliers)
@@ -190,10 +195,10 @@ def _views_of(
     A view whose camera is a guess is empty, unless its focal length will be estimated.
     """
     usable = [(image.cam_from_rig, image.look) for image in images if image.look is not None]
-    finds_focal = len(usable) == 1 and options.solver is not Solver.REGISTRATION
+    finds_focal = _finds_focal(images, options)
     views = []
     for (cam_from_rig, look), of_image in zip(usable, matches, strict=True):
-        guessed = look.evidence.camera_source is CameraSource.GUESS
+        guessed = _is_guessed(look)
         counted = of_image if finds_focal or not guessed else Matches.none()
         views.append(
             MatchedView(
@@ -210,6 +215,22 @@ def _views_of(
 def _sources_of(images: Sequence[SeenImage]) -> tuple[CameraSource, ...]:
     """Where the cameras of the images that could be used came from."""
     return tuple(image.look.evidence.camera_source for image in images if image.look is not None)
+
+
+def _shown_in(images: Sequence[SeenImage], options: LocalizeOptions) -> tuple[Shown | None, ...]:
+    """What each view of ``_views_of`` shows; None for those whose camera is not known."""
+    finds_focal = _finds_focal(images, options)
+    looks = [image.look for image in images if image.look is not None]
+    return tuple(look.shown if finds_focal or not _is_guessed(look) else None for look in looks)
+
+
+def _finds_focal(images: Sequence[SeenImage], options: LocalizeOptions) -> bool:
+    num_usable = sum(image.look is not None for image in images)
+    return num_usable == 1 and options.solver is not Solver.REGISTRATION
+
+
+def _is_guessed(look: Look) -> bool:
+    return look.evidence.camera_source is CameraSource.GUESS
 
 
 def _shown(image: SeenImage, found: Camera | None) -> ImageAnswer:

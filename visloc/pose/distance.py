@@ -37,3 +37,22 @@ def mahalanobis2(
         return math.inf
     # So far from the origin that rounding left no digits, it may be negative or no number.
     return squared if squared >= 0 else math.inf
+
+
+def viewpoints_apart(
+    rotations: NDArray[np.float64], centers: NDArray[np.float64], pose: Pose, reach: float
+) -> NDArray[np.float64]:
+    """How far viewpoints (n,) are from a pose, in radians.
+
+    The sum of two angles by which what is seen moves: that of the turn, and that under which the
+    way between both is seen from where the photos look.
+
+    Args:
+        rotations: (n, 3, 3) camera from world.
+        centers: (n, 3) of the cameras.
+        pose: camera from world.
+        reach: distance from photos to what they see, above 0.
+    """
+    cosines = (np.einsum("nij,ij->n", rotations, pose.rotation) - 1.0) / 2.0
+    angles = np.arccos(np.clip(cosines, -1.0, 1.0))
+    return np.asarray(angles + np.linalg.norm(centers - pose.center, axis=1) / reach)

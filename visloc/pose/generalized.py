@@ -48,12 +48,14 @@ class GeneralizedPose:
             (collinear points, for one).
         camera: with the focal length that was found together with the pose; None where it was
             known.
+        probability: that it is right, 0 to 1; None when it was not judged.
     """
 
     rig_from_world: Pose
     inliers: tuple[NDArray[np.bool_], ...]
     covariance: NDArray[np.float64] | None
     camera: Camera | None = None
+    probability: float | None = None
 
     @property
     def num_inliers(self) -> int:

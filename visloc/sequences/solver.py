@@ -139,7 +139,8 @@ class SequenceSolver:
         if self._first_timestamp is None:
             self._first_timestamp = seen.timestamp
         ticks = seen.timestamp - self._first_timestamp
-        self._entries.append(_Entry(seen, solved, ticks))
+        # What the images show is large, and was used.
+        self._entries.append(_Entry(replace(seen, images=()), solved, ticks))
         self._rest = max(0, self._rest - 1)
         return self._answer(ended=False)
 
@@ -320,6 +321,8 @@ class SequenceSolver:
             return replace(answer, pose=None, refusal=answer.refusal or contradiction)
         pose = rig_pose(found.pose, found.covariance, self._geometry, found.source)
         measured = found.source is PoseSource.ESTIMATED
+        if measured and answer.pose is not None:  # the motion agrees with what the images showed
+            pose = replace(pose, probability=answer.pose.probability)
         return replace(answer, pose=pose, refusal=None if measured else answer.refusal)
 
 

@@ -965,6 +965,9 @@ class PoseEstimate(_message.Message):
     COVARIANCE_FIELD_NUMBER: _builtins.int
     POSITION_STD_FIELD_NUMBER: _builtins.int
     ORIENTATION_STD_DEG_FIELD_NUMBER: _builtins.int
+    PROBABILITY_FIELD_NUMBER: _builtins.int
+    probability: _builtins.float
+    """That the pose is right, 0 to 1; absent when it was not judged."""
     @_builtins.property
     def cam_from_world(self) -> Global___Transform: ...
     @_builtins.property
@@ -998,12 +1001,15 @@ class PoseEstimate(_message.Message):
         covariance: _abc.Iterable[_builtins.float] | None = ...,
         position_std: _abc.Iterable[_builtins.float] | None = ...,
         orientation_std_deg: _abc.Iterable[_builtins.float] | None = ...,
+        probability: _builtins.float | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["cam_from_world", b"cam_from_world"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_probability", b"_probability", "cam_from_world", b"cam_from_world", "probability", b"probability"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["cam_from_world", b"cam_from_world", "covariance", b"covariance", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "position", b"position", "position_std", b"position_std"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_probability", b"_probability", "cam_from_world", b"cam_from_world", "covariance", b"covariance", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "position", b"position", "position_std", b"position_std", "probability", b"probability"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
+    _WhichOneofReturnType__probability: _TypeAlias = _typing.Literal["probability"]  # noqa: Y015
+    _WhichOneofArgType__probability: _TypeAlias = _typing.Literal["_probability", b"_probability"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__probability) -> _WhichOneofReturnType__probability | None: ...
 
 Global___PoseEstimate: _TypeAlias = PoseEstimate  # noqa: Y015
 
@@ -1477,6 +1483,9 @@ class RigPose(_message.Message):
     COVARIANCE_FIELD_NUMBER: _builtins.int
     POSITION_STD_FIELD_NUMBER: _builtins.int
     ORIENTATION_STD_DEG_FIELD_NUMBER: _builtins.int
+    PROBABILITY_FIELD_NUMBER: _builtins.int
+    probability: _builtins.float
+    """as of PoseEstimate; absent unless its own images measured it"""
     @_builtins.property
     def rig_from_world(self) -> Global___Transform: ...
     @_builtins.property
@@ -1504,12 +1513,15 @@ class RigPose(_message.Message):
         covariance: _abc.Iterable[_builtins.float] | None = ...,
         position_std: _abc.Iterable[_builtins.float] | None = ...,
         orientation_std_deg: _abc.Iterable[_builtins.float] | None = ...,
+        probability: _builtins.float | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["rig_from_world", b"rig_from_world"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_probability", b"_probability", "probability", b"probability", "rig_from_world", b"rig_from_world"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["covariance", b"covariance", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "position", b"position", "position_std", b"position_std", "rig_from_world", b"rig_from_world"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_probability", b"_probability", "covariance", b"covariance", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "position", b"position", "position_std", b"position_std", "probability", b"probability", "rig_from_world", b"rig_from_world"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
+    _WhichOneofReturnType__probability: _TypeAlias = _typing.Literal["probability"]  # noqa: Y015
+    _WhichOneofArgType__probability: _TypeAlias = _typing.Literal["_probability", b"_probability"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__probability) -> _WhichOneofReturnType__probability | None: ...
 
 Global___RigPose: _TypeAlias = RigPose  # noqa: Y015
 

@@ -39,6 +39,10 @@ _COVARIANCE = (
     "6 x 6, row by row: rotation (rad), then translation, for R <- Exp(w) R and t <- t + dt of "
 )
 _ABOUT = "standard deviations about the {}'s x, y and z axes, degrees"
+# Of a pose. Older services do not state it.
+_PROBABILITY = (
+    "that the pose is right, 0 to 1, judged by what the photo shows of all that the map has there; "
+)
 
 
 def _stated(description: str) -> Any:
@@ -116,6 +120,9 @@ class PoseEstimate(_PoseWithDigits):
     covariance: Annotated[Covariance, _stated(f"{_COVARIANCE}cam_from_world")]
     position_std: _PositionStd
     orientation_std_deg: Annotated[Numbers3, _stated(_ABOUT.format("camera"))]
+    probability: Annotated[
+        float | None, Field(ge=0, le=1, description=f"{_PROBABILITY}null when it was not judged")
+    ] = None
 
 
 class RigPose(_PoseWithDigits):
@@ -132,6 +139,14 @@ class RigPose(_PoseWithDigits):
     covariance: Annotated[Covariance, _stated(f"{_COVARIANCE}rig_from_world")]
     position_std: _PositionStd
     orientation_std_deg: Annotated[Numbers3, _stated(_ABOUT.format("rig"))]
+    probability: Annotated[
+        float | None,
+        Field(
+            ge=0,
+            le=1,
+            description=f"{_PROBABILITY}null when the instant's own images did not measure it",
+        ),
+    ] = None
 
 
 class Refusal(Answer):

@@ -74,6 +74,8 @@ export interface PoseEstimate {
   covariance: number[];
   position_std: number[];
   orientation_std_deg: number[];
+  /** That the pose is right, 0 to 1; null when it was not judged. */
+  probability: number | null;
 }
 
 export interface LocalizeResponse {

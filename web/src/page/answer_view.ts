@@ -187,6 +187,16 @@ function poseTable(pose: PoseEstimate, metric: boolean): HTMLElement {
         ),
       ),
     ),
+    ...(pose.probability === null
+      ? []
+      : [
+          element(
+            "p",
+            { class: "small" },
+            element("span", { class: "quiet" }, "Probability that it is right: "),
+            element("span", { class: "number" }, pose.probability.toFixed(3)),
+          ),
+        ]),
     element(
       "p",
       { class: "small" },

@@ -74,6 +74,12 @@ export const ADVICE: Readonly<Record<string, Advice>> = {
     meaning: "The best pose contradicts the priors.",
     tries: ["Check the priors.", "Send no priors."],
   },
+  unlikely_pose: {
+    meaning:
+      "A pose was found, but the map has other things there than the photo shows: this may be " +
+      "a print, a screen, a mirror, or another place that looks alike.",
+    tries: [ANOTHER_PLACE, CHECK_CAMERA],
+  },
   ambiguous: {
     meaning: "Two places explain the photo about equally well.",
     tries: [
