@@ -957,6 +957,10 @@ class PoseEstimate(_message.Message):
     COVARIANCE_FIELD_NUMBER: _builtins.int
     POSITION_STD_FIELD_NUMBER: _builtins.int
     ORIENTATION_STD_DEG_FIELD_NUMBER: _builtins.int
+    PHOTO_COVARIANCE_FIELD_NUMBER: _builtins.int
+    UNCERTAINTY_FIELD_NUMBER: _builtins.int
+    uncertainty: _builtins.str
+    """whole, or photo only: the map's own errors are not in covariance"""
     @_builtins.property
     def cam_from_world(self) -> Global___Transform: ...
     @_builtins.property
@@ -970,7 +974,7 @@ class PoseEstimate(_message.Message):
     @_builtins.property
     def covariance(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """6 x 6, row by row: rotation (rad), then translation, for R <- Exp(w) R and t <- t + dt of
-        cam_from_world.
+        cam_from_world: the whole, as far as uncertainty says.
         """
 
     @_builtins.property
@@ -981,6 +985,12 @@ class PoseEstimate(_message.Message):
     def orientation_std_deg(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """about the camera's x, y, z axes, degrees"""
 
+    @_builtins.property
+    def photo_covariance(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """The part of covariance that the scatter of the matches leaves open; empty for a pose that no
+        image of its own measured.
+        """
+
     def __init__(
         self,
         *,
@@ -990,10 +1000,12 @@ class PoseEstimate(_message.Message):
         covariance: _abc.Iterable[_builtins.float] | None = ...,
         position_std: _abc.Iterable[_builtins.float] | None = ...,
         orientation_std_deg: _abc.Iterable[_builtins.float] | None = ...,
+        photo_covariance: _abc.Iterable[_builtins.float] | None = ...,
+        uncertainty: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["cam_from_world", b"cam_from_world"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["cam_from_world", b"cam_from_world", "covariance", b"covariance", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "position", b"position", "position_std", b"position_std"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["cam_from_world", b"cam_from_world", "covariance", b"covariance", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "photo_covariance", b"photo_covariance", "position", b"position", "position_std", b"position_std", "uncertainty", b"uncertainty"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -1469,6 +1481,10 @@ class RigPose(_message.Message):
     COVARIANCE_FIELD_NUMBER: _builtins.int
     POSITION_STD_FIELD_NUMBER: _builtins.int
     ORIENTATION_STD_DEG_FIELD_NUMBER: _builtins.int
+    PHOTO_COVARIANCE_FIELD_NUMBER: _builtins.int
+    UNCERTAINTY_FIELD_NUMBER: _builtins.int
+    uncertainty: _builtins.str
+    """as of PoseEstimate"""
     @_builtins.property
     def rig_from_world(self) -> Global___Transform: ...
     @_builtins.property
@@ -1487,6 +1503,10 @@ class RigPose(_message.Message):
     def position_std(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
     @_builtins.property
     def orientation_std_deg(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
+    @_builtins.property
+    def photo_covariance(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """as of PoseEstimate"""
+
     def __init__(
         self,
         *,
@@ -1496,10 +1516,12 @@ class RigPose(_message.Message):
         covariance: _abc.Iterable[_builtins.float] | None = ...,
         position_std: _abc.Iterable[_builtins.float] | None = ...,
         orientation_std_deg: _abc.Iterable[_builtins.float] | None = ...,
+        photo_covariance: _abc.Iterable[_builtins.float] | None = ...,
+        uncertainty: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["rig_from_world", b"rig_from_world"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["covariance", b"covariance", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "position", b"position", "position_std", b"position_std", "rig_from_world", b"rig_from_world"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["covariance", b"covariance", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "photo_covariance", b"photo_covariance", "position", b"position", "position_std", b"position_std", "rig_from_world", b"rig_from_world", "uncertainty", b"uncertainty"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

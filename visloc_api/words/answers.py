@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 import visloc.options
 import visloc.types
@@ -22,6 +22,7 @@ from visloc_api.words.base import (
     NumbersNx2,
     NumbersNx3,
     OneOf,
+    OptionalCovariance,
     SentAs,
 )
 from visloc_api.words.geometry import Transform
@@ -30,14 +31,37 @@ from visloc_api.words.geopose import GeoPose, GeoPoseYpr
 # A sequence has thousands of images, and each may have been matched against a thousand photos.
 MAX_RETRIEVED = 20
 # Of every stated uncertainty.
-_NOT_COVERED = (
-    "; computed from the scatter of the matches only, so errors that landmarks "
-    "share are missing (depth, calibration, poses of mapping photos): on one "
-    "map from depth the error was 13 times as large"
+_COVERED = (
+    "; the whole, with the errors that landmarks of the map share, where uncertainty says so; else "
+    "from the scatter of the matches only"
 )
 _COVARIANCE = (
     "6 x 6, row by row: rotation (rad), then translation, for R <- Exp(w) R and t <- t + dt of "
 )
+
+
+_PHOTO_PART = (
+    "6 x 6, the part of covariance that the scatter of the matches alone leaves open; "
+    "null for a pose that no image of its own measured"
+)
+_UNCERTAINTY = (
+    "whole: covariance holds the errors of the photo and of the map, as the map's own test found "
+    "them; photo only: the map has no such test"
+)
+
+
+def _uncertainty(value: Any) -> Any:
+    """An older service states what the photo tells, and no word for it."""
+    return value or visloc.types.Uncertainty.PHOTO_ONLY.value
+
+
+_Uncertainty = Annotated[
+    str,
+    OneOf(visloc.types.Uncertainty),
+    BeforeValidator(_uncertainty),
+    Field(description=_UNCERTAINTY),
+]
+_PhotoCovariance = Annotated[OptionalCovariance, Field(description=_PHOTO_PART)]
 
 
 class _ReceivedPose(Pose):
@@ -102,22 +126,19 @@ class PoseEstimate(_PoseWithDigits):
         Field(description="camera centre in the world, metres when the map is metric"),
     ]
     orientation: Annotated[Numbers4, Field(description="rotation of world_from_cam as w, x, y, z")]
-    covariance: Annotated[
-        Covariance, Field(description=f"{_COVARIANCE}cam_from_world{_NOT_COVERED}")
-    ]
+    covariance: Annotated[Covariance, Field(description=f"{_COVARIANCE}cam_from_world{_COVERED}")]
     position_std: Annotated[
         Numbers3,
-        Field(
-            description=f"standard deviations of the position along the world's axes{_NOT_COVERED}"
-        ),
+        Field(description=f"standard deviations of the position along the world's axes{_COVERED}"),
     ]
     orientation_std_deg: Annotated[
         Numbers3,
         Field(
-            description="standard deviations about the camera's x, y and z axes, degrees"
-            + _NOT_COVERED
+            description="standard deviations about the camera's x, y and z axes, degrees" + _COVERED
         ),
     ]
+    photo_covariance: _PhotoCovariance = None
+    uncertainty: _Uncertainty = visloc.types.Uncertainty.PHOTO_ONLY.value
 
 
 class RigPose(_PoseWithDigits):
@@ -131,22 +152,19 @@ class RigPose(_PoseWithDigits):
         Field(description="the rig's origin in the world, metres when the map is metric"),
     ]
     orientation: Annotated[Numbers4, Field(description="rotation of world_from_rig as w, x, y, z")]
-    covariance: Annotated[
-        Covariance, Field(description=f"{_COVARIANCE}rig_from_world{_NOT_COVERED}")
-    ]
+    covariance: Annotated[Covariance, Field(description=f"{_COVARIANCE}rig_from_world{_COVERED}")]
     position_std: Annotated[
         Numbers3,
-        Field(
-            description=f"standard deviations of the position along the world's axes{_NOT_COVERED}"
-        ),
+        Field(description=f"standard deviations of the position along the world's axes{_COVERED}"),
     ]
     orientation_std_deg: Annotated[
         Numbers3,
         Field(
-            description="standard deviations about the rig's x, y and z axes, degrees"
-            + _NOT_COVERED
+            description="standard deviations about the rig's x, y and z axes, degrees" + _COVERED
         ),
     ]
+    photo_covariance: _PhotoCovariance = None
+    uncertainty: _Uncertainty = visloc.types.Uncertainty.PHOTO_ONLY.value
 
 
 class Refusal(Answer):

@@ -15,8 +15,8 @@ from mapping.build.settings import BuildSettings
 from mapping.cli.main import app
 from mapping.maps.editing import content_of, moved, selected
 from mapping.maps.merging import join_as_set, merge_maps
+from mapping.own_test.publishing import publish_edited
 from mapping.sample import write_sample
-from mapping.stages.publishing import publish_edited
 from mapping.stages.work_folder import exclusive
 from visloc.archive import Anchor, Geodetic, Map, MapStore, SetOutline
 from visloc.errors import Conflict, InvalidInput

@@ -14,7 +14,7 @@ from mapping.maps.editing import content_of, selected
 from mapping.maps.pruning import Kept, Pruned, choose, prune_map, size_with
 from mapping.maps.pruning.accuracy import BINS, Accuracy, lost
 from mapping.maps.pruning.choosing import least, num_landmarks
-from mapping.stages.publishing import publish_edited
+from mapping.own_test.publishing import publish_edited
 from visloc.archive import Map, MapStore
 from visloc.errors import Conflict, InvalidInput, VislocError
 

@@ -21,8 +21,8 @@ from mapping.frames.set_poses import poses_on_earth, read_poses
 from mapping.maps.editing import content_of, moved
 from mapping.maps.sets import publish_set
 from mapping.maps.splitting import cut, split_map
+from mapping.own_test.publishing import publish_edited
 from mapping.sample import write_sample
-from mapping.stages.publishing import publish_edited
 from visloc.archive import Anchor, Geodetic, Map, MapStore, SetOutline
 from visloc.archive.places import enu_of
 from visloc.errors import Conflict, InvalidInput

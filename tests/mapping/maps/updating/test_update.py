@@ -20,8 +20,8 @@ from mapping.maps.editing import content_of
 from mapping.maps.updating import UpdateSettings, update_map
 from mapping.maps.updating.job import Updated
 from mapping.maps.updating.placing import beside
+from mapping.own_test.publishing import publish_edited
 from mapping.sample import write_sample
-from mapping.stages.publishing import publish_edited
 from visloc.archive import Map, MapStore, open_map, verify_map
 from visloc.errors import Conflict, VislocError
 from visloc.evaluation import pose_error
