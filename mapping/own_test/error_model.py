@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, f
 
+from visloc.archive.schema import MAX_FACTOR
+
 _DIMENSIONS = 3
 # Of Student's t. Among held-out mapping photos errors scatter nearly like a normal distribution
 # around what a map adds; eight degrees of freedom leave room for some that do not.
@@ -21,7 +23,7 @@ _TAIL = math.sqrt(
     _DIMENSIONS * f.ppf(_SHARE, _DIMENSIONS, _FREEDOM) / chi2.ppf(_SHARE, _DIMENSIONS)
 )
 _MAX_ROUNDS, _SETTLED = 200, 1e-9
-_LEAST_VARIANCE, _MOST_FACTOR = 1e-12, 1000.0
+_LEAST_VARIANCE = 1e-12
 
 
 def mahalanobis2(
@@ -49,7 +51,7 @@ def fitted_factor(squares: NDArray[np.float64]) -> float:
     variance = _scale2(squares, _PRIOR_PHOTOS)
     if len(squares):
         variance = max(variance, _scale2(squares, 0.0))
-    return min(max(_TAIL * math.sqrt(variance), 1.0), _MOST_FACTOR)
+    return min(max(_TAIL * math.sqrt(variance), 1.0), MAX_FACTOR)
 
 
 def _scale2(squares: NDArray[np.float64], prior_photos: float) -> float:

@@ -207,8 +207,9 @@ class Method(Record):
 
 
 # A pose is off by more than its photo tells, but not without bounds.
-_MOST_FACTOR = 1000.0
+MAX_FACTOR = 1000.0
 MAX_WRONG_SCORES = 32
+_MOST_PHOTOS = 2**31
 
 
 class Score(Record):
@@ -232,11 +233,11 @@ class OwnTest(Record):
         wrong_at: the scores of wrong poses, the most convincing first.
     """
 
-    tested: Annotated[int, Field(ge=0)]
-    localized: Annotated[int, Field(ge=0)]
-    wrong: Annotated[int, Field(ge=0)]
-    position_factor: Annotated[float, Field(ge=1, le=_MOST_FACTOR)]
-    orientation_factor: Annotated[float, Field(ge=1, le=_MOST_FACTOR)]
+    tested: Annotated[int, Field(ge=0, le=_MOST_PHOTOS)]
+    localized: Annotated[int, Field(ge=0, le=_MOST_PHOTOS)]
+    wrong: Annotated[int, Field(ge=0, le=_MOST_PHOTOS)]
+    position_factor: Annotated[float, Field(ge=1, le=MAX_FACTOR)]
+    orientation_factor: Annotated[float, Field(ge=1, le=MAX_FACTOR)]
     independent: bool
     wrong_at: Annotated[tuple[Score, ...], Field(max_length=MAX_WRONG_SCORES)] = ()
 

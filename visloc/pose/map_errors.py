@@ -41,7 +41,8 @@ class MapErrors:
         centred[3:, :3] = -cross_matrix(rig_from_world.translation)
         factors = np.repeat([self.orientation_factor, self.position_factor], 3)
         widening = centred @ (factors[:, None] * centred)
-        return np.asarray(widening @ covariance @ widening.T)
+        whole = widening @ covariance @ widening.T
+        return np.asarray((whole + whole.T) / 2)
 
 
 # Of maps that were never tested: what is stated is the photo's part alone.

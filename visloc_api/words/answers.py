@@ -52,7 +52,7 @@ _UNCERTAINTY = (
 
 def _uncertainty(value: Any) -> Any:
     """An older service states what the photo tells, and no word for it."""
-    return value or visloc.types.Uncertainty.PHOTO_ONLY.value
+    return value or visloc.types.Uncertainty.PHOTO_ONLY
 
 
 _Uncertainty = Annotated[
@@ -138,7 +138,7 @@ class PoseEstimate(_PoseWithDigits):
         ),
     ]
     photo_covariance: _PhotoCovariance = None
-    uncertainty: _Uncertainty = visloc.types.Uncertainty.PHOTO_ONLY.value
+    uncertainty: _Uncertainty = visloc.types.Uncertainty.PHOTO_ONLY
 
 
 class RigPose(_PoseWithDigits):
@@ -164,7 +164,7 @@ class RigPose(_PoseWithDigits):
         ),
     ]
     photo_covariance: _PhotoCovariance = None
-    uncertainty: _Uncertainty = visloc.types.Uncertainty.PHOTO_ONLY.value
+    uncertainty: _Uncertainty = visloc.types.Uncertainty.PHOTO_ONLY
 
 
 class Refusal(Answer):

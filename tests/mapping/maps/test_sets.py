@@ -191,6 +191,15 @@ def test_tiles_of_no_size_are_refused(hall: Map, tile: float, overlap: float, co
     assert caught.value.code == code
 
 
+def test_tiles_carry_the_test_of_their_map(store: MapStore, hall: Map) -> None:
+    """They share its landmarks and frame, and it was tested with more photos than each has."""
+    tiles = store.outline("halls")
+    assert isinstance(tiles, SetOutline)
+    assert hall.manifest.parts.own_test is not None
+    for tile in tiles.tiles:
+        assert store.open(tile.ref).manifest.parts.own_test == hall.manifest.parts.own_test
+
+
 def test_an_interrupted_split_goes_on(store: MapStore) -> None:
     before = store.outline("halls")
     assert isinstance(before, SetOutline)

@@ -94,7 +94,10 @@ def test_a_map_of_one_photo_says_that_it_tested_none(
 def test_poses_that_were_estimated_with_the_landmarks_are_not_independent(square: Map) -> None:
     method = square.manifest.method.model_copy(update={"settings": {"poses": "estimate"}})
     manifest = square.manifest.model_copy(update={"method": method})
-    assert not own_test(replace(square, manifest=manifest)).independent
+    exact, estimated = own_test(square), own_test(replace(square, manifest=manifest))
+    assert (exact.independent, estimated.independent) == (True, False)
+    assert estimated.position_factor == pytest.approx(1.5 * exact.position_factor, abs=0.01)
+    assert estimated.orientation_factor == pytest.approx(1.5 * exact.orientation_factor, abs=0.01)
 
 
 def score(inliers: int) -> Score:
