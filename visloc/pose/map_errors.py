@@ -36,6 +36,8 @@ class MapErrors:
         together: e = -(dt + [t] w), with [t] the matrix of the cross product. That matrix is its
         own inverse.
         """
+        if self.uncertainty is Uncertainty.PHOTO_ONLY:
+            return covariance  # to the last bit
         centred = np.eye(6)
         centred[3:, 3:] *= -1.0
         centred[3:, :3] = -cross_matrix(rig_from_world.translation)
