@@ -25,7 +25,7 @@ from visloc.localization.judge import TIE_ANGLE, TIE_REACH_SHARE
 from visloc.options import LocalizeOptions
 
 # Photos that are tried: so many of a small map, a fifth of a larger one, up to a limit. The test
-# then takes a tenth of a build (docs/performance.md).
+# then takes a tenth of a build (docs/decisions/0028-the-maps-own-test.md).
 _LEAST_PHOTOS, _SHARE_OF_PHOTOS, _MOST_PHOTOS = 12, 5, 60
 # A query stands about so far from the nearest mapping photo, as ``Viewpoints.apart_from`` counts.
 _LEFT_OUT_WITHIN = 0.2
