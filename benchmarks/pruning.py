@@ -19,7 +19,7 @@ from mapping.cli.prune import accuracy_rows, parse_size
 from mapping.maps.editing import content_of, selected
 from mapping.maps.pruning.accuracy import of_queries
 from mapping.maps.pruning.job import keep_within
-from mapping.stages.publishing import publish_edited
+from mapping.own_test.publishing import publish_edited
 from visloc.archive import Map, MapStore, open_map
 from visloc.features import make_global_descriptor, make_local_features
 

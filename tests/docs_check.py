@@ -152,6 +152,7 @@ RULES = (
         r"mapping anchor .* --dataset",
         "needs better GNSS; test_anchor.py",
     ),
+    Rule(Tier.PARSED, r"mapping\.md", r".*mapping upgrade", "needs an old map; test_upgrading.py"),
     Rule(Tier.PARSED, r"mapping\.md", r"mapping anchor .* --corr", "needs points; test_anchor.py"),
     Rule(Tier.PARSED, r"mapping\.md", r".* recorded .* rgbd", "needs a recording with depth"),
     Rule(Tier.PARSED, r"operations", r"visloc-service --host 0\.0", "would listen to the network"),

@@ -81,6 +81,13 @@ class PoseSource(StrEnum):
     NEAREST = "nearest"  # the nearest instant
 
 
+class Uncertainty(StrEnum):
+    """What a covariance covers."""
+
+    WHOLE = "whole"  # errors of the photo's measurements, and those of the map
+    PHOTO_ONLY = "photo only"  # the map has no test of its own: its errors are not in it
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RigSensor:
     """One camera of a rig.
@@ -222,12 +229,15 @@ class Localized:
         evidence: what led to it.
         cam_from_world: the pose.
         covariance: (6, 6) float64 of rotation (rad) then translation, for R <- Exp(w) R and
-            t <- t + dt of ``cam_from_world``. It tells what the scatter of the image
-            measurements leaves open, not errors that the whole map shares.
+            t <- t + dt of ``cam_from_world``: the photo's part, widened by the errors of the map
+            as far as ``uncertainty`` says.
         position_std: (3,) standard deviations of the camera centre along the world's axes.
         orientation_std: (3,) standard deviations of w (rad), about the camera's x, y, z.
         inlier_keypoints: (N, 2) float32 pixels of the photo as stored.
         inlier_points: (N, 3) float64 in the world.
+        photo_covariance: (6, 6) float64, the photo's part of ``covariance``: what the scatter of
+            its own measurements leaves open.
+        uncertainty: what ``covariance`` covers.
         probability: that the pose is right, 0 to 1 (docs/decisions/0029-evidence-against.md); None
             when the photo's features were not compared with the map around the pose.
     """
@@ -239,6 +249,8 @@ class Localized:
     orientation_std: NDArray[np.float64]
     inlier_keypoints: NDArray[np.float32]
     inlier_points: NDArray[np.float64]
+    photo_covariance: NDArray[np.float64]
+    uncertainty: Uncertainty
     probability: float | None = None
 
 
@@ -284,10 +296,13 @@ class RigPose:
     Attributes:
         rig_from_world: the pose.
         covariance: (6, 6) float64 of rotation (rad) then translation, for R <- Exp(w) R and
-            t <- t + dt of ``rig_from_world``.
+            t <- t + dt of ``rig_from_world``: the whole, as far as ``uncertainty`` says.
         position_std: (3,) standard deviations of the rig's origin along the world's axes.
         orientation_std: (3,) standard deviations of w (rad), about the rig's x, y, z.
         source: ESTIMATED when the instant's own images measured it.
+        photo_covariance: (6, 6) float64, the part of ``covariance`` that the scatter of the
+            instant's own images leaves open; None for a pose that they did not measure.
+        uncertainty: what ``covariance`` covers.
         probability: that the pose is right, 0 to 1, judged by the instant's own images; None when
             they did not measure it.
     """
@@ -297,6 +312,8 @@ class RigPose:
     position_std: NDArray[np.float64]
     orientation_std: NDArray[np.float64]
     source: PoseSource
+    photo_covariance: NDArray[np.float64] | None
+    uncertainty: Uncertainty
     probability: float | None = None
 
 

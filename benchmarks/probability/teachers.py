@@ -186,7 +186,8 @@ class Teacher:
             return
         matches = look.matches
         view = MatchedView(look.evidence.camera, Pose.identity(), matches.pixels, matches.points)
-        problem = Problem((view,), options, Constraints(localizer.geometry, NO_PRIORS))
+        constraints = Constraints(localizer.geometry, NO_PRIORS)
+        problem = Problem((view,), (look.evidence.camera_source,), options, constraints)
         pose = problem.solve()
         if pose is None or pose.covariance is None or pose.num_inliers < _LEAST_INLIERS:
             return

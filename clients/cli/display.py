@@ -12,6 +12,7 @@ from rich.text import Text
 
 from clients.evaluation.run import Outcome
 from clients.wire.answers import LocalizeResult
+from visloc.types import Uncertainty
 from visloc_api.words.answers import PoseEstimate
 from visloc_api.words.geopose import GeoPose
 from visloc_api.words.maps import MapInfo
@@ -152,8 +153,16 @@ def _print_pose(console: Console, pose: PoseEstimate, unit: str) -> None:
         f"{_numbers(pose.orientation, 6)} (w x y z, world_from_cam), "
         f"std {_numbers(pose.orientation_std_deg, 3)} degrees",
     )
+    print_line(console, "uncertainty", _UNCERTAINTY.get(pose.uncertainty, pose.uncertainty))
     if pose.probability is not None:
         print_line(console, "probability", f"{pose.probability:.3f} that the pose is right")
+
+
+# What the standard deviations cover, for people.
+_UNCERTAINTY: Mapping[str, str] = {
+    Uncertainty.WHOLE: "whole: scatter of the photo's matches, and errors of the map",
+    Uncertainty.PHOTO_ONLY: "photo only: the errors of the map are not in it",
+}
 
 
 def _poses(modes: Mapping[str, Mapping[str, Any]], num_with_truth: int, unit: str) -> Table:
@@ -203,6 +212,16 @@ def _poses(modes: Mapping[str, Mapping[str, Any]], num_with_truth: int, unit: st
                 f"{label} {name}",
                 ("-" if f[field] is None else f"{f[field][name]:.4f}" for f in figures),
             )
+    table.add_section()
+    held = [f["calibration"] for f in figures]
+    row(
+        "inside stated 95 %",
+        ("-" if one is None else f"{one['inside_95']:.1%}" for one in held),
+    )
+    row(
+        "error / stated std, p50",
+        ("-" if one is None else f"{one['median_ratio']:.2f}" for one in held),
+    )
     return table
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from clients.wire.answers import ServerInfo
 from visloc.errors import InvalidInput, refuse
 from visloc.evaluation import (
     Threshold,
+    calibration,
     median_errors_localized,
     percentile,
     pose_error,
@@ -161,6 +162,7 @@ def figures_of(
         "median_orientation_error_deg": _finite(median_orientation_deg),
         "position_error_m": _error_percentiles([position for position, _ in errors]),
         "orientation_error_deg": _error_percentiles([orientation for _, orientation in errors]),
+        "calibration": _calibration(run.outcomes, poses),
         "recall": _recall(errors, num_with_truth, thresholds),
         "latency_s": {f"p{q}": _finite(percentile(run.latencies_s, q)) for q in (50, 90, 99)},
         "throughput_qps": len(run.latencies_s) / run.wall_s if run.wall_s > 0 else None,
@@ -177,6 +179,20 @@ def pose_errors(
         for outcome, pose in zip(outcomes, poses, strict=True)
         if pose is not None and outcome.query.truth is not None
     ]
+
+
+def _calibration(
+    outcomes: Sequence[Outcome], poses: Sequence[TracedPose | None]
+) -> dict[str, float] | None:
+    """Whether the stated uncertainties hold, over photos with a pose and a known true one."""
+    held = calibration(
+        [
+            (pose.pose, pose.covariance, outcome.query.truth)
+            for outcome, pose in zip(outcomes, poses, strict=True)
+            if pose is not None and outcome.query.truth is not None
+        ]
+    )
+    return None if held is None else asdict(held)
 
 
 def _sources(poses: Sequence[TracedPose | None]) -> dict[str, dict[str, float]]:

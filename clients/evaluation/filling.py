@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clients.wire.answers import (
     ImageResult,
@@ -16,7 +17,7 @@ from clients.wire.rigs import Rig
 from visloc.geometry import Pose, center_covariance
 from visloc.sequences.filling import TracedPose, fill_rig
 from visloc.types import PoseSource
-from visloc_api.words.answers import PoseEstimate
+from visloc_api.words.answers import PoseEstimate, RigPose
 
 
 def measured(pose: PoseEstimate, num_inliers: int) -> TracedPose:
@@ -60,7 +61,13 @@ def photo_result(result: InstantResult, index: int) -> LocalizeResult:
     image, raw = result.images[index], result.raw["images"][index]
     pose, status, refusal = None, result.status, result.raw["refusal"]
     if (traced := _measured_by(result, image)) is not None:
-        pose = pose_as_json(traced) | {"cam_from_world": raw["cam_from_world"]}
+        assert result.pose is not None  # it was measured
+        photo, turn = result.pose.photo_covariance, _turned_into(image, result.pose)
+        pose = pose_as_json(traced) | {
+            "cam_from_world": raw["cam_from_world"],
+            "photo_covariance": None if photo is None else (turn @ photo @ turn.T).ravel().tolist(),
+            "uncertainty": result.pose.uncertainty,
+        }
     elif result.localized:
         status = "not_localized"
         refusal = {
@@ -128,9 +135,17 @@ def _measured_by(result: InstantResult, image: ImageResult) -> TracedPose | None
     assert result.pose is not None
     if image.cam_from_world is None:
         raise ValueError("a photo without a pose in an instant with one")
-    # The camera sees the rig's (w, dt) rotated: R = R_c R_rig, t = R_c t_rig + t_c.
-    turn = np.zeros((6, 6))
-    cam_from_rig = image.cam_from_world.rotation @ result.pose.rig_from_world.rotation.T
-    turn[:3, :3] = turn[3:, 3:] = cam_from_rig
+    turn = _turned_into(image, result.pose)
     covariance = turn @ result.pose.covariance @ turn.T
     return TracedPose(image.cam_from_world, covariance, PoseSource.ESTIMATED, image.inliers)
+
+
+def _turned_into(image: ImageResult, rig: RigPose) -> NDArray[np.float64]:
+    """Matrix (6, 6) from the rig's (w, dt) to that of a camera, which sees it rotated.
+
+    R = R_c R_rig, t = R_c t_rig + t_c.
+    """
+    assert image.cam_from_world is not None  # the caller has looked
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = image.cam_from_world.rotation @ rig.rig_from_world.rotation.T
+    return turn

@@ -24,6 +24,7 @@ from mapping.cluster.workers import one_thread_here
 from mapping.methods.known_model import landmarks_from_reconstruction
 from mapping.methods.rgbd import landmarks_from_depth
 from mapping.methods.sfm import landmarks_from_matches
+from mapping.own_test.publishing import publish_content
 from mapping.pairing import write_pairs
 from mapping.progress import Progress, one_step
 from mapping.stages.colours import landmark_colours
@@ -38,7 +39,7 @@ from mapping.stages.local_features import (
 from mapping.stages.networks import Networks
 from mapping.stages.photos import MappingPhoto, collect_photos
 from mapping.stages.previews import keep_photos
-from mapping.stages.publishing import PAIRS, publish_content
+from mapping.stages.publishing import PAIRS
 from mapping.stages.work_folder import WorkFolder, exclusive
 from visloc.archive import GlobalFeatures, MapContent, MapStore
 from visloc.errors import refuse

@@ -63,6 +63,19 @@ def summary_of(opened: Map) -> dict[str, Any]:
     }
 
 
+def _own_test(opened: Map) -> str:
+    """What the map's own test found, for people."""
+    test = opened.manifest.parts.own_test
+    if test is None:
+        return "none: answers state the uncertainty of the photo only (mapping upgrade adds it)"
+    text = (
+        f"{test.localized} of {test.tested} photos localized without themselves, {test.wrong} "
+        f"wrong; positions are {test.position_factor:g} times, orientations "
+        f"{test.orientation_factor:g} times as uncertain as a photo tells"
+    )
+    return text if test.independent else f"{text}; their poses are not independent of the map"
+
+
 def print_map(opened: Map) -> None:
     """Print the contents of a map."""
     summary = summary_of(opened)
@@ -91,6 +104,7 @@ def print_map(opened: Map) -> None:
         "gravity": gravity_text(opened.gravity),
         "place": place_text(opened.place) + _scale(opened),
         "method": summary["method"]["name"],
+        "own test": _own_test(opened),
         "keeps": ", ".join(summary["keeps"]) or "neither photos nor colours",
         "size": f"{summary['size_bytes'] / 2**20:.1f} MiB, "
         f"{summary['bytes_per_observation']:.0f} bytes per observation",

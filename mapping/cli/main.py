@@ -13,7 +13,7 @@ from mapping.cli.build import build, import_
 from mapping.cli.datasets import calibrate_rig_command, export_features_command, pairs, sample
 from mapping.cli.display import ERR
 from mapping.cli.from_settings import from_settings
-from mapping.cli.maps import anchor, export, inspect, pack, verify
+from mapping.cli.maps import anchor, export, inspect, pack, upgrade, verify
 from mapping.cli.merge import merge
 from mapping.cli.prune import prune
 from mapping.cli.report import report
@@ -27,6 +27,7 @@ COMMANDS: Mapping[str, Callable[..., None]] = {
     "calibrate-rig": calibrate_rig_command,
     "import": import_,
     "anchor": anchor,
+    "upgrade": upgrade,
     "export": export,
     "pack": pack,
     "inspect": inspect,

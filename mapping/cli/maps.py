@@ -1,4 +1,4 @@
-"""Commands about a map: ``anchor``, ``export``, ``pack``, ``inspect`` and ``verify``."""
+"""Commands about a map: its place on Earth, upgrades, other formats, contents and checks."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from mapping.frames.georeference import (
 )
 from mapping.maps.export import EXPORTERS, export_map
 from mapping.maps.packing import write_packed
+from mapping.maps.upgrading import lacking, upgrade_map
 from mapping.options import Gravity, MapArgument, MapsDirOption, WeightsDirOption
 from mapping.progress import one_step
 from mapping.stages.imported_points import read_imported_points
@@ -146,6 +147,20 @@ def anchor(
     print_georeference(found)
     folder = publish_anchored(opened, found, maps_dir, force=force)
     say(f"map {open_map(folder).ref}")
+
+
+def upgrade(map_ref: MapArgument, maps_dir: MapsDirOption = Path("maps")) -> None:
+    """Add to a map of an older format what needs no photos; publish it as a new version.
+
+    The map is tested with what it stores of its own photos. Answers then state their whole
+    uncertainty.
+    """
+    opened = open_map(map_folder(map_ref, maps_dir))
+    with _step("own test"):
+        folder = upgrade_map(opened, maps_dir)
+    upgraded = open_map(folder)
+    say(f"map {upgraded.ref}: own test added")
+    say_notes(lacking(upgraded))
 
 
 def export(

@@ -6,6 +6,7 @@ The same functions answer as online. Its own map may be asked, without it, or an
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ def match_stored(
     target: Map,
     photos: Iterable[int],
     without: NDArray[np.integer] | None = None,
+    features: NDArray[np.int64] | None = None,
 ) -> Correspondences:
     """Match the features that a map keeps of a photo with what photos of a map see.
 
@@ -36,6 +38,7 @@ def match_stored(
         target: the map that is asked; may be the same.
         photos: rows of its photos, most similar first.
         without: (k,) landmarks that it is not to have; None for none.
+        features: (m,) rows of the photo's features that count; None for all.
     """
     scale = target.manifest.local_features.descriptor_scale
 
@@ -47,10 +50,12 @@ def match_stored(
         return landmarks[there], EightBitRows(descriptors[there], scale)
 
     own_scale = source.manifest.local_features.descriptor_scale
-    return match_landmarks(
-        EightBitRows(source.observations(image)[1], own_scale),
+    descriptors = source.observations(image)[1]
+    matched = match_landmarks(
+        EightBitRows(descriptors if features is None else descriptors[features], own_scale),
         [observed(int(photo)) for photo in photos],
     )
+    return matched if features is None else replace(matched, keypoints=features[matched.keypoints])
 
 
 def solve_stored(

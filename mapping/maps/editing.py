@@ -81,6 +81,7 @@ def content_of(opened: Map) -> MapContent:
         computed_with=local.computed_with,
         fusion=opened.fusion,
         descriptor_scale=scale,
+        own_test=manifest.parts.own_test,
     )
 
 

@@ -103,15 +103,17 @@ def hold_out(
 
 def chosen_photos(num_photos: int) -> list[int]:
     """Rows of at most ``MAX_PHOTOS`` photos, evenly spread."""
-    chosen = np.linspace(0, num_photos - 1, min(num_photos, MAX_PHOTOS)).astype(np.int64)
+    return spread_photos(num_photos, MAX_PHOTOS)
+
+
+def spread_photos(num_photos: int, most: int) -> list[int]:
+    """Rows of at most so many photos, evenly spread."""
+    chosen = np.linspace(0, num_photos - 1, min(num_photos, most)).astype(np.int64)
     return [int(image) for image in np.unique(chosen)]
 
 
-def left_out_sets(opened: Map, viewpoints: Viewpoints, image: int) -> list[NDArray[np.int64]]:
-    """Which photos (k,) to leave out in each run of one, fewest first.
-
-    Those that the same rig took at the same instant always go with it: no query has them.
-    """
+def taken_with(opened: Map, image: int) -> NDArray[np.bool_]:
+    """Which photos (n,) the same rig took at the same instant, the photo itself among them."""
     record = opened.images[image]
     on_rig = set[str]().union(*(rig for rig in opened.rigs.values() if record.camera in rig))
     others = on_rig - {record.camera}
@@ -119,6 +121,15 @@ def left_out_sets(opened: Map, viewpoints: Viewpoints, image: int) -> list[NDArr
         [i.timestamp == record.timestamp and i.camera in others for i in opened.images]
     )
     together[image] = True
+    return together
+
+
+def left_out_sets(opened: Map, viewpoints: Viewpoints, image: int) -> list[NDArray[np.int64]]:
+    """Which photos (k,) to leave out in each run of one, fewest first.
+
+    Those that the same rig took at the same instant always go with it: no query has them.
+    """
+    together = taken_with(opened, image)
     apart = viewpoints.apart_from(viewpoints.pose(image))
     sets: list[NDArray[np.int64]] = []
     for within in LEAVE_OUT_WITHIN:
@@ -136,7 +147,7 @@ def localize_held_out(
     options = LocalizeOptions()
     camera = opened.cameras[opened.images[image].camera]
     pose = viewpoints.pose(image)
-    matched = _match(opened, image, left_out, options)
+    matched = match_held_out(opened, image, left_out, options)
     pixels = opened.keypoints(image)[matched.keypoints].astype(np.float64)
     points = opened.landmarks[matched.landmarks].astype(np.float64)
     view = MatchedView(camera, Pose.identity(), pixels, points)
@@ -182,17 +193,29 @@ def too_seldom_seen(opened: Map, seen: NDArray[np.integer]) -> NDArray[np.int64]
     return landmarks[remaining < least].astype(np.int64)
 
 
-def _match(
-    opened: Map, image: int, left_out: NDArray[np.int64], options: LocalizeOptions
+def match_held_out(
+    opened: Map,
+    image: int,
+    left_out: NDArray[np.int64],
+    options: LocalizeOptions,
+    features: NDArray[np.int64] | None = None,
 ) -> Correspondences:
-    """Match a photo's features with a map without some of its photos, as the localizer does."""
+    """Match a photo's features with a map without some of its photos, as the localizer does.
+
+    Args:
+        opened: the map.
+        image: row of the photo.
+        left_out: (k,) rows of the photos that the map is not to have.
+        options: how many photos are asked.
+        features: (m,) rows of the photo's features that count; None for all.
+    """
     remaining = np.ones(len(opened.images))
     remaining[left_out] = 0.0
     rows = opened.global_descriptors
     query = {name: rows[name][image] for name in opened.fusion.counted(rows)}
     retrieved = retrieve(query, rows, options.top_k, remaining, opened.fusion)
     gone = vanishing(opened, left_out)
-    return match_stored(opened, image, opened, retrieved.images.tolist(), gone)
+    return match_stored(opened, image, opened, retrieved.images.tolist(), gone, features)
 
 
 def _key(opened: Map, image: int) -> str:

@@ -105,6 +105,8 @@ def _uncertain(measured: visloc.types.RigPose) -> dict[str, Any]:
         "covariance": measured.covariance,
         "position_std": measured.position_std,
         "orientation_std_deg": np.degrees(measured.orientation_std),
+        "photo_covariance": measured.photo_covariance,
+        "uncertainty": measured.uncertainty.value,
         "probability": measured.probability,
     }
 

@@ -19,6 +19,7 @@ from benchmarks.retrieval import (
     visible_landmarks,
     whole_numbers,
 )
+from visloc.archive.schema import Parts
 from visloc.geometry import Camera, Pose
 from visloc.retrieval.fusion import EQUAL_GHARM
 from visloc.retrieval.rows import GlobalRows
@@ -63,7 +64,7 @@ def test_landmarks_are_shared_within_an_angle_and_a_ratio_of_distances() -> None
         ),
     ]
     opened: Any = SimpleNamespace(
-        manifest=SimpleNamespace(world=SimpleNamespace(origin=tuple(origin))),
+        manifest=SimpleNamespace(world=SimpleNamespace(origin=tuple(origin)), parts=Parts()),
         landmarks=point.astype(np.float32),
         images=centers,
         image_poses=np.array([looking_from(list(np.array(c) + origin)) for c in centers]),

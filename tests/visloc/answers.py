@@ -20,6 +20,7 @@ from visloc.types import (
     Reason,
     Refusal,
     RigPose,
+    Uncertainty,
 )
 
 CAMERA = Camera("PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
@@ -41,7 +42,15 @@ def localized(
         num_inliers=inliers,
     )
     spread = np.sqrt(np.diag(position_covariance(pose, covariance)))
-    rig = RigPose(pose, covariance, spread, np.full(3, 1e-4), PoseSource.ESTIMATED)
+    rig = RigPose(
+        pose,
+        covariance,
+        spread,
+        np.full(3, 1e-4),
+        PoseSource.ESTIMATED,
+        covariance,
+        Uncertainty.WHOLE,
+    )
     image = ImageAnswer("camera", Pose.identity(), evidence, None)
     return InstantAnswer(None, (image,), rig, None, {})
 

@@ -42,12 +42,15 @@ class Place:
 
     def geometry_of(self, centers: Any) -> MapGeometry:
         """That of a map with photos at these centres, relative to the origin."""
+        from visloc.archive.schema import Parts
         from visloc.localization.constraints import MapGeometry
 
         local = np.asarray(centers, dtype=np.float64).reshape(-1, 3)
         identity = np.tile([1.0, 0.0, 0.0, 0.0], (len(local), 1))
         opened: Any = SimpleNamespace(
-            manifest=SimpleNamespace(world=SimpleNamespace(origin=tuple(self.origin))),
+            manifest=SimpleNamespace(
+                world=SimpleNamespace(origin=tuple(self.origin)), parts=Parts()
+            ),
             gravity=self.down,
             image_poses=np.hstack([identity, -(local + self.origin)]),
             landmarks=(local + np.array([0.0, 0.0, 5.0])).astype(np.float32),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from visloc.archive.anchoring import write_anchored
 from visloc.archive.checks import sha256_of
+from visloc.archive.parts import add_own_test, write_tested
 from visloc.archive.places import GeoCircle, circle_of, down_of
 from visloc.archive.reader import Map, MapOutline, open_map, verify_map
 from visloc.archive.schema import (
@@ -12,6 +13,7 @@ from visloc.archive.schema import (
     Geodetic,
     ImageRecord,
     Manifest,
+    OwnTest,
     World,
 )
 from visloc.archive.set_schema import SetManifest, SetWorld, SimilarityRecord, TileRecord
@@ -45,6 +47,7 @@ __all__ = [
     "MapOutline",
     "MapSet",
     "MapStore",
+    "OwnTest",
     "SetContent",
     "SetManifest",
     "SetOutline",
@@ -52,6 +55,7 @@ __all__ = [
     "SimilarityRecord",
     "TileRecord",
     "World",
+    "add_own_test",
     "circle_of",
     "down_of",
     "open_map",
@@ -66,4 +70,5 @@ __all__ = [
     "write_anchored",
     "write_map",
     "write_set",
+    "write_tested",
 ]

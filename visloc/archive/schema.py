@@ -14,6 +14,7 @@ from pydantic import (
     JsonValue,
     ValidationInfo,
     field_validator,
+    model_validator,
 )
 from pydantic.dataclasses import dataclass
 
@@ -23,7 +24,7 @@ from visloc.retrieval.fusion import LateFusion
 from visloc.types import Fingerprint
 
 FORMAT = "visloc-map"
-FORMAT_MAJOR, FORMAT_MINOR = 2, 2
+FORMAT_MAJOR, FORMAT_MINOR = 3, 0
 
 ID_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 # Names of a map's files: a path below the map on every operating system.
@@ -205,6 +206,54 @@ class Method(Record):
     settings: dict[str, JsonValue]
 
 
+# A pose is off by more than its photo tells, but not without bounds.
+MAX_FACTOR = 1000.0
+MAX_WRONG_SCORES = 32
+_MOST_PHOTOS = 2**31
+
+
+class Score(Record):
+    """What spoke for a wrong pose of the own test."""
+
+    inliers: Annotated[int, Field(ge=0)]
+    inlier_ratio: Annotated[float, Field(ge=0, le=1)]
+
+
+class OwnTest(Record):
+    """What a map learned from its own photos, each localized in the map without itself.
+
+    Attributes:
+        tested: photos that were tried.
+        localized: of these, those that got a pose.
+        wrong: of these, those at another place than the photo.
+        position_factor: by how much poses are further off than the scatter of their photos tells;
+            ``visloc.pose.map_errors.MapErrors``.
+        orientation_factor: likewise.
+        independent: whether the photos' own poses came from elsewhere than the map's landmarks.
+        wrong_at: the scores of wrong poses, the most convincing first.
+    """
+
+    tested: Annotated[int, Field(ge=0, le=_MOST_PHOTOS)]
+    localized: Annotated[int, Field(ge=0, le=_MOST_PHOTOS)]
+    wrong: Annotated[int, Field(ge=0, le=_MOST_PHOTOS)]
+    position_factor: Annotated[float, Field(ge=1, le=MAX_FACTOR)]
+    orientation_factor: Annotated[float, Field(ge=1, le=MAX_FACTOR)]
+    independent: bool
+    wrong_at: Annotated[tuple[Score, ...], Field(max_length=MAX_WRONG_SCORES)] = ()
+
+    @model_validator(mode="after")
+    def _counts_fit(self) -> OwnTest:
+        if not len(self.wrong_at) <= self.wrong <= self.localized <= self.tested:
+            raise ValueError("wrong, localized and tested photos do not fit each other")
+        return self
+
+
+class Parts(Record):
+    """Parts that a map may have or not; a reader ignores those that it does not know."""
+
+    own_test: OwnTest | None = None
+
+
 class Manifest(Record):
     """``manifest.json``."""
 
@@ -220,6 +269,8 @@ class Manifest(Record):
     # Maps of formats before 2.1 have none and use the default.
     retrieval: RetrievalRecord = RetrievalRecord()
     counts: Counts
+    # Maps of formats before 3.0 have none.
+    parts: Parts = Parts()
     notes: tuple[str, ...] = ()
     content_hash: Sha256
     manifest_hash: Sha256

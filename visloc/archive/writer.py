@@ -24,6 +24,7 @@ from visloc.archive.schema import (
     Anchor,
     FingerprintRecord,
     ImageRecord,
+    OwnTest,
     RetrievalRecord,
     Vector,
 )
@@ -104,6 +105,7 @@ class MapContent:
         fusion: how queries rank the photos by default.
         descriptor_scale: the step in which descriptors are stored. The step of the map that they
             were read from stores them unchanged; None chooses one that fits the largest value.
+        own_test: of a map that this is or is a part of; None when it took none.
     """
 
     metric: bool
@@ -125,6 +127,7 @@ class MapContent:
     computed_with: str | None = None
     fusion: LateFusion = EQUAL_GHARM
     descriptor_scale: float | None = None
+    own_test: OwnTest | None = None
 
 
 def pose_row(pose: Pose) -> PoseRow:
@@ -190,6 +193,9 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
             "landmarks": len(landmarks.points),
             "observations": len(landmarks.observed),
         },
+        "parts": {}
+        if content.own_test is None
+        else {"own_test": content.own_test.model_dump(mode="json")},
         "notes": list(content.notes),
         "files": files.entries(),
     }

@@ -22,6 +22,7 @@ from visloc.pose.colmap import normalized_rays
 from visloc.pose.distance import mahalanobis2, viewpoints_apart
 from visloc.pose.generalized import MAX_FOCAL, MIN_FOCAL
 from visloc.pose.gravity import KnownGravity, gravity_deviation
+from visloc.pose.map_errors import PHOTO_ONLY, MapErrors
 from visloc.pose.views import MatchedView
 from visloc.priors import HEIGHT_REACH, POSE_PRIOR_STDS, REACH, Priors
 
@@ -47,6 +48,10 @@ class MapGeometry:
         self.opened = opened
         self.origin = np.array(opened.manifest.world.origin)
         self.down = opened.gravity
+        test = opened.manifest.parts.own_test
+        self.errors = (
+            PHOTO_ONLY if test is None else MapErrors(test.position_factor, test.orientation_factor)
+        )
 
     @property
     def ref(self) -> str:
@@ -137,6 +142,11 @@ class Constraints:
             )
 
     @property
+    def errors(self) -> MapErrors:
+        """Of the map."""
+        return self.geometry.errors
+
+    @property
     def narrow(self) -> bool:
         """Whether the priors exclude photos or poses from the search."""
         priors = self._priors
@@ -171,7 +181,7 @@ class Constraints:
 
         Args:
             pose: ``device_from_world`` relative to the origin.
-            covariance: (6, 6) of it.
+            covariance: (6, 6) of it, the errors of the map included.
         """
         own = _OWN_STDS * largest_std(pose, covariance)
         center = pose.center + self.geometry.origin

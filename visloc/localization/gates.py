@@ -163,7 +163,8 @@ def determined(_: Problem, pose: GeneralizedPose) -> Refusal | None:
 def within_the_priors(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
     """Refuse a pose that contradicts a prior."""
     assert pose.covariance is not None  # ``determined`` comes first
-    return contradicts_priors(problem.constraints, pose.rig_from_world, pose.covariance)
+    constraints, where = problem.constraints, pose.rig_from_world
+    return contradicts_priors(constraints, where, constraints.errors.whole(where, pose.covariance))
 
 
 def not_better_without_gravity(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
@@ -309,7 +310,13 @@ def not_better_elsewhere(elsewhere: Problem, pose: GeneralizedPose | None) -> Re
 def contradicts_priors(
     constraints: Constraints, rig_from_world: Pose, covariance: NDArray[np.float64]
 ) -> Refusal | None:
-    """Refuse a pose (covariance (6, 6)) that contradicts the priors, both from the map's origin."""
+    """Refuse a pose that contradicts the priors, both from the map's origin.
+
+    Args:
+        constraints: the priors.
+        rig_from_world: the pose.
+        covariance: (6, 6), the errors of the map included.
+    """
     contradiction = constraints.contradiction(rig_from_world, covariance)
     if contradiction is None:
         return None

@@ -294,7 +294,7 @@ class Localizer:
         (image,) = answer.images
         assert image.evidence is not None  # it was looked at
         evidence = replace(image.evidence, seconds=answer.seconds)
-        if answer.refusal is not None or pose is None or solved.pose is None:
+        if answer.refusal is not None or pose is None or pose.photo_covariance is None:
             assert answer.refusal is not None  # without a pose there is a reason
             refusal = answer.refusal
             refused = NotLocalized(evidence, refusal.stage, refusal.reason, refusal.message)
@@ -307,6 +307,8 @@ class Localizer:
             orientation_std=pose.orientation_std,
             inlier_keypoints=look.matches.pixels[inliers].astype(np.float32),
             inlier_points=look.matches.points[inliers] + self.geometry.origin,
+            photo_covariance=pose.photo_covariance,
+            uncertainty=pose.uncertainty,
             probability=pose.probability,
         )
         return localized, inliers

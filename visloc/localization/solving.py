@@ -162,7 +162,7 @@ def solve_instant(
         refusal = refusal and _with_turned_photos(refusal, looks)
     pose = None
     if refusal is None and found is not None and found.covariance is not None:
-        pose = rig_pose(found.rig_from_world, found.covariance, geometry, PoseSource.ESTIMATED)
+        pose = measured_pose(found.rig_from_world, found.covariance, geometry)
         pose = replace(pose, probability=found.probability)
     inliers = () if found is None else tuple(found.inliers)
     camera = None if refusal is not None or found is None else found.camera
@@ -259,13 +259,39 @@ def with_inliers(
     return tuple(counted)
 
 
+def measured_pose(
+    rig_from_local: Pose, photo_covariance: NDArray[np.float64], geometry: MapGeometry
+) -> RigPose:
+    """State a pose that images measured, in the world.
+
+    Args:
+        rig_from_local: in the map's own coordinates.
+        photo_covariance: (6, 6), what the scatter of the images leaves open; the errors of the map
+            are added here.
+        geometry: of the map.
+    """
+    whole = geometry.errors.whole(rig_from_local, photo_covariance)
+    return rig_pose(rig_from_local, whole, geometry, PoseSource.ESTIMATED, photo_covariance)
+
+
 def rig_pose(
     rig_from_local: Pose,
     covariance: NDArray[np.float64],
     geometry: MapGeometry,
     source: PoseSource,
+    photo_covariance: NDArray[np.float64] | None = None,
 ) -> RigPose:
-    """Move a pose and its covariance (6, 6) from the map's own coordinates to the world."""
+    """Move a pose from the map's own coordinates to the world.
+
+    Args:
+        rig_from_local: the pose.
+        covariance: (6, 6), the errors of the map included.
+        geometry: of the map.
+        source: what the pose rests on.
+        photo_covariance: (6, 6), the part of the instant's own images, if they measured the pose.
+    """
+    if photo_covariance is not None:
+        _, photo_covariance = with_origin(rig_from_local, photo_covariance, geometry.origin)
     position_variance = np.diag(position_covariance(rig_from_local, covariance))
     rig_from_world, covariance = with_origin(rig_from_local, covariance, geometry.origin)
     return RigPose(
@@ -274,6 +300,8 @@ def rig_pose(
         position_std=np.sqrt(position_variance),
         orientation_std=np.sqrt(np.diag(covariance)[:3]),
         source=source,
+        photo_covariance=photo_covariance,
+        uncertainty=geometry.errors.uncertainty,
     )
 
 

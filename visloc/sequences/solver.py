@@ -29,6 +29,7 @@ from visloc.localization.solving import (
 )
 from visloc.options import LocalizeOptions
 from visloc.pose.centre import with_origin
+from visloc.pose.map_errors import MapErrors
 from visloc.pose.motion import RelativeMotion, default_motion_covariance, link_from_motion
 from visloc.priors import Priors
 from visloc.sequences.filling import MAX_GAP_S, Odometry, TimeUnit, TracedPose, fill_sequence
@@ -216,7 +217,7 @@ class SequenceSolver:
         found: list[WindowPose | None] = [None] * len(self._entries)
         if not blind or self._rest == 0:
             found = solve_window(
-                [_window_instant(entry.solved) for entry in self._entries],
+                [_window_instant(entry.solved, self._geometry.errors) for entry in self._entries],
                 motions,
                 registration=registration,
                 seed=self._options.seed,
@@ -252,6 +253,7 @@ class SequenceSolver:
                     replace(alone, images=with_inliers(alone.images, pose.inliers)),
                     TracedPose(pose.rig_from_world, covariance, source),
                     entry.seen.priors,
+                    pose.photo_covariance,
                 )
             )
         return answers
@@ -313,13 +315,28 @@ class SequenceSolver:
         )
         return TracedPose(pose, covariance, answer.pose.source, answer.num_inliers)
 
-    def _with_pose(self, answer: InstantAnswer, found: TracedPose, priors: Priors) -> InstantAnswer:
-        """Give an answer a pose, unless it contradicts the priors."""
+    def _with_pose(
+        self,
+        answer: InstantAnswer,
+        found: TracedPose,
+        priors: Priors,
+        photo_covariance: NDArray[np.float64] | None = None,
+    ) -> InstantAnswer:
+        """Give an answer a pose, unless it contradicts the priors.
+
+        Args:
+            answer: of the instant.
+            found: with the errors of the map.
+            priors: of the instant.
+            photo_covariance: (6, 6), if the instant's own images measured the pose.
+        """
         constraints = Constraints(self._geometry, priors)
         contradiction = contradicts_priors(constraints, found.pose, found.covariance)
         if contradiction is not None:
             return replace(answer, pose=None, refusal=answer.refusal or contradiction)
-        pose = rig_pose(found.pose, found.covariance, self._geometry, found.source)
+        pose = rig_pose(
+            found.pose, found.covariance, self._geometry, found.source, photo_covariance
+        )
         measured = found.source is PoseSource.ESTIMATED
         if measured and answer.pose is not None:  # the motion agrees with what the images showed
             pose = replace(pose, probability=answer.pose.probability)
@@ -355,7 +372,7 @@ def check_odometry(odometry: Odometry | None, *, metric: bool) -> None:
         raise refuse("sequence.odometry", field="odometry")
 
 
-def _window_instant(solved: Solved) -> WindowInstant:
+def _window_instant(solved: Solved, errors: MapErrors) -> WindowInstant:
     refusal = solved.answer.refusal
     if refusal is not None and refusal.reason in _NO_EVIDENCE:
         # Matches under wrong priors could pass together the gate that refused each alone. Matches
@@ -364,8 +381,8 @@ def _window_instant(solved: Solved) -> WindowInstant:
         return WindowInstant((), None)
     if any(view.focal_unknown for view in solved.views):
         # A window takes cameras as they are: such pixels would fit a wrong pose.
-        return WindowInstant((), solved.pose)
-    return WindowInstant(solved.views, solved.pose)
+        return WindowInstant((), solved.pose, errors)
+    return WindowInstant(solved.views, solved.pose, errors)
 
 
 def _way(a: WindowPose | None, b: WindowPose | None) -> tuple[float, float]:

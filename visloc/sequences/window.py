@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from visloc.geometry import Pose
 from visloc.options import RegistrationPreset
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
+from visloc.pose.map_errors import PHOTO_ONLY, MapErrors
 from visloc.pose.motion import (
     RelativeMotion,
     UncertainPose,
@@ -46,10 +47,12 @@ class WindowInstant:
     Attributes:
         views: one for each image, matched against the map; there may be none.
         alone: the pose that they gave on their own, when it passed the gate.
+        errors: of the map.
     """
 
     views: tuple[MatchedView, ...]
     alone: GeneralizedPose | None
+    errors: MapErrors = PHOTO_ONLY
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,12 +61,15 @@ class WindowPose:
 
     Attributes:
         rig_from_world: in the frame of the views' points.
-        covariance: (6, 6) of rotation (rad) then translation, for R <- Exp(w) R and t <- t + dt.
+        covariance: (6, 6) of rotation (rad) then translation, for R <- Exp(w) R and t <- t + dt,
+            with the errors of the map.
         inliers: per view, (n,) bool, reprojection error within the threshold.
         measured: the instant's own images measured it: they support it as the gate demands.
             Otherwise it rests on other instants and the motion.
         supported: its own images took part, be it with a few pixels. One that is not hangs on
             the motion alone.
+        photo_covariance: (6, 6), what the instant's own images leave open; None when they did not
+            measure the pose.
     """
 
     rig_from_world: Pose
@@ -71,6 +77,7 @@ class WindowPose:
     inliers: tuple[NDArray[np.bool_], ...]
     measured: bool
     supported: bool
+    photo_covariance: NDArray[np.float64] | None = None
 
 
 def solve_window(
@@ -161,8 +168,20 @@ def _alone(instant: WindowInstant) -> WindowPose | None:
     pose = instant.alone
     if pose is None or pose.covariance is None:
         return None
+    return _measured(pose, pose.covariance, instant.errors)
+
+
+def _measured(
+    pose: GeneralizedPose, photo_covariance: NDArray[np.float64], errors: MapErrors
+) -> WindowPose:
+    """A pose that an instant's own images measured, with the errors of the map."""
     return WindowPose(
-        pose.rig_from_world, pose.covariance, pose.inliers, measured=True, supported=True
+        pose.rig_from_world,
+        errors.whole(pose.rig_from_world, photo_covariance),
+        pose.inliers,
+        measured=True,
+        supported=True,
+        photo_covariance=photo_covariance,
     )
 
 
@@ -242,10 +261,10 @@ def _solve_together(
         return None
     taking_part = {*known.measured, *known.seen}
     return [
-        _measured_from(instant.views, pose, registration)
+        _measured_from(instant, pose, registration)
         or WindowPose(
             pose,
-            UncertainPose(pose, covariance).additive(),
+            _with_map_errors(UncertainPose(pose, covariance).additive(), pose, instant, known),
             _inliers(instant.views, pose, registration),
             measured=False,
             supported=i in taking_part,
@@ -263,19 +282,29 @@ def _selected(
     return tuple(v.selected(k) for v, k in zip(views, inliers, strict=True) if k.any())
 
 
+def _with_map_errors(
+    covariance: NDArray[np.float64], pose: Pose, instant: WindowInstant, known: Chain
+) -> NDArray[np.float64]:
+    """Add the errors of the map to a pose that others support.
+
+    Measured poses brought them along. Where pixels took part beside them or instead of them, the
+    pixels know nothing of these errors: the whole covariance is widened.
+    """
+    return instant.errors.whole(pose, covariance) if known.seen else covariance
+
+
 def _measured_from(
-    views: Sequence[MatchedView], start: Pose, registration: RegistrationPreset
+    instant: WindowInstant, start: Pose, registration: RegistrationPreset
 ) -> WindowPose | None:
     """The pose that an instant's own images give near ``start``, if they support it."""
+    views = instant.views
     enough = max(registration.min_inliers, _MIN_OWN_INLIERS)
     if not _supports(_inliers(views, start, registration), enough, registration):
         return None
     own = refine_generalized_pose(views, start, max_error_px=registration.max_error_px)
     if own is None or own.covariance is None or not _supports(own.inliers, enough, registration):
         return None
-    return WindowPose(
-        own.rig_from_world, own.covariance, own.inliers, measured=True, supported=True
-    )
+    return _measured(own, own.covariance, instant.errors)
 
 
 def _inliers(

@@ -87,11 +87,15 @@ def scaled_device(cam_from_rig: Pose, scale: float) -> Pose:
 
 def _moved_rig(rig: RigPose, set_from_tile: Similarity) -> RigPose:
     pose, covariance = moved_pose(rig.rig_from_world, rig.covariance, set_from_tile)
+    photo = rig.photo_covariance
+    if photo is not None:
+        _, photo = moved_pose(rig.rig_from_world, photo, set_from_tile)
     return replace(
         rig,
         rig_from_world=pose,
         covariance=covariance,
         position_std=_position_std(rig.rig_from_world, rig.covariance, set_from_tile),
+        photo_covariance=photo,
     )
 
 

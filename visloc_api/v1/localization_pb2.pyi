@@ -965,7 +965,11 @@ class PoseEstimate(_message.Message):
     COVARIANCE_FIELD_NUMBER: _builtins.int
     POSITION_STD_FIELD_NUMBER: _builtins.int
     ORIENTATION_STD_DEG_FIELD_NUMBER: _builtins.int
+    PHOTO_COVARIANCE_FIELD_NUMBER: _builtins.int
+    UNCERTAINTY_FIELD_NUMBER: _builtins.int
     PROBABILITY_FIELD_NUMBER: _builtins.int
+    uncertainty: _builtins.str
+    """whole, or photo only: the map's own errors are not in covariance"""
     probability: _builtins.float
     """That the pose is right, 0 to 1; absent when it was not judged."""
     @_builtins.property
@@ -981,7 +985,7 @@ class PoseEstimate(_message.Message):
     @_builtins.property
     def covariance(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """6 x 6, row by row: rotation (rad), then translation, for R <- Exp(w) R and t <- t + dt of
-        cam_from_world.
+        cam_from_world: the whole, as far as uncertainty says.
         """
 
     @_builtins.property
@@ -992,6 +996,12 @@ class PoseEstimate(_message.Message):
     def orientation_std_deg(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """about the camera's x, y, z axes, degrees"""
 
+    @_builtins.property
+    def photo_covariance(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """The part of covariance that the scatter of the matches leaves open; empty for a pose that no
+        image of its own measured.
+        """
+
     def __init__(
         self,
         *,
@@ -1001,11 +1011,13 @@ class PoseEstimate(_message.Message):
         covariance: _abc.Iterable[_builtins.float] | None = ...,
         position_std: _abc.Iterable[_builtins.float] | None = ...,
         orientation_std_deg: _abc.Iterable[_builtins.float] | None = ...,
+        photo_covariance: _abc.Iterable[_builtins.float] | None = ...,
+        uncertainty: _builtins.str = ...,
         probability: _builtins.float | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_probability", b"_probability", "cam_from_world", b"cam_from_world", "probability", b"probability"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_probability", b"_probability", "cam_from_world", b"cam_from_world", "covariance", b"covariance", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "position", b"position", "position_std", b"position_std", "probability", b"probability"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_probability", b"_probability", "cam_from_world", b"cam_from_world", "covariance", b"covariance", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "photo_covariance", b"photo_covariance", "position", b"position", "position_std", b"position_std", "probability", b"probability", "uncertainty", b"uncertainty"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__probability: _TypeAlias = _typing.Literal["probability"]  # noqa: Y015
     _WhichOneofArgType__probability: _TypeAlias = _typing.Literal["_probability", b"_probability"]  # noqa: Y015
@@ -1483,7 +1495,11 @@ class RigPose(_message.Message):
     COVARIANCE_FIELD_NUMBER: _builtins.int
     POSITION_STD_FIELD_NUMBER: _builtins.int
     ORIENTATION_STD_DEG_FIELD_NUMBER: _builtins.int
+    PHOTO_COVARIANCE_FIELD_NUMBER: _builtins.int
+    UNCERTAINTY_FIELD_NUMBER: _builtins.int
     PROBABILITY_FIELD_NUMBER: _builtins.int
+    uncertainty: _builtins.str
+    """as of PoseEstimate"""
     probability: _builtins.float
     """as of PoseEstimate; absent unless its own images measured it"""
     @_builtins.property
@@ -1504,6 +1520,10 @@ class RigPose(_message.Message):
     def position_std(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
     @_builtins.property
     def orientation_std_deg(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
+    @_builtins.property
+    def photo_covariance(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """as of PoseEstimate"""
+
     def __init__(
         self,
         *,
@@ -1513,11 +1533,13 @@ class RigPose(_message.Message):
         covariance: _abc.Iterable[_builtins.float] | None = ...,
         position_std: _abc.Iterable[_builtins.float] | None = ...,
         orientation_std_deg: _abc.Iterable[_builtins.float] | None = ...,
+        photo_covariance: _abc.Iterable[_builtins.float] | None = ...,
+        uncertainty: _builtins.str = ...,
         probability: _builtins.float | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_probability", b"_probability", "probability", b"probability", "rig_from_world", b"rig_from_world"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_probability", b"_probability", "covariance", b"covariance", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "position", b"position", "position_std", b"position_std", "probability", b"probability", "rig_from_world", b"rig_from_world"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_probability", b"_probability", "covariance", b"covariance", "orientation", b"orientation", "orientation_std_deg", b"orientation_std_deg", "photo_covariance", b"photo_covariance", "position", b"position", "position_std", b"position_std", "probability", b"probability", "rig_from_world", b"rig_from_world", "uncertainty", b"uncertainty"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__probability: _TypeAlias = _typing.Literal["probability"]  # noqa: Y015
     _WhichOneofArgType__probability: _TypeAlias = _typing.Literal["_probability", b"_probability"]  # noqa: Y015

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 import visloc.options
 import visloc.types
@@ -22,6 +22,7 @@ from visloc_api.words.base import (
     NumbersNx2,
     NumbersNx3,
     OneOf,
+    OptionalCovariance,
     SentAs,
 )
 from visloc_api.words.geometry import Transform
@@ -30,10 +31,9 @@ from visloc_api.words.geopose import GeoPose, GeoPoseYpr
 # A sequence has thousands of images, and each may have been matched against a thousand photos.
 MAX_RETRIEVED = 20
 # Appended to the description of every stated uncertainty.
-_NOT_COVERED = (
-    "; computed from the scatter of the matches only, so errors that landmarks "
-    "share are missing (depth, calibration, poses of mapping photos): on one "
-    "map from depth the error was 13 times as large"
+_COVERED = (
+    "; the whole, with the errors that landmarks of the map share, where uncertainty says so; else "
+    "from the scatter of the matches only"
 )
 _COVARIANCE = (
     "6 x 6, row by row: rotation (rad), then translation, for R <- Exp(w) R and t <- t + dt of "
@@ -46,13 +46,37 @@ _PROBABILITY = (
 
 
 def _stated(description: str) -> Any:
-    """Describe a field with an uncertainty, and what it leaves out."""
-    return Field(description=description + _NOT_COVERED)
+    """Describe a field with an uncertainty, and what it covers."""
+    return Field(description=description + _COVERED)
 
 
 _PositionStd = Annotated[
     Numbers3, _stated("standard deviations of the position along the world's axes")
 ]
+
+
+_PHOTO_PART = (
+    "6 x 6, the part of covariance that the scatter of the matches alone leaves open; "
+    "null for a pose that no image of its own measured"
+)
+_UNCERTAINTY = (
+    "whole: covariance holds the errors of the photo and of the map, as the map's own test found "
+    "them; photo only: the map has no such test"
+)
+
+
+def _uncertainty(value: Any) -> Any:
+    """An older service states what the photo tells, and no word for it."""
+    return value or visloc.types.Uncertainty.PHOTO_ONLY
+
+
+_Uncertainty = Annotated[
+    str,
+    OneOf(visloc.types.Uncertainty),
+    BeforeValidator(_uncertainty),
+    Field(description=_UNCERTAINTY),
+]
+_PhotoCovariance = Annotated[OptionalCovariance, Field(description=_PHOTO_PART)]
 
 
 class _ReceivedPose(Pose):
@@ -120,6 +144,8 @@ class PoseEstimate(_PoseWithDigits):
     covariance: Annotated[Covariance, _stated(f"{_COVARIANCE}cam_from_world")]
     position_std: _PositionStd
     orientation_std_deg: Annotated[Numbers3, _stated(_ABOUT.format("camera"))]
+    photo_covariance: _PhotoCovariance = None
+    uncertainty: _Uncertainty = visloc.types.Uncertainty.PHOTO_ONLY
     probability: Annotated[
         float | None, Field(ge=0, le=1, description=f"{_PROBABILITY}null when it was not judged")
     ] = None
@@ -139,6 +165,8 @@ class RigPose(_PoseWithDigits):
     covariance: Annotated[Covariance, _stated(f"{_COVARIANCE}rig_from_world")]
     position_std: _PositionStd
     orientation_std_deg: Annotated[Numbers3, _stated(_ABOUT.format("rig"))]
+    photo_covariance: _PhotoCovariance = None
+    uncertainty: _Uncertainty = visloc.types.Uncertainty.PHOTO_ONLY
     probability: Annotated[
         float | None,
         Field(

@@ -74,6 +74,10 @@ export interface PoseEstimate {
   covariance: number[];
   position_std: number[];
   orientation_std_deg: number[];
+  /** The part of covariance that the scatter of the matches alone leaves open. */
+  photo_covariance: number[] | null;
+  /** What covariance covers. */
+  uncertainty: "whole" | "photo only";
   /** That the pose is right, 0 to 1; null when it was not judged. */
   probability: number | null;
 }

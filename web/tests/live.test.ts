@@ -41,6 +41,8 @@ function answered(position: number[] | null, changes: Partial<LocalizeResponse> 
     covariance: [],
     position_std: [],
     orientation_std_deg: [],
+    photo_covariance: null,
+    uncertainty: "whole",
     probability: null,
   };
   const refusal = { stage: "gate", reason: "too_few_inliers", message: "too few" };

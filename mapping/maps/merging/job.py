@@ -11,8 +11,9 @@ import numpy as np
 from mapping.maps.editing import content_of, joined, moved, refuse_other_features, same_model
 from mapping.maps.merging.registration import Registration, register, updates_of
 from mapping.maps.sets import publish_set
+from mapping.own_test.publishing import publish_edited
 from mapping.report.cameras import origins_record
-from mapping.stages.publishing import photo_files, publish_edited
+from mapping.stages.publishing import photo_files
 from mapping.stages.work_folder import exclusive
 from visloc.archive import GlobalFeatures, Map, MapContent, MapStore
 from visloc.archive.schema import ID_PATTERN

@@ -9,7 +9,8 @@ from functools import partial
 from mapping.maps.editing import content_of, selected
 from mapping.maps.pruning.accuracy import Accuracy, of_held_out_photos
 from mapping.maps.pruning.choosing import LEFT_OUT, Kept, choose, least, num_landmarks, size_with
-from mapping.stages.publishing import link_photos, photo_files, write_content
+from mapping.own_test.publishing import write_content
+from mapping.stages.publishing import link_photos, photo_files
 from mapping.stages.work_folder import exclusive
 from visloc.archive import Map, MapContent, MapStore, open_map
 from visloc.archive.version_rules import outdated

@@ -45,6 +45,7 @@ from mapping.methods.rgbd import (
 )
 from mapping.methods.sfm import landmarks_from_matches
 from mapping.methods.sfm_settings import SfmSettings
+from mapping.own_test.publishing import publish_edited
 from mapping.progress import Progress, one_step
 from mapping.stages.colours import landmark_colours
 from mapping.stages.context import BuildContext
@@ -52,7 +53,7 @@ from mapping.stages.landmarks import MadeLandmarks
 from mapping.stages.networks import Networks
 from mapping.stages.photos import MappingPhoto, some
 from mapping.stages.previews import keep_photos
-from mapping.stages.publishing import photo_files, publish_edited
+from mapping.stages.publishing import photo_files
 from mapping.stages.work_folder import WorkFolder, exclusive
 from visloc.archive import Map, MapContent, MapStore, open_map
 from visloc.archive.schema import photo_file

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 import mapping.build.build
-import mapping.stages.publishing
+import mapping.own_test.publishing
 from mapping.build.build import build_map
 from mapping.build.settings import BuildSettings
 from mapping.cluster.workers import Workers
@@ -453,7 +453,7 @@ def test_a_full_disk_is_named_and_the_same_build_resumes(
 
     before = MapStore(maps_dir).open("room")
     with monkeypatch.context() as full:
-        full.setattr(mapping.stages.publishing, "write_map", write_on_full_disk)
+        full.setattr(mapping.own_test.publishing, "write_map", write_on_full_disk)
         with pytest.raises(Unavailable, match=r"No space left on device.*resumes") as caught:
             build(sample / "mapping", maps_dir)
     assert caught.value.code == "storage.failed"

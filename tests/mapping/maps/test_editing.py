@@ -11,7 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from mapping.maps.editing import content_of, joined, moved, selected
-from mapping.stages.publishing import link_photos, photo_files, publish_content, publish_edited
+from mapping.own_test.publishing import publish_content, publish_edited
+from mapping.stages.publishing import link_photos, photo_files
 from visloc.archive import Geodetic, Map, MapContent, MapStore
 from visloc.archive.places import enu_of
 from visloc.errors import Conflict

@@ -15,8 +15,9 @@ from mapping.build.settings import BuildSettings
 from mapping.cli.main import app
 from mapping.maps.editing import content_of, moved, selected
 from mapping.maps.merging import join_as_set, merge_maps
+from mapping.own_test.publishing import publish_edited
+from mapping.own_test.trials import own_test
 from mapping.sample import write_sample
-from mapping.stages.publishing import publish_edited
 from mapping.stages.work_folder import exclusive
 from visloc.archive import Anchor, Geodetic, Map, MapStore, SetOutline
 from visloc.errors import Conflict, InvalidInput
@@ -120,6 +121,12 @@ def test_the_merged_map_localizes_as_a_whole(
     np.testing.assert_array_equal(merged.observation_descriptors[:num], a.observation_descriptors)
     assert merged.manifest.world.metric
     assert f"{b.ref} was registered by" in merged.manifest.notes[-1]
+
+
+def test_a_merged_map_is_tested_anew(merged: Map) -> None:
+    learned = merged.manifest.parts.own_test
+    assert learned == own_test(merged)
+    assert learned.localized > 0
 
 
 def test_another_building_is_refused(halves: MapStore, tmp_path: Path) -> None:

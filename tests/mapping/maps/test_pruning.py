@@ -14,7 +14,8 @@ from mapping.maps.editing import content_of, selected
 from mapping.maps.pruning import Kept, Pruned, choose, prune_map, size_with
 from mapping.maps.pruning.accuracy import BINS, Accuracy, lost
 from mapping.maps.pruning.choosing import least, num_landmarks
-from mapping.stages.publishing import publish_edited
+from mapping.own_test.publishing import publish_edited
+from mapping.own_test.trials import own_test
 from visloc.archive import Map, MapStore
 from visloc.errors import Conflict, InvalidInput, VislocError
 
@@ -39,6 +40,13 @@ def store(built: Map, tmp_path: Path) -> MapStore:
 def pruned(store: MapStore) -> Pruned:
     size = store.open("room").size_bytes
     return prune_map(store, "room", max_bytes=size * 7 // 10, progress=quiet)
+
+
+def test_a_pruned_map_is_tested_anew(pruned: Pruned) -> None:
+    learned = pruned.after.manifest.parts.own_test
+    assert learned == own_test(pruned.after)
+    assert learned != pruned.before.manifest.parts.own_test
+    assert learned.localized > 0
 
 
 def keep_all(opened: Map) -> Kept:

@@ -21,8 +21,8 @@ from mapping.frames.set_poses import poses_on_earth, read_poses
 from mapping.maps.editing import content_of, moved
 from mapping.maps.sets import publish_set
 from mapping.maps.splitting import cut, split_map
+from mapping.own_test.publishing import publish_edited
 from mapping.sample import write_sample
-from mapping.stages.publishing import publish_edited
 from visloc.archive import Anchor, Geodetic, Map, MapStore, SetOutline
 from visloc.archive.places import enu_of
 from visloc.errors import Conflict, InvalidInput
@@ -189,6 +189,15 @@ def test_tiles_of_no_size_are_refused(hall: Map, tile: float, overlap: float, co
     with pytest.raises(InvalidInput) as caught:
         cut(hall, tile, overlap)
     assert caught.value.code == code
+
+
+def test_tiles_carry_the_test_of_their_map(store: MapStore, hall: Map) -> None:
+    """They share its landmarks and frame, and it was tested with more photos than each has."""
+    tiles = store.outline("halls")
+    assert isinstance(tiles, SetOutline)
+    assert hall.manifest.parts.own_test is not None
+    for tile in tiles.tiles:
+        assert store.open(tile.ref).manifest.parts.own_test == hall.manifest.parts.own_test
 
 
 def test_an_interrupted_split_goes_on(store: MapStore) -> None:

@@ -26,6 +26,7 @@ from visloc.types import (
     Reason,
     Refusal,
     RigPose,
+    Uncertainty,
 )
 
 TRACE, SPAN = "0af7651916cd43dd8448eb211c80319c", "b7ad6b7169203331"
@@ -40,7 +41,10 @@ EVIDENCE = Evidence(
 )
 POSE = Pose.from_quaternion((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 IMAGE = ImageAnswer("camera", Pose.identity(), EVIDENCE, None)
-RIG_POSE = RigPose(POSE, np.eye(6), np.ones(3), np.ones(3), PoseSource.ESTIMATED)
+RIG_POSE = RigPose(
+    *(POSE, np.eye(6), np.ones(3), np.ones(3), PoseSource.ESTIMATED),
+    *(np.eye(6), Uncertainty.WHOLE),
+)
 YES = Localization(
     InstantAnswer(None, (IMAGE,), RIG_POSE, None, {"queued": 0.25, "pose": 0.5}), "hall", "1"
 )

@@ -219,7 +219,7 @@ def replace_array(name: str, array: np.ndarray) -> Callable[[Path], None]:
         (lambda f: (f / "manifest.json").write_text("{"), "map.manifest"),
         (lambda f: (f / "manifest.json").write_text("[]"), "map.manifest"),
         (lambda f: (f / "manifest.json").write_bytes(b"\xff\xfe"), "map.manifest"),
-        (edit_manifest(format_version="3.0"), "map.format_version"),
+        (edit_manifest(format_version="4.0"), "map.format_version"),
         (edit_manifest(format_version="9" * 9 + ".0"), "map.manifest"),
         (edit_manifest(format="zip"), "map.manifest"),
         (edit_manifest(files={}), "map.file_missing"),
@@ -240,8 +240,8 @@ def test_a_damaged_map_is_refused_at_opening_with_the_reason(
 
 
 def test_a_newer_minor_format_with_unknown_fields_opens(folder: Path) -> None:
-    edit_manifest(format_version="2.9", colours="yes")(folder)
-    assert open_map(folder).manifest.format_version == "2.9"
+    edit_manifest(format_version="3.9", colours="yes")(folder)
+    assert open_map(folder).manifest.format_version == "3.9"
 
 
 @pytest.mark.parametrize("turn", [None, 6])
@@ -264,7 +264,7 @@ def test_programs_that_know_formats_1_call_this_one_newer(
     monkeypatch.setattr("visloc.archive.checks.FORMAT_MAJOR", 1)
     with pytest.raises(MapCorrupt, match="newer visloc wrote the map; upgrade") as caught:
         open_map(folder)
-    assert (caught.value.code, caught.value.got) == ("map.format_version", "2.2")
+    assert (caught.value.code, caught.value.got) == ("map.format_version", "3.0")
 
 
 @pytest.mark.parametrize(
@@ -345,7 +345,7 @@ def test_a_map_of_ready_made_features_with_colours_and_anchor_reads_back(tmp_pat
     folder = write_content(tmp_path / "incoming", make_ready_made_content())
     MapStore(tmp_path / "maps").publish(folder, "room", "v1")
     opened = MapStore(tmp_path / "maps").open("room")
-    assert opened.manifest.format_version == "2.2"
+    assert opened.manifest.format_version == "3.0"
     assert opened.manifest.world.anchor == ANCHOR
     assert opened.manifest.local_features.fingerprint.name == "kapture:D2-Net"
     assert opened.colors is not None

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from visloc.archive import MapStore
+from visloc.archive.schema import Parts
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose, covariance_from_center
@@ -43,7 +44,7 @@ def test_centres_are_told_relative_to_the_origin_without_losing_digits(far_place
     quaternion = TURNED.rotation_wxyz
     world = far_place.to_world(TURNED)
     opened: Any = SimpleNamespace(
-        manifest=SimpleNamespace(world=SimpleNamespace(origin=tuple(origin))),
+        manifest=SimpleNamespace(world=SimpleNamespace(origin=tuple(origin)), parts=Parts()),
         gravity=None,
         image_poses=np.array([[*quaternion, *world.translation]]),
     )

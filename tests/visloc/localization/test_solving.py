@@ -11,10 +11,11 @@ from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose, center_covariance
 from visloc.localization.gates import registration_for
-from visloc.localization.solving import Matches, Solved, solve_instant
+from visloc.localization.solving import Matches, Solved, measured_pose, solve_instant
 from visloc.options import LocalizeOptions
 from visloc.pose.centre import with_origin
 from visloc.pose.colmap import normalized_rays
+from visloc.pose.map_errors import MapErrors
 from visloc.priors import (
     NO_PRIORS,
     GravityPrior,
@@ -23,7 +24,7 @@ from visloc.priors import (
     PositionPrior,
     Priors,
 )
-from visloc.types import PoseSource, Reason, Refusal
+from visloc.types import PoseSource, Reason, Refusal, Uncertainty
 
 OPTIONS = LocalizeOptions()
 TRUTH = Pose(Rotation.from_rotvec([0.3, -1.2, 0.4]).as_matrix(), np.array([1.0, -2.0, 0.5]))
@@ -670,3 +671,23 @@ def test_of_sharp_photos_the_same_few_inliers_are_enough(place: Any) -> None:
     for seed in range(12):
         images = [place.image(street(place, seed, noise=0.5))]
         assert error_of(solve(images, place), place, Pose.identity()) < (0.5, 1.0)
+
+
+def test_the_whole_uncertainty_and_the_photos_part_are_told_apart(place: Any) -> None:
+    geometry = place.geometry
+    geometry.errors = MapErrors(5.0, 3.0)
+    root = 0.01 * np.random.default_rng(0).normal(size=(6, 6))
+    found = Pose(np.eye(3), np.array([1.0, 2.0, 3.0]))
+
+    pose = measured_pose(found, root @ root.T, geometry)
+
+    assert pose.uncertainty is Uncertainty.WHOLE
+    assert pose.photo_covariance is not None
+    whole, photo = (
+        center_covariance(pose.rig_from_world, one)
+        for one in (pose.covariance, pose.photo_covariance)
+    )
+    assert whole[3:, 3:] == pytest.approx(25.0 * photo[3:, 3:], rel=1e-6)
+    assert whole[:3, :3] == pytest.approx(9.0 * photo[:3, :3])
+    assert pose.position_std == pytest.approx(np.sqrt(np.diag(whole)[3:]), rel=1e-6)
+    assert pose.orientation_std == pytest.approx(np.sqrt(np.diag(whole)[:3]))

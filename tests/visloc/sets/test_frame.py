@@ -16,7 +16,15 @@ from visloc.pose.centre import moved_pose, position_covariance
 from visloc.pose.distance import mahalanobis2
 from visloc.priors import NO_PRIORS, GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
 from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
-from visloc.types import CameraSource, Evidence, ImageAnswer, InstantAnswer, PoseSource, RigPose
+from visloc.types import (
+    CameraSource,
+    Evidence,
+    ImageAnswer,
+    InstantAnswer,
+    PoseSource,
+    RigPose,
+    Uncertainty,
+)
 
 RANDOM = np.random.default_rng(0)
 SET_FROM_TILE = Similarity(
@@ -33,6 +41,8 @@ RIG_POSE = RigPose(
     np.sqrt(np.diag(position_covariance(CAM_FROM_TILE, COVARIANCE))),
     np.sqrt(np.diag(COVARIANCE)[:3]),
     PoseSource.ESTIMATED,
+    COVARIANCE / 4,
+    Uncertainty.WHOLE,
 )
 CAM_FROM_RIG = Pose(np.eye(3), np.array([0.5, 0.0, 0.0]))
 ANSWER = InstantAnswer(7, (ImageAnswer("cam", CAM_FROM_RIG, EVIDENCE, None),), RIG_POSE, None, {})

@@ -90,10 +90,14 @@ export function inShort(answer: LocalizeResponse): string {
     : `not localized: ${answer.refusal?.message ?? ""}`;
 }
 
-const LEFT_OUT =
-  "This leaves out errors that landmarks share, of depth, calibration and the mapping photos’ poses: " +
-  "on one map from depth the error was 13 times as large. " +
-  "Look-alike places, prints, mirrors and a wrong camera can fool it.";
+const COVERED = {
+  whole:
+    "This holds the scatter of the matches and the errors of the map, as its own test measured them. ",
+  "photo only":
+    "This is the scatter of the matches alone: the map has no test of its own, and errors that landmarks " +
+    "share, of depth, calibration and the mapping photos’ poses, are left out. ",
+};
+const FOOLED = "Look-alike places, prints, mirrors and a wrong camera can fool it.";
 
 function localized(answer: LocalizeResponse, pose: PoseEstimate, metric: boolean): HTMLElement {
   const std = ellipsoid95(covarianceOfPosition(pose)).halfAxes[0] / REACH_95;
@@ -104,10 +108,10 @@ function localized(answer: LocalizeResponse, pose: PoseEstimate, metric: boolean
     element(
       "p",
       {},
-      `${percent(answer)} of the matches agree on a place. Their scatter leaves ±${lengthText(std, metric, 2)} ` +
-        "open (one standard deviation).",
+      `${percent(answer)} of the matches agree on a place, known to ±${lengthText(std, metric, 2)} ` +
+        "(one standard deviation).",
     ),
-    element("p", {}, LEFT_OUT),
+    element("p", {}, COVERED[pose.uncertainty] + FOOLED),
   );
 }
 

@@ -304,7 +304,8 @@ function answerInWords(
 ): string {
   if (pose === null) return sentence(refusal?.message ?? "no reason was given");
   const std = lengthText(Math.hypot(...pose.position_std), metric, 2);
-  return `± ${std} by scatter alone; ${countText(inliers)} of ${countText(correspondences)} matches agree.`;
+  const alone = pose.uncertainty === "photo only" ? " by scatter alone" : "";
+  return `± ${std}${alone}; ${countText(inliers)} of ${countText(correspondences)} matches agree.`;
 }
 
 /** Of the box around the map's landmarks. */

@@ -20,8 +20,9 @@ from mapping.maps.editing import content_of
 from mapping.maps.updating import UpdateSettings, update_map
 from mapping.maps.updating.job import Updated
 from mapping.maps.updating.placing import beside
+from mapping.own_test.publishing import publish_edited
+from mapping.own_test.trials import own_test
 from mapping.sample import write_sample
-from mapping.stages.publishing import publish_edited
 from visloc.archive import Map, MapStore, open_map, verify_map
 from visloc.errors import Conflict, VislocError
 from visloc.evaluation import pose_error
@@ -123,6 +124,13 @@ def updated(
     shutil.copytree(first_maps, maps)
     done = update(captures / "second", maps)
     return verify_map(done.folder), done
+
+
+def test_an_updated_map_is_tested_anew(updated: tuple[Map, Updated]) -> None:
+    opened, _ = updated
+    learned = opened.manifest.parts.own_test
+    assert learned == own_test(opened)
+    assert learned.localized > 0
 
 
 def test_a_capture_in_a_frame_of_its_own_is_tied_to_within_centimetres(

@@ -1,0 +1,55 @@
+"""Adding to maps of older formats what needs no photos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mapping.own_test.trials import own_test
+from mapping.stages.publishing import new_version
+from mapping.stages.work_folder import exclusive
+from visloc.archive import Map, MapStore, write_tested
+from visloc.archive.version_rules import outdated
+from visloc.errors import refuse
+
+
+def upgrade_map(opened: Map, maps_dir: Path) -> Path:
+    """Publish a map with a test of its own as a new version, and make it current.
+
+    Landmarks, photos and features stay as they are; both versions share their files.
+
+    Returns:
+        The folder of the new version.
+
+    Raises:
+        Conflict: ``map.upgraded`` when there is nothing to add; ``map.outdated`` when another
+            version is in use; ``build.running``.
+    """
+    if opened.manifest.parts.own_test is not None:
+        raise refuse("map.upgraded", field="MAP", ref=opened.ref)
+    map_id, based_on = opened.manifest.id, opened.manifest.version
+    store = MapStore(maps_dir)
+    with (
+        exclusive(maps_dir / ".work" / f"{map_id}.lock"),
+        store.incoming() as incoming,
+    ):
+        if (current := store.current_version(map_id)) != based_on:
+            raise outdated(map_id, based_on, current)
+        test = own_test(opened)
+        version, created = new_version()
+        version = write_tested(opened, incoming, test, version=version, created=created)
+        return store.publish(incoming, map_id, version, based_on=based_on)
+
+
+def lacking(opened: Map) -> list[str]:
+    """Say what newer formats have that only a new build from the photos can give a map."""
+    missing = []
+    if opened.manifest.local_features.keypoint_step_px is None:
+        missing.append("keypoints and global descriptors stay in 32 bits: the map is larger")
+    if opened.manifest.local_features.computed_with is None:
+        missing.append("what computed the features stays unknown")
+    if opened.manifest.world.anchor is None:
+        missing.append("what position, orientation and scale rest on stays unknown")
+    from_depth = opened.manifest.method.name == "rgbd"
+    if not from_depth and "landmark_angle_deg.npy" not in opened.manifest.files:
+        missing.append("the angles between viewing rays stay unknown")
+    return [f"only a new build from the photos can add this: {text}" for text in missing]

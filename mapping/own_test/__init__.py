@@ -1,0 +1,1 @@
+"""A map's own test, and the publishing of maps that took it."""

@@ -1,0 +1,171 @@
+"""A map's own photos, each localized in the map without itself and its nearest neighbours.
+
+What is learned from them goes into the map (docs/map-format.md), and with it into every answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from mapping.cluster.workers import one_thread_here
+from mapping.frames.stored_queries import solve_stored
+from mapping.own_test.error_model import fitted_factor, mahalanobis2
+from mapping.report.held_out import match_held_out, spread_photos, taken_with
+from mapping.report.viewpoints import Viewpoints
+from visloc.archive import Map
+from visloc.archive.schema import MAX_FACTOR, MAX_WRONG_SCORES, OwnTest, Score
+from visloc.geometry import Pose, center_covariance
+from visloc.localization.constraints import MapGeometry
+from visloc.localization.judge import TIE_ANGLE, TIE_REACH_SHARE
+from visloc.options import LocalizeOptions
+
+# Photos that are tried: so many of a small map, a fifth of a larger one, up to a limit. The test
+# then takes a tenth of a build (docs/decisions/0028-the-maps-own-test.md).
+_LEAST_PHOTOS, _SHARE_OF_PHOTOS, _MOST_PHOTOS = 12, 5, 60
+# A query stands about so far from the nearest mapping photo, as ``Viewpoints.apart_from`` counts.
+_LEFT_OUT_WITHIN = 0.2
+# Fewer than online, which takes 20: the last ones add little, and each costs as much.
+_PHOTOS_ASKED = 8
+# As many as a query has. Stored photos may have more, which would hide the errors of the map less.
+_MOST_KEYPOINTS = 2500
+# Photos whose poses were estimated together with the landmarks fit them better than a query does:
+# by so much on a painted room that was built with its exact poses and without
+# (docs/decisions/0028-the-maps-own-test.md).
+_FLATTERED = 1.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trial:
+    """One photo, localized.
+
+    Attributes:
+        error: (6,) rotation (rad) then centre, in the camera's axes, estimated less true.
+        photo_covariance: (6, 6) of it, as far as the photo's own measurements tell.
+        score: what spoke for the pose.
+    """
+
+    error: NDArray[np.float64]
+    photo_covariance: NDArray[np.float64]
+    score: Score
+
+
+def own_test(opened: Map) -> OwnTest:
+    """Test a map with what it stores of its own photos.
+
+    The photos are spread evenly and every random choice has a seed, so that equal maps have equal
+    tests.
+    """
+    viewpoints, geometry = Viewpoints.of(opened), MapGeometry(opened)
+    most = min(max(_LEAST_PHOTOS, len(opened.images) // _SHARE_OF_PHOTOS), _MOST_PHOTOS)
+    images = spread_photos(len(opened.images), most)
+    tested, trials = 0, []
+    with one_thread_here():
+        for image in images:
+            left_out = _left_out(opened, viewpoints, image)
+            if left_out is None:
+                continue
+            tested += 1
+            trial = _trial(opened, geometry, viewpoints, image, left_out)
+            if trial is not None:
+                trials.append(trial)
+    return learned(trials, tested, geometry.reach, independent=_independent(opened))
+
+
+def learned(trials: Sequence[Trial], tested: int, reach: float, *, independent: bool) -> OwnTest:
+    """Learn the errors of a map from its trials.
+
+    A pose at another place, by more than a tenth of how far the photos see or five degrees, counts
+    as wrong. The factors are of the right ones.
+
+    Args:
+        trials: photos that were localized.
+        tested: photos that were tried.
+        reach: how far the map's photos see, units of the world.
+        independent: whether the photos' poses came from elsewhere than the map's landmarks.
+    """
+    errors = np.array([trial.error for trial in trials]).reshape(-1, 6)
+    covariances = np.array([trial.photo_covariance for trial in trials]).reshape(-1, 6, 6)
+    turned, moved = np.linalg.norm(errors[:, :3], axis=1), np.linalg.norm(errors[:, 3:], axis=1)
+    wrong = (turned > TIE_ANGLE) | (moved > TIE_REACH_SHARE * reach)
+    errors, covariances = errors[~wrong], covariances[~wrong]
+    scores = [trial.score for trial, is_wrong in zip(trials, wrong, strict=True) if is_wrong]
+    scores.sort(key=lambda score: (-score.inliers, -score.inlier_ratio))
+    return OwnTest(
+        tested=tested,
+        localized=len(trials),
+        wrong=len(scores),
+        position_factor=_factor(errors[:, 3:], covariances[:, 3:, 3:], independent),
+        orientation_factor=_factor(errors[:, :3], covariances[:, :3, :3], independent),
+        independent=independent,
+        wrong_at=tuple(scores[:MAX_WRONG_SCORES]),
+    )
+
+
+def _factor(
+    errors: NDArray[np.float64], covariances: NDArray[np.float64], independent: bool
+) -> float:
+    factor = fitted_factor(mahalanobis2(errors, covariances))
+    if not independent:
+        factor = min(_FLATTERED * factor, MAX_FACTOR)
+    # Two digits, so that last bits, which differ between machines, make no other map.
+    return round(factor, 2)
+
+
+def _left_out(opened: Map, viewpoints: Viewpoints, image: int) -> NDArray[np.int64] | None:
+    """Photos (k,) to leave out with one; None when nothing would remain."""
+    apart = viewpoints.apart_from(viewpoints.pose(image))
+    left_out = np.flatnonzero(taken_with(opened, image) | (apart < _LEFT_OUT_WITHIN))
+    if len(left_out) == len(opened.images):
+        left_out = np.flatnonzero(taken_with(opened, image))
+    return left_out if len(left_out) < len(opened.images) else None
+
+
+def _trial(
+    opened: Map,
+    geometry: MapGeometry,
+    viewpoints: Viewpoints,
+    image: int,
+    left_out: NDArray[np.int64],
+) -> Trial | None:
+    """Localize one photo in what the map would be without some; None when it is refused."""
+    options = LocalizeOptions(top_k=_PHOTOS_ASKED)
+    num = len(opened.observations(image)[0])
+    rows = np.random.default_rng(image).permutation(num)[:_MOST_KEYPOINTS]
+    matched = match_held_out(opened, image, left_out, options, np.sort(rows))
+    solved = solve_stored(opened, image, opened, geometry, matched, options)
+    if solved.pose is None or solved.pose.covariance is None:
+        return None
+    found, true = solved.pose.rig_from_world, viewpoints.pose(image)
+    covariance = _in_camera_axes(found, solved.pose.covariance)
+    score = Score(
+        inliers=solved.answer.num_inliers,
+        inlier_ratio=solved.answer.num_inliers / solved.answer.num_correspondences,
+    )
+    return Trial(_error(found, true), covariance, score)
+
+
+def _error(found: Pose, true: Pose) -> NDArray[np.float64]:
+    turned = Rotation.from_matrix(found.rotation @ true.rotation.T).as_rotvec()
+    return np.concatenate([turned, found.rotation @ (found.center - true.center)])
+
+
+def _in_camera_axes(pose: Pose, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariance (6, 6) of rotation and centre, the latter in the camera's axes too."""
+    turn = np.eye(6)
+    turn[3:, 3:] = pose.rotation
+    return np.asarray(turn @ center_covariance(pose, covariance) @ turn.T)
+
+
+def _independent(opened: Map) -> bool:
+    """Whether the photos' poses came from elsewhere than the landmarks.
+
+    Where both were estimated together, a photo that is left out has its pose from landmarks that
+    are still there.
+    """
+    method = opened.manifest.method
+    return method.name != "model" and method.settings.get("poses") != "estimate"

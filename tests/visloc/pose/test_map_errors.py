@@ -1,0 +1,42 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from visloc.geometry import Pose, Similarity, center_covariance
+from visloc.pose.centre import moved_pose, position_covariance
+from visloc.pose.map_errors import PHOTO_ONLY, MapErrors
+from visloc.types import Uncertainty
+
+RANDOM = np.random.default_rng(0)
+POSE = Pose(Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix(), np.array([30.0, -7.0, 4.0]))
+ROOT = 0.01 * RANDOM.normal(size=(6, 6))
+COVARIANCE = ROOT @ ROOT.T
+
+
+def test_position_and_orientation_are_widened_by_their_own_factors() -> None:
+    whole = MapErrors(5.0, 3.0).whole(POSE, COVARIANCE)
+    assert position_covariance(POSE, whole) == pytest.approx(
+        25.0 * position_covariance(POSE, COVARIANCE)
+    )
+    assert whole[:3, :3] == pytest.approx(9.0 * COVARIANCE[:3, :3])
+
+
+def test_how_position_and_rotation_hang_together_stays() -> None:
+    before = center_covariance(POSE, COVARIANCE)
+    after = center_covariance(POSE, MapErrors(5.0, 3.0).whole(POSE, COVARIANCE))
+    assert after[:3, 3:] == pytest.approx(15.0 * before[:3, 3:])
+
+
+def test_without_a_test_of_the_map_nothing_changes_in_the_last_bit() -> None:
+    assert (PHOTO_ONLY.whole(POSE, COVARIANCE) == COVARIANCE).all()
+    assert PHOTO_ONLY.uncertainty is Uncertainty.PHOTO_ONLY
+
+
+def test_another_frame_and_unit_make_no_difference() -> None:
+    errors = MapErrors(5.0, 3.0)
+    tie = Similarity(2.5, Rotation.from_rotvec([0.3, 0.1, 1.0]).as_matrix(), np.array([9.0, 2, -4]))
+    pose, moved = moved_pose(POSE, COVARIANCE, tie)
+    _, expected = moved_pose(POSE, errors.whole(POSE, COVARIANCE), tie)
+    assert errors.whole(pose, moved) == pytest.approx(expected, rel=1e-6, abs=1e-9)

@@ -1,0 +1,50 @@
+"""The optional parts of a map: a new manifest over the same files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from visloc.archive.anchoring import link_or_copy
+from visloc.archive.reader import Map
+from visloc.archive.schema import FORMAT_MAJOR, FORMAT_MINOR, OwnTest
+from visloc.archive.writer import Files
+
+
+def add_own_test(folder: Path, test: OwnTest, *, version: str) -> str:
+    """Write the own test of a map into its manifest, before the map is published.
+
+    Args:
+        folder: the map.
+        test: replaces one that the map has.
+        version: as for ``write_map``.
+
+    Returns:
+        The version.
+    """
+    manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+    manifest["format_version"] = f"{FORMAT_MAJOR}.{FORMAT_MINOR}"
+    manifest["parts"] = {**manifest.get("parts", {}), "own_test": test.model_dump(mode="json")}
+    return Files(folder).finish(manifest, version)
+
+
+def write_tested(opened: Map, folder: Path, test: OwnTest, *, version: str, created: str) -> str:
+    """Write a map with its own test into an empty folder; files are shared by hard links.
+
+    Args:
+        opened: the map, which stays as it is.
+        folder: exists and is empty.
+        test: of the map.
+        version: as for ``write_map``.
+        created: ISO 8601 in UTC.
+
+    Returns:
+        The version.
+    """
+    for name in opened.manifest.files:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        link_or_copy(opened.path / name, folder / name)
+    manifest = json.loads((opened.path / "manifest.json").read_text(encoding="utf-8"))
+    manifest["created"] = created
+    (folder / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
+    return add_own_test(folder, test, version=version)
