@@ -53,6 +53,10 @@ class MapGeometry:
         """The map, ``id@version``."""
         return self._map.ref
 
+    def photo_name(self, row: int) -> str:
+        """Return the name of a photo of the map."""
+        return self._map.images[int(row)].name
+
     @cached_property
     def centers(self) -> NDArray[np.float64]:
         """(n, 3) camera centres of the photos, relative to the origin."""

@@ -12,6 +12,7 @@ from visloc.errors import VislocError, refuse
 from visloc.geometry import Camera, Pose
 from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.gates import Problem, accepted, not_better_elsewhere
+from visloc.localization.rivals import Proposed, stronger_place
 from visloc.options import LocalizeOptions, ReadAs, Solver
 from visloc.pose.centre import position_covariance, with_origin
 from visloc.pose.generalized import (
@@ -66,6 +67,7 @@ class Look:
         elsewhere: with landmarks of photos that look more like the query but that the priors
             exclude; usually none.
         refusal: why there is nothing to solve; None otherwise.
+        proposed: all pairs that the searched photos proposed; None when they were not kept.
     """
 
     evidence: Evidence
@@ -73,6 +75,7 @@ class Look:
     landmarks: NDArray[np.int64]
     elsewhere: Matches
     refusal: Refusal | None = None
+    proposed: Proposed | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,6 +157,10 @@ def solve_instant(
             refusal = (
                 not_better_elsewhere(Problem(elsewhere, options, constraints), found) or refusal
             )
+        proposed = [look.proposed for look in looks if look.proposed is not None]
+        if refusal is None and found is not None and len(proposed) == len(looks):
+            problem = Problem(views, options, constraints)
+            found, refusal = stronger_place(problem, geometry, proposed, found)
         refusal = refusal and _with_turned_photos(refusal, looks)
     pose = None
     if refusal is None and found is not None and found.covariance is not None:
