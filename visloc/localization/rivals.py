@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from visloc.geometry import Pose, rotation_angle
 from visloc.localization.constraints import MapGeometry
-from visloc.localization.gates import GATES, Problem, first_refusal
+from visloc.localization.gates import GATES, Problem, contradicts_priors, first_refusal
 from visloc.matching.correspondences import Proposals
 from visloc.pose.centre import largest_std
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
@@ -180,8 +180,9 @@ class _Pairs:
     def by_keypoint(
         self, errors: NDArray[np.float64], photos: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return the error of each keypoint's most similar landmark in some photos; infinity where
-        it has none there.
+        """Return the error of each keypoint's most similar landmark in some photos.
+
+        Infinity where it has none there.
         """
         rows = np.flatnonzero(np.isin(self.photos, photos))
         rows = rows[np.argsort(self.similarities[rows], kind="stable")]
@@ -224,7 +225,7 @@ def stronger_place(
     errors = pairs.errors(best.rig_from_world)
     for photos in pairs.places_elsewhere(errors, geometry):
         other = pairs.solve(photos, best)
-        if other is None or _same_place(best, other, geometry.reach):
+        if other is None or not _is_rival(problem, best, other, geometry.reach):
             continue
         elsewhere = pairs.errors(other.rig_from_world)
         theirs = pairs.showing(elsewhere, photos)[:NUM_COMPARED]
@@ -265,15 +266,19 @@ def preference(first: NDArray[np.floating], second: NDArray[np.floating]) -> flo
     return float(difference.sum()) / spread if spread > 0.0 else 0.0
 
 
-def _same_place(best: GeneralizedPose, other: GeneralizedPose, reach: float) -> bool:
+def _is_rival(
+    problem: Problem, best: GeneralizedPose, other: GeneralizedPose, reach: float
+) -> bool:
+    """Tell whether a pose lies elsewhere, and where the priors allow it."""
+    if best.covariance is None or other.covariance is None:
+        return False  # without an uncertainty, nothing says that they differ
     a, b = best.rig_from_world, other.rig_from_world
-    covariances = [pose.covariance for pose in (best, other)]
-    if any(covariance is None for covariance in covariances):
-        return True  # without an uncertainty, nothing says that they differ
-    stds = [largest_std(pose.rig_from_world, pose.covariance) for pose in (best, other)]
+    std = math.hypot(largest_std(a, best.covariance), largest_std(b, other.covariance))
     away = float(np.linalg.norm(a.center - b.center))
     turned = rotation_angle(a.rotation @ b.rotation.T)
-    return away <= _APART_REACH_SHARE * reach + _STDS * math.hypot(*stds) and turned <= _APART_ANGLE
+    if away <= _APART_REACH_SHARE * reach + _STDS * std and turned <= _APART_ANGLE:
+        return False
+    return contradicts_priors(problem.constraints, b, other.covariance) is None
 
 
 def _described(
