@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from visloc.archive import Map
 from visloc.errors import refuse
 from visloc.geometry import Pose
+from visloc.matching.products import EightBitRows
 from visloc.pose.centre import largest_std, with_origin
 from visloc.pose.colmap import normalized_rays
 from visloc.pose.distance import mahalanobis2
@@ -56,6 +57,28 @@ class MapGeometry:
     def photo_name(self, row: int) -> str:
         """Return the name of a photo of the map."""
         return self._map.images[int(row)].name
+
+    def observed(self, row: int) -> tuple[NDArray[np.integer], EightBitRows]:
+        """Return the landmarks (m,) that a photo sees, and their descriptors."""
+        landmarks, descriptors = self._map.observations(int(row))
+        return landmarks, EightBitRows(
+            descriptors, self._map.manifest.local_features.descriptor_scale
+        )
+
+    def points(self, landmarks: NDArray[np.integer]) -> NDArray[np.float32]:
+        """Return landmarks (n, 3), relative to the origin."""
+        return np.asarray(self._map.landmarks[landmarks])
+
+    def nearest_photos(self, row: int, count: int) -> NDArray[np.int64]:
+        """Return the photos taken most like one of them, itself first.
+
+        A turn by one radian counts as much as a move by how far photos see.
+        """
+        rotations = Rotation.from_quat(self._map.image_poses[:, :4], scalar_first=True)
+        turned = (rotations * rotations[int(row)].inv()).magnitude()
+        away = np.linalg.norm(self.centers - self.centers[row], axis=1)
+        apart = away / max(self.reach, _LEAST_REACH) + turned
+        return np.argsort(apart, kind="stable")[:count]
 
     @cached_property
     def centers(self) -> NDArray[np.float64]:

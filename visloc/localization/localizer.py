@@ -354,8 +354,9 @@ class Localizer:
             )
         evidence = replace(evidence, retrieved=tuple(self._describe_retrieved(retrieved)))
         with timed(seconds, "matching"):
-            pairs = self._match_photos(local, retrieved.images, options, rematching)
-            others = self._match_photos(local, elsewhere, options, rematching)
+            rows = round_descriptors(local.descriptors)
+            pairs = self._match_photos(rows, retrieved.images, options, rematching)
+            others = self._match_photos(rows, elsewhere, options, rematching)
         matched = pairs.settled()
         matches = self._matches(local, matched)
         evidence = replace(evidence, num_correspondences=len(matches.pixels))
@@ -365,13 +366,17 @@ class Localizer:
             matched.landmarks,
             self._matches(local, others.settled()),
             proposed=Proposed(
-                local.keypoints, pairs, self.map.landmarks[pairs.landmarks], retrieved.images
+                local.keypoints,
+                pairs,
+                self.map.landmarks[pairs.landmarks],
+                retrieved.images,
+                rows,
             ),
         )
 
     def _match_photos(
         self,
-        local: LocalFeatures,
+        query: EightBitRows,
         photos: NDArray[np.int64],
         options: LocalizeOptions,
         rematching: Rematching | None,
@@ -380,7 +385,7 @@ class Localizer:
         scale = self.map.manifest.local_features.descriptor_scale
         observed = (self.map.observations(int(photo)) for photo in photos)
         return propose_landmarks(
-            round_descriptors(local.descriptors),
+            query,
             ((landmarks, EightBitRows(rows, scale)) for landmarks, rows in observed),
             CLEAR_RATIO if options.matcher is Matcher.RATIO else None,
             None if rematching is None else lambda rank: rematching.match(int(photos[rank])),

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from visloc.geometry import Pose, rotation_angle
 from visloc.localization.constraints import MapGeometry
 from visloc.localization.gates import GATES, Problem, contradicts_priors, first_refusal
-from visloc.matching.correspondences import Proposals
+from visloc.matching.correspondences import Proposals, propose_landmarks
+from visloc.matching.products import EightBitRows
 from visloc.pose.centre import largest_std
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
 from visloc.pose.reprojection import reprojection_errors
@@ -30,7 +31,7 @@ from visloc.types import Reason, Refusal
 # Photos of each place that are compared.
 NUM_COMPARED = 5
 # Places that are solved for, those with the most unexplained matches first.
-_MAX_PLACES = 2
+_MAX_PLACES = 4
 # Of the photos that show the best place, the one that speaks for it most sets the measure. A photo
 # with less than the first share of its score shows another place, if at least the second share of
 # its number of agreeing matches is as similar and unexplained.
@@ -59,12 +60,25 @@ class Proposed:
         pairs: of keypoints and landmarks; ranks are rows of ``photos``.
         points: (n, 3) float32 landmarks of the pairs, relative to the map's origin.
         photos: (r,) int64 rows of the map's photos.
+        query: descriptors of the keypoints.
     """
 
     pixels: NDArray[np.float32]
     pairs: Proposals
     points: NDArray[np.float32]
     photos: NDArray[np.int64]
+    query: EightBitRows
+
+    def matched_with(self, photos: NDArray[np.int64], geometry: MapGeometry) -> Proposed:
+        """Add the pairs that further photos propose."""
+        further = photos[~np.isin(photos, self.photos)]
+        found = propose_landmarks(self.query, [geometry.observed(photo) for photo in further])
+        return replace(
+            self,
+            pairs=self.pairs.followed_by(found, len(self.photos)),
+            points=np.concatenate([self.points, geometry.points(found.landmarks)]),
+            photos=np.concatenate([self.photos, further]),
+        )
 
 
 def score(errors: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -190,6 +204,11 @@ class _Pairs:
         found[self.keypoints[rows]] = errors[rows]  # the last one counts, the most similar
         return found
 
+    def scores(self, errors: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return how much each keypoint speaks for a pose, with the photos that show it best."""
+        shown = self.showing(errors, self.all_photos)[:NUM_COMPARED]
+        return score(self.by_keypoint(errors, shown)).astype(np.float32)
+
     def views(self, photos: NDArray[np.int64]) -> list[MatchedView]:
         """Return the views with the pairs of some photos, conflicts settled."""
         views = []
@@ -204,7 +223,7 @@ def stronger_place(
     geometry: MapGeometry,
     proposed: Sequence[Proposed],
     best: GeneralizedPose,
-) -> tuple[GeneralizedPose, Refusal | None]:
+) -> tuple[GeneralizedPose, Refusal | None, NDArray[np.float32]]:
     """Compare the best pose with those of other places, and let the photo's evidence decide.
 
     Another place counts when its pose differs from the best one by more than their uncertainty.
@@ -219,7 +238,7 @@ def stronger_place(
 
     Returns:
         The pose of the place that explains the photo better, and no refusal; or ``best`` and a
-        refusal, ``ambiguous``.
+        refusal, ``ambiguous``. The scores (k,) of all keypoints in the place of that pose.
     """
     pairs = _Pairs(problem, proposed, best)
     errors = pairs.errors(best.rig_from_world)
@@ -227,27 +246,63 @@ def stronger_place(
         other = pairs.solve(photos, best)
         if other is None or not _is_rival(problem, best, other, geometry.reach):
             continue
-        elsewhere = pairs.errors(other.rig_from_world)
-        theirs = pairs.showing(elsewhere, photos)[:NUM_COMPARED]
-        mine = pairs.showing(errors, pairs.all_photos)[: len(theirs)]
-        a, b = pairs.by_keypoint(errors, mine), pairs.by_keypoint(elsewhere, theirs)
-        verdict = preference(score(a), score(b))
-        if verdict >= SURE:
+        verdict, is_clear, compared = _compared(problem, geometry, proposed, best, other, photos)
+        if verdict >= SURE or not is_clear:
             continue
         if verdict <= -SURE:
             found = pairs.refined(problem, other)
             if found is not None and first_refusal(GATES, problem, found) is None:
-                return found, None
-        counts = int((a <= 1.0).sum()), int((b <= 1.0).sum())
-        first = _described(best, counts[0], mine, geometry)
-        second = _described(other, counts[1], theirs, geometry)
-        return best, Refusal(
+                errors = pairs.errors(found.rig_from_world)
+                return found, None, pairs.scores(errors)
+        first, second = (_described(*each, geometry) for each in compared)
+        refusal = Refusal(
             "gate",
             Reason.AMBIGUOUS,
             f"two places of {geometry.ref} explain the photo about equally well: {first}, and "
             f"{second}; send priors that exclude one of them, or a photo with more of the scene",
         )
-    return best, None
+        return best, refusal, pairs.scores(errors)
+    return best, None, pairs.scores(errors)
+
+
+def _compared(
+    problem: Problem,
+    geometry: MapGeometry,
+    proposed: Sequence[Proposed],
+    best: GeneralizedPose,
+    other: GeneralizedPose,
+    photos: NDArray[np.int64],
+) -> tuple[float, bool, list[tuple[GeneralizedPose, int, int]]]:
+    """Compare two poses on equal terms: each with as many photos of its place.
+
+    Few photos of the other place may have been searched. Others taken next to the one that shows
+    it best are matched too.
+
+    Args:
+        photos: of the other place, among those that were searched.
+
+    Returns:
+        ``preference`` for the best pose; whether the other pose surely explains more than chance
+        does; of each pose its inliers and the photo that shows it best.
+    """
+    pairs = _Pairs(problem, proposed, best)
+    seed = pairs.showing(pairs.errors(other.rig_from_world), photos)[0]
+    theirs = geometry.nearest_photos(seed, NUM_COMPARED)
+    own = pairs.showing(pairs.errors(best.rig_from_world), pairs.all_photos)
+    own = own[~np.isin(own, theirs)][:NUM_COMPARED]
+    pairs = _Pairs(problem, [each.matched_with(theirs, geometry) for each in proposed], best)
+    threshold = problem.registration.max_error_px
+    again = refine_generalized_pose(
+        pairs.views(theirs), other.rig_from_world, max_error_px=threshold
+    )
+    scores, compared = [], []
+    for pose, shown in ((best, own), (again or other, theirs[: len(own)])):
+        errors = pairs.by_keypoint(pairs.errors(pose.rig_from_world), shown)
+        scores.append(score(errors))
+        compared.append((pose, int((errors <= 1.0).sum()), int(shown[0])))
+    first, second = scores
+    is_clear = preference(second, np.zeros_like(second)) >= SURE
+    return preference(first, second), is_clear, compared
 
 
 def preference(first: NDArray[np.floating], second: NDArray[np.floating]) -> float:
@@ -281,8 +336,6 @@ def _is_rival(
     return contradicts_priors(problem.constraints, b, other.covariance) is None
 
 
-def _described(
-    pose: GeneralizedPose, num: int, photos: NDArray[np.int64], geometry: MapGeometry
-) -> str:
+def _described(pose: GeneralizedPose, num: int, photo: int, geometry: MapGeometry) -> str:
     x, y, z = pose.rig_from_world.center + geometry.origin
-    return f"({x:.2f}, {y:.2f}, {z:.2f}) with {num} inliers in {geometry.photo_name(photos[0])}"
+    return f"({x:.2f}, {y:.2f}, {z:.2f}) with {num} inliers in {geometry.photo_name(photo)}"

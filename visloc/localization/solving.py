@@ -150,6 +150,7 @@ def solve_instant(
     looks = [image.look for image in images if image.look is not None]
     views = _views_of(images, [look.matches for look in looks], options)
     seconds = _summed([look.evidence.seconds for look in looks])
+    scores = np.empty(0, np.float32)
     with timed(seconds, "pose"):
         found, refusal = _find_pose(images, Problem(views, options, constraints))
         if refusal is None or refusal.reason is not Reason.CONTRADICTS_PRIOR:
@@ -160,7 +161,7 @@ def solve_instant(
         proposed = [look.proposed for look in looks if look.proposed is not None]
         if refusal is None and found is not None and len(proposed) == len(looks):
             problem = Problem(views, options, constraints)
-            found, refusal = stronger_place(problem, geometry, proposed, found)
+            found, refusal, scores = stronger_place(problem, geometry, proposed, found)
         refusal = refusal and _with_turned_photos(refusal, looks)
     pose = None
     if refusal is None and found is not None and found.covariance is not None:
@@ -168,7 +169,7 @@ def solve_instant(
     inliers = () if found is None else tuple(found.inliers)
     camera = None if refusal is not None or found is None else found.camera
     shown = with_inliers([_shown(image, camera) for image in images], inliers)
-    answer = InstantAnswer(timestamp, shown, pose, refusal, seconds)
+    answer = InstantAnswer(timestamp, shown, pose, refusal, seconds, scores)
     views = tuple(replace(view, camera=camera or view.camera) for view in views)
     return Solved(answer, views, found if refusal is None else None, inliers)
 

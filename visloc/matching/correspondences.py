@@ -71,6 +71,15 @@ class Proposals:
             self.similarities[which],
         )
 
+    def followed_by(self, others: Proposals, num_photos: int) -> Proposals:
+        """Add the pairs of further photos, which come after so many."""
+        return Proposals(
+            np.concatenate([self.keypoints, others.keypoints]),
+            np.concatenate([self.landmarks, others.landmarks]),
+            np.concatenate([self.ranks, others.ranks + num_photos]),
+            np.concatenate([self.similarities, others.similarities]),
+        )
+
     def settled(self) -> Correspondences:
         """Settle conflicts by vote; each photo votes with 1 / rank."""
         votes = 1.0 / (self.ranks + 1)
