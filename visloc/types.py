@@ -346,6 +346,8 @@ class InstantAnswer:
         refusal: why the instant's own images gave no pose; None when they did. A filled pose has
             both.
         seconds: wall time by stage, of all images together.
+        scores: (k,) float32, how much each keypoint of the images speaks for the pose
+            (``visloc.localization.rivals.score``); empty when that is not known. Never sent.
     """
 
     timestamp: int | None
@@ -353,6 +355,7 @@ class InstantAnswer:
     pose: RigPose | None
     refusal: Refusal | None
     seconds: Mapping[str, float]
+    scores: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
 
     @property
     def num_correspondences(self) -> int:

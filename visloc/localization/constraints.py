@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from visloc.archive import Map
 from visloc.errors import refuse
 from visloc.geometry import Pose
+from visloc.matching.products import EightBitRows
 from visloc.pose.centre import largest_std, with_origin
 from visloc.pose.colmap import normalized_rays
 from visloc.pose.distance import mahalanobis2, viewpoints_apart
@@ -57,6 +58,27 @@ class MapGeometry:
     def ref(self) -> str:
         """The map, ``id@version``."""
         return self.opened.ref
+
+    def photo_name(self, row: int) -> str:
+        """Return the name of a photo of the map."""
+        return self.opened.images[int(row)].name
+
+    def observed(self, row: int) -> tuple[NDArray[np.integer], EightBitRows]:
+        """Return the landmarks (m,) that a photo sees, and their descriptors."""
+        landmarks, descriptors = self.opened.observations(int(row))
+        return landmarks, EightBitRows(
+            descriptors, self.opened.manifest.local_features.descriptor_scale
+        )
+
+    def points(self, landmarks: NDArray[np.integer]) -> NDArray[np.float32]:
+        """Return landmarks (n, 3), relative to the origin."""
+        return np.asarray(self.opened.landmarks[landmarks])
+
+    def nearest_photos(self, row: int, count: int) -> NDArray[np.int64]:
+        """Return the photos taken most like one of them, itself first."""
+        rotation = self.rotations[int(row)]
+        pose = Pose(rotation, -rotation @ self.centers[int(row)])
+        return np.argsort(self.apart_from(pose), kind="stable")[:count]
 
     @cached_property
     def centers(self) -> NDArray[np.float64]:

@@ -14,12 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from visloc.geometry import Similarity, rotation_angle
+from visloc.localization.rivals import preference
 from visloc.pose.centre import largest_std, moved_pose, position_covariance
 from visloc.types import InstantAnswer, Reason, Refusal, RigPose
 
 # As shares of the most inliers. All answers above the first share must agree, or the result is
 # ambiguous. Among the answers above the second share, the most certain wins.
 _RIVAL_SHARE, _SIMILAR_SHARE = 0.5, 0.8
+# A place with fewer is a rival too, unless the keypoints speak for the other place by this many
+# standard deviations (``visloc.localization.rivals.preference``). More than within a map: maps
+# differ in how well they were made, and neighbouring keypoints err together.
+SURE_OF_MAPS = 5.0
 # Two answers agree when they differ by less than three standard deviations plus the slack of the
 # tie between their places: a tenth of how far their photos see, and five degrees.
 STDS = 3.0
@@ -59,11 +64,12 @@ Ties = Callable[[int, int], Tie | None]
 def judge(candidates: Sequence[Candidate], ties: Ties) -> int | Refusal:
     """Choose the answer among those of several places.
 
-    The answer with the most inliers wins, or one with similarly many that is more certain. Places
-    that explain the photo at least half as well as the best are rivals. The photo is refused if the
-    poses of two rivals differ, or cannot be compared because no tie is known: guessing could put
-    the device into the wrong building. All pairs are compared, since an uncertain answer agrees
-    with places that contradict each other.
+    The answer with the most inliers wins, or one with similarly many that is more certain. A place
+    is a rival when it explains the photo at least half as well as the best, or when the keypoints
+    do not surely speak against it. The photo is refused if the poses of two rivals differ, or
+    cannot be compared because no tie is known: guessing could put the device into the wrong
+    building. All pairs are compared, since an uncertain answer agrees with places that contradict
+    each other.
 
     Args:
         candidates: at least one. An answer that a set refused as ambiguous counts as explaining the
@@ -81,8 +87,9 @@ def judge(candidates: Sequence[Candidate], ties: Ties) -> int | Refusal:
             range(len(answers)),
             key=lambda i: (answers[i].num_inliers, answers[i].num_correspondences),
         )
-    most = max(answers[i].num_inliers for i in explains)
-    rivals = [i for i in explains if answers[i].num_inliers >= _RIVAL_SHARE * most]
+    best = max(explains, key=lambda i: answers[i].num_inliers)
+    most = answers[best].num_inliers
+    rivals = [i for i in explains if i == best or _is_rival(answers[i], answers[best])]
     for i in rivals:
         if measured_pose(answers[i]) is None:
             return i
@@ -99,6 +106,17 @@ def judge(candidates: Sequence[Candidate], ties: Ties) -> int | Refusal:
         return _spread(answers[i]) * (1.0 if tie is None else tie.a_from_b.scale**2)
 
     return min(similar, key=spread)
+
+
+def _is_rival(answer: InstantAnswer, best: InstantAnswer) -> bool:
+    """Tell whether a place may be right although another one has more inliers."""
+    if answer.num_inliers >= _RIVAL_SHARE * best.num_inliers:
+        return True
+    # The maps of a set find the same keypoints in a photo.
+    compared = measured_pose(answer) is not None and measured_pose(best) is not None
+    if not compared or not len(answer.scores) == len(best.scores) > 0:
+        return False
+    return preference(best.scores, answer.scores) < SURE_OF_MAPS
 
 
 def measured_pose(answer: InstantAnswer) -> RigPose | None:

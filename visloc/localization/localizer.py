@@ -31,6 +31,7 @@ from visloc.localization.query_features import (
     max_sent_keypoints,
 )
 from visloc.localization.rematching import Rematching, seen_as_found
+from visloc.localization.rivals import Proposed
 from visloc.localization.solving import (
     Look,
     Matches,
@@ -39,7 +40,12 @@ from visloc.localization.solving import (
     check_solver,
     solve_instant,
 )
-from visloc.matching.correspondences import CLEAR_RATIO, match_landmarks
+from visloc.matching.correspondences import (
+    CLEAR_RATIO,
+    Correspondences,
+    Proposals,
+    propose_landmarks,
+)
 from visloc.matching.products import EightBitRows, round_descriptors, start_threads
 from visloc.options import LocalizeOptions, Matcher, ReadAs
 from visloc.priors import NO_PRIORS, Priors
@@ -353,10 +359,19 @@ class Localizer:
         evidence = replace(evidence, retrieved=tuple(self._describe_retrieved(retrieved)))
         with timed(seconds, "matching"):
             shown = Shown(local.keypoints, round_descriptors(local.descriptors))
-            matches, landmarks = self._match_photos(shown, retrieved.images, options, rematching)
-            others, _ = self._match_photos(shown, elsewhere, options, rematching)
+            pairs = self._match_photos(shown, retrieved.images, options, rematching)
+            others = self._match_photos(shown, elsewhere, options, rematching)
+        matched = pairs.settled()
+        matches = self._matches(shown, matched)
         evidence = replace(evidence, num_correspondences=len(matches.pixels))
-        return Look(evidence, matches, landmarks, others, shown=shown)
+        return Look(
+            evidence,
+            matches,
+            matched.landmarks,
+            self._matches(shown, others.settled()),
+            shown=shown,
+            proposed=Proposed(shown, pairs, self.map.landmarks[pairs.landmarks], retrieved.images),
+        )
 
     def _match_photos(
         self,
@@ -364,21 +379,22 @@ class Localizer:
         photos: NDArray[np.int64],
         options: LocalizeOptions,
         rematching: Rematching | None,
-    ) -> tuple[Matches, NDArray[np.int64]]:
-        """Match with the landmarks that these photos see, best photo first; also return rows."""
+    ) -> Proposals:
+        """Match with the landmarks that these photos see, best photo first."""
         scale = self.map.manifest.local_features.descriptor_scale
         observed = (self.map.observations(int(photo)) for photo in photos)
-        pairs = match_landmarks(
+        return propose_landmarks(
             shown.descriptors,
             ((landmarks, EightBitRows(rows, scale)) for landmarks, rows in observed),
             CLEAR_RATIO if options.matcher is Matcher.RATIO else None,
             None if rematching is None else lambda rank: rematching.match(int(photos[rank])),
         )
-        matches = Matches(
+
+    def _matches(self, shown: Shown, pairs: Correspondences) -> Matches:
+        return Matches(
             shown.keypoints[pairs.keypoints].astype(np.float64),
             self.map.landmarks[pairs.landmarks].astype(np.float64),
         )
-        return matches, pairs.landmarks
 
     def _elsewhere(
         self,

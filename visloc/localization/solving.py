@@ -14,6 +14,7 @@ from visloc.localization.camera_check import only_focal_length_contradicts
 from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.evidence import Shown
 from visloc.localization.gates import Problem, accepted, not_better_elsewhere
+from visloc.localization.rivals import Proposed, stronger_place
 from visloc.options import LocalizeOptions, ReadAs, Solver
 from visloc.pose.centre import position_covariance, with_origin
 from visloc.pose.generalized import (
@@ -69,6 +70,7 @@ class Look:
             exclude; usually none.
         refusal: why there is nothing to solve; None otherwise.
         shown: all that was found in the image; None when a pose shall not be compared with it.
+        proposed: all pairs that the searched photos proposed; None when they were not kept.
     """
 
     evidence: Evidence
@@ -77,6 +79,7 @@ class Look:
     elsewhere: Matches
     refusal: Refusal | None = None
     shown: Shown | None = None
+    proposed: Proposed | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,6 +154,7 @@ def solve_instant(
     looks = [image.look for image in images if image.look is not None]
     views = _views_of(images, [look.matches for look in looks], options)
     seconds = _summed([look.evidence.seconds for look in looks])
+    scores = np.empty(0, np.float32)
     with timed(seconds, "pose"):
         problem, found, refusal = _find_pose(
             images,
@@ -159,6 +163,10 @@ def solve_instant(
         if refusal is None or refusal.reason is not Reason.CONTRADICTS_PRIOR:
             elsewhere = _views_of(images, [look.elsewhere for look in looks], options)
             refusal = not_better_elsewhere(problem.of(elsewhere), found) or refusal
+        proposed = [look.proposed for look in looks if look.proposed is not None]
+        if refusal is None and found is not None and len(proposed) == len(looks):
+            place, refusal, scores = stronger_place(problem, geometry, proposed, found)
+            found, refusal = (place, refusal) if place is found else accepted(problem, place)
         refusal = refusal and _with_turned_photos(refusal, looks)
     pose = None
     if refusal is None and found is not None and found.covariance is not None:
@@ -167,7 +175,7 @@ def solve_instant(
     inliers = () if found is None else tuple(found.inliers)
     camera = None if refusal is not None or found is None else found.camera
     shown = with_inliers([_shown(image, camera) for image in images], inliers)
-    answer = InstantAnswer(timestamp, shown, pose, refusal, seconds)
+    answer = InstantAnswer(timestamp, shown, pose, refusal, seconds, scores)
     views = tuple(replace(view, camera=camera or view.camera) for view in problem.views)
     return Solved(answer, views, found if refusal is None else None, inliers)
 

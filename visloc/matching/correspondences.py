@@ -43,6 +43,64 @@ class Correspondences:
         return len(self.keypoints)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Proposals:
+    """Pairs that mapping photos propose; one keypoint may have several, in different photos.
+
+    Attributes:
+        keypoints: (n,) int64 rows of the query's features.
+        landmarks: (n,) int64 rows of the map's landmarks.
+        ranks: (n,) int64, the position of the photo among those asked, from 0.
+        similarities: (n,) float32, cosine similarities.
+    """
+
+    keypoints: NDArray[np.int64]
+    landmarks: NDArray[np.int64]
+    ranks: NDArray[np.int64]
+    similarities: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+    def of(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> Proposals:
+        """Keep some of the pairs, by mask or by rows."""
+        return Proposals(
+            self.keypoints[which],
+            self.landmarks[which],
+            self.ranks[which],
+            self.similarities[which],
+        )
+
+    def followed_by(self, others: Proposals, num_photos: int) -> Proposals:
+        """Add the pairs of further photos, which come after so many."""
+        return Proposals(
+            np.concatenate([self.keypoints, others.keypoints]),
+            np.concatenate([self.landmarks, others.landmarks]),
+            np.concatenate([self.ranks, others.ranks + num_photos]),
+            np.concatenate([self.similarities, others.similarities]),
+        )
+
+    def settled(self) -> Correspondences:
+        """Settle conflicts by vote; each photo votes with 1 / rank."""
+        votes = 1.0 / (self.ranks + 1)
+        return settled(self.keypoints, self.landmarks, votes, self.similarities)
+
+    def settled_rows(self) -> NDArray[np.intp]:
+        """Return a row of each pair that is left when conflicts are settled, in that order."""
+        chosen = self.settled()
+        size = int(self.landmarks.max(initial=0)) + 1
+        pairs = self.keypoints * size + self.landmarks
+        order = np.argsort(pairs, kind="stable")
+        wanted = chosen.keypoints * size + chosen.landmarks
+        return np.asarray(order[np.searchsorted(pairs[order], wanted)])
+
+    @staticmethod
+    def none() -> Proposals:
+        """Return no pairs."""
+        none = np.empty(0, dtype=np.int64)
+        return Proposals(none, none, none, np.empty(0, dtype=np.float32))
+
+
 def mutual_nearest_neighbours(
     a: EightBitRows, b: EightBitRows, max_ratio: float | None = None
 ) -> Pairs:
@@ -89,20 +147,13 @@ def mutual_nearest_neighbours(
     return mutual, best_b[mutual], (best[mutual] * (a.scale * b.scale)).astype(np.float32)
 
 
-def match_landmarks(
+def propose_landmarks(
     query: EightBitRows,
     photos: Iterable[tuple[NDArray[np.integer], EightBitRows]],
     max_ratio: float | None = None,
     rematch: Callable[[int], Pairs] | None = None,
-) -> Correspondences:
-    """Match a query against several mapping photos and settle conflicts by vote.
-
-    Every photo proposes pairs of keypoint and landmark by mutual nearest neighbours and votes for
-    them with 1 / rank: the photo most like the query sees a corner most as the query does, and
-    shares the errors of the map there; several further photos that agree can outvote it. The pair
-    with more support wins, then the more similar one; each keypoint and each landmark is used
-    once. Measured beside the alternatives in docs/decisions/0005-votes-by-rank.md, the 8 bits in
-    0015-whole-number-matching.md.
+) -> Proposals:
+    """Match a query against several mapping photos, each by mutual nearest neighbours.
 
     Args:
         query: (n, D) descriptors of the query.
@@ -121,15 +172,32 @@ def match_landmarks(
 
     found = in_threads(match, photos)
     if not found:
-        none = np.empty(0, dtype=np.int64)
-        return Correspondences(none, none, np.empty(0), np.empty(0, dtype=np.float32))
+        return Proposals.none()
     if rematch is not None:
         best = sorted(range(len(found)), key=lambda photo: -len(found[photo][0]))[:NUM_REMATCHED]
         for photo, pairs in zip(best, in_threads(rematch, best), strict=True):
             found[photo] = pairs
     keypoints, landmarks, similarities = map(np.concatenate, zip(*found, strict=True))
-    ranks = np.repeat(np.arange(1, len(found) + 1), [len(i) for i, _, _ in found])
-    return settled(keypoints, landmarks, 1.0 / ranks, similarities)
+    ranks = np.repeat(np.arange(len(found)), [len(i) for i, _, _ in found])
+    return Proposals(keypoints, landmarks, ranks, similarities)
+
+
+def match_landmarks(
+    query: EightBitRows,
+    photos: Iterable[tuple[NDArray[np.integer], EightBitRows]],
+    max_ratio: float | None = None,
+    rematch: Callable[[int], Pairs] | None = None,
+) -> Correspondences:
+    """Match a query against several mapping photos and settle conflicts by vote.
+
+    Every photo proposes pairs of keypoint and landmark and votes for
+    them with 1 / rank: the photo most like the query sees a corner most as the query does, and
+    shares the errors of the map there; several further photos that agree can outvote it. The pair
+    with more support wins, then the more similar one; each keypoint and each landmark is used
+    once. Measured beside the alternatives in docs/decisions/0005-votes-by-rank.md, the 8 bits in
+    0015-whole-number-matching.md. Arguments as of ``propose_landmarks``.
+    """
+    return propose_landmarks(query, photos, max_ratio, rematch).settled()
 
 
 def settled(

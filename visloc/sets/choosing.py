@@ -20,8 +20,9 @@ from visloc.types import InstantAnswer
 
 # Maximum number of tiles searched for one query.
 MAX_SEARCHED = 5
-# Tiles with at least this share of the best score are searched together with the best.
-_CLOSE_SCORE = 0.8
+# Tiles with at least this share of the best score are searched together with the best: look-alike
+# floors score 0.55 to 1 of each other, places that are not alike below 0.3.
+_CLOSE_SCORE = 0.5
 # With so many inliers no other tile is searched.
 CLEAR_INLIERS = 100
 _NAMED = 5

@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.visloc.localization.test_constraints import Building, assert_on
+from visloc.archive import MapStore
+from visloc.localization.localizer import Localizer
+from visloc.localization.rivals import SURE, preference, score
+from visloc.priors import NO_PRIORS, Priors
+from visloc.types import NotLocalized, Reason
+
+
+@pytest.fixture(scope="module")
+def room(built_maps: Any) -> Localizer:
+    from visloc.features import make_local_features
+
+    return Localizer(MapStore(built_maps).open("room"), make_local_features("sift"))
+
+
+def test_chance_matches_count_nothing_on_average_and_right_ones_count() -> None:
+    rng = np.random.default_rng(0)
+    by_chance = np.sqrt(rng.uniform(0, 1, 100_000))  # spread evenly over the disc
+
+    assert score(by_chance).mean() == pytest.approx(0.0, abs=0.005)
+    assert (score(np.array([0.0, 0.1, 0.3])) == 1.0).all()
+    assert (score(np.array([1.01, np.inf])) == 0.0).all()
+
+
+def test_preference_is_standard_normal_where_nothing_tells_and_grows_with_evidence() -> None:
+    rng = np.random.default_rng(0)
+    scores = score(np.sqrt(rng.uniform(0, 4, (2, 2000, 200))))
+    found = [preference(a, b) for a, b in zip(*scores, strict=True)]
+    assert np.mean(found) == pytest.approx(0.0, abs=0.1)
+    assert np.std(found) == pytest.approx(1.0, abs=0.1)
+
+    same, sign, none = np.ones(500), np.ones(20), np.zeros(20)
+    with_sign, without = np.concatenate([same, sign]), np.concatenate([same, none])
+    assert preference(with_sign, without) == pytest.approx(np.sqrt(20))
+    assert preference(without, with_sign) == -preference(with_sign, without)
+    assert preference(same, same) == 0.0
+    assert preference(np.empty(0), np.empty(0)) == 0.0
+
+
+@pytest.mark.parametrize("floor", [0, 1])
+def test_identical_places_are_refused_with_both_named(
+    room: Localizer, place: Any, floor: int
+) -> None:
+    answer = Building(room, 0.0, 0.0).ask(place, floor, NO_PRIORS)
+
+    assert isinstance(answer, NotLocalized)
+    assert (answer.stage, answer.reason) == ("gate", Reason.AMBIGUOUS)
+    for candidate in (0, 1):
+        z = Building.pose(candidate, 2.2).center[2]
+        assert f"{z:.1f}" in answer.message
+    assert answer.message.count("inliers in") == 2
+
+
+@pytest.mark.parametrize("floor", [0, 1])
+def test_a_sign_decides_between_places_that_are_otherwise_identical(
+    room: Localizer, place: Any, floor: int
+) -> None:
+    assert_on(Building(room, 0.5, 0.5).ask(place, floor, NO_PRIORS), floor)
+
+
+@pytest.mark.parametrize("floor", [0, 1])
+def test_where_retrieval_is_a_coin_toss_the_wrong_place_is_never_the_answer(
+    room: Localizer, place: Any, floor: int
+) -> None:
+    answer = Building(room, 0.3, 0.0).ask(place, floor, NO_PRIORS)
+
+    if isinstance(answer, NotLocalized):
+        assert answer.reason is Reason.AMBIGUOUS
+    else:
+        assert_on(answer, floor)
+
+
+@pytest.mark.parametrize("floor", [0, 1])
+def test_a_prior_that_excludes_one_of_two_identical_places_decides(
+    room: Localizer, place: Any, floor: int
+) -> None:
+    building = Building(room, 0.0, 0.0)
+
+    assert_on(building.ask(place, floor, Priors(height=building.band(floor))), floor)
+
+
+def test_a_single_keypoint_decides_nothing() -> None:
+    assert preference(np.array([1.0]), np.array([0.0])) < SURE

@@ -1,0 +1,341 @@
+"""A second place that explains an instant nearly as well as its best pose does.
+
+RANSAC over all matches returns the pose with the most inliers. Where two places look alike, that is
+a coin toss: a door has more inliers than its twin because more photos were taken of it. Here the
+searched photos that the best pose leaves unexplained are solved again, place by place, and both
+poses are compared on equal terms: keypoint by keypoint, each place with its best photos, as many of
+one as of the other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.geometry import Pose, rotation_angle
+from visloc.localization.constraints import MapGeometry
+from visloc.localization.evidence import Shown
+from visloc.localization.gates import GATES, Problem, contradicts_priors, first_refusal
+from visloc.matching.correspondences import Proposals, propose_landmarks
+from visloc.pose.centre import largest_std
+from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
+from visloc.pose.reprojection import reprojection_errors
+from visloc.pose.search import MAX_TRIALS, search_with_pycolmap
+from visloc.pose.views import MatchedView
+from visloc.types import Reason, Refusal
+
+# Photos of each place that are compared.
+NUM_COMPARED = 5
+# Places that are solved for, those with the most unexplained matches first.
+_MAX_PLACES = 4
+# Of the photos that show the best place, the one that speaks for it most sets the measure. A photo
+# with less than the first share of its score shows another place, if at least the second share of
+# its number of agreeing matches is as similar and unexplained.
+_OF_THE_PLACE, _LEAST_SHARE = 0.25, 0.5
+# Photos nearer to each other than this share of how far they see are of one place.
+_PLACE_REACH_SHARE = 0.5
+# Poses of two places differ by more than this beyond three standard deviations.
+_APART_REACH_SHARE, _APART_ANGLE, _STDS = 0.2, math.radians(10.0), 3.0
+# The probability to miss a pose with half the share of inliers, and the fewest trials.
+_MISSED, _MIN_TRIALS = 0.01, 100
+# One of two equal places seems as much better as this once in a hundred times (one-sided normal).
+SURE = 2.33
+# Matches by chance spread evenly over the disc of the inlier threshold, right ones lie in its
+# middle. What lies within this share of the radius counts for a pose ...
+_MIDDLE = 1 / 3
+# ... and what lies in the ring around it against it, so that chance counts nothing on average.
+_RING_WEIGHT = -(_MIDDLE**2) / (1.0 - _MIDDLE**2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Proposed:
+    """Pairs that the searched photos proposed for one image, before conflicts were settled.
+
+    Attributes:
+        shown: all keypoints of the image.
+        pairs: of keypoints and landmarks; ranks are rows of ``photos``.
+        points: (n, 3) float32 landmarks of the pairs, relative to the map's origin.
+        photos: (r,) int64 rows of the map's photos.
+    """
+
+    shown: Shown
+    pairs: Proposals
+    points: NDArray[np.float32]
+    photos: NDArray[np.int64]
+
+    def matched_with(self, photos: NDArray[np.int64], geometry: MapGeometry) -> Proposed:
+        """Add the pairs that further photos propose."""
+        further = photos[~np.isin(photos, self.photos)]
+        found = propose_landmarks(
+            self.shown.descriptors, [geometry.observed(photo) for photo in further]
+        )
+        return replace(
+            self,
+            pairs=self.pairs.followed_by(found, len(self.photos)),
+            points=np.concatenate([self.points, geometry.points(found.landmarks)]),
+            photos=np.concatenate([self.photos, further]),
+        )
+
+
+def score(errors: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Say how much each keypoint (k,) speaks for a pose.
+
+    Args:
+        errors: (k,) reprojection errors in units of the inlier threshold; infinity where the place
+            has no match.
+    """
+    inside = np.where(errors <= _MIDDLE, 1.0, _RING_WEIGHT)
+    return np.where(errors <= 1.0, inside, 0.0)
+
+
+class _Pairs:
+    """All proposed pairs of an instant's images in one table; keypoints of all images counted on.
+
+    Args:
+        problem: its views are those of the images.
+        proposed: of each view.
+        best: the focal length that was found with it counts.
+    """
+
+    def __init__(
+        self, problem: Problem, proposed: Sequence[Proposed], best: GeneralizedPose
+    ) -> None:
+        self._problem, self._proposed = problem, proposed
+        self._views = [
+            replace(
+                view,
+                camera=best.camera or view.camera,
+                pixels=each.shown.keypoints[each.pairs.keypoints].astype(np.float64),
+                points=each.points.astype(np.float64),
+                focal_unknown=False,
+            )
+            for view, each in zip(problem.views, proposed, strict=True)
+        ]
+        starts = np.cumsum([0, *(len(each.shown.keypoints) for each in proposed)])
+        self.num_keypoints = int(starts[-1])
+        self.keypoints = np.concatenate(
+            [each.pairs.keypoints + start for each, start in zip(proposed, starts, strict=False)]
+        )
+        self.photos = np.concatenate([each.photos[each.pairs.ranks] for each in proposed])
+        self.similarities = np.concatenate([each.pairs.similarities for each in proposed])
+        self.all_photos, self._photo = np.unique(self.photos, return_inverse=True)
+
+    def errors(self, pose: Pose) -> NDArray[np.float64]:
+        """Return each pair's reprojection error in units of the inlier threshold."""
+        threshold = self._problem.registration.max_error_px
+        errors = np.concatenate([reprojection_errors(view, pose) for view in self._views])
+        return np.where(np.isnan(errors), np.inf, errors / threshold)
+
+    def showing(self, errors: NDArray[np.float64], photos: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Sort photos by how much their pairs speak for a pose, most first."""
+        scores = np.bincount(self._photo, score(errors), minlength=len(self.all_photos))
+        of_photos = scores[np.searchsorted(self.all_photos, photos)]
+        return photos[np.argsort(-of_photos, kind="stable")]
+
+    def places_elsewhere(
+        self, errors: NDArray[np.float64], geometry: MapGeometry
+    ) -> Iterator[NDArray[np.int64]]:
+        """Yield the photos of other places that may explain the images about as well.
+
+        A photo shows another place when few of its pairs agree with the best pose and about as
+        many others are as similar as those that do agree elsewhere.
+        """
+        explained = errors <= 1.0
+        strong = self.similarities >= np.median(self.similarities[explained])
+        num = len(self.all_photos)
+        agreeing = np.bincount(self._photo[strong & explained], minlength=num)
+        unexplained = np.bincount(self._photo[strong & ~explained], minlength=num)
+        scores = np.bincount(self._photo, score(errors), minlength=num)
+        elsewhere = np.flatnonzero(scores < _OF_THE_PLACE * scores.max())
+        left = elsewhere[np.argsort(-unexplained[elsewhere], kind="stable")]
+        for _ in range(_MAX_PLACES):
+            if len(left) == 0 or unexplained[left[0]] < _LEAST_SHARE * agreeing.max():
+                return
+            centers = geometry.centers[self.all_photos[left]]
+            near = (
+                np.linalg.norm(centers - centers[0], axis=1) <= _PLACE_REACH_SHARE * geometry.reach
+            )
+            yield self.all_photos[left[near]]
+            left = left[~near]
+
+    def solve(self, photos: NDArray[np.int64], best: GeneralizedPose) -> GeneralizedPose | None:
+        """Find the pose that the pairs of some photos agree on best.
+
+        The search stops where a pose with half the best one's share of inliers is found surely.
+        """
+        views = self.views(photos)
+        num = sum(map(len, views))
+        ratio = 0.5 * best.num_inliers / max(self._problem.num_matches, 1)
+        trials = math.ceil(math.log(_MISSED) / math.log1p(-(ratio**3)))
+        threshold = self._problem.registration.max_error_px
+        starts = search_with_pycolmap(
+            views,
+            max_error_px=threshold,
+            seed=self._problem.options.seed,
+            max_trials=min(max(trials, _MIN_TRIALS), MAX_TRIALS),
+        )
+        if num == 0 or not starts:
+            return None
+        return refine_generalized_pose(views, starts[0], max_error_px=threshold)
+
+    def refined(self, problem: Problem, other: GeneralizedPose) -> GeneralizedPose | None:
+        """Refine the pose of another place on all matches of the problem."""
+        views = [
+            replace(view, camera=known.camera)
+            for view, known in zip(problem.views, self._views, strict=True)
+        ]
+        threshold = problem.registration.max_error_px
+        return refine_generalized_pose(views, other.rig_from_world, max_error_px=threshold)
+
+    def by_keypoint(
+        self, errors: NDArray[np.float64], photos: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Return the error of each keypoint's most similar landmark in some photos.
+
+        Infinity where it has none there.
+        """
+        rows = np.flatnonzero(np.isin(self.photos, photos))
+        rows = rows[np.argsort(self.similarities[rows], kind="stable")]
+        found = np.full(self.num_keypoints, np.inf)
+        found[self.keypoints[rows]] = errors[rows]  # the last one counts, the most similar
+        return found
+
+    def scores(self, errors: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return how much each keypoint speaks for a pose, with the photos that show it best."""
+        shown = self.showing(errors, self.all_photos)[:NUM_COMPARED]
+        return score(self.by_keypoint(errors, shown)).astype(np.float32)
+
+    def views(self, photos: NDArray[np.int64]) -> list[MatchedView]:
+        """Return the views with the pairs of some photos, conflicts settled."""
+        views = []
+        for view, each in zip(self._views, self._proposed, strict=True):
+            rows = np.flatnonzero(np.isin(each.photos, photos)[each.pairs.ranks])
+            views.append(view.selected(rows[each.pairs.of(rows).settled_rows()]))
+        return views
+
+
+def stronger_place(
+    problem: Problem,
+    geometry: MapGeometry,
+    proposed: Sequence[Proposed],
+    best: GeneralizedPose,
+) -> tuple[GeneralizedPose, Refusal | None, NDArray[np.float32]]:
+    """Compare the best pose with those of other places, and let the photo's evidence decide.
+
+    Another place counts when its pose differs from the best one by more than their uncertainty.
+    The difference of the scores (``score``) of all keypoints, over its standard deviation, tells
+    which place is right; a keypoint that both places explain equally well tells nothing.
+
+    Args:
+        problem: the one that was solved.
+        geometry: of the map.
+        proposed: of each view of the problem.
+        best: its best pose, which passed the gates.
+
+    Returns:
+        The pose of the place that explains the photo better, and no refusal; or ``best`` and a
+        refusal, ``ambiguous``. The scores (k,) of all keypoints in the place of that pose.
+    """
+    pairs = _Pairs(problem, proposed, best)
+    errors = pairs.errors(best.rig_from_world)
+    for photos in pairs.places_elsewhere(errors, geometry):
+        other = pairs.solve(photos, best)
+        if other is None or not _is_rival(problem, best, other, geometry.reach):
+            continue
+        verdict, is_clear, compared = _compared(problem, geometry, proposed, best, other, photos)
+        if verdict >= SURE or not is_clear:
+            continue
+        if verdict <= -SURE:
+            found = pairs.refined(problem, other)
+            if found is not None and first_refusal(GATES, problem, found) is None:
+                errors = pairs.errors(found.rig_from_world)
+                return found, None, pairs.scores(errors)
+        first, second = (_described(*each, geometry) for each in compared)
+        refusal = Refusal(
+            "gate",
+            Reason.AMBIGUOUS,
+            f"two places of {geometry.ref} explain the photo about equally well: {first}, and "
+            f"{second}; send priors that exclude one of them, or a photo with more of the scene",
+        )
+        return best, refusal, pairs.scores(errors)
+    return best, None, pairs.scores(errors)
+
+
+def _compared(
+    problem: Problem,
+    geometry: MapGeometry,
+    proposed: Sequence[Proposed],
+    best: GeneralizedPose,
+    other: GeneralizedPose,
+    photos: NDArray[np.int64],
+) -> tuple[float, bool, list[tuple[GeneralizedPose, int, int]]]:
+    """Compare two poses on equal terms: each with as many photos of its place.
+
+    Few photos of the other place may have been searched. Others taken next to the one that shows
+    it best are matched too.
+
+    Args:
+        photos: of the other place, among those that were searched.
+
+    Returns:
+        ``preference`` for the best pose; whether the other pose surely explains more than chance
+        does; of each pose its inliers and the photo that shows it best.
+    """
+    pairs = _Pairs(problem, proposed, best)
+    seed = pairs.showing(pairs.errors(other.rig_from_world), photos)[0]
+    theirs = geometry.nearest_photos(seed, NUM_COMPARED)
+    own = pairs.showing(pairs.errors(best.rig_from_world), pairs.all_photos)
+    own = own[~np.isin(own, theirs)][:NUM_COMPARED]
+    pairs = _Pairs(problem, [each.matched_with(theirs, geometry) for each in proposed], best)
+    threshold = problem.registration.max_error_px
+    again = refine_generalized_pose(
+        pairs.views(theirs), other.rig_from_world, max_error_px=threshold
+    )
+    scores, compared = [], []
+    for pose, shown in ((best, own), (again or other, theirs[: len(own)])):
+        errors = pairs.by_keypoint(pairs.errors(pose.rig_from_world), shown)
+        scores.append(score(errors))
+        compared.append((pose, int((errors <= 1.0).sum()), int(shown[0])))
+    first, second = scores
+    is_clear = preference(second, np.zeros_like(second)) >= SURE
+    return preference(first, second), is_clear, compared
+
+
+def preference(first: NDArray[np.floating], second: NDArray[np.floating]) -> float:
+    """Say how surely the keypoints speak for the first of two places, in standard deviations.
+
+    Args:
+        first: (k,) scores of the keypoints in one place.
+        second: (k,) of the same keypoints in the other place.
+
+    Returns:
+        The sum of the differences over the root of the sum of their squares: about standard
+        normal when neither place explains the photo better. 0 when nothing differs.
+    """
+    difference = first - second
+    spread = float(np.sqrt((difference * difference).sum()))
+    return float(difference.sum()) / spread if spread > 0.0 else 0.0
+
+
+def _is_rival(
+    problem: Problem, best: GeneralizedPose, other: GeneralizedPose, reach: float
+) -> bool:
+    """Tell whether a pose lies elsewhere, and where the priors allow it."""
+    if best.covariance is None or other.covariance is None:
+        return False  # without an uncertainty, nothing says that they differ
+    a, b = best.rig_from_world, other.rig_from_world
+    std = math.hypot(largest_std(a, best.covariance), largest_std(b, other.covariance))
+    away = float(np.linalg.norm(a.center - b.center))
+    turned = rotation_angle(a.rotation @ b.rotation.T)
+    if away <= _APART_REACH_SHARE * reach + _STDS * std and turned <= _APART_ANGLE:
+        return False
+    return contradicts_priors(problem.constraints, b, other.covariance) is None
+
+
+def _described(pose: GeneralizedPose, num: int, photo: int, geometry: MapGeometry) -> str:
+    x, y, z = pose.rig_from_world.center + geometry.origin
+    return f"({x:.2f}, {y:.2f}, {z:.2f}) with {num} inliers in {geometry.photo_name(photo)}"
