@@ -238,6 +238,8 @@ class CannedService:
                 "covariance": (np.eye(6) * (4e-4 if is_filled else 1e-4)).ravel().tolist(),
                 "position_std": [0.01, 0.01, 0.01],
                 "orientation_std_deg": [0.57, 0.57, 0.57],
+                "photo_covariance": [] if is_filled else (np.eye(6) * 2.5e-5).ravel().tolist(),
+                "uncertainty": "whole",
                 "probability": None if is_filled else 0.75,
             },
             "refusal": refusal if rig_from_world is None or is_filled else None,
