@@ -47,6 +47,8 @@ POSE: dict[str, Any] = {
     "covariance": [1e-9 * (1 / (i + j + 1) + 7 * (i == j)) for i in range(6) for j in range(6)],
     "position_std": [0.004, 0.005, 1 / 3],
     "orientation_std_deg": [0.1, 0.2, 0.3],
+    "photo_covariance": [1e-10 / (i + j + 1) for i in range(6) for j in range(6)],
+    "uncertainty": "whole",
     "probability": 1 / 3,
 }
 GEOPOSE: dict[str, Any] = {
