@@ -220,7 +220,7 @@ def test_the_example_that_reads_points_sees_the_map(built_maps: Path, desk: Desk
         # of ready-made features, uploads and keys; `make docs-check` runs those commands as well.
         if not re.match(
             r"make|\.venv/bin/(visloc-service|pip |"
-            r"mapping (build|anchor|set|split|prune|merge|update|pack))"
+            r"mapping (build|anchor|set|split|prune|merge|update|upgrade|pack))"
             r"|.*/mapping import .* --map|.* --features-dir|.*/localize maps push"
             r"|.* https://maps\.example\.org",
             line,

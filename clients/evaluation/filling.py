@@ -65,8 +65,9 @@ def photo_result(result: InstantResult, index: int) -> LocalizeResult:
         photo, turn = result.pose.photo_covariance, _turned_into(image, result.pose)
         pose = pose_as_json(traced) | {
             "cam_from_world": raw["cam_from_world"],
-            "photo_covariance": None if photo is None else (turn @ photo @ turn.T).ravel().tolist(),
+            "photo_covariance": [] if photo is None else (turn @ photo @ turn.T).ravel().tolist(),
             "uncertainty": result.pose.uncertainty,
+            "probability": result.pose.probability,
         }
     elif result.localized:
         status = "not_localized"

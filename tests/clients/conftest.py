@@ -47,6 +47,8 @@ POSE: dict[str, Any] = {
     "covariance": [1e-9 * (1 / (i + j + 1) + 7 * (i == j)) for i in range(6) for j in range(6)],
     "position_std": [0.004, 0.005, 1 / 3],
     "orientation_std_deg": [0.1, 0.2, 0.3],
+    "photo_covariance": [1e-10 / (i + j + 1) for i in range(6) for j in range(6)],
+    "uncertainty": "whole",
     "probability": 1 / 3,
 }
 GEOPOSE: dict[str, Any] = {
@@ -238,6 +240,8 @@ class CannedService:
                 "covariance": (np.eye(6) * (4e-4 if is_filled else 1e-4)).ravel().tolist(),
                 "position_std": [0.01, 0.01, 0.01],
                 "orientation_std_deg": [0.57, 0.57, 0.57],
+                "photo_covariance": [] if is_filled else (np.eye(6) * 2.5e-5).ravel().tolist(),
+                "uncertainty": "whole",
                 "probability": None if is_filled else 0.75,
             },
             "refusal": refusal if rig_from_world is None or is_filled else None,

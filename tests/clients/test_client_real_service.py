@@ -104,12 +104,16 @@ def test_a_sequence_is_localized_alike_and_filled_where_a_photo_is_bad(
         async with AsyncClient(url) as client:
             return [answer async for answer in client.localize_sequence(instants, "room")]
 
+    texts = []
     for url in doors:
         with Client(url) as client:
-            answers = list(client.localize_sequence(instants, "room"))
+            answers = list(client.localize_sequence(instants, "room", request_id="same"))
         assert [a.status for a in answers] == ["localized", "filled", "localized"]
         assert answers[1].source is PoseSource.INTERPOLATED
+        assert [a.pose.photo_covariance is None for a in answers if a.pose] == [False, True, False]
         assert [a.status for a in asyncio.run(ask(url))] == ["localized", "filled", "localized"]
+        texts.append(json.dumps([{**a.raw, "seconds": None} for a in answers], sort_keys=True))
+    assert texts[0] == texts[1]
 
 
 def test_priors_keep_a_photo_from_being_found_elsewhere(

@@ -57,7 +57,7 @@ _PositionStd = Annotated[
 
 _PHOTO_PART = (
     "6 x 6, the part of covariance that the scatter of the matches alone leaves open; "
-    "null for a pose that no image of its own measured"
+    "empty for a pose that no image of its own measured"
 )
 _UNCERTAINTY = (
     "whole: covariance holds the errors of the photo and of the map, as the map's own test found "

@@ -132,16 +132,16 @@ def _in_a_row(array: NDArray[Any]) -> list[Any]:
 
 
 def _optional_covariance(value: Any) -> NDArray[np.float64] | None:
-    """As ``_covariance``; gRPC cannot tell an empty list from one that is not there."""
+    """As ``_covariance``; empty when there is none, because gRPC has no list that is null."""
     return None if value is None or len(value) == 0 else _covariance(value)
 
 
-def _in_a_row_or_none(array: NDArray[Any] | None) -> list[Any] | None:
-    return None if array is None else _in_a_row(array)
+def _in_a_row_or_empty(array: NDArray[Any] | None) -> list[Any]:
+    return [] if array is None else _in_a_row(array)
 
 
 _AS_NUMBERS = PlainSerializer(_in_a_row, return_type=list[float])
-_AS_NUMBERS_OR_NONE = PlainSerializer(_in_a_row_or_none, return_type=list[float] | None)
+_AS_NUMBERS_OR_EMPTY = PlainSerializer(_in_a_row_or_empty, return_type=list[float])
 
 Numbers3 = Annotated[NDArray[np.float64], _array(3), _AS_NUMBERS, _NUMBERS]
 Numbers4 = Annotated[NDArray[np.float64], _array(4), _AS_NUMBERS, _NUMBERS]
@@ -149,7 +149,7 @@ NumbersNx2 = Annotated[NDArray[np.float64], _array(-1, 2), _AS_NUMBERS, _NUMBERS
 NumbersNx3 = Annotated[NDArray[np.float64], _array(-1, 3), _AS_NUMBERS, _NUMBERS]
 Covariance = Annotated[NDArray[np.float64], BeforeValidator(_covariance), _AS_NUMBERS, _NUMBERS]
 OptionalCovariance = Annotated[
-    NDArray[np.float64] | None, BeforeValidator(_optional_covariance), _AS_NUMBERS_OR_NONE
+    NDArray[np.float64] | None, BeforeValidator(_optional_covariance), _AS_NUMBERS_OR_EMPTY
 ]
 Flags = Annotated[
     NDArray[np.bool_],

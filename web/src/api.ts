@@ -75,7 +75,7 @@ export interface PoseEstimate {
   position_std: number[];
   orientation_std_deg: number[];
   /** The part of covariance that the scatter of the matches alone leaves open. */
-  photo_covariance: number[] | null;
+  photo_covariance: number[];
   /** What covariance covers. */
   uncertainty: "whole" | "photo only";
   /** That the pose is right, 0 to 1; null when it was not judged. */

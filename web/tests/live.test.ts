@@ -41,7 +41,7 @@ function answered(position: number[] | null, changes: Partial<LocalizeResponse> 
     covariance: [],
     position_std: [],
     orientation_std_deg: [],
-    photo_covariance: null,
+    photo_covariance: [],
     uncertainty: "whole",
     probability: null,
   };

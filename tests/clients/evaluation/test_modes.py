@@ -325,6 +325,10 @@ def test_mode_gp3p_gives_each_photo_the_pose_of_the_rig(
     ]
     assert [line["source"] for line in lines[4:7]] == [None, None, "rig"]
     assert lines[6]["error"]["code"] == "image.undecodable"
+    for pose in (line["pose"] for line in lines[:4]):
+        assert (pose["uncertainty"], pose["probability"]) == ("whole", 0.75)
+        part = np.array(pose["covariance"]) / 4
+        assert pose["photo_covariance"] == pytest.approx(part, abs=1e-12)
     assert [line["name"] for line in lines] == [q.name for q in read_queries(dataset).photos]
     poses, filled = (poses_of(output / f"{file}.txt") for file in ("poses", "poses_filled"))
     truth = truth_of(dataset)

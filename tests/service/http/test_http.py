@@ -23,7 +23,6 @@ from pydantic import BaseModel
 from starlette.responses import PlainTextResponse
 
 import visloc
-from service import api as schemas
 from service.http.acceptor import OpenConnections
 from service.http.app import create_app
 from service.http.envelope import RequestEnvelope
@@ -32,6 +31,7 @@ from service.values import RigJob
 from tests.turning import png, turned_camera, turned_pixels, turned_pose
 from visloc.geometry import Pose, rotation_angle
 from visloc.images import read_photo
+from visloc_api.words import answers, maps, scenes, status
 
 
 def encoded(image: Image.Image, file_format: str = "PNG", **options: Any) -> bytes:
@@ -495,14 +495,14 @@ def test_openapi_describes_both_kinds_of_bodies_and_every_reference_resolves(doo
         body = schema["paths"][path]["post"]["requestBody"]["content"]
         assert set(body) == {"multipart/form-data", "application/json"}
         assert all(content["examples"] for content in body.values())
-    answers = schema["paths"]["/localize/sequence"]["post"]["responses"]["200"]["content"]
-    assert set(answers) == {"application/json", "application/x-ndjson"}
-    line = answers["application/x-ndjson"]
+    described = schema["paths"]["/localize/sequence"]["post"]["responses"]["200"]["content"]
+    assert set(described) == {"application/json", "application/x-ndjson"}
+    line = described["application/x-ndjson"]
     answer, problem = line["schema"]["oneOf"]
     assert answer == {"$ref": "#/components/schemas/InstantAnswer"}
     assert problem["properties"] == {"problem": {"$ref": "#/components/schemas/Problem"}}
-    schemas.InstantAnswer.model_validate(line["examples"]["answer"]["value"])
-    schemas.Problem.model_validate(line["examples"]["error"]["value"]["problem"])
+    answers.InstantAnswer.model_validate(line["examples"]["answer"]["value"])
+    status.Problem.model_validate(line["examples"]["error"]["value"]["problem"])
 
     def references(part: Any) -> Iterator[str]:
         if isinstance(part, dict):
@@ -521,17 +521,17 @@ def test_openapi_describes_both_kinds_of_bodies_and_every_reference_resolves(doo
 @pytest.mark.parametrize(
     ("path", "method", "status", "model", "names"),
     [
-        ("/localize", "post", "200", schemas.LocalizeResponse, {"localized", "not_localized"}),
-        ("/localize/rig", "post", "200", schemas.InstantAnswer, {"localized"}),
-        ("/localize/sequence", "post", "200", schemas.LocalizeSequenceResponse, {"sequence"}),
-        ("/maps", "get", "200", schemas.ListMapsResponse, {"maps"}),
-        ("/maps/{ref}", "get", "200", schemas.MapInfo, {"map", "set"}),
-        ("/maps/{ref}/images", "get", "200", schemas.MapImages, {"images"}),
-        ("/maps/{map_id}/current", "post", "200", schemas.MapInfo, {"map"}),
-        ("/maps/{map_id}/versions/{version}", "get", "200", schemas.MapInfo, {"map"}),
-        ("/maps/{map_id}/versions/{version}", "put", "201", schemas.MapInfo, {"map"}),
-        ("/readyz", "get", "200", schemas.Readiness, {"ready"}),
-        ("/readyz", "get", "503", schemas.Readiness, {"loading"}),
+        ("/localize", "post", "200", answers.LocalizeResponse, {"localized", "not_localized"}),
+        ("/localize/rig", "post", "200", answers.InstantAnswer, {"localized"}),
+        ("/localize/sequence", "post", "200", answers.LocalizeSequenceResponse, {"sequence"}),
+        ("/maps", "get", "200", maps.ListMapsResponse, {"maps"}),
+        ("/maps/{ref}", "get", "200", maps.MapInfo, {"map", "set"}),
+        ("/maps/{ref}/images", "get", "200", scenes.MapImages, {"images"}),
+        ("/maps/{map_id}/current", "post", "200", maps.MapInfo, {"map"}),
+        ("/maps/{map_id}/versions/{version}", "get", "200", maps.MapInfo, {"map"}),
+        ("/maps/{map_id}/versions/{version}", "put", "201", maps.MapInfo, {"map"}),
+        ("/readyz", "get", "200", status.Readiness, {"ready"}),
+        ("/readyz", "get", "503", status.Readiness, {"loading"}),
     ],
 )
 def test_openapi_shows_answers_that_are_whole(
