@@ -151,6 +151,7 @@ class _Pairs:
         unexplained = np.bincount(self._photo[strong & ~explained], minlength=num)
         scores = np.bincount(self._photo, score(errors), minlength=num)
         elsewhere = np.flatnonzero(scores < _OF_THE_PLACE * scores.max())
+        elsewhere = elsewhere[elsewhere != scores.argmax()]  # where hardly anything speaks for it
         left = elsewhere[np.argsort(-unexplained[elsewhere], kind="stable")]
         for _ in range(_MAX_PLACES):
             if len(left) == 0 or unexplained[left[0]] < _LEAST_SHARE * agreeing.max():
@@ -287,8 +288,10 @@ def _compared(
     """
     pairs = _Pairs(problem, proposed, best)
     seed = pairs.showing(pairs.errors(other.rig_from_world), photos)[0]
-    theirs = geometry.nearest_photos(seed, NUM_COMPARED)
     own = pairs.showing(pairs.errors(best.rig_from_world), pairs.all_photos)
+    theirs = geometry.nearest_photos(seed, NUM_COMPARED + 1)
+    # In a small map even the photo that shows the best place best is among the nearest.
+    theirs = theirs[theirs != own[0]][:NUM_COMPARED]
     own = own[~np.isin(own, theirs)][:NUM_COMPARED]
     pairs = _Pairs(problem, [each.matched_with(theirs, geometry) for each in proposed], best)
     threshold = problem.registration.max_error_px

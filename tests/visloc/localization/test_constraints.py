@@ -447,7 +447,7 @@ class Building:
         center = around.T @ [0.0, -1.0, 0.0] + [0.0, 0.0, FLOOR * floor + 1.6]
         return Pose(rotation, -rotation @ center)
 
-    def ask(self, place: Any, floor: int, priors: Priors) -> Answer:
+    def ask(self, place: Any, floor: int, priors: Priors, top_k: int = 4) -> Answer:
         """Localize a photo of a floor, a little beside one of the map's."""
         rng = np.random.default_rng(7)
         pose = self.pose(floor, 2.2)
@@ -464,7 +464,7 @@ class Building:
             self.descriptors[floor, seen].astype(np.float32),
             {"kapture:B": like},
         )
-        options = LocalizeOptions(top_k=4, min_inliers=15)
+        options = LocalizeOptions(top_k=top_k, min_inliers=15)
         return self.localizer.localize_features(features, place.camera, options, priors)
 
     def band(self, floor: int) -> HeightBand:

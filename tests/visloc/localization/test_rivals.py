@@ -58,6 +58,18 @@ def test_identical_places_are_refused_with_both_named(
     assert answer.message.count("inliers in") == 2
 
 
+@pytest.mark.parametrize("top_k", [2, 3, 16])
+@pytest.mark.parametrize("floor", [0, 1])
+def test_however_many_photos_are_searched_identical_places_are_told_from_no_other(
+    room: Localizer, place: Any, floor: int, top_k: int
+) -> None:
+    """With two, all that show one place are among the nearest to the photo of the other."""
+    answer = Building(room, 0.0, 0.0).ask(place, floor, NO_PRIORS, top_k)
+
+    assert isinstance(answer, NotLocalized)
+    assert answer.reason is Reason.AMBIGUOUS
+
+
 @pytest.mark.parametrize("floor", [0, 1])
 def test_a_sign_decides_between_places_that_are_otherwise_identical(
     room: Localizer, place: Any, floor: int
