@@ -21,12 +21,13 @@ from visloc.localization.constraints import MapGeometry
 from visloc.localization.evidence import Shown
 from visloc.localization.gates import GATES, Problem, contradicts_priors, first_refusal
 from visloc.matching.correspondences import Proposals, propose_landmarks
+from visloc.matching.products import round_descriptors
 from visloc.pose.centre import largest_std
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
 from visloc.pose.reprojection import reprojection_errors
 from visloc.pose.search import MAX_TRIALS, search_with_pycolmap
 from visloc.pose.views import MatchedView
-from visloc.types import Reason, Refusal
+from visloc.types import LocalFeatures, Reason, Refusal
 
 # Photos of each place that are compared.
 NUM_COMPARED = 5
@@ -67,6 +68,14 @@ class Proposed:
     points: NDArray[np.float32]
     photos: NDArray[np.int64]
 
+    @staticmethod
+    def none(features: LocalFeatures) -> Proposed:
+        """Return what was proposed for features of which there are none."""
+        shown = Shown(features.keypoints, round_descriptors(features.descriptors))
+        return Proposed(
+            shown, Proposals.none(), np.empty((0, 3), np.float32), np.empty(0, np.int64)
+        )
+
     def matched_with(self, photos: NDArray[np.int64], geometry: MapGeometry) -> Proposed:
         """Add the pairs that further photos propose."""
         further = photos[~np.isin(photos, self.photos)]
@@ -96,7 +105,8 @@ class _Pairs:
     """All proposed pairs of an instant's images in one table; keypoints of all images counted on.
 
     Args:
-        problem: its views are those of the images.
+        problem: its views are those of the images; those without matches, as of a camera that was
+            left out, have no pairs.
         proposed: of each view.
         best: the focal length that was found with it counts.
     """
@@ -104,6 +114,10 @@ class _Pairs:
     def __init__(
         self, problem: Problem, proposed: Sequence[Proposed], best: GeneralizedPose
     ) -> None:
+        proposed = [
+            each if len(view) else replace(each, pairs=Proposals.none(), points=each.points[:0])
+            for view, each in zip(problem.views, proposed, strict=True)
+        ]
         self._problem, self._proposed = problem, proposed
         self._views = [
             replace(
@@ -336,7 +350,8 @@ def _is_rival(
     turned = rotation_angle(a.rotation @ b.rotation.T)
     if away <= _APART_REACH_SHARE * reach + _STDS * std and turned <= _APART_ANGLE:
         return False
-    return contradicts_priors(problem.constraints, b, other.covariance) is None
+    whole = problem.constraints.errors.whole(b, other.covariance)
+    return contradicts_priors(problem.constraints, b, whole) is None
 
 
 def _described(pose: GeneralizedPose, num: int, photo: int, geometry: MapGeometry) -> str:
