@@ -76,8 +76,12 @@ def _projected(
 
     They work for every camera model; their error is about 1e-9 relative.
     """
-    step = 1e-5 * np.linalg.norm(in_cam, axis=1)
-    shifts = step[:, None] * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])[:, None]
+    x, y, z = in_cam.T  # column by column: a sum over rows of three takes four times as long
+    step = 1e-5 * np.sqrt(x * x + y * y + z * z)
+    shifted = np.tile(in_cam, (7, 1, 1))
+    for axis in range(3):
+        shifted[1 + axis, :, axis] += step
+        shifted[4 + axis, :, axis] -= step
     # All at once: with few points, the calls take longer than the work.
-    pixels = project(camera, (in_cam + shifts).reshape(-1, 3)).reshape(7, -1, 2)
+    pixels = project(camera, shifted.reshape(-1, 3)).reshape(7, -1, 2)
     return pixels[0], np.stack([*(pixels[1:4] - pixels[4:])], axis=2) / (2 * step)[:, None, None]
