@@ -65,8 +65,11 @@ def has_derivative(errors: NDArray[np.float64], jacobian: NDArray[np.float64]) -
     Those that are not say nothing about how errors change with the pose. A camera of 180 degrees
     sees points so close to its edge that a step of the difference leaves the view.
     """
-    known = np.abs(jacobian).max(axis=(1, 2), initial=0.0) < _MAX_DERIVATIVE  # False for NaN
-    return np.asarray(known & np.isfinite(errors).all(axis=1))
+    # One row per derivative: a maximum over short rows takes ten times as long.
+    rows = np.ascontiguousarray(np.moveaxis(jacobian, 0, 2))
+    known = np.abs(rows).max(axis=(0, 1), initial=0.0) < _MAX_DERIVATIVE  # False for NaN
+    x, y = errors.T
+    return np.asarray(known & np.isfinite(x) & np.isfinite(y))
 
 
 def _projected(
