@@ -11,7 +11,6 @@ from benchmarks.trust.maps import FLOOR_11
 from benchmarks.trust.measures import calibration_error, uncertainty
 from benchmarks.trust.outcomes import Outcome
 from benchmarks.trust.scenarios import FOCAL_FACTORS, OWN, PRINT_SHARES, RIG
-from visloc.options import PRESETS
 
 SURE = 0.99
 OWN_NAMES = [*(scenario for scenario, *_ in OWN), RIG]
@@ -56,7 +55,7 @@ def _own(by_scenario: dict[str, list[Outcome]]) -> Iterator[str]:
                 sum(each.accepted for each in outcomes),
                 sum(each.right is True for each in outcomes),
                 sum(each.right is False for each in outcomes),
-                _at_config1(outcomes),
+                _likely(outcomes),
                 medians,
             ]
         )
@@ -88,7 +87,7 @@ def _own(by_scenario: dict[str, list[Outcome]]) -> Iterator[str]:
         "Photos of the mapped place",
         (
             *("photos of", "photos", "answered", "right", "wrong"),
-            *(AT_CONFIG1, "median error, cm (gardenspoint: 0.01 units)"),
+            *(_OF_LIKELY, "median error, cm (gardenspoint: 0.01 units)"),
         ),
         right,
     )
@@ -125,14 +124,14 @@ def _places(by_scenario: dict[str, list[Outcome]]) -> Iterator[str]:
     yield from _table("Other floors, other places, and the same place at night", _COUNTS, rows)
 
 
-AT_CONFIG1 = "right, wrong at a quarter of inliers"
-_COUNTS = ("what", "photos", "accepted", "right", "wrong", AT_CONFIG1, "refused because")
+LIKELY = 0.5
+_OF_LIKELY = f"right, wrong at a probability of {LIKELY}"
+_COUNTS = ("what", "photos", "accepted", "right", "wrong", _OF_LIKELY, "refused because")
 
 
-def _at_config1(outcomes: Sequence[Outcome]) -> str:
-    """Count the answers whose share of inliers the preset ``config1`` would take."""
-    least = PRESETS["config1"].min_inlier_ratio
-    kept = [each.right for each in outcomes if each.accepted and each.inlier_ratio >= least]
+def _likely(outcomes: Sequence[Outcome]) -> str:
+    """Count the answers that are left for a caller who gates on the probability."""
+    kept = [each.right for each in outcomes if each.accepted and (each.probability or 0) >= LIKELY]
     return f"{kept.count(True)}, {kept.count(False)}"
 
 
@@ -144,7 +143,7 @@ def _counts(name: str, outcomes: Sequence[Outcome]) -> list[object]:
         sum(each.accepted for each in outcomes),
         sum(each.right is True for each in outcomes),
         sum(each.right is False for each in outcomes),
-        _at_config1(outcomes),
+        _likely(outcomes),
         ", ".join(f"{reason} {count}" for reason, count in reasons.most_common()) or "-",
     ]
 

@@ -19,7 +19,7 @@ from visloc.evaluation import Threshold
 from visloc.geometry import Pose
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
-from visloc.types import InstantAnswer, PoseSource, RigPose
+from visloc.types import InstantAnswer, PoseSource, RigPose, Uncertainty
 
 ASKED = Outcome("redkitchen", "redkitchen", "a.jpg", accepted=True, right=True)
 
@@ -79,7 +79,15 @@ def test_an_answer_is_held_against_the_truth() -> None:
     # The camera moved by 0.1 along the world's x.
     moved = Pose(truth.rotation, truth.translation - truth.rotation @ [0.1, 0.0, 0.0])
     in_camera = np.diag([0, 0, 0, 1e-4, 4e-4, 9e-4])
-    pose = RigPose(moved, in_camera, np.ones(3), np.ones(3), PoseSource.ESTIMATED)
+    pose = RigPose(
+        moved,
+        in_camera,
+        np.ones(3),
+        np.ones(3),
+        PoseSource.ESTIMATED,
+        photo_covariance=in_camera,
+        uncertainty=Uncertainty.WHOLE,
+    )
 
     outcome = outcome_of(query, InstantAnswer(None, (), pose, None, {}))
 

@@ -24,9 +24,12 @@ from visloc.pose.intrinsics import (
 from visloc.pose.views import MatchedView
 from visloc.types import CameraSource
 
-# Standard deviation of what a right camera is off by: of the focal length, of fx / fy, and of the
-# principal point in longer sides. A calibration is good to one per cent, EXIF hardly better.
+# Standard deviation of what a right camera is off by: of the focal length and of fx / fy. A
+# calibration is good to one per cent, EXIF hardly better.
 _CAMERA_STD = 0.01
+# Of the principal point, in longer sides. A turn of the camera hides a shift of it, so that a map
+# that is slightly bent moves it by a tenth. Crops off the centre move it by more.
+_PRINCIPAL_POINT_STD = 0.04
 _ESTIMATED_FOCAL_STD = 1.0  # it is what the matches say already
 # Sensors are read row by row, within 1/30 s: a camera that tilts by one radian per second meanwhile
 # stretches its rows apart by 3 %, and fy with them.
@@ -130,6 +133,7 @@ def _tolerance(source: CameraSource) -> NDArray[np.float64]:
     """Covariance (4, 4) of what a right camera is off by."""
     stds = np.full(4, _CAMERA_STD)
     stds[FOCAL] = _focal_std(source)
+    stds[[SHIFT_X, SHIFT_Y]] = _PRINCIPAL_POINT_STD
     shutter = np.zeros(4)
     shutter[[FOCAL, ASPECT]] = 0.5 * _SHUTTER_STD, -_SHUTTER_STD
     return np.asarray(np.diag(stds**2) + np.outer(shutter, shutter))
