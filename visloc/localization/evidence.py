@@ -224,7 +224,8 @@ def _coherence(explaining: Sequence[MatchedView], rig_from_world: Pose) -> float
         some = view.selected(np.arange(0, len(view), max(1, -(-len(view) // _MAX_COHERENT))))
         in_cam = (some.cam_from_rig @ rig_from_world).apply(some.points)
         errors = project(some.camera, in_cam) - some.pixels
-        _, near = KDTree(some.pixels).query(some.pixels, k=range(2, _NUM_NEIGHBOURS + 2))
+        tree = KDTree(some.pixels, balanced_tree=False)
+        _, near = tree.query(some.pixels, k=range(2, _NUM_NEIGHBOURS + 2))
         along += float(np.sum(errors * errors[np.asarray(near)].mean(axis=1)))
         total += float(np.sum(errors * errors))
     return along / total
@@ -241,7 +242,8 @@ def _compare(
     comparable, explained = np.zeros(num, dtype=np.bool_), np.zeros(num, dtype=np.bool_)
     above_chance = np.zeros(num)
     if num and len(keypoints):
-        distances, near = KDTree(keypoints).query(
+        # A tree that is not balanced is made in half the time, and asked only once.
+        distances, near = KDTree(keypoints, balanced_tree=False).query(
             expected.pixels,
             k=range(1, _NUM_KEYPOINTS + 1),  # a range keeps the axis
             distance_upper_bound=_NEAR_SHARE * max_error_px,
@@ -320,19 +322,19 @@ def _expected(
     seen = [_some_rows(opened.observation_offsets, image) for image in nearest.tolist()]
     observations, photos = np.concatenate(seen), np.repeat(nearest, [len(each) for each in seen])
     landmarks = np.asarray(opened.observation_landmarks)[observations].astype(np.int64)
-    points = np.asarray(opened.landmarks)[landmarks].astype(np.float64)
+    points = np.take(opened.landmarks, landmarks, axis=0).astype(np.float64)
     in_cam = cam_from_world.apply(points)
     pixels = project(camera, in_cam)
-    size = (camera.width, camera.height)
-    in_photo = np.all((pixels >= 0) & (pixels < size), axis=1)  # False for NaN
-    inside = np.asarray(in_photo & (in_cam[:, 2] > 0))
+    (x, y), (width, height) = pixels.T, (camera.width, camera.height)
+    # False for NaN.
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (in_cam[:, 2] > 0)
     unlike = np.full(len(points), np.inf)
     unlike[inside] = _unlike(
         points[inside], cam_from_world.center, geometry.centers[photos[inside]]
     )
     kept = np.flatnonzero(np.isfinite(unlike))
-    order = kept[np.lexsort((unlike[kept], landmarks[kept]))]
-    _, first = np.unique(landmarks[order], return_index=True)
+    order = kept[np.argsort(unlike[kept], kind="stable")]
+    _, first = np.unique(landmarks[order], return_index=True)  # of each, the most alike
     rows = order[first][:: max(1, -(-len(first) // _MAX_EXPECTED))]
     descriptors = np.asarray(opened.observation_descriptors)[observations[rows]]
     return float(apart[nearest[0]]), _Expected(pixels[rows], descriptors)
@@ -344,13 +346,19 @@ def _unlike(
     """Return how differently landmarks (n, 3) look from two places; infinity for too much."""
     from_pose, from_photo = points - center, points - photo_centers
     away, photo_away = (
-        np.maximum(np.linalg.norm(rays, axis=1), _LEAST) for rays in (from_pose, from_photo)
+        np.maximum(np.sqrt(_dots(rays, rays)), _LEAST) for rays in (from_pose, from_photo)
     )
-    cosines = np.sum(from_pose * from_photo, axis=1) / (away * photo_away)
+    cosines = _dots(from_pose, from_photo) / (away * photo_away)
     angles = np.arccos(np.clip(cosines, -1.0, 1.0))
     octaves = np.abs(np.log2(away / photo_away))
     alike = (angles <= _MAX_ANGLE) & (octaves <= _MAX_OCTAVES)
     return np.asarray(np.where(alike, angles / _MAX_ANGLE + octaves, np.inf))
+
+
+def _dots(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the dot products (n,) of rows (n, 3)."""
+    x, y, z = (a * b).T  # faster than a sum over rows of three
+    return np.asarray(x + y + z)
 
 
 def _some_rows(offsets: NDArray[np.int64], image: int) -> NDArray[np.int64]:

@@ -73,7 +73,8 @@ def judge(candidates: Sequence[Candidate], ties: Ties) -> int | Refusal:
 
     Args:
         candidates: at least one. An answer that a set refused as ambiguous counts as explaining the
-            photo.
+            photo. So does one that was refused for its camera, with more inliers than any pose: a
+            wrong camera in the right place does not make another place right.
         ties: between their frames.
 
     Returns:
@@ -82,11 +83,11 @@ def judge(candidates: Sequence[Candidate], ties: Ties) -> int | Refusal:
     """
     answers = [candidate.answer for candidate in candidates]
     explains = [i for i, answer in enumerate(answers) if _explains(answer)]
-    if not explains:
-        return max(
-            range(len(answers)),
-            key=lambda i: (answers[i].num_inliers, answers[i].num_correspondences),
-        )
+    closest = max(
+        range(len(answers)), key=lambda i: (answers[i].num_inliers, answers[i].num_correspondences)
+    )
+    if not explains or _has_wrong_camera(answers[closest]):
+        return closest
     best = max(explains, key=lambda i: answers[i].num_inliers)
     most = answers[best].num_inliers
     rivals = [i for i in explains if i == best or _is_rival(answers[i], answers[best])]
@@ -128,6 +129,10 @@ def _explains(answer: InstantAnswer) -> bool:
     if answer.refusal is not None:
         return answer.refusal.reason is Reason.AMBIGUOUS
     return answer.pose is not None
+
+
+def _has_wrong_camera(answer: InstantAnswer) -> bool:
+    return answer.refusal is not None and answer.refusal.reason is Reason.CAMERA_CONTRADICTED
 
 
 def _spread(answer: InstantAnswer) -> float:

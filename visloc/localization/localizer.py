@@ -334,12 +334,14 @@ class Localizer:
             rematching = Rematching(network, self.map, seen_as_found(local, evidence))
         evidence = replace(evidence, num_keypoints=len(local))
         if len(local) == 0:
-            return _nothing(
+            blank = _nothing(
                 evidence,
                 "features",
                 Reason.NO_KEYPOINTS,
                 "no keypoints were found: the photo is blank, dark, blurred or too small",
             )
+            # Other cameras of the rig may show two places.
+            return replace(blank, proposed=Proposed.none(local))
         with timed(seconds, "global_features"):
             query = {
                 name: self._describe(name, features)

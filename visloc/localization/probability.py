@@ -1,7 +1,7 @@
 """The probability that a pose is right, from the evidence for and against it.
 
 A logistic regression with a dozen numbers (``probability.json``), learned from poses that were
-known to be right or wrong: ```python -m benchmarks.probability fit``` (docs/decisions/0029).
+known to be right or wrong: ``python -m benchmarks.probability fit`` (docs/decisions/0029).
 """
 
 from __future__ import annotations

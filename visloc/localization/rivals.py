@@ -21,12 +21,13 @@ from visloc.localization.constraints import MapGeometry
 from visloc.localization.evidence import Shown
 from visloc.localization.gates import GATES, Problem, contradicts_priors, first_refusal
 from visloc.matching.correspondences import Proposals, propose_landmarks
+from visloc.matching.products import round_descriptors
 from visloc.pose.centre import largest_std
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
 from visloc.pose.reprojection import reprojection_errors
 from visloc.pose.search import MAX_TRIALS, search_with_pycolmap
 from visloc.pose.views import MatchedView
-from visloc.types import Reason, Refusal
+from visloc.types import LocalFeatures, Reason, Refusal
 
 # Photos of each place that are compared.
 NUM_COMPARED = 5
@@ -67,6 +68,14 @@ class Proposed:
     points: NDArray[np.float32]
     photos: NDArray[np.int64]
 
+    @staticmethod
+    def none(features: LocalFeatures) -> Proposed:
+        """Return what was proposed for features of which there are none."""
+        shown = Shown(features.keypoints, round_descriptors(features.descriptors))
+        return Proposed(
+            shown, Proposals.none(), np.empty((0, 3), np.float32), np.empty(0, np.int64)
+        )
+
     def matched_with(self, photos: NDArray[np.int64], geometry: MapGeometry) -> Proposed:
         """Add the pairs that further photos propose."""
         further = photos[~np.isin(photos, self.photos)]
@@ -96,7 +105,8 @@ class _Pairs:
     """All proposed pairs of an instant's images in one table; keypoints of all images counted on.
 
     Args:
-        problem: its views are those of the images.
+        problem: its views are those of the images; those without matches, as of a camera that was
+            left out, have no pairs.
         proposed: of each view.
         best: the focal length that was found with it counts.
     """
@@ -104,6 +114,10 @@ class _Pairs:
     def __init__(
         self, problem: Problem, proposed: Sequence[Proposed], best: GeneralizedPose
     ) -> None:
+        proposed = [
+            each if len(view) else replace(each, pairs=Proposals.none(), points=each.points[:0])
+            for view, each in zip(problem.views, proposed, strict=True)
+        ]
         self._problem, self._proposed = problem, proposed
         self._views = [
             replace(
@@ -151,6 +165,7 @@ class _Pairs:
         unexplained = np.bincount(self._photo[strong & ~explained], minlength=num)
         scores = np.bincount(self._photo, score(errors), minlength=num)
         elsewhere = np.flatnonzero(scores < _OF_THE_PLACE * scores.max())
+        elsewhere = elsewhere[elsewhere != scores.argmax()]  # where hardly anything speaks for it
         left = elsewhere[np.argsort(-unexplained[elsewhere], kind="stable")]
         for _ in range(_MAX_PLACES):
             if len(left) == 0 or unexplained[left[0]] < _LEAST_SHARE * agreeing.max():
@@ -287,8 +302,10 @@ def _compared(
     """
     pairs = _Pairs(problem, proposed, best)
     seed = pairs.showing(pairs.errors(other.rig_from_world), photos)[0]
-    theirs = geometry.nearest_photos(seed, NUM_COMPARED)
     own = pairs.showing(pairs.errors(best.rig_from_world), pairs.all_photos)
+    theirs = geometry.nearest_photos(seed, NUM_COMPARED + 1)
+    # In a small map even the photo that shows the best place best is among the nearest.
+    theirs = theirs[theirs != own[0]][:NUM_COMPARED]
     own = own[~np.isin(own, theirs)][:NUM_COMPARED]
     pairs = _Pairs(problem, [each.matched_with(theirs, geometry) for each in proposed], best)
     threshold = problem.registration.max_error_px
@@ -333,7 +350,8 @@ def _is_rival(
     turned = rotation_angle(a.rotation @ b.rotation.T)
     if away <= _APART_REACH_SHARE * reach + _STDS * std and turned <= _APART_ANGLE:
         return False
-    return contradicts_priors(problem.constraints, b, other.covariance) is None
+    whole = problem.constraints.errors.whole(b, other.covariance)
+    return contradicts_priors(problem.constraints, b, whole) is None
 
 
 def _described(pose: GeneralizedPose, num: int, photo: int, geometry: MapGeometry) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import PIL.Image  # noqa: F401  Pillow saves PNGs only when it was imported before pycolmap
 import pycolmap
@@ -17,6 +19,12 @@ def colmap_camera(camera: Camera) -> pycolmap.Camera:
     )
 
 
+@lru_cache(maxsize=64)
+def _kept_camera(camera: Camera) -> pycolmap.Camera:
+    """Return the same as ``colmap_camera``, to be read only: a query asks for it dozens of times."""
+    return colmap_camera(camera)
+
+
 def pose_from_colmap(rigid: pycolmap.Rigid3d) -> Pose:
     """Return pycolmap's transform as ours, with a rotation that is a copy, not a view."""
     matrix = np.array(rigid.matrix(), dtype=np.float64)
@@ -30,7 +38,7 @@ def normalized_rays(camera: Camera, pixels: NDArray[np.floating]) -> NDArray[np.
     """
     if len(pixels) == 0:
         return np.empty((0, 3))
-    plane = np.asarray(colmap_camera(camera).cam_from_img(np.asarray(pixels, dtype=np.float64)))
+    plane = np.asarray(_kept_camera(camera).cam_from_img(np.asarray(pixels, dtype=np.float64)))
     return np.column_stack([plane, np.ones(len(plane))])
 
 
@@ -38,4 +46,4 @@ def project(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Project points (N, 3) in the camera's frame to pixels (N, 2); NaN behind the camera."""
     if len(points) == 0:
         return np.empty((0, 2))
-    return np.asarray(colmap_camera(camera).img_from_cam(points))
+    return np.asarray(_kept_camera(camera).img_from_cam(points))

@@ -72,15 +72,16 @@ def pose_covariance(
     slope = np.mean(weight**2)  # half the trace of the second derivative
     if slope == 0:  # all errors are huge
         return None
-    common, bread = _inverse(_squared(jacobian.reshape(-1, num_parameters))), _inverse(curvature)
-    if common is None or bread is None:
+    root = _root_of_inverse(_squared(jacobian.reshape(-1, num_parameters)))
+    bread = _inverse(curvature)
+    if root is None or bread is None:
         return None
     # Never quite zero: exact correspondences, as in tests, would leave nothing to compare.
-    common *= max(np.sum(psi**2) / spare, _MIN_VARIANCE_PX2) / slope**2
+    root *= math.sqrt(max(np.sum(psi**2) / spare, _MIN_VARIANCE_PX2)) / slope
     sandwich = bread @ scatter @ bread * (2 * num_points / spare)
     # The sandwich scatters by about 1 / sqrt(n) in each direction: the largest of both would be
     # too wide by that in half of them, were it not taken off first.
-    wider = _wider(common, sandwich / (1.0 + _SANDWICH_SCATTER / math.sqrt(num_points)))
+    wider = _wider(root, sandwich / (1.0 + _SANDWICH_SCATTER / math.sqrt(num_points)))
     if num_parameters == 6:
         return wider
     if wider[6, 6] > _MAX_FOCAL_STD**2:
@@ -115,20 +116,43 @@ def _squared(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _inverse(information: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Inverse of a symmetric positive matrix, None when it is not clearly positive."""
-    # Rotation and translation have different units: judge the conditioning without them.
+    scaled = _without_units(information)
+    if scaled is None:
+        return None
+    matrix, scale = scaled
+    return np.asarray(np.linalg.inv(matrix) / np.outer(scale, scale))
+
+
+def _root_of_inverse(information: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """A matrix whose product with its transpose is the inverse; None as ``_inverse``.
+
+    Rounding may leave the inverse itself without a root: far from the origin, rotation and
+    translation are nearly the same.
+    """
+    scaled = _without_units(information)
+    if scaled is None:
+        return None
+    matrix, scale = scaled
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(matrix)).T / scale[:, None])
+
+
+def _without_units(
+    information: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """A symmetric matrix scaled to a diagonal of 1, and the scale (k,).
+
+    None when it is not clearly positive. Rotation and translation have different units, which say
+    nothing about the conditioning.
+    """
     scale = np.sqrt(np.abs(np.diag(information)))
     if not (scale > 0).all():
         return None
-    units = np.outer(scale, scale)
-    if np.linalg.eigvalsh(information / units)[0] < _MIN_INFORMATION:
-        return None
-    return np.asarray(np.linalg.inv(information / units) / units)
+    matrix = information / np.outer(scale, scale)
+    return None if np.linalg.eigvalsh(matrix)[0] < _MIN_INFORMATION else (matrix, scale)
 
 
-def _wider(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The smallest covariance that is at least ``a`` and ``b`` along their common axes."""
-    scale = np.sqrt(np.diag(a))
-    root = scale[:, None] * np.linalg.cholesky(a / np.outer(scale, scale))
+def _wider(root: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The smallest covariance that is at least ``root root^T`` and ``b`` along common axes."""
     inverse = np.linalg.inv(root)
     ratios, axes = np.linalg.eigh(inverse @ b @ inverse.T)
     half = root @ (axes * np.sqrt(np.maximum(ratios, 1.0)))

@@ -182,6 +182,7 @@ def _minimized(
     for width, max_steps in zip(widths, _MAX_STEPS[-len(widths) :], strict=True):
         damping = _MIN_DAMPING
         normal = _normal_equations(state, max_error_px, width)
+        loss = _loss(state, max_error_px, width)
         for _ in range(max_steps):
             if normal is None:
                 return None
@@ -193,8 +194,9 @@ def _minimized(
             tried = _state(view, free, moved(state.rig_from_world, step[:6]), change)
             enough = _CONVERGED * normal.variance
             gain = -0.5 * float(normal.gradient @ step)
-            if _loss(tried, max_error_px, width) <= _loss(state, max_error_px, width):
-                state, damping = tried, max(damping / 10.0, _MIN_DAMPING)
+            tried_loss = _loss(tried, max_error_px, width)
+            if tried_loss <= loss:
+                state, loss, damping = tried, tried_loss, max(damping / 10.0, _MIN_DAMPING)
                 normal = _normal_equations(state, max_error_px, width)
             else:
                 damping = max(10.0 * damping, _REJECTED_DAMPING)

@@ -65,8 +65,11 @@ def has_derivative(errors: NDArray[np.float64], jacobian: NDArray[np.float64]) -
     Those that are not say nothing about how errors change with the pose. A camera of 180 degrees
     sees points so close to its edge that a step of the difference leaves the view.
     """
-    known = np.abs(jacobian).max(axis=(1, 2), initial=0.0) < _MAX_DERIVATIVE  # False for NaN
-    return np.asarray(known & np.isfinite(errors).all(axis=1))
+    # One row per derivative: a maximum over short rows takes ten times as long.
+    rows = np.ascontiguousarray(np.moveaxis(jacobian, 0, 2))
+    known = np.abs(rows).max(axis=(0, 1), initial=0.0) < _MAX_DERIVATIVE  # False for NaN
+    x, y = errors.T
+    return np.asarray(known & np.isfinite(x) & np.isfinite(y))
 
 
 def _projected(
@@ -76,8 +79,12 @@ def _projected(
 
     They work for every camera model; their error is about 1e-9 relative.
     """
-    step = 1e-5 * np.linalg.norm(in_cam, axis=1)
-    shifts = step[:, None] * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])[:, None]
+    x, y, z = in_cam.T  # column by column: a sum over rows of three takes four times as long
+    step = 1e-5 * np.sqrt(x * x + y * y + z * z)
+    shifted = np.tile(in_cam, (7, 1, 1))
+    for axis in range(3):
+        shifted[1 + axis, :, axis] += step
+        shifted[4 + axis, :, axis] -= step
     # All at once: with few points, the calls take longer than the work.
-    pixels = project(camera, (in_cam + shifts).reshape(-1, 3)).reshape(7, -1, 2)
+    pixels = project(camera, shifted.reshape(-1, 3)).reshape(7, -1, 2)
     return pixels[0], np.stack([*(pixels[1:4] - pixels[4:])], axis=2) / (2 * step)[:, None, None]

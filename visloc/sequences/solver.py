@@ -45,7 +45,12 @@ _UNCHECKED_SHARE = 0.05
 # Searching a window in which no instant has its own pose takes seconds. After a search in vain, the
 # next one waits for this many new instants.
 _BLIND_REST = 10
-_NO_EVIDENCE = (Reason.CONTRADICTS_PRIOR, Reason.AMBIGUOUS, Reason.CAMERA_CONTRADICTED)
+_NO_EVIDENCE = (
+    Reason.CONTRADICTS_PRIOR,
+    Reason.AMBIGUOUS,
+    Reason.CAMERA_CONTRADICTED,
+    Reason.UNLIKELY_POSE,
+)
 _CONTRADICTED = Refusal(
     "gate",
     Reason.CONTRADICTS_MOTION,
@@ -377,7 +382,7 @@ def _window_instant(solved: Solved, errors: MapErrors) -> WindowInstant:
     if refusal is not None and refusal.reason in _NO_EVIDENCE:
         # Matches under wrong priors could pass together the gate that refused each alone. Matches
         # that another map explains as well are no evidence for this one. Pixels of a wrong camera
-        # fit a wrong pose.
+        # fit a wrong pose. A print or another floor is as unlikely in the next photo.
         return WindowInstant((), None)
     if any(view.focal_unknown for view in solved.views):
         # A window takes cameras as they are: such pixels would fit a wrong pose.

@@ -447,8 +447,14 @@ class Building:
         center = around.T @ [0.0, -1.0, 0.0] + [0.0, 0.0, FLOOR * floor + 1.6]
         return Pose(rotation, -rotation @ center)
 
-    def ask(self, place: Any, floor: int, priors: Priors) -> Answer:
+    def ask(self, place: Any, floor: int, priors: Priors, top_k: int = 4) -> Answer:
         """Localize a photo of a floor, a little beside one of the map's."""
+        options = LocalizeOptions(top_k=top_k, min_inliers=15)
+        features = self.features(place, floor)
+        return self.localizer.localize_features(features, place.camera, options, priors)
+
+    def features(self, place: Any, floor: int) -> QueryFeatures:
+        """What that photo shows."""
         rng = np.random.default_rng(7)
         pose = self.pose(floor, 2.2)
         pixels = project(place.camera, pose.apply(self.landmarks[floor]))
@@ -458,14 +464,12 @@ class Building:
             & (pixels < [640, 480]).all(1)
         )
         like = self.globals[floor, 2] + 0.2 * self._units(rng, 1, 64)[0]
-        features = QueryFeatures(
+        return QueryFeatures(
             "kapture:A",
             pixels[seen] + rng.normal(size=(len(seen), 2)) * 0.4,
             self.descriptors[floor, seen].astype(np.float32),
             {"kapture:B": like},
         )
-        options = LocalizeOptions(top_k=4, min_inliers=15)
-        return self.localizer.localize_features(features, place.camera, options, priors)
 
     def band(self, floor: int) -> HeightBand:
         return HeightBand(FLOOR * floor, FLOOR * floor + FLOOR)

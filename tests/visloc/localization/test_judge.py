@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -119,6 +120,32 @@ def test_a_set_that_could_not_decide_leaves_no_room_for_a_weaker_answer() -> Non
 
     assert judge(of(localized(200), undecided), one_frame) == 1
     assert judge(of(localized(601), undecided), one_frame) == 0
+
+
+def test_a_wrong_camera_in_one_place_makes_no_other_place_right() -> None:
+    wrong_camera = refused(300, Reason.CAMERA_CONTRADICTED)
+
+    assert judge(of(localized(60), wrong_camera), one_frame) == 1
+    assert judge(of(localized(301), wrong_camera), one_frame) == 0
+
+
+def with_scores(answer: Any, scores: Any) -> Any:
+    return replace(answer, scores=np.array(scores, np.float32))
+
+
+def test_a_place_of_few_inliers_is_a_rival_unless_the_keypoints_speak_against_it() -> None:
+    both, one, none = np.ones(40), np.ones(20), np.zeros(20)
+    best = with_scores(localized(200), np.concatenate([both, one]))
+    like = with_scores(localized(60, (100, 0, 0)), np.concatenate([both, none]))
+    unlike = with_scores(localized(60, (100, 0, 0)), np.concatenate([0 * both, none]))
+
+    undecided = judge(of(best, like), one_frame)
+
+    assert isinstance(undecided, Refusal)
+    assert undecided.reason is Reason.AMBIGUOUS
+    assert judge(of(best, unlike), one_frame) == 0
+    # Of other keypoints, which cannot be compared.
+    assert judge(of(best, with_scores(like, [1.0])), one_frame) == 0
 
 
 def test_without_a_pose_the_answer_that_came_furthest_counts() -> None:

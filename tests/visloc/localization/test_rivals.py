@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -7,10 +8,13 @@ import pytest
 
 from tests.visloc.localization.test_constraints import Building, assert_on
 from visloc.archive import MapStore
+from visloc.geometry import Pose
 from visloc.localization.localizer import Localizer
 from visloc.localization.rivals import SURE, preference, score
+from visloc.localization.solving import SeenImage, Solved
+from visloc.options import LocalizeOptions
 from visloc.priors import NO_PRIORS, Priors
-from visloc.types import NotLocalized, Reason
+from visloc.types import CameraSource, NotLocalized, Reason
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +62,18 @@ def test_identical_places_are_refused_with_both_named(
     assert answer.message.count("inliers in") == 2
 
 
+@pytest.mark.parametrize("top_k", [2, 3, 16])
+@pytest.mark.parametrize("floor", [0, 1])
+def test_however_many_photos_are_searched_identical_places_are_told_from_no_other(
+    room: Localizer, place: Any, floor: int, top_k: int
+) -> None:
+    """With two, all that show one place are among the nearest to the photo of the other."""
+    answer = Building(room, 0.0, 0.0).ask(place, floor, NO_PRIORS, top_k)
+
+    assert isinstance(answer, NotLocalized)
+    assert answer.reason is Reason.AMBIGUOUS
+
+
 @pytest.mark.parametrize("floor", [0, 1])
 def test_a_sign_decides_between_places_that_are_otherwise_identical(
     room: Localizer, place: Any, floor: int
@@ -84,6 +100,43 @@ def test_a_prior_that_excludes_one_of_two_identical_places_decides(
     building = Building(room, 0.0, 0.0)
 
     assert_on(building.ask(place, floor, Priors(height=building.band(floor))), floor)
+
+
+def rig_beside(building: Building, place: Any, other: str) -> Solved:
+    """Two cameras: one sees a floor, the other nothing, or the same with a camera that is a guess.
+
+    A rig leaves out cameras that are a guess.
+    """
+    options = LocalizeOptions(top_k=4, min_inliers=15)
+    features = building.features(place, 0)
+    none = replace(features, keypoints=features.keypoints[:0], descriptors=features.descriptors[:0])
+    sees = building.localizer.look_at_features(features, place.camera, options)
+    if other == "blank":
+        beside = building.localizer.look_at_features(none, place.camera, options)
+    else:
+        evidence = replace(sees.evidence, camera_source=CameraSource.GUESS)
+        beside = replace(sees, evidence=evidence)
+    looks = {"cam0": sees, "cam1": beside}
+    images = [SeenImage(sensor, Pose.identity(), look) for sensor, look in looks.items()]
+    return building.localizer.solve(images, options)
+
+
+@pytest.mark.parametrize("other", ["blank", "guess"])
+def test_a_camera_that_shows_nothing_does_not_hide_a_second_place(
+    room: Localizer, place: Any, other: str
+) -> None:
+    refusal = rig_beside(Building(room, 0.0, 0.0), place, other).answer.refusal
+    assert refusal is not None
+    assert refusal.reason is Reason.AMBIGUOUS
+
+
+def test_a_camera_that_was_left_out_speaks_for_no_place(room: Localizer, place: Any) -> None:
+    building = Building(room, 0.5, 0.5)
+    num = len(building.features(place, 0).keypoints)
+    scores = rig_beside(building, place, "guess").answer.scores
+    assert scores[:num].any()
+    assert len(scores) == 2 * num
+    assert not scores[num:].any()
 
 
 def test_a_single_keypoint_decides_nothing() -> None:

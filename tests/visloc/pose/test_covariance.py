@@ -167,6 +167,24 @@ def test_where_the_rig_has_its_origin_does_not_change_what_is_known() -> None:
     assert new == pytest.approx(turn @ old @ turn.T, rel=1e-6, abs=1e-9)
 
 
+def test_far_from_the_origin_the_centre_is_as_uncertain_or_undetermined() -> None:
+    """There, rotation and translation are nearly the same, and rounding eats what tells them."""
+    num_stated = 0
+    for seed in range(80):
+        exact, truth = look(seed, ALONE, 40)
+        (view,) = noisy(exact, truth, np.random.default_rng(seed), 1.0, 0.0)
+        near = pose_covariance([view], truth, LOSS_SCALE_PX)
+        assert near is not None
+        away = 1e4 * (0.8 + 0.02 * seed) * np.array([0.6, 0.64, 0.48])
+        shifted = Pose(truth.rotation, truth.translation - truth.rotation @ away)
+        far = pose_covariance([replace(view, points=view.points + away)], shifted, LOSS_SCALE_PX)
+        if far is not None:
+            num_stated += 1
+            stated, expected = position_covariance(shifted, far), position_covariance(truth, near)
+            assert np.trace(stated) == pytest.approx(np.trace(expected), rel=0.05)
+    assert num_stated >= 20
+
+
 def test_views_without_inliers_do_not_matter() -> None:
     views, truth = look(5, SURROUND, 80)
     empty = replace(views[0], pixels=np.empty((0, 2)), points=np.empty((0, 3)))

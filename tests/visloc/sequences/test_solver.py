@@ -18,7 +18,7 @@ from visloc.priors import NO_PRIORS, HeightBand, PositionPrior, Priors
 from visloc.sequences import solver as sequence_module
 from visloc.sequences.filling import MAX_GAP_S, Odometry, TimeUnit
 from visloc.sequences.solver import MAX_WAITING, SeenInstant, SequenceSolver
-from visloc.types import CameraSource, InstantAnswer, PoseSource, Reason
+from visloc.types import CameraSource, InstantAnswer, PoseSource, Reason, Refusal
 
 OPTIONS = LocalizeOptions()
 ODOMETRY_FROM_LOCAL = Pose(
@@ -442,6 +442,23 @@ def test_many_weak_frames_localize_all(here: Any) -> None:
     answers = answers_to(solver(here, 1.0), instants_of(here, "wwwww", moving=True))
     check_answers(answers, here, [rig_at(i) for i in range(5)])
     assert all(answer.pose is not None for answer in answers)
+
+
+@pytest.mark.parametrize(
+    "reason", [Reason.AMBIGUOUS, Reason.CAMERA_CONTRADICTED, Reason.UNLIKELY_POSE]
+)
+def test_photos_with_evidence_against_their_pose_do_not_pass_together(
+    here: Any, reason: Reason
+) -> None:
+    """A print, or another floor, that is filmed is in every photo."""
+    solving = solver(here, 1.0)
+    answers = []
+    for seen in instants_of(here, "ggggg", moving=True):
+        refused = solving.solve(seen).refused(Refusal("gate", reason, "refused"))
+        answers += solving.take(seen, refused)
+    answers += solving.finish()
+    assert sources(answers) == "-----"
+    assert {a.refusal.reason for a in answers if a.refusal is not None} == {reason}
 
 
 def test_motion_reaches_no_further_than_the_gap(here: Any) -> None:
