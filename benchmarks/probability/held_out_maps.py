@@ -15,6 +15,8 @@ from visloc.retrieval.rows import GlobalRows
 
 def without(opened: Map, photos: NDArray[np.int64]) -> Map:
     """Leave out photos (k,) and the landmarks that need them; rows of landmarks stay."""
+    if len(photos) == 0:
+        return opened
     gone = vanishing(opened, photos)
     kept = np.setdiff1d(np.arange(len(opened.images)), photos)
     offsets = opened.observation_offsets

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, f
+from scipy.special import chdtri, fdtri
 
 from visloc.archive.schema import MAX_FACTOR
 
@@ -14,13 +14,14 @@ _DIMENSIONS = 3
 # Of Student's t. Among held-out mapping photos errors scatter nearly like a normal distribution
 # around what a map adds; eight degrees of freedom leave room for some that do not.
 _FREEDOM = 8
-# Before a map has said anything: the median over seven maps and the weight, in photos, of that.
+# Before a map has said anything: about what six maps had in the median, and the weight of that in
+# photos.
 _PRIOR_FACTOR, _PRIOR_PHOTOS = 2.0, 8.0
 # A covariance is read with normal quantiles. So that 95 % of such errors lie in the ellipsoid that
 # a normal distribution has for 95 %, it is wider by the ratio of both quantiles.
 _SHARE = 0.95
 _TAIL = math.sqrt(
-    _DIMENSIONS * f.ppf(_SHARE, _DIMENSIONS, _FREEDOM) / chi2.ppf(_SHARE, _DIMENSIONS)
+    _DIMENSIONS * fdtri(_DIMENSIONS, _FREEDOM, _SHARE) / chdtri(_DIMENSIONS, 1.0 - _SHARE)
 )
 _MAX_ROUNDS, _SETTLED = 200, 1e-9
 _LEAST_VARIANCE = 1e-12

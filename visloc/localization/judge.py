@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visloc.geometry import Similarity, rotation_angle
-from visloc.localization.rivals import preference
+from visloc.localization.preference import preference
 from visloc.pose.centre import largest_std, moved_pose, position_covariance
 from visloc.types import InstantAnswer, Reason, Refusal, RigPose
 
@@ -22,7 +22,7 @@ from visloc.types import InstantAnswer, Reason, Refusal, RigPose
 # ambiguous. Among the answers above the second share, the most certain wins.
 _RIVAL_SHARE, _SIMILAR_SHARE = 0.5, 0.8
 # A place with fewer is a rival too, unless the keypoints speak for the other place by this many
-# standard deviations (``visloc.localization.rivals.preference``). More than within a map: maps
+# standard deviations (``visloc.localization.preference``). More than within a map: maps
 # differ in how well they were made, and neighbouring keypoints err together.
 SURE_OF_MAPS = 5.0
 # Two answers agree when they differ by less than three standard deviations plus the slack of the

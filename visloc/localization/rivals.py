@@ -20,6 +20,7 @@ from visloc.geometry import Pose, rotation_angle
 from visloc.localization.constraints import MapGeometry
 from visloc.localization.evidence import Shown
 from visloc.localization.gates import GATES, Problem, contradicts_priors, first_refusal
+from visloc.localization.preference import SURE, preference
 from visloc.matching.correspondences import Proposals, propose_landmarks
 from visloc.matching.products import round_descriptors
 from visloc.pose.centre import largest_std
@@ -43,8 +44,6 @@ _PLACE_REACH_SHARE = 0.5
 _APART_REACH_SHARE, _APART_ANGLE, _STDS = 0.2, math.radians(10.0), 3.0
 # The probability to miss a pose with half the share of inliers, and the fewest trials.
 _MISSED, _MIN_TRIALS = 0.01, 100
-# One of two equal places seems as much better as this once in a hundred times (one-sided normal).
-SURE = 2.33
 # Matches by chance spread evenly over the disc of the inlier threshold, right ones lie in its
 # middle. What lies within this share of the radius counts for a pose ...
 _MIDDLE = 1 / 3
@@ -320,22 +319,6 @@ def _compared(
     first, second = scores
     is_clear = preference(second, np.zeros_like(second)) >= SURE
     return preference(first, second), is_clear, compared
-
-
-def preference(first: NDArray[np.floating], second: NDArray[np.floating]) -> float:
-    """Say how surely the keypoints speak for the first of two places, in standard deviations.
-
-    Args:
-        first: (k,) scores of the keypoints in one place.
-        second: (k,) of the same keypoints in the other place.
-
-    Returns:
-        The sum of the differences over the root of the sum of their squares: about standard
-        normal when neither place explains the photo better. 0 when nothing differs.
-    """
-    difference = first - second
-    spread = float(np.sqrt((difference * difference).sum()))
-    return float(difference.sum()) / spread if spread > 0.0 else 0.0
 
 
 def _is_rival(

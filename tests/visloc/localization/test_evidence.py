@@ -14,14 +14,18 @@ from visloc.archive import MapStore
 from visloc.features import make_local_features
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo, read_photo
+from visloc.localization.constraints import Constraints
 from visloc.localization.evidence import FEATURES, SeenView, Shown, evidence_of
+from visloc.localization.gates import Problem, likely
 from visloc.localization.localizer import Localizer
 from visloc.localization.probability import read_model, shipped_model
 from visloc.matching.products import EightBitRows
 from visloc.options import LocalizeOptions
 from visloc.pose.colmap import project
+from visloc.pose.generalized import GeneralizedPose
 from visloc.pose.views import MatchedView
-from visloc.types import Localized, NotLocalized, Reason
+from visloc.priors import NO_PRIORS
+from visloc.types import CameraSource, Localized, NotLocalized, Reason, Refusal
 
 OPTIONS = LocalizeOptions()
 
@@ -166,21 +170,24 @@ def test_a_print_is_never_believed(
         assert isinstance(answer, NotLocalized), answer.probability
 
 
-def test_who_names_thresholds_gets_the_pose_and_its_probability(
-    localizer: Localizer, queries: list[Query]
-) -> None:
-    rgb = read_photo(queries[0].image).rgb
-    scene = np.random.default_rng(1).integers(0, 255, (400, 640, 3), dtype=np.uint8)
-    scene[100 : 100 + rgb.shape[0], 200 : 200 + rgb.shape[1]] = rgb
-    camera = Camera("SIMPLE_PINHOLE", 640, 400, (600.0, 320.0, 200.0))
-    asked = LocalizeOptions(min_inliers=12, min_inlier_ratio=0.001)
-    believed = localizer.localize(Photo(scene), camera, asked)
-    assert isinstance(believed, Localized)
+def test_who_names_thresholds_gets_the_pose_and_its_probability(localizer: Localizer) -> None:
+    """The photo shows a tenth of what the map has there; the pose is uncertain by a metre."""
+    seen, pose = seen_from(localizer, 0, shown_share=0.1)
+    found = GeneralizedPose(pose, (seen.inliers,), np.eye(6))
+
+    def judged(options: LocalizeOptions) -> tuple[GeneralizedPose, Refusal | None]:
+        constraints = Constraints(localizer.geometry, NO_PRIORS)
+        sources = (CameraSource.GIVEN,)
+        return likely(Problem((seen.view,), sources, options, constraints, (seen.shown,)), found)
+
+    believed, none = judged(LocalizeOptions(min_inliers=12))
+    refused, refusal = judged(OPTIONS)
+
+    assert none is None
     assert believed.probability is not None
-    assert believed.probability < 0.5
-    refused = localizer.localize(Photo(scene), camera, OPTIONS)
-    assert isinstance(refused, NotLocalized)
-    assert refused.reason in (Reason.UNLIKELY_POSE, Reason.LOW_INLIER_RATIO)
+    assert believed.probability == refused.probability < 0.1
+    assert refusal is not None
+    assert refusal.reason is Reason.UNLIKELY_POSE
 
 
 def test_a_model_of_other_features_is_refused(tmp_path: Path) -> None:

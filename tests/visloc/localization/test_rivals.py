@@ -10,7 +10,8 @@ from tests.visloc.localization.test_constraints import Building, assert_on
 from visloc.archive import MapStore
 from visloc.geometry import Pose
 from visloc.localization.localizer import Localizer
-from visloc.localization.rivals import SURE, preference, score
+from visloc.localization.preference import SURE, preference
+from visloc.localization.rivals import score
 from visloc.localization.solving import SeenImage, Solved
 from visloc.options import LocalizeOptions
 from visloc.priors import NO_PRIORS, Priors
