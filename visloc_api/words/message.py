@@ -31,21 +31,30 @@ MAX_JSON_VALUES = 11_000
 MAX_INSTANT_VALUES = 100_000
 
 
-class IncomingMessage(BaseModel):
+if TYPE_CHECKING:  # a type checker shall see the fields
+    _Made = BaseModel
+else:
+
+    class _Making(type(BaseModel)):
+        """Lets messages that are made in Python raise as ``IncomingMessage.read``.
+
+        Not an ``__init__``: pydantic would call it for messages within messages too, and lose
+        their place and limits.
+        """
+
+        def __call__(cls, **given: Any) -> Any:
+            return cls._checked(lambda: super(_Making, cls).__call__(**given))
+
+    class _Made(BaseModel, metaclass=_Making):
+        pass
+
+
+class IncomingMessage(_Made):
     """A request, or a part of one. Unknown fields are refused by name."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, defer_build=True)
     # Where this message sits in the request, for errors of what is read on its own.
     path: ClassVar[str] = ""
-
-    if not TYPE_CHECKING:  # a type checker shall see the fields
-
-        def __init__(self, **given: Any) -> None:
-            """Make a message in Python; raises as ``read``."""
-            self._checked(lambda: BaseModel.__init__(self, **given))
-
-        # Else pydantic calls it for messages within messages too, and loses their place and limits.
-        __init__.__pydantic_base_init__ = True
 
     @model_validator(mode="before")
     @classmethod
