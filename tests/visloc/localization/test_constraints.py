@@ -58,7 +58,7 @@ def test_the_reach_is_the_median_distance_to_what_photos_see(place: Any) -> None
 
 def test_a_map_whose_photos_see_nothing_has_no_reach_and_can_be_searched(place: Any) -> None:
     geometry = place.geometry_of([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
-    geometry._map.observation_offsets = np.zeros(3, dtype=np.int64)
+    geometry.opened.observation_offsets = np.zeros(3, dtype=np.int64)
     assert geometry.reach == 0.0
     prior = Priors(PositionPrior(np.zeros(3), 1.0))
     assert Constraints(geometry, prior).photo_weights == pytest.approx([1.0, 0.0])
