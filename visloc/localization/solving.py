@@ -17,9 +17,7 @@ from visloc.localization.gates import Problem, accepted, not_better_elsewhere
 from visloc.localization.rivals import Proposed, stronger_place
 from visloc.options import LocalizeOptions, ReadAs, Solver
 from visloc.pose.centre import position_covariance, with_origin
-from visloc.pose.generalized import (
-    GeneralizedPose,
-)
+from visloc.pose.generalized import GeneralizedPose
 from visloc.pose.views import MatchedView
 from visloc.priors import Priors
 from visloc.timing import timed
@@ -162,6 +160,10 @@ def solve_instant(
         )
         if refusal is None or refusal.reason is not Reason.CONTRADICTS_PRIOR:
             elsewhere = _views_of(images, [look.elsewhere for look in looks], options)
+            elsewhere = tuple(  # of a search that does not believe EXIF, with its camera
+                replace(view, focal_unknown=searched.focal_unknown)
+                for view, searched in zip(elsewhere, problem.views, strict=True)
+            )
             refusal = not_better_elsewhere(problem.of(elsewhere), found) or refusal
         proposed = [look.proposed for look in looks if look.proposed is not None]
         if refusal is None and found is not None and len(proposed) == len(looks):
@@ -326,7 +328,9 @@ def _find_pose(
     if refusal is not None:
         return problem, None, refusal
     best, refusal = _judged(problem)
-    if refusal is not None and refusal.reason is Reason.CAMERA_CONTRADICTED and best is not None:
+    # A wrong focal length moves the pose, so that it may contradict a prior first.
+    reasons = (Reason.CAMERA_CONTRADICTED, Reason.CONTRADICTS_PRIOR)
+    if refusal is not None and refusal.reason in reasons and best is not None:
         as_guess = _without_exif(problem, best)
         if as_guess is not None:
             return as_guess, *_judged(as_guess)

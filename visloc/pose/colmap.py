@@ -21,7 +21,7 @@ def colmap_camera(camera: Camera) -> pycolmap.Camera:
 
 @lru_cache(maxsize=64)
 def _kept_camera(camera: Camera) -> pycolmap.Camera:
-    """Return ``colmap_camera``, only to be read: a query asks for it dozens of times."""
+    """Return the same as ``colmap_camera``, to be read only; a query asks dozens of times."""
     return colmap_camera(camera)
 
 

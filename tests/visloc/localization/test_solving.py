@@ -24,7 +24,7 @@ from visloc.priors import (
     PositionPrior,
     Priors,
 )
-from visloc.types import PoseSource, Reason, Refusal, Uncertainty
+from visloc.types import CameraSource, PoseSource, Reason, Refusal, Uncertainty
 
 OPTIONS = LocalizeOptions()
 TRUTH = Pose(Rotation.from_rotvec([0.3, -1.2, 0.4]).as_matrix(), np.array([1.0, -2.0, 0.5]))
@@ -507,6 +507,23 @@ def test_a_place_that_the_priors_exclude_and_that_fits_better_refuses_the_answer
     for count, expected in ((100, Reason.CONTRADICTS_PRIOR), (75, None), (20, None), (0, None)):
         image = hall.image(inside, elsewhere=hall.matches(other, count, 30 if count else 0, seed=5))
         assert reason(solve([image], hall, priors)) is expected
+
+
+def test_what_the_priors_exclude_is_searched_without_exif_where_the_photo_contradicts_it(
+    hall: Any,
+) -> None:
+    _, other = twins(hall, 1, 1)
+    priors = Priors(PositionPrior(hall.to_world(TRUTH).center, 20.0))
+    wrong = Camera("SIMPLE_PINHOLE", 640, 480, (1000.0, 322.0, 239.0))
+    for count, expected in ((400, Reason.CONTRADICTS_PRIOR), (0, None)):
+        image = hall.image(
+            hall.matches(TRUTH, 200, 30, seed=1), elsewhere=hall.matches(other, count, seed=5)
+        )
+        evidence = replace(image.look.evidence, camera=wrong, camera_source=CameraSource.EXIF)
+        image = replace(image, look=replace(image.look, evidence=evidence))
+        solved = solve([image], hall, priors)
+        assert reason(solved) is expected
+        assert solved.views[0].focal_unknown
 
 
 def test_a_photo_that_shows_only_what_the_priors_exclude_is_told_so(hall: Any) -> None:
