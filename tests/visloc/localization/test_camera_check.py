@@ -18,7 +18,7 @@ from visloc.pose.colmap import project
 from visloc.pose.generalized import estimate_generalized_pose
 from visloc.pose.intrinsics import ASPECT, FOCAL, SHIFT_X, SHIFT_Y, find_intrinsics
 from visloc.pose.views import MatchedView
-from visloc.priors import NO_PRIORS
+from visloc.priors import NO_PRIORS, PositionPrior, Priors
 from visloc.types import CameraSource, Reason
 
 TRUTH = Pose(Rotation.from_rotvec([0.3, -1.2, 0.4]).as_matrix(), np.array([1.0, -2.0, 0.5]))
@@ -218,6 +218,17 @@ def test_a_wrong_focal_length_of_exif_gives_way_to_the_one_found(place: Any) -> 
     assert evidence.camera_source is CameraSource.ESTIMATED
     assert evidence.camera.focal_length == pytest.approx(520.0, rel=0.02)
     assert all(view.focal_unknown for view in solved.views)  # a sequence takes it for no evidence
+
+
+def test_exif_gives_way_where_its_pose_contradicts_a_prior(place: Any) -> None:
+    wrong = Camera("SIMPLE_PINHOLE", 640, 480, (700.0, 320.0, 240.0))
+    priors = Priors(PositionPrior(TRUTH.center + place.geometry.origin, 0.3))
+    image = with_camera(place.image(seen_by(RIGHT)), wrong, CameraSource.EXIF)
+
+    solved = solve_instant([image], place.geometry, LocalizeOptions(), priors)
+
+    assert solved.answer.pose is not None
+    assert solved.views[0].focal_unknown
 
 
 def test_exif_of_a_cropped_photo_is_no_reason_to_guess(place: Any) -> None:
