@@ -25,6 +25,7 @@ from visloc.archive.schema import (
     FingerprintRecord,
     ImageRecord,
     OwnTest,
+    Parts,
     RetrievalRecord,
     Vector,
 )
@@ -193,9 +194,7 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
             "landmarks": len(landmarks.points),
             "observations": len(landmarks.observed),
         },
-        "parts": {}
-        if content.own_test is None
-        else {"own_test": content.own_test.model_dump(mode="json")},
+        "parts": Parts(own_test=content.own_test).model_dump(mode="json", exclude_none=True),
         "notes": list(content.notes),
         "files": files.entries(),
     }

@@ -46,7 +46,7 @@ from visloc.matching.correspondences import (
     Proposals,
     propose_landmarks,
 )
-from visloc.matching.products import EightBitRows, round_descriptors, start_threads
+from visloc.matching.products import round_descriptors, start_threads
 from visloc.options import LocalizeOptions, Matcher, ReadAs
 from visloc.priors import NO_PRIORS, Priors
 from visloc.retrieval.fusion import LateFusion, chosen_fusion
@@ -383,11 +383,9 @@ class Localizer:
         rematching: Rematching | None,
     ) -> Proposals:
         """Match with the landmarks that these photos see, best photo first."""
-        scale = self.map.manifest.local_features.descriptor_scale
-        observed = (self.map.observations(int(photo)) for photo in photos)
         return propose_landmarks(
             shown.descriptors,
-            ((landmarks, EightBitRows(rows, scale)) for landmarks, rows in observed),
+            (self.geometry.observed(photo) for photo in photos),
             CLEAR_RATIO if options.matcher is Matcher.RATIO else None,
             None if rematching is None else lambda rank: rematching.match(int(photos[rank])),
         )
@@ -412,14 +410,13 @@ class Localizer:
         """
         if weights is None:
             return np.empty(0, dtype=np.int64)
-        excluded = np.asarray(weights == 0, dtype=np.float64)
-        others = retrieve(query, self.map.global_descriptors, _NUM_ELSEWHERE, excluded, fusion)
+        excluded, index = np.asarray(weights == 0, dtype=np.float64), self.map.global_descriptors
+        others = retrieve(query, index, _NUM_ELSEWHERE, excluded, fusion)
         # Fuse both lists together: scores that are ranks only compare within one ranking.
-        found, num = (retrieved.similarities, others.similarities), len(retrieved.images)
-        scores = fusion.scores({name: np.concatenate([f[name] for f in found]) for name in query})
+        both, num = (retrieved.similarities, others.similarities), len(retrieved.images)
+        scores = fusion.scores({name: np.concatenate([f[name] for f in both]) for name in query})
         best = np.sort(scores[:num])[::-1][:_NUM_ELSEWHERE]
-        close = scores[num:] > best.min(initial=np.inf)
-        return np.asarray(others.images[close])
+        return np.asarray(others.images[scores[num:] > best.min(initial=np.inf)])
 
     def _describe(self, name: str, features: _Features) -> NDArray[np.float32]:
         if name in features.sent:
@@ -436,24 +433,16 @@ class Localizer:
         return self._extractor is not None and set(counted) <= set(self._descriptors)
 
     def _features_required(self, fusion: LateFusion) -> VislocError:
+        names = ", ".join(fusion.counted(self.map.global_descriptors))
         kind = self.map.manifest.local_features.fingerprint.name
-        names = fusion.counted(self.map.global_descriptors)
-        return refuse(
-            "features.required",
-            field="image",
-            expected=f"features of kind {kind}, with {', '.join(names)}",
-            got="a photo",
-        )
+        expected = f"features of kind {kind}, with {names}"
+        return refuse("features.required", field="image", expected=expected, got="a photo")
 
     def _describe_retrieved(self, retrieved: Retrieved) -> Iterator[RetrievedImage]:
         for rank, image in enumerate(retrieved.images):
-            yield RetrievedImage(
-                name=self.map.images[image].name,
-                score=float(retrieved.scores[rank]),
-                similarities={
-                    name: float(values[rank]) for name, values in retrieved.similarities.items()
-                },
-            )
+            similarities = {name: float(row[rank]) for name, row in retrieved.similarities.items()}
+            score = float(retrieved.scores[rank])
+            yield RetrievedImage(self.map.images[image].name, score, similarities)
 
 
 def _nothing(evidence: Evidence, stage: Stage, reason: Reason, message: str) -> Look:

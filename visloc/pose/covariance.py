@@ -69,10 +69,8 @@ def pose_covariance(
     curvature = _squared(by_weight.reshape(-1, num_parameters)) - 2.0 / loss_scale_px**2 * scatter
 
     spare = 2 * num_points - num_parameters
-    slope = np.mean(weight**2)  # half the trace of the second derivative
-    if slope == 0:  # all errors are huge
-        return None
-    root = _root_of_inverse(_squared(jacobian.reshape(-1, num_parameters)))
+    slope = np.mean(weight**2)  # half the trace of the second derivative; 0 for huge errors
+    root = None if slope == 0 else _root_of_inverse(_squared(jacobian.reshape(-1, num_parameters)))
     bread = _inverse(curvature)
     if root is None or bread is None:
         return None
