@@ -124,7 +124,7 @@ def _places(by_scenario: dict[str, list[Outcome]]) -> Iterator[str]:
     yield from _table("Other floors, other places, and the same place at night", _COUNTS, rows)
 
 
-LIKELY = 0.5
+LIKELY = 0.8
 _OF_LIKELY = f"right, wrong at a probability of {LIKELY}"
 _COUNTS = ("what", "photos", "accepted", "right", "wrong", _OF_LIKELY, "refused because")
 
