@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from benchmarks.probability.disguises import DISGUISES, Image, printed, resembling
 from benchmarks.probability.held_out_maps import without
+from mapping.report.look_alikes import shares_place
 from mapping.report.viewpoints import Viewpoints
 from samples.render import render_photo
 from samples.scene import NUM_SURFACES, make_room
@@ -40,7 +41,6 @@ _LEAST_MATCHES, _LEAST_INLIERS = 20, 12  # far below what any gate lets through
 # How many parts of a map are left out in turn: every third photo, then two quarters in a row.
 _THIRDS, _QUARTERS = 3, (1, 2)
 _APART = (0.35, 0.6, 0.9)  # radians, within which all photos are left out
-_ELSEWHERE_APART = 1.2
 _DISGUISES_PER_PHOTO, _PRINTS_PER_PHOTO = 3, 2
 # Of painted rooms: shares of surfaces that are painted anew, and from which share of a photo's
 # pixels on it shows another room. With less it shows the same room, changed.
@@ -122,14 +122,8 @@ class Teacher:
 
     def from_elsewhere(self, num_photos: int) -> Iterator[Taught]:
         """Ask about photos of a part of the place of which the map has nothing."""
-        count = len(self._full.images)
-        for image in _evenly(np.arange(count), num_photos):
-            seen = self._full.observations(image)[0]
-            shares = np.array(
-                [np.isin(self._full.observations(i)[0], seen).any() for i in range(count)]
-            )
-            apart = self._viewpoints.apart_from(self._viewpoints.pose(image))
-            left_out = np.flatnonzero(shares | (apart < _ELSEWHERE_APART))
+        for image in _evenly(np.arange(len(self._full.images)), num_photos):
+            left_out = np.flatnonzero(shares_place(self._full, self._viewpoints, image))
             yield from self._ask_without(image, left_out, "elsewhere")
 
     def painted(self, seed: int, num_photos: int) -> Iterator[Taught]:

@@ -171,6 +171,7 @@ def summary_of_report(data: Mapping[str, Any]) -> dict[str, Any]:
         "likely": sum(chance >= 0.9 for chance in chances) / len(chances) if chances else None,
         "unlikely": sum(chance < 0.1 for chance in chances) / len(chances) if chances else None,
         "weak_spots": data["coverage"]["weak_spots"],
+        "look_alikes": data["look_alikes"],
     }
 
 
@@ -245,6 +246,8 @@ def _print_summary(summary: Mapping[str, Any], *, metric: bool, decimals: int) -
             )
         OUT.print(table, highlight=False)
         say("looking: as a clock on the plan of the report, where 12 is up")
+    for pair in summary["look_alikes"]:
+        say(f"look-alikes: {pair['told']}")
     if summary["up"] != "gravity":
         say(f"note: {UP_IS_A_GUESS}")
     say(f"report: {summary['output']}")

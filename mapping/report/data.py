@@ -14,6 +14,7 @@ from mapping.cluster.workers import Workers
 from mapping.report.cameras import camera_lines
 from mapping.report.grid import Grid, Plan, forecast_grid, make_grid
 from mapping.report.held_out import HeldOut, hold_out
+from mapping.report.look_alikes import LookAlike, find_look_alikes
 from mapping.report.model import Forecast, Learned, Within, learn, tolerance_of
 from mapping.report.statistics import statistics_of
 from mapping.report.viewpoints import Viewpoints
@@ -55,6 +56,9 @@ def make_report_data(
     viewpoints = Viewpoints.of(opened)
     within = tolerance_of(opened, viewpoints)
     runs = hold_out(opened, work, workers, partial(progress, "held-out photos"))
+    alike = find_look_alikes(
+        opened, viewpoints, runs, work, workers, partial(progress, "look-alikes")
+    )
     learned = learn(opened, viewpoints, runs, within, partial(progress, "what is found again"))
     plan = Plan.of(opened, viewpoints)
     grid = make_grid(plan, viewpoints)
@@ -75,6 +79,7 @@ def make_report_data(
         "images": _images(opened, viewpoints, origin, digits),
         "statistics": statistics_of(opened),
         "held_out": _held_out(runs, learned, digits),
+        "look_alikes": [_look_alike(one, opened, digits) for one in alike],
         "coverage": {
             "within": {"position": within.position, "orientation_deg": within.orientation_deg},
             "cell": grid.side,
@@ -202,6 +207,17 @@ def _held_out(runs: Sequence[HeldOut], learned: Learned, digits: int) -> list[di
             runs, learned.expected_inliers, learned.probabilities, strict=True
         )
     ]
+
+
+def _look_alike(one: LookAlike, opened: Map, digits: int) -> dict[str, Any]:
+    return {
+        "image": one.image,
+        "twin": one.twin,
+        "position": _numbers(one.position + opened.manifest.world.origin, digits),
+        "inliers": one.inliers,
+        "own_inliers": one.own_inliers,
+        "told": one.told(opened),
+    }
 
 
 def _cell(position: list[float], forecasts: Sequence[Forecast]) -> dict[str, Any]:

@@ -91,14 +91,40 @@ def hold_out(
         By photo, then by how many were left out. Nothing for a map of which nothing would remain.
     """
     images = chosen_photos(len(opened.images))
-    keys = {image: _key(opened, image) for image in images}
-    todo = [image for image in images if not work.has(keys[image])]
-    progress(len(images) - len(todo), len(images))
+    task = partial(_keep_runs, opened.path, work)
+    items = ask_photos(work, workers, images, partial(_key, opened), task, progress)
+    return [
+        run for image, item in zip(images, items, strict=True) for run in _unpacked(image, item)
+    ]
+
+
+def ask_photos(
+    work: WorkFolder,
+    workers: Workers,
+    images: Sequence[int],
+    key: Callable[[int], str],
+    task: Callable[[int], None],
+    progress: Callable[[int, int], None],
+) -> list[Item]:
+    """Do a task for each photo that the work folder does not have yet.
+
+    Args:
+        work: where the task keeps its results.
+        workers: where it is done; it travels there.
+        images: rows of the photos.
+        key: under which the result of a photo is kept.
+        task: finds and keeps the result of one photo.
+        progress: told how many photos are done, and of how many.
+
+    Returns:
+        The results, by photo.
+    """
+    todo = [image for image in images if not work.has(key(image))]
+    done = len(images) - len(todo)
+    progress(done, len(images))
     if todo:
-        task = partial(_keep_runs, opened.path, work)
-        done = len(images) - len(todo)
         workers.run(task, todo, lambda now, _: progress(done + now, len(images)))
-    return [run for image in images for run in _unpacked(image, work.read(keys[image]))]
+    return [work.read(key(image)) for image in images]
 
 
 def chosen_photos(num_photos: int) -> list[int]:
@@ -231,14 +257,14 @@ def _key(opened: Map, image: int) -> str:
 
 
 @lru_cache(maxsize=1)
-def _opened(folder: Path) -> tuple[Map, Viewpoints]:
+def opened_once(folder: Path) -> tuple[Map, Viewpoints]:
     """A map, once per process: its arrays must not travel to workers with every photo."""
     opened = open_map(folder)
     return opened, Viewpoints.of(opened)
 
 
 def _keep_runs(folder: Path, work: WorkFolder, image: int) -> None:
-    opened, viewpoints = _opened(folder)
+    opened, viewpoints = opened_once(folder)
     work.get(_key(opened, image), lambda: _runs_of(opened, viewpoints, image))
 
 

@@ -62,7 +62,7 @@ def make_map(tmp_path_factory: pytest.TempPathFactory) -> MakeMap:
     """Write and open a map of points (P, 3) seen by cameras at poses.
 
     A landmark looks a little different in every photo, the more so the further aside it is seen
-    from; points that no photo sees are left out.
+    from; points that no photo sees are left out. Those of the same number in ``look`` look alike.
     """
 
     def make(
@@ -78,11 +78,14 @@ def make_map(tmp_path_factory: pytest.TempPathFactory) -> MakeMap:
         ready_made: bool = False,
         seed: int = 0,
         nearest: float = 0.1,
+        look: NDArray[np.int64] | None = None,
     ) -> Map:
         random = np.random.default_rng(seed)
         points = points.astype(np.float32)
         looks = random.normal(size=(len(points), _DIM))
         turns = 3.0 * random.normal(size=(len(points), 3, _DIM))
+        if look is not None:
+            looks, turns = looks[look], turns[look]
         observed, keypoints, rows, offsets = [], [], [], [0]
         for pose in poses:
             in_cam = pose.apply(points.astype(np.float64))

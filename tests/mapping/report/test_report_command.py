@@ -56,6 +56,7 @@ def _data(**changes: Any) -> dict[str, Any]:
             *(_run(1, 1, None), _run(1, 5, None)),
             *(_run(2, 1, 0.2), _run(2, 5, 0.3)),
         ],
+        "look_alikes": [{"told": "photos around a.jpg look like those around [b].jpg"}],
         "coverage": {
             "within": {"position": 0.05, "orientation_deg": 5.0},
             "cell": 0.3,
@@ -119,6 +120,7 @@ def test_people_see_what_failed_where_it_is_weak_and_where_the_file_is(
     assert "90 % or more: 50 %; of less than 10 %: 25 %" in out
     assert "9 o'clock" in out
     assert "few landmarks [there]" in out
+    assert "look-alikes: photos around a.jpg look like those around [b].jpg\n" in out
     assert out.endswith(f"report: {target}\n")
 
 

@@ -46,7 +46,8 @@ def half_mapped(half_mapped_room, tmp_path_factory):
 def test_the_report_has_the_shape_that_the_page_reads(half_mapped):
     data, _ = half_mapped
     assert set(data) == {
-        *("map", "made_by", "up", "cameras", "images", "statistics", "held_out", "coverage")
+        *("map", "made_by", "up", "cameras", "images", "statistics", "held_out", "coverage"),
+        "look_alikes",
     }
     assert set(data["coverage"]) == {
         *("within", "cell", "right", "ahead", "directions_deg", "pitch_deg", "camera", "cells"),

@@ -45,6 +45,19 @@ export interface WeakSpot {
   why: string;
 }
 
+/** A photo, and where the map would find it if its own place were not mapped. */
+export interface LookAlike {
+  /** Rows of `images`: the photo, and the one nearest to where it was found. */
+  image: number;
+  twin: number;
+  /** Where it was found. */
+  position: Vector3;
+  inliers: number;
+  own_inliers: number;
+  /** In words. */
+  told: string;
+}
+
 export interface ReportData {
   map: {
     id: string;
@@ -77,6 +90,7 @@ export interface ReportData {
     landmarks_per_image: Histogram;
   };
   held_out: HeldOutRun[];
+  look_alikes: LookAlike[];
   coverage: {
     /** What counts as localized: within so far and so many degrees of where it was taken. */
     within: { position: number; orientation_deg: number };

@@ -36,6 +36,7 @@ function main(): void {
       section("Coverage", ...coverage.nodes),
       section("In 3D", stage),
       section("Held-out trials", ...trials(data)),
+      section("Places that look alike", lookAlikes(data)),
       section("The map in numbers", statistics(data)),
       section("How this was computed", ...aboutSection(data)),
     ),
@@ -85,6 +86,12 @@ function heading(data: ReportData): HTMLElement[] {
     element("p", { class: "note" }, `Cameras: ${map.cameras.join("; ")}.`),
     ...map.notes.map((text) => element("p", { class: "note" }, `Note: ${text}`)),
   ];
+}
+
+function lookAlikes({ look_alikes: pairs }: ReportData): HTMLElement {
+  return pairs.length > 0
+    ? element("ul", {}, ...pairs.map(({ told }) => element("li", {}, told)))
+    : element("p", {}, "None were found.");
 }
 
 function statistics({ statistics: all }: ReportData): HTMLElement {
