@@ -56,9 +56,8 @@ def make_report_data(
     viewpoints = Viewpoints.of(opened)
     within = tolerance_of(opened, viewpoints)
     runs = hold_out(opened, work, workers, partial(progress, "held-out photos"))
-    alike = find_look_alikes(
-        opened, viewpoints, runs, work, workers, partial(progress, "look-alikes")
-    )
+    told = partial(progress, "look-alikes")
+    alike = find_look_alikes(opened, viewpoints, runs, work, workers, told)
     learned = learn(opened, viewpoints, runs, within, partial(progress, "what is found again"))
     plan = Plan.of(opened, viewpoints)
     grid = make_grid(plan, viewpoints)
@@ -66,13 +65,10 @@ def make_report_data(
     unit = " m" if opened.manifest.world.metric else ""
     spots = find_weak_spots(grid, plan, forecasts, learned.model, within, unit)
     origin = np.array(opened.manifest.world.origin)
-    notes = [*opened.manifest.notes, *_doubts(runs, within)]
-    if plan.up_source != "gravity":
-        notes.append(UP_IS_A_GUESS)
     # Micrometres, and of small worlds as much finer.
     digits = max(6, decimals_of(viewpoints.reach / 1e5))
     return {
-        "map": {**_about(opened), "notes": notes},
+        "map": {**_about(opened), "notes": _notes(opened, plan, runs, within)},
         "made_by": {"command": command, "version": __version__},
         "up": {"direction": _numbers(plan.up, 9), "source": plan.up_source},
         "cameras": {name: _camera(camera) for name, camera in opened.cameras.items()},
@@ -97,6 +93,11 @@ def make_report_data(
             "rank_correlation": rank_correlation_of(runs, learned.probabilities),
         },
     }
+
+
+def _notes(opened: Map, plan: Plan, runs: Sequence[HeldOut], within: Within) -> list[str]:
+    guess = [] if plan.up_source == "gravity" else [UP_IS_A_GUESS]
+    return [*opened.manifest.notes, *_doubts(runs, within), *guess]
 
 
 def calibration_of(
