@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +38,7 @@ APART = 10_000.0
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Where everything lies.
+    """The folders that the questions read from and the maps are built in.
 
     Attributes:
         data: the shared data sets.
@@ -68,7 +69,7 @@ class Places:
 
 
 # How each map is built.
-SETTINGS: Mapping[str, Mapping[str, object]] = {
+SETTINGS: Mapping[str, Mapping[str, Any]] = {
     "redkitchen": {"method": "rgbd"},
     "castle": {"method": "sfm"},
     "kitti_curve": {"method": "sfm"},
@@ -100,7 +101,7 @@ def make_missing(places: Places, needed: set[str], tell: Callable[[str], None]) 
             tell(f"building {map_id}")
             dataset = places.dataset(map_id, "mapping")
             made = BuildSettings(dataset, map_id, maps_dir=places.maps, workers=2)
-            build_map(replace(made, **settings), lambda *_: None)  # type: ignore[arg-type]
+            build_map(replace(made, **settings), lambda *_: None)
     if FLOORS in needed - there:
         tell(f"making the set {FLOORS}")
         tiles = [

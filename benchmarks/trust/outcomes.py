@@ -33,7 +33,7 @@ class Query:
     Attributes:
         scenario: what is tried.
         map_id: the map that is asked.
-        name: of the photo.
+        name: the photo's name.
         photos: one, or those of a rig.
         truth: the pose in the map's frame; None when it is not known.
         within: how near to the truth a right answer is; None when every pose is wrong.
@@ -49,7 +49,7 @@ class Query:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of a question; one line of JSON.
+    """The answer to one question, held against the truth; written as one line of JSON.
 
     Attributes:
         scenario: what was tried.
@@ -61,7 +61,7 @@ class Outcome:
         correspondences: that were given to the solver.
         right: whether the pose is right; None without a pose, or when nobody knows.
         error: (x, y, z) of the position in the map's unit; None without a pose or the truth.
-        error_deg: of the orientation.
+        error_deg: error of the orientation, degrees.
         covariance: (3, 3) that was stated for the position.
         probability: that was stated for the pose; None when none was.
         camera: where the intrinsics came from, and the parameters that were used.

@@ -69,8 +69,8 @@ def cut_to(photo: Photo, camera: Camera, width: int, height: int) -> tuple[Photo
     Args:
         photo: pixels.
         camera: without distortion, or with a distortion about its principal point.
-        width: of the result.
-        height: of the result.
+        width: the result's width, pixels.
+        height: the result's height, pixels.
     """
     scale = max(width / photo.width, height / photo.height)
     cut_width, cut_height = round(width / scale), round(height / scale)

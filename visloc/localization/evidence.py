@@ -303,7 +303,8 @@ def _best(
 ) -> NDArray[np.float64]:
     """Return the largest product of each landmark (n, D) with keypoints (n, k, D) near it.
 
-    Whole numbers of 8 bits: exact in single precision, so equal on every machine.
+    Up to about a thousand dimensions, sums of 8-bit products are exact in single precision, so
+    they are equal on every machine.
     """
     products = np.einsum("nkd,nd->nk", theirs, ours)
     return np.asarray(np.where(there, products, -np.inf).max(axis=1), dtype=np.float64)

@@ -245,8 +245,8 @@ def cameras_agree(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
 def likely(problem: Problem, pose: GeneralizedPose) -> tuple[GeneralizedPose, Refusal | None]:
     """Add the probability that a pose is right, and refuse one that is probably wrong.
 
-    Who names thresholds of their own gets what they ask for, with the probability beside it. A
-    pose has none when no image may be compared with the map.
+    A caller who names ``min_inliers`` or a preset gets every pose, with its probability. A pose
+    has no probability when no image may be compared with the map.
     """
     seen = [
         (view if pose.camera is None else replace(view, camera=pose.camera), shown, inliers)
