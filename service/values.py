@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from visloc.archive import Geodetic, MapOutline, SetOutline
 from visloc.errors import refuse
 from visloc.geometry import Camera
+from visloc.localization.judge import PlaceAnswer
 from visloc.options import Inference, LocalizeOptions
 from visloc.priors import NO_PRIORS, Priors
 from visloc.sequences.filling import Odometry, TimeUnit
@@ -167,9 +168,14 @@ class Localization:
     anchor_rms: float = 0.0
 
     @property
+    def place(self) -> PlaceAnswer:
+        """The answer for the judge, with the map, or the set and its tile, that gave it."""
+        return PlaceAnswer(f"{self.map_id}@{self.map_version}", self.answer, self.tile)
+
+    @property
     def ref(self) -> str:
         """``id@version`` of the map, or, for a set, of the tile, that gave the answer."""
-        return self.tile or f"{self.map_id}@{self.map_version}"
+        return self.place.ref
 
 
 def check_order(before: int, timestamp: int) -> None:

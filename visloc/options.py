@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from typing import Any
 
@@ -121,6 +121,10 @@ MAX_MAPS = 16
 
 DEFAULT_PRESET = "default"
 
+# A pose that is nine times as likely wrong as right is no answer. Above that, the answer says how
+# likely it is, and the caller decides.
+LEAST_PROBABILITY = 0.1
+
 # config1 and config2: table 2 of Humenberger et al. 2020 (abs_pose_max_error,
 # abs_pose_min_num_inliers, abs_pose_min_inlier_ratio). config2 was made to give an answer
 # whenever it can; it is for comparisons with the paper, not for robots.
@@ -186,6 +190,13 @@ class LocalizeOptions:
         1.0,
         unset=_PRESETS_VALUE,
     )
+    min_probability: float | None = _option(
+        None,
+        "smallest probability of an accepted pose",
+        0.0,
+        1.0,
+        unset=f"{LEAST_PROBABILITY:g}; 0 with another preset or with min_inliers",
+    )
     read_as: ReadAs = _option(
         ReadAs.UPRIGHT,
         "orientation in which features are found",
@@ -243,3 +254,22 @@ class LocalizeOptions:
             preset.min_inliers if self.min_inliers is None else self.min_inliers,
             preset.min_inlier_ratio if self.min_inlier_ratio is None else self.min_inlier_ratio,
         )
+
+    @property
+    def least_probability(self) -> float:
+        """The smallest probability of an accepted pose, 0 to 1.
+
+        A caller who names ``min_inliers`` or a preset, and no probability, gets every pose.
+        """
+        if self.min_probability is not None:
+            return self.min_probability
+        has_own_thresholds = self.preset != DEFAULT_PRESET or self.min_inliers is not None
+        return 0.0 if has_own_thresholds else LEAST_PROBABILITY
+
+    def before_rivals(self) -> LocalizeOptions:
+        """Return the options for one of several places, before their poses are compared.
+
+        A raised ``min_probability`` counts afterwards: if it removed the best place before, the
+        second best would be the answer.
+        """
+        return replace(self, min_probability=min(self.least_probability, LEAST_PROBABILITY))

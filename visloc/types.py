@@ -255,6 +255,29 @@ class Localized:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """One of the two places between which an ambiguous query leaves the choice.
+
+    Attributes:
+        rig_from_world: the pose there, in the frame of ``map``; of the camera, for a photo on its
+            own.
+        num_inliers: keypoints that agree with it.
+        map: ``id@version`` of the map, or of the set of maps.
+        tile: of a set, ``id@version`` of the map in it; None otherwise.
+        image: the mapping photo that speaks most for this place; None when none is known.
+        preference: how surely the keypoints speak for this place and against the other one, in
+            standard deviations; None when they were not compared.
+    """
+
+    rig_from_world: Pose
+    num_inliers: int
+    map: str
+    tile: str | None = None
+    image: str | None = None
+    preference: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class NotLocalized:
     """The map was searched and gave no pose that can be trusted.
 
@@ -263,12 +286,14 @@ class NotLocalized:
         stage: the stage that gave up.
         reason: why, as a stable word.
         message: why, for a person.
+        candidates: the two places of an ambiguous photo; () otherwise.
     """
 
     evidence: Evidence
     stage: Stage
     reason: Reason
     message: str
+    candidates: tuple[Candidate, ...] = ()
 
 
 Answer = Localized | NotLocalized
@@ -282,11 +307,13 @@ class Refusal:
         stage: the stage that gave up.
         reason: why, as a stable word.
         message: why, for a person.
+        candidates: the two places of an ambiguous instant, most inliers first; () otherwise.
     """
 
     stage: Stage
     reason: Reason
     message: str
+    candidates: tuple[Candidate, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,7 +13,7 @@ from rich.text import Text
 from clients.evaluation.run import Outcome
 from clients.wire.answers import LocalizeResult
 from visloc.types import Uncertainty
-from visloc_api.words.answers import PoseEstimate
+from visloc_api.words.answers import Candidate, PoseEstimate
 from visloc_api.words.geopose import GeoPose
 from visloc_api.words.maps import MapInfo
 
@@ -54,6 +54,7 @@ def print_result(console: Console, result: LocalizeResult, unit: str) -> None:
         print_line(console, "not localized", result.refusal.message, "bold yellow")
         print_line(console, "gave up at", f"{result.refusal.stage} ({result.refusal.reason})")
         print_line(console, "map", f"{result.map.id}@{result.map.version}")
+        _print_candidates(console, result.refusal.candidates)
     if result.tile is not None:
         print_line(console, "tile", result.tile)
     print_line(
@@ -156,6 +157,24 @@ def _print_pose(console: Console, pose: PoseEstimate, unit: str) -> None:
     print_line(console, "uncertainty", _UNCERTAINTY.get(pose.uncertainty, pose.uncertainty))
     if pose.probability is not None:
         print_line(console, "probability", f"{pose.probability:.3f} that the pose is right")
+
+
+def _print_candidates(console: Console, candidates: Sequence[Candidate]) -> None:
+    """Print the two places of an ambiguous photo."""
+    for label, each in zip(("either", "or"), candidates, strict=False):
+        preference = each.preference
+        facts = [
+            f"{each.inliers} inliers",
+            *([] if each.image is None else [f"most like {each.image}"]),
+            *([] if preference is None else [f"preferred by {preference:+.1f} deviations"]),
+        ]
+        place = each.tile or f"{each.map.id}@{each.map.version}"
+        print_line(
+            console,
+            label,
+            f"{_numbers(each.position, 4)} in {place}, turned {_numbers(each.orientation, 4)}: "
+            f"{', '.join(facts)}",
+        )
 
 
 # What the standard deviations cover, for people.

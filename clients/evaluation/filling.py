@@ -60,6 +60,9 @@ def photo_result(result: InstantResult, index: int) -> LocalizeResult:
     """
     image, raw = result.images[index], result.raw["images"][index]
     pose, status, refusal = None, result.status, result.raw["refusal"]
+    if refusal is not None:
+        # Candidates are poses of the rig, and a refusal does not tell where the camera sits in it.
+        refusal = {**refusal, "candidates": []}
     if (traced := _measured_by(result, image)) is not None:
         assert result.pose is not None  # it was measured
         photo, turn = result.pose.photo_covariance, _turned_into(image, result.pose)

@@ -17,6 +17,7 @@ from visloc.types import PoseSource
 from visloc_api.words.answers import (
     MAX_RETRIEVED,
     CameraUsed,
+    Candidate,
     Debug,
     ImageAnswer,
     ImageError,
@@ -43,7 +44,7 @@ def localize_response(found: Localization, request_id: str) -> LocalizeResponse:
         request_id=request_id,
         status="not_localized" if pose is None else "localized",
         pose=None if pose is None else _pose_estimate(pose),
-        refusal=None if refusal is None else Refusal.model_validate(refusal),
+        refusal=None if refusal is None else _refusal(refusal),
         keypoints=evidence.num_keypoints,
         correspondences=evidence.num_correspondences,
         inliers=evidence.num_inliers,
@@ -76,7 +77,7 @@ def instant_answer(found: Localization, request_id: str) -> InstantAnswer:
         else "filled",
         source=None if pose is None else pose.source,
         pose=None if pose is None else _rig_pose(pose),
-        refusal=None if answer.refusal is None else Refusal.model_validate(answer.refusal),
+        refusal=None if answer.refusal is None else _refusal(answer.refusal),
         images=tuple(_image_answer(image, pose) for image in answer.images),
         correspondences=correspondences,
         inliers=answer.num_inliers,
@@ -86,6 +87,29 @@ def instant_answer(found: Localization, request_id: str) -> InstantAnswer:
         geopose=geopose,
         geopose_ypr=geopose_ypr,
         tile=found.tile,
+    )
+
+
+def _refusal(refusal: visloc.types.Refusal) -> Refusal:
+    return Refusal(
+        stage=refusal.stage,
+        reason=refusal.reason,
+        message=refusal.message,
+        candidates=tuple(_candidate(each) for each in refusal.candidates),
+    )
+
+
+def _candidate(found: visloc.types.Candidate) -> Candidate:
+    pose = found.rig_from_world
+    map_id, _, version = found.map.partition("@")
+    return Candidate(
+        map=MapRef(id=map_id, version=version),
+        tile=found.tile,
+        position=pose.center,
+        orientation=pose.inverse().rotation_wxyz,
+        inliers=found.num_inliers,
+        image=found.image,
+        preference=found.preference,
     )
 
 

@@ -6,7 +6,7 @@ import asyncio
 import logging
 from collections.abc import AsyncGenerator, AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import aclosing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from service.engine.catalog import Catalog
 from service.engine.instant_tasks import localize_in
@@ -18,7 +18,7 @@ from service.engine.uploads import Uploads
 from service.errors import stopping_error
 from service.telemetry.metrics import Metrics
 from service.values import InstantJob, Localization, RigJob, SequenceJob, ServedMap, WorkerSettings
-from service.workers.judging import judged
+from service.workers.judging import gated, judged
 from service.workers.pool import Workers
 from visloc.archive import MapStore
 from visloc.errors import VislocError, refuse
@@ -213,10 +213,12 @@ class Engine:
     async def _search(self, job: RigJob) -> Localization:
         async with self._catalog.using(job.maps) as maps:
             sets, alone = parted(maps, job.priors)
-            searches = [self._sets.localize(job, each) for each in sets]
+            one_place = not sets and len(alone) == 1
+            searched = job if one_place else replace(job, options=job.options.before_rivals())
+            searches = [self._sets.localize(searched, each) for each in sets]
             if alone:
-                searches.append(localize_in(self.workers, job, alone))
-            return judged(await answers_of(searches), job.priors)[1]
+                searches.append(localize_in(self.workers, searched, alone))
+            return gated(judged(await answers_of(searches), job.priors)[1], job.options)
 
     async def localize_sequence(
         self, start: SequenceJob, instants: AsyncIterator[InstantJob] | Sequence[InstantJob]

@@ -39,6 +39,7 @@ from service.values import (
     SequenceStep,
     check_order,
 )
+from service.workers.judging import gated
 from service.workers.pool import Workers
 from service.workers.tasks import Vision
 from visloc.archive import SetOutline
@@ -256,14 +257,14 @@ class SetSequence:
                 one.leg.start.rig,
                 one.instant.images,
                 instant.timestamp,
-                self._start.options,
+                self._start.options.before_rivals(),
                 one.priors,
                 ypr=self._start.ypr,
             )
             return await self._workers.run(Vision.solve_rig, job, (folder,), one.looks)
 
         row, found = await self._search.search(self._outline, choice, photos, ask)
-        return pending[row], found
+        return pending[row], gated(found, self._start.options)
 
     def _seconds_since(self, track: Track | None, instant: InstantJob) -> float:
         """Return the time since the last measured pose; infinite without one."""

@@ -262,7 +262,7 @@ def in_set(found: Localization, outline: SetOutline, tile: TileRecord) -> Locali
         debug = replace(debug, points=moved.apply(debug.points))
     return replace(
         found,
-        answer=answer_in_set(found.answer, moved),
+        answer=answer_in_set(found.answer, moved, outline.ref),
         debug=debug,
         map_id=outline.manifest.id,
         map_version=outline.manifest.version,

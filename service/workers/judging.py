@@ -9,14 +9,15 @@ from dataclasses import replace
 from service.values import Localization
 from visloc.archive.places import similarity_on_earth
 from visloc.geometry import Similarity
+from visloc.localization.gates import not_probable_enough
 from visloc.localization.judge import (
     STDS,
     TIE_REACH_SHARE,
-    Candidate,
     Tie,
     judge,
     measured_pose,
 )
+from visloc.options import LocalizeOptions
 from visloc.priors import NO_PRIORS, Priors
 from visloc.types import Refusal
 
@@ -41,7 +42,7 @@ def judged(found: Sequence[Localization], priors: Priors = NO_PRIORS) -> tuple[i
         rows.append(row)
     asked = [found[row] for row in rows]
     verdict = judge(
-        [Candidate(each.ref, each.answer) for each in asked],
+        [each.place for each in asked],
         lambda i, j: _tie(asked[i], asked[j], priors),
     )
     if not isinstance(verdict, Refusal):
@@ -49,6 +50,14 @@ def judged(found: Sequence[Localization], priors: Priors = NO_PRIORS) -> tuple[i
     row = max(rows, key=lambda row: found[row].answer.num_inliers)
     refused = replace(found[row].answer, pose=None, refusal=verdict)
     return row, replace(found[row], answer=refused)
+
+
+def gated(found: Localization, options: LocalizeOptions) -> Localization:
+    """Refuse the judged answer if its pose is less probable than the caller asks for."""
+    refusal = not_probable_enough(found.answer, options)
+    if refusal is None:
+        return found
+    return replace(found, answer=replace(found.answer, pose=None, refusal=refusal))
 
 
 def _tie(a: Localization, b: Localization, priors: Priors) -> Tie | None:

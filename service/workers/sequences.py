@@ -9,11 +9,13 @@ from service.values import InstantJob, Localization, SequenceJob, check_order
 from service.workers.instants import Target, check_images, check_options, check_priors
 from service.workers.judging import judged
 from visloc.errors import inside, refuse
+from visloc.localization.gates import not_probable_enough
+from visloc.localization.judge import candidate, most_inliers_first
 from visloc.localization.solving import SeenImage, Solved
 from visloc.priors import Priors
 from visloc.sequences.filling import TimeUnit, guess_time_unit
 from visloc.sequences.solver import SeenInstant, SequenceSolver, check_max_gap, check_odometry
-from visloc.types import InstantAnswer, Reason, Refusal, RigPose
+from visloc.types import Candidate, InstantAnswer, Reason, Refusal, RigPose
 
 
 class SequenceRun:
@@ -103,7 +105,12 @@ class SequenceRun:
             i for i, held in enumerate(self._held) if any(each.pose is not None for each in held)
         ]
         if len(self._held) > 1 and len(placed) > 1:
-            self._held = [[_unplaced(answer) for answer in held] for held in self._held]
+            instants = list(zip(*self._held, strict=True))
+            undecided = [self._candidates(answers) for answers in instants]
+            self._held = [
+                [_unplaced(*each) for each in zip(held, undecided, strict=True)]
+                for held in self._held
+            ]
         self._keep(placed[0] if placed else 0)
         return self._released()
 
@@ -123,11 +130,23 @@ class SequenceRun:
         ]
         best, verdict = judged(found, priors)
         if verdict.answer.pose is not None:
-            return best, solved
+            is_sure = not_probable_enough(verdict.answer, self._start.options) is None
+            return (best if is_sure else None), solved
         refusal = verdict.answer.refusal
         if refusal is None or refusal.reason is not Reason.AMBIGUOUS:
             return None, solved
         return None, [one if one.pose is None else one.refused(refusal) for one in solved]
+
+    def _candidates(self, answers: Sequence[InstantAnswer]) -> tuple[Candidate, ...]:
+        """State the poses of an instant, given its answers by target, in two of the maps."""
+        found = most_inliers_first(
+            [
+                candidate(target.localization(answer, ypr=False).place)
+                for target, answer in zip(self.targets, answers, strict=True)
+                if answer.pose is not None
+            ]
+        )
+        return found[:2] if len(found) > 1 else ()
 
     def _keep(self, index: int) -> None:
         """Search only this map from now on."""
@@ -149,7 +168,7 @@ class SequenceRun:
         )
 
 
-def _unplaced(answer: InstantAnswer) -> InstantAnswer:
+def _unplaced(answer: InstantAnswer, candidates: tuple[Candidate, ...]) -> InstantAnswer:
     """Remove a pose that another map contradicts."""
     if answer.pose is None:
         return answer
@@ -157,6 +176,7 @@ def _unplaced(answer: InstantAnswer) -> InstantAnswer:
         "gate",
         Reason.AMBIGUOUS,
         "several of the maps explain the sequence; name one, or say where it is (priors)",
+        candidates,
     )
     return replace(answer, pose=None, refusal=refusal)
 

@@ -19,7 +19,13 @@ from visloc.localization.camera_check import camera_contradiction
 from visloc.localization.constraints import Constraints
 from visloc.localization.evidence import SeenView, Shown, evidence_of
 from visloc.localization.probability import against, shipped_model
-from visloc.options import DEFAULT_PRESET, PRESETS, LocalizeOptions, RegistrationPreset
+from visloc.options import (
+    DEFAULT_PRESET,
+    LEAST_PROBABILITY,
+    PRESETS,
+    LocalizeOptions,
+    RegistrationPreset,
+)
 from visloc.pose.distance import mahalanobis2
 from visloc.pose.generalized import (
     GeneralizedPose,
@@ -27,7 +33,7 @@ from visloc.pose.generalized import (
     refine_generalized_pose,
 )
 from visloc.pose.views import MatchedView
-from visloc.types import CameraSource, Reason, Refusal
+from visloc.types import CameraSource, InstantAnswer, Reason, Refusal
 
 # The default max_error_px applies to photos whose longer side has at least this many pixels, and
 # shrinks with smaller ones. In a photo of 256 px, 12 px let wrong poses explain up to 10 % of the
@@ -40,9 +46,6 @@ _AMBIGUOUS_SHARE = 0.7
 # chi-square with six degrees of freedom: above the limit once in a thousand times.
 _SURE_INLIERS = 100
 _MAX_HALVES_MAHALANOBIS2 = 22.46
-# A pose that is nine times as likely wrong as right is no answer. Above that, the answer says how
-# likely it is, and the caller decides.
-_LEAST_PROBABILITY = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -245,7 +248,7 @@ def cameras_agree(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
 def likely(problem: Problem, pose: GeneralizedPose) -> tuple[GeneralizedPose, Refusal | None]:
     """Add the probability that a pose is right, and refuse one that is probably wrong.
 
-    A caller who names ``min_inliers`` or a preset gets every pose, with its probability. A pose
+    A raised ``min_probability`` counts once rivals were compared (``not_probable_enough``). A pose
     has no probability when no image may be compared with the map.
     """
     seen = [
@@ -264,15 +267,28 @@ def likely(problem: Problem, pose: GeneralizedPose) -> tuple[GeneralizedPose, Re
     )
     probability = float(shipped_model().probability(features))
     pose = replace(pose, probability=probability)
-    options = problem.options
-    has_own_thresholds = options.preset != DEFAULT_PRESET or options.min_inliers is not None
-    if probability >= _LEAST_PROBABILITY or has_own_thresholds:
+    if probability >= min(problem.options.least_probability, LEAST_PROBABILITY):
         return pose, None
     return pose, _refused(
         Reason.UNLIKELY_POSE,
         f"the best pose explains {pose.num_inliers} matches, but is right with a probability of "
         f"{probability:.2f} only: {against(features)}. Is this a print, a screen or a mirror, or "
         "another place that looks alike?",
+    )
+
+
+def not_probable_enough(answer: InstantAnswer, options: LocalizeOptions) -> Refusal | None:
+    """Refuse a pose that is less probable than the caller asks for, after rivals were compared.
+
+    A pose without a probability, such as one from motion, is not judged.
+    """
+    probability = None if answer.pose is None else answer.pose.probability
+    if probability is None or probability >= options.least_probability:
+        return None
+    return _refused(
+        Reason.UNLIKELY_POSE,
+        f"the best pose is right with a probability of {probability:.2f}, but min_probability asks "
+        f"for {options.least_probability:g}",
     )
 
 

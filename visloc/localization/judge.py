@@ -16,7 +16,7 @@ import numpy as np
 from visloc.geometry import Similarity, rotation_angle
 from visloc.localization.preference import preference
 from visloc.pose.centre import largest_std, moved_pose, position_covariance
-from visloc.types import InstantAnswer, Reason, Refusal, RigPose
+from visloc.types import Candidate, InstantAnswer, Reason, Refusal, RigPose
 
 # As shares of the most inliers. All answers above the first share must agree, or the result is
 # ambiguous. Among the answers above the second share, the most certain wins.
@@ -32,21 +32,28 @@ TIE_REACH_SHARE, TIE_ANGLE = 0.1, math.radians(5.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
+class PlaceAnswer:
     """The answer of one place.
 
     Attributes:
-        ref: the map, ``id@version``.
-        answer: in the place's own frame.
+        map: ``id@version`` of the map, or of the set of maps, in whose frame the answer is.
+        answer: to the query.
+        tile: of a set, ``id@version`` of the map in it; None otherwise.
     """
 
-    ref: str
+    map: str
     answer: InstantAnswer
+    tile: str | None = None
+
+    @property
+    def ref(self) -> str:
+        """``id@version`` of the map that was searched."""
+        return self.tile or self.map
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tie:
-    """The transform between the frames of two candidates.
+    """The transform between the frames of two places.
 
     Attributes:
         a_from_b: from the frame of the second to that of the first.
@@ -57,11 +64,11 @@ class Tie:
     slack: float
 
 
-# Returns the tie of two candidates, or None if the transform is unknown.
+# Returns the tie of two places, or None if the transform is unknown.
 Ties = Callable[[int, int], Tie | None]
 
 
-def judge(candidates: Sequence[Candidate], ties: Ties) -> int | Refusal:
+def judge(places: Sequence[PlaceAnswer], ties: Ties) -> int | Refusal:
     """Choose the answer among those of several places.
 
     The answer with the most inliers wins, or one with similarly many that is more certain. A place
@@ -72,7 +79,7 @@ def judge(candidates: Sequence[Candidate], ties: Ties) -> int | Refusal:
     each other.
 
     Args:
-        candidates: at least one. An answer that a set refused as ambiguous counts as explaining the
+        places: at least one. An answer that a set refused as ambiguous counts as explaining the
             photo. So does one that was refused for its camera, with more inliers than any pose: a
             wrong camera in the right place does not make another place right.
         ties: between their frames.
@@ -81,7 +88,7 @@ def judge(candidates: Sequence[Candidate], ties: Ties) -> int | Refusal:
         The row of the chosen answer, or a refusal, ``ambiguous``. If no place gave a pose, the row
         of the answer that came closest to one.
     """
-    answers = [candidate.answer for candidate in candidates]
+    answers = [place.answer for place in places]
     explains = [i for i, answer in enumerate(answers) if _explains(answer)]
     closest = max(
         range(len(answers)), key=lambda i: (answers[i].num_inliers, answers[i].num_correspondences)
@@ -97,7 +104,7 @@ def judge(candidates: Sequence[Candidate], ties: Ties) -> int | Refusal:
     for i, j in itertools.combinations(rivals, 2):
         tie = ties(i, j)
         if tie is None or not _agree(answers[i], answers[j], tie):
-            return _ambiguous(candidates[i], candidates[j], tied=tie is not None)
+            return _ambiguous(places[i], places[j], tied=tie is not None)
     similar = [i for i in rivals if answers[i].num_inliers >= _SIMILAR_SHARE * most]
     first = similar[0]
 
@@ -113,11 +120,18 @@ def _is_rival(answer: InstantAnswer, best: InstantAnswer) -> bool:
     """Tell whether a place may be right although another one has more inliers."""
     if answer.num_inliers >= _RIVAL_SHARE * best.num_inliers:
         return True
+    compared = _preference(best, answer)
+    return compared is not None and compared < SURE_OF_MAPS
+
+
+def _preference(first: InstantAnswer, second: InstantAnswer) -> float | None:
+    """Say how surely the keypoints speak for the first answer; None when they do not compare."""
+    if measured_pose(first) is None or measured_pose(second) is None:
+        return None
     # The maps of a set find the same keypoints in a photo.
-    compared = measured_pose(answer) is not None and measured_pose(best) is not None
-    if not compared or not len(answer.scores) == len(best.scores) > 0:
-        return False
-    return preference(best.scores, answer.scores) < SURE_OF_MAPS
+    if not len(first.scores) == len(second.scores) > 0:
+        return None
+    return preference(first.scores, second.scores)
 
 
 def measured_pose(answer: InstantAnswer) -> RigPose | None:
@@ -157,7 +171,7 @@ def _agree(a: InstantAnswer, b: InstantAnswer, tie: Tie) -> bool:
     return away <= tie.slack + STDS * move_std and turned <= TIE_ANGLE + STDS * turn_std
 
 
-def _ambiguous(a: Candidate, b: Candidate, *, tied: bool) -> Refusal:
+def _ambiguous(a: PlaceAnswer, b: PlaceAnswer, *, tied: bool) -> Refusal:
     where = "at different places" if tied else "in frames without a known transform"
     advice = (
         "send priors that exclude one of them"
@@ -169,4 +183,36 @@ def _ambiguous(a: Candidate, b: Candidate, *, tied: bool) -> Refusal:
         Reason.AMBIGUOUS,
         f"{a.ref} and {b.ref} both explain the query, {where}, with {a.answer.num_inliers} and "
         f"{b.answer.num_inliers} inliers; {advice}",
+        most_inliers_first([candidate(a, b.answer), candidate(b, a.answer)]),
     )
+
+
+def candidate(place: PlaceAnswer, other: InstantAnswer | None = None) -> Candidate:
+    """State the pose of one of two places, and what speaks for it.
+
+    Args:
+        place: with a pose.
+        other: the answer of the other place; None when their keypoints shall not be compared.
+    """
+    answer = place.answer
+    assert answer.pose is not None  # the caller has looked
+    return Candidate(
+        answer.pose.rig_from_world,
+        answer.num_inliers,
+        place.map,
+        place.tile,
+        _best_image(answer),
+        None if other is None else _preference(answer, other),
+    )
+
+
+def most_inliers_first(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """Sort candidates for a refusal."""
+    return tuple(sorted(candidates, key=lambda each: -each.num_inliers))
+
+
+def _best_image(answer: InstantAnswer) -> str | None:
+    """Return the mapping photo that looks most like the image with the most inliers."""
+    seen = [i.evidence for i in answer.images if i.evidence is not None and i.evidence.retrieved]
+    best = max(seen, key=lambda evidence: evidence.num_inliers, default=None)
+    return None if best is None else best.retrieved[0].name

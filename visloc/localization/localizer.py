@@ -303,7 +303,9 @@ class Localizer:
         if answer.refusal is not None or pose is None or pose.photo_covariance is None:
             assert answer.refusal is not None  # without a pose there is a reason
             refusal = answer.refusal
-            refused = NotLocalized(evidence, refusal.stage, refusal.reason, refusal.message)
+            refused = NotLocalized(
+                evidence, refusal.stage, refusal.reason, refusal.message, refusal.candidates
+            )
             return refused, inliers
         localized = Localized(
             evidence=evidence,

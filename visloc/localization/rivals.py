@@ -23,12 +23,12 @@ from visloc.localization.gates import GATES, Problem, contradicts_priors, first_
 from visloc.localization.preference import SURE, preference
 from visloc.matching.correspondences import Proposals, propose_landmarks
 from visloc.matching.products import round_descriptors
-from visloc.pose.centre import largest_std
+from visloc.pose.centre import largest_std, moved_origin
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
 from visloc.pose.reprojection import reprojection_errors
 from visloc.pose.search import MAX_TRIALS, search_with_pycolmap
 from visloc.pose.views import MatchedView
-from visloc.types import LocalFeatures, Reason, Refusal
+from visloc.types import Candidate, LocalFeatures, Reason, Refusal
 
 # Photos of each place that are compared.
 NUM_COMPARED = 5
@@ -274,6 +274,7 @@ def stronger_place(
             Reason.AMBIGUOUS,
             f"two places of {geometry.ref} explain the photo about equally well: {first}, and "
             f"{second}; send priors that exclude one of them, or a photo with more of the scene",
+            _candidates(compared, verdict, geometry),
         )
         return best, refusal, pairs.scores(errors)
     return best, None, pairs.scores(errors)
@@ -335,6 +336,25 @@ def _is_rival(
         return False
     whole = problem.constraints.errors.whole(b, other.covariance)
     return contradicts_priors(problem.constraints, b, whole) is None
+
+
+def _candidates(
+    compared: Sequence[tuple[GeneralizedPose, int, int]], verdict: float, geometry: MapGeometry
+) -> tuple[Candidate, ...]:
+    """State both places that were compared, most inliers first."""
+    candidates = [
+        Candidate(
+            moved_origin(pose.rig_from_world, geometry.origin),
+            num,
+            geometry.ref,
+            image=geometry.photo_name(photo),
+            preference=preference_for,
+        )
+        for (pose, num, photo), preference_for in zip(
+            compared, (verdict, 0.0 - verdict), strict=True
+        )
+    ]
+    return tuple(sorted(candidates, key=lambda each: -each.num_inliers))
 
 
 def _described(pose: GeneralizedPose, num: int, photo: int, geometry: MapGeometry) -> str:

@@ -13,7 +13,12 @@ from visloc.geometry import Camera, Pose
 from visloc.localization.camera_check import only_focal_length_contradicts
 from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.evidence import Shown
-from visloc.localization.gates import Problem, accepted, not_better_elsewhere
+from visloc.localization.gates import (
+    Problem,
+    accepted,
+    not_better_elsewhere,
+    not_probable_enough,
+)
 from visloc.localization.rivals import Proposed, stronger_place
 from visloc.options import LocalizeOptions, ReadAs, Solver
 from visloc.pose.centre import position_covariance, with_origin
@@ -179,7 +184,9 @@ def solve_instant(
     shown = with_inliers([_shown(image, camera) for image in images], inliers)
     answer = InstantAnswer(timestamp, shown, pose, refusal, seconds, scores)
     views = tuple(replace(view, camera=camera or view.camera) for view in problem.views)
-    return Solved(answer, views, found if refusal is None else None, inliers)
+    solved = Solved(answer, views, found if refusal is None else None, inliers)
+    refusal = not_probable_enough(answer, options)
+    return solved if refusal is None else solved.refused(refusal)
 
 
 def check_solver(options: LocalizeOptions, num_cameras: int) -> None:

@@ -35,11 +35,15 @@ def with_origin(
     x_local = x_world - origin, so t_world = t_local - R origin; the covariance of t_world
     gains the part that the rotation causes at that distance.
     """
-    offset = cam_from_local.rotation @ origin
-    pose = Pose(cam_from_local.rotation, cam_from_local.translation - offset)
     jacobian = np.eye(6)
-    jacobian[3:, :3] = cross_matrix(offset)
-    return pose, jacobian @ covariance @ jacobian.T
+    jacobian[3:, :3] = cross_matrix(cam_from_local.rotation @ origin)
+    return moved_origin(cam_from_local, origin), jacobian @ covariance @ jacobian.T
+
+
+def moved_origin(cam_from_local: Pose, origin: NDArray[np.float64]) -> Pose:
+    """Move a pose found in coordinates relative to ``origin`` (3,) to the world."""
+    rotation = cam_from_local.rotation
+    return Pose(rotation, cam_from_local.translation - rotation @ origin)
 
 
 def moved_pose(

@@ -19,7 +19,11 @@ from numpy.typing import NDArray
 from visloc.errors import refuse
 from visloc.geometry import center_covariance, covariance_from_center, rotation_angle
 from visloc.localization.constraints import Constraints, MapGeometry
-from visloc.localization.gates import contradicts_priors, registration_for
+from visloc.localization.gates import (
+    contradicts_priors,
+    not_probable_enough,
+    registration_for,
+)
 from visloc.localization.solving import (
     SeenImage,
     Solved,
@@ -129,7 +133,7 @@ class SequenceSolver:
         return self.take(seen, self.solve(seen))
 
     def solve(self, seen: SeenInstant) -> Solved:
-        """Solve an instant on its own.
+        """Solve an instant on its own, before ``min_probability`` counts, so that maps compare.
 
         Raises:
             InvalidInput: ``sequence.odometry`` for a map that is not metric; ``priors.*`` that
@@ -137,11 +141,18 @@ class SequenceSolver:
         """
         check_odometry(seen.odometry, metric=self._metric)
         return solve_instant(
-            seen.images, self._geometry, self._options, seen.priors, seen.timestamp
+            seen.images,
+            self._geometry,
+            self._options.before_rivals(),
+            seen.priors,
+            seen.timestamp,
         )
 
     def take(self, seen: SeenInstant, solved: Solved) -> list[InstantAnswer]:
         """Take one more instant that was solved; return the answers that are final now."""
+        refusal = not_probable_enough(solved.answer, self._options)
+        if refusal is not None:
+            solved = solved.refused(refusal)
         if self._first_timestamp is None:
             self._first_timestamp = seen.timestamp
         ticks = seen.timestamp - self._first_timestamp

@@ -14,14 +14,32 @@ from visloc.priors import HeightBand, PosePrior, PositionPrior, Priors
 from visloc.types import InstantAnswer, RigPose
 
 
-def answer_in_set(answer: InstantAnswer, set_from_tile: Similarity) -> InstantAnswer:
-    """Move the pose and the rig of a tile's answer to the set's frame and unit."""
+def answer_in_set(answer: InstantAnswer, set_from_tile: Similarity, set_ref: str) -> InstantAnswer:
+    """Move the poses and the rig of a tile's answer to the set's frame and unit.
+
+    Args:
+        answer: of the tile.
+        set_from_tile: transform of the tile.
+        set_ref: ``id@version`` of the set, which candidates then name.
+    """
     images = tuple(
         replace(image, cam_from_rig=scaled_device(image.cam_from_rig, set_from_tile.scale))
         for image in answer.images
     )
     rig = None if answer.pose is None else _moved_rig(answer.pose, set_from_tile)
-    return replace(answer, images=images, pose=rig)
+    refusal = answer.refusal
+    if refusal is not None:
+        candidates = tuple(
+            replace(
+                each,
+                rig_from_world=set_from_tile.move(each.rig_from_world),
+                map=set_ref,
+                tile=each.map,
+            )
+            for each in refusal.candidates
+        )
+        refusal = replace(refusal, candidates=candidates)
+    return replace(answer, images=images, pose=rig, refusal=refusal)
 
 
 def down_in_set(priors: Priors, down: NDArray[np.float64] | None) -> NDArray[np.float64] | None:

@@ -91,6 +91,7 @@ class LocalizeOptions(_message.Message):
     MATCHER_FIELD_NUMBER: _builtins.int
     SOLVER_FIELD_NUMBER: _builtins.int
     SEED_FIELD_NUMBER: _builtins.int
+    MIN_PROBABILITY_FIELD_NUMBER: _builtins.int
     preset: _builtins.str
     """thresholds to start from"""
     top_k: _builtins.int
@@ -115,6 +116,8 @@ class LocalizeOptions(_message.Message):
     """of the pose"""
     seed: _builtins.int
     """of RANSAC"""
+    min_probability: _builtins.float
+    """smallest probability of an accepted pose, 0 to 1"""
     @_builtins.property
     def fusion_weights(self) -> _containers.ScalarMap[_builtins.str, _builtins.float]:
         """Weight by global descriptor; descriptors without a weight are not used. When empty, the map's
@@ -136,10 +139,11 @@ class LocalizeOptions(_message.Message):
         matcher: _builtins.str | None = ...,
         solver: _builtins.str | None = ...,
         seed: _builtins.int | None = ...,
+        min_probability: _builtins.float | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fusion", b"_fusion", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fusion", b"fusion", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fusion", b"_fusion", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_min_probability", b"_min_probability", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fusion", b"fusion", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "min_probability", b"min_probability", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fusion", b"_fusion", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fusion", b"fusion", "fusion_weights", b"fusion_weights", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fusion", b"_fusion", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_min_probability", b"_min_probability", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fusion", b"fusion", "fusion_weights", b"fusion_weights", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "min_probability", b"min_probability", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__extraction: _TypeAlias = _typing.Literal["extraction"]  # noqa: Y015
     _WhichOneofArgType__extraction: _TypeAlias = _typing.Literal["_extraction", b"_extraction"]  # noqa: Y015
@@ -153,6 +157,8 @@ class LocalizeOptions(_message.Message):
     _WhichOneofArgType__min_inlier_ratio: _TypeAlias = _typing.Literal["_min_inlier_ratio", b"_min_inlier_ratio"]  # noqa: Y015
     _WhichOneofReturnType__min_inliers: _TypeAlias = _typing.Literal["min_inliers"]  # noqa: Y015
     _WhichOneofArgType__min_inliers: _TypeAlias = _typing.Literal["_min_inliers", b"_min_inliers"]  # noqa: Y015
+    _WhichOneofReturnType__min_probability: _TypeAlias = _typing.Literal["min_probability"]  # noqa: Y015
+    _WhichOneofArgType__min_probability: _TypeAlias = _typing.Literal["_min_probability", b"_min_probability"]  # noqa: Y015
     _WhichOneofReturnType__preset: _TypeAlias = _typing.Literal["preset"]  # noqa: Y015
     _WhichOneofArgType__preset: _TypeAlias = _typing.Literal["_preset", b"_preset"]  # noqa: Y015
     _WhichOneofReturnType__read_as: _TypeAlias = _typing.Literal["read_as"]  # noqa: Y015
@@ -175,6 +181,8 @@ class LocalizeOptions(_message.Message):
     def WhichOneof(self, oneof_group: _WhichOneofArgType__min_inlier_ratio) -> _WhichOneofReturnType__min_inlier_ratio | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__min_inliers) -> _WhichOneofReturnType__min_inliers | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__min_probability) -> _WhichOneofReturnType__min_probability | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__preset) -> _WhichOneofReturnType__preset | None: ...
     @_typing.overload
@@ -1026,28 +1034,99 @@ class PoseEstimate(_message.Message):
 Global___PoseEstimate: _TypeAlias = PoseEstimate  # noqa: Y015
 
 @_typing.final
+class Candidate(_message.Message):
+    """One of the two places between which an ambiguous query leaves the choice."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MAP_FIELD_NUMBER: _builtins.int
+    TILE_FIELD_NUMBER: _builtins.int
+    POSITION_FIELD_NUMBER: _builtins.int
+    ORIENTATION_FIELD_NUMBER: _builtins.int
+    INLIERS_FIELD_NUMBER: _builtins.int
+    IMAGE_FIELD_NUMBER: _builtins.int
+    PREFERENCE_FIELD_NUMBER: _builtins.int
+    tile: _builtins.str
+    """of a set: the map in it, id@version"""
+    inliers: _builtins.int
+    """keypoints that agree with the pose"""
+    image: _builtins.str
+    """the mapping photo that speaks most for this place"""
+    preference: _builtins.float
+    """How surely the keypoints speak for this place and against the other one, in standard
+    deviations; absent when they were not compared.
+    """
+    @_builtins.property
+    def map(self) -> Global___MapRef:
+        """the map, or the set of maps, in whose frame the pose is"""
+
+    @_builtins.property
+    def position(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """camera centre, or the rig's origin, in the world"""
+
+    @_builtins.property
+    def orientation(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """rotation of world_from_cam, or world_from_rig: w, x, y, z"""
+
+    def __init__(
+        self,
+        *,
+        map: Global___MapRef | None = ...,
+        tile: _builtins.str | None = ...,
+        position: _abc.Iterable[_builtins.float] | None = ...,
+        orientation: _abc.Iterable[_builtins.float] | None = ...,
+        inliers: _builtins.int = ...,
+        image: _builtins.str | None = ...,
+        preference: _builtins.float | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_image", b"_image", "_preference", b"_preference", "_tile", b"_tile", "image", b"image", "map", b"map", "preference", b"preference", "tile", b"tile"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_image", b"_image", "_preference", b"_preference", "_tile", b"_tile", "image", b"image", "inliers", b"inliers", "map", b"map", "orientation", b"orientation", "position", b"position", "preference", b"preference", "tile", b"tile"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__image: _TypeAlias = _typing.Literal["image"]  # noqa: Y015
+    _WhichOneofArgType__image: _TypeAlias = _typing.Literal["_image", b"_image"]  # noqa: Y015
+    _WhichOneofReturnType__preference: _TypeAlias = _typing.Literal["preference"]  # noqa: Y015
+    _WhichOneofArgType__preference: _TypeAlias = _typing.Literal["_preference", b"_preference"]  # noqa: Y015
+    _WhichOneofReturnType__tile: _TypeAlias = _typing.Literal["tile"]  # noqa: Y015
+    _WhichOneofArgType__tile: _TypeAlias = _typing.Literal["_tile", b"_tile"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__image) -> _WhichOneofReturnType__image | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__preference) -> _WhichOneofReturnType__preference | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__tile) -> _WhichOneofReturnType__tile | None: ...
+
+Global___Candidate: _TypeAlias = Candidate  # noqa: Y015
+
+@_typing.final
 class Refusal(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
     STAGE_FIELD_NUMBER: _builtins.int
     REASON_FIELD_NUMBER: _builtins.int
     MESSAGE_FIELD_NUMBER: _builtins.int
+    CANDIDATES_FIELD_NUMBER: _builtins.int
     stage: _builtins.str
     """features, retrieval, matching, pose or gate"""
     reason: _builtins.str
     """a stable word"""
     message: _builtins.str
     """for a person"""
+    @_builtins.property
+    def candidates(self) -> _containers.RepeatedCompositeFieldContainer[Global___Candidate]:
+        """of reason ambiguous: the two places, most inliers first"""
+
     def __init__(
         self,
         *,
         stage: _builtins.str = ...,
         reason: _builtins.str = ...,
         message: _builtins.str = ...,
+        candidates: _abc.Iterable[Global___Candidate] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["message", b"message", "reason", b"reason", "stage", b"stage"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["candidates", b"candidates", "message", b"message", "reason", b"reason", "stage", b"stage"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

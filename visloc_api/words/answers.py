@@ -177,12 +177,55 @@ class RigPose(_PoseWithDigits):
     ] = None
 
 
+class MapRef(Answer):
+    """The map that answered, or the set of maps."""
+
+    id: str
+    version: str
+
+
+class Candidate(AnswerWithArrays):
+    """One of the two places between which an ambiguous query leaves the choice."""
+
+    map: Annotated[
+        MapRef, Field(description="the map, or the set of maps, in whose frame the pose is")
+    ]
+    tile: Annotated[
+        str | None, Field(description="of a set: id@version of the map in it; null otherwise")
+    ] = None
+    position: Annotated[
+        Numbers3,
+        Field(description="camera centre, or the rig's origin, in the world"),
+    ]
+    orientation: Annotated[
+        Numbers4,
+        Field(description="rotation of world_from_cam, or of world_from_rig, as w, x, y, z"),
+    ]
+    inliers: Annotated[int, Field(description="keypoints that agree with the pose")]
+    image: Annotated[
+        str | None, Field(description="the mapping photo that speaks most for this place")
+    ] = None
+    preference: Annotated[
+        float | None,
+        Field(
+            description="how surely the keypoints speak for this place and against the other one, "
+            "in standard deviations; null when they were not compared"
+        ),
+    ] = None
+
+
 class Refusal(Answer):
     """Why there is no pose."""
 
     stage: Annotated[str, OneOf(visloc.types.Stage), Field(description="the stage that refused")]
     reason: Annotated[str, OneOf(visloc.types.Reason), Field(description="a stable word")]
     message: Annotated[str, Field(description="for a person")]
+    candidates: Annotated[
+        tuple[Candidate, ...],
+        Field(
+            description="of reason ambiguous: the two places, most inliers first; empty otherwise"
+        ),
+    ] = ()
 
 
 class RetrievedImage(Answer):
@@ -246,13 +289,6 @@ class Orientation(Answer):
             "stored: in the pixels as stored, or the features were sent"
         ),
     ]
-
-
-class MapRef(Answer):
-    """The map that answered, or the set of maps."""
-
-    id: str
-    version: str
 
 
 # In Python, keypoints are (n, 2), points (n, 3) and inliers (n,).

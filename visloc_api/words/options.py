@@ -110,6 +110,7 @@ class LocalizeOptions(IncomingMessage):
     max_error_px: Annotated[float | None, _option("max_error_px")] = None
     min_inliers: Annotated[int | None, _option("min_inliers")] = None
     min_inlier_ratio: Annotated[float | None, _option("min_inlier_ratio")] = None
+    min_probability: Annotated[float | None, _option("min_probability")] = None
     read_as: Annotated[str | None, _option("read_as")] = None
     extraction: Annotated[str | None, _option("extraction")] = None
     fusion: Annotated[str | None, _option("fusion")] = None

@@ -82,11 +82,26 @@ export interface PoseEstimate {
   probability: number | null;
 }
 
+/** One of the two places between which an ambiguous photo leaves the choice. */
+export interface Candidate {
+  /** In whose frame the pose is: a map, or a set of maps. */
+  map: { id: string; version: string };
+  /** Of a set: `id@version` of the map in it. */
+  tile: string | null;
+  position: number[];
+  orientation: number[];
+  inliers: number;
+  /** The mapping photo that speaks most for this place. */
+  image: string | null;
+  /** How surely the keypoints speak for this place, in standard deviations; null if not compared. */
+  preference: number | null;
+}
+
 export interface LocalizeResponse {
   request_id: string;
   status: "localized" | "not_localized";
   pose: PoseEstimate | null;
-  refusal: { stage: string; reason: string; message: string } | null;
+  refusal: { stage: string; reason: string; message: string; candidates: Candidate[] } | null;
   keypoints: number;
   correspondences: number;
   inliers: number;

@@ -33,7 +33,7 @@ from visloc.geometry import Pose, Similarity
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.constraints import Constraints, MapGeometry
-from visloc.localization.judge import TIE_REACH_SHARE, Candidate, Tie, judge
+from visloc.localization.judge import TIE_REACH_SHARE, PlaceAnswer, Tie, judge
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import SeenImage
 from visloc.options import LocalizeOptions
@@ -294,7 +294,8 @@ def localize_in(store: MapStore, set_id: str, photo: Any, camera: Any, priors: P
         look = localizer.look(photo, camera, options, in_tile)
         seen = SeenImage("camera", Pose.identity(), look)
         answer = localizer.solve([seen], options, in_tile).answer
-        found.append(Candidate(tile.ref, answer_in_set(answer, set_from_tile)))
+        in_set = answer_in_set(answer, set_from_tile, opened.ref)
+        found.append(PlaceAnswer(opened.ref, in_set, tile.ref))
     tie = Tie(Similarity.identity(), TIE_REACH_SHARE * float(opened.reaches.max()))
     chosen = judge(found, lambda *_: tie)
     return chosen if isinstance(chosen, Refusal) else found[chosen]

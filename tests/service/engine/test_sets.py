@@ -166,6 +166,23 @@ def test_priors_choose_tiles_and_are_obeyed_in_the_frame_of_the_set(
         assert caught.value.code == "priors.maps"
 
 
+def test_a_raised_gate_counts_in_a_set(client: Client, query: Any) -> None:
+    own = client.localize(query.image, "site", query.camera)
+    assert own.pose is not None
+    assert own.pose.probability is not None
+    more = {"min_probability": min(1.0, own.pose.probability + 1e-6)}
+    for maps in ("site", ["site", "room"]):
+        found = client.localize(query.image, maps, query.camera, options=more)
+        assert found.refusal is not None
+        assert found.refusal.reason == "unlikely_pose"
+    less = {"min_probability": own.pose.probability}
+    assert client.localize(query.image, "site", query.camera, options=less).localized
+    sent = instants([query.image] * 2, query.camera)
+    for each in client.localize_sequence(sent, "site", options=more):
+        assert each.refusal is not None
+        assert each.refusal.reason == "unlikely_pose"
+
+
 def test_two_places_that_look_alike_are_no_answer(client: Client, site: Path, query: Any) -> None:
     found = client.localize(query.image, "twice", query.camera)
     assert found.pose is None
@@ -174,6 +191,13 @@ def test_two_places_that_look_alike_are_no_answer(client: Client, site: Path, qu
     assert f"room@{MapStore(site).current_version('room')}" in found.refusal.message
     assert "copy@v1" in found.refusal.message
     assert found.inliers > 0
+    places = {place.tile: place for place in found.refusal.candidates}
+    assert set(places) == {f"room@{MapStore(site).current_version('room')}", "copy@v1"}
+    assert {place.map.id for place in places.values()} == {"twice"}
+    for tile, place in places.items():  # in the set's frame, where each tile says that it is
+        alone = client.localize(query.image, "twice", query.camera, priors=Priors(maps=(tile,)))
+        assert place.position == pytest.approx(alone.pose.position, abs=1e-6)
+        assert place.orientation == pytest.approx(alone.pose.orientation, abs=1e-6)
     one = client.localize(query.image, "twice", query.camera, priors=Priors(maps=("copy@v1",)))
     assert one.pose is not None
     assert one.tile == "copy@v1"

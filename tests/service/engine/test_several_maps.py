@@ -83,6 +83,17 @@ def test_a_photo_that_two_maps_explain_is_refused(client: Client, query: Any) ->
         assert "room@" in found.refusal.message
         assert "twin@v1" in found.refusal.message
         assert found.inliers > 0
+        room, twin = sorted(found.refusal.candidates, key=lambda each: each.map.id)
+        assert (room.map.id, twin.map.id, twin.map.version) == ("room", "twin", "v1")
+        # Each is in the frame of its own map; the twin is a copy.
+        for each in (room, twin):
+            assert each.tile is None
+            assert each.position == pytest.approx(query.cam_from_world.center, abs=0.05)
+            turned = query.cam_from_world.inverse().rotation_wxyz
+            assert each.orientation == pytest.approx(turned, abs=0.01)
+            assert each.inliers > 30
+            assert each.image in {image.image for image in found.retrieved}
+        assert room.preference == pytest.approx(-twin.preference)
 
 
 def test_a_rig_that_two_maps_explain_is_refused(client: Client, sample: Path) -> None:
@@ -95,6 +106,11 @@ def test_a_rig_that_two_maps_explain_is_refused(client: Client, sample: Path) ->
     assert found.pose is None
     assert found.refusal is not None
     assert found.refusal.reason == "ambiguous"
+    alone = client.localize_rig(images, "room", "rig").pose
+    for each in found.refusal.candidates:
+        assert each.position == pytest.approx(alone.position, abs=1e-6)
+        assert each.orientation == pytest.approx(alone.orientation, abs=1e-6)
+    assert {each.map.id for each in found.refusal.candidates} == {"room", "twin"}
 
 
 def test_a_sequence_that_two_maps_explain_is_refused(client: Client, query: Any) -> None:
@@ -106,6 +122,7 @@ def test_a_sequence_that_two_maps_explain_is_refused(client: Client, query: Any)
         assert each.pose is None
         assert each.refusal is not None
         assert each.refusal.reason == "ambiguous"
+        assert {place.map.id for place in each.refusal.candidates} == {"room", "twin"}
 
 
 def test_maps_of_one_frame_agree(client: Client, query: Any) -> None:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from service.values import Localization
-from service.workers.judging import judged
+from service.workers.judging import gated, judged
 from tests.visloc.answers import localized, refused
 from visloc.archive import Geodetic
-from visloc.types import Reason
+from visloc.options import LocalizeOptions
+from visloc.types import InstantAnswer, Reason
 
 
 def of_map(ref: str, answer: Any, tile: str | None = None, **frame: Any) -> Localization:
@@ -66,3 +68,29 @@ def test_certainty_is_compared_in_one_unit() -> None:
     for found in ([coarse, fine], [fine, coarse]):
         assert judged(found)[1].map_id == "fine"
     assert np.isclose(coarse.reach, fine.reach)
+
+
+def likely(answer: InstantAnswer, probability: float) -> InstantAnswer:
+    assert answer.pose is not None
+    return replace(answer, pose=replace(answer.pose, probability=probability))
+
+
+def test_a_raised_gate_refuses_the_best_place_and_never_makes_the_second_best_win() -> None:
+    best = of_map("site@v1", likely(localized(400), 0.5), tile="a@v1")
+    second = of_map("site@v1", likely(localized(60, (50, 0, 0)), 0.95), tile="b@v1")
+    row, found = judged([second, best])
+    assert row == 1
+
+    for asked, believed in ((None, True), (0.4, True), (0.8, False)):
+        answer = gated(found, LocalizeOptions(min_probability=asked)).answer
+        assert (answer.pose is not None) == believed
+        if not believed:
+            assert answer.refusal is not None
+            assert answer.refusal.reason is Reason.UNLIKELY_POSE
+            assert "0.50" in answer.refusal.message
+
+
+def test_a_pose_that_was_not_judged_passes_every_gate() -> None:
+    found = of_map("room@v1", localized(200))
+
+    assert gated(found, LocalizeOptions(min_probability=1.0)) is found

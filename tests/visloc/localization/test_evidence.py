@@ -190,6 +190,25 @@ def test_who_names_thresholds_gets_the_pose_and_its_probability(localizer: Local
     assert refusal.reason is Reason.UNLIKELY_POSE
 
 
+def test_a_raised_gate_refuses_a_right_pose_that_is_not_sure_enough(
+    localizer: Localizer, queries: list[Query]
+) -> None:
+    query = queries[0]
+    photo = read_photo(query.image)
+    believed = localizer.localize(photo, query.camera, OPTIONS)
+    assert isinstance(believed, Localized)
+    assert believed.probability is not None
+
+    least = replace(OPTIONS, min_probability=believed.probability)
+    more = replace(OPTIONS, min_probability=np.nextafter(believed.probability, 1.0))
+
+    assert isinstance(localizer.localize(photo, query.camera, least), Localized)
+    refused = localizer.localize(photo, query.camera, more)
+    assert isinstance(refused, NotLocalized)
+    assert (refused.stage, refused.reason) == ("gate", Reason.UNLIKELY_POSE)
+    assert "min_probability" in refused.message
+
+
 def test_a_model_of_other_features_is_refused(tmp_path: Path) -> None:
     other = tmp_path / "model.json"
     other.write_text('{"bias": 0.0, "mean_scale_weight": {"luck": [0.0, 1.0, 1.0]}}')

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.visloc.answers import localized, refused
 from visloc.geometry import Similarity
-from visloc.localization.judge import Candidate, Tie, judge
+from visloc.localization.judge import PlaceAnswer, Tie, judge
 from visloc.pose.centre import moved_pose
 from visloc.sets.frame import answer_in_set
 from visloc.types import Reason, Refusal
@@ -25,8 +25,8 @@ def untied(*_: int) -> None:
     return None
 
 
-def of(*answers: Any) -> list[Candidate]:
-    return [Candidate(f"map-{i}@v1", answer) for i, answer in enumerate(answers)]
+def of(*answers: Any) -> list[PlaceAnswer]:
+    return [PlaceAnswer(f"map-{i}@v1", answer) for i, answer in enumerate(answers)]
 
 
 def test_most_inliers_win() -> None:
@@ -50,6 +50,36 @@ def test_two_places_that_explain_it_are_refused() -> None:
     assert answer.reason is Reason.AMBIGUOUS
     assert "map-0@v1 and map-1@v1" in answer.message
     assert "at different places, with 200 and 100 inliers" in answer.message
+
+
+def test_a_refusal_states_both_places_and_what_speaks_for_them() -> None:
+    few, many = localized(150, (3, 0, 0)), localized(200, turn=np.pi)
+    few = replace(few, scores=np.ones(40, np.float32))
+    many = replace(many, scores=np.ones(40, np.float32))
+    few.scores[:9] = 0.0
+    places = [PlaceAnswer("set@v1", few, "left@v1"), PlaceAnswer("set@v1", many, "right@v2")]
+
+    answer = judge(places, one_frame)
+
+    assert isinstance(answer, Refusal)
+    first, second = answer.candidates
+    assert (first.num_inliers, first.map, first.tile) == (200, "set@v1", "right@v2")
+    assert (second.num_inliers, second.map, second.tile) == (150, "set@v1", "left@v1")
+    np.testing.assert_allclose(second.rig_from_world.center, (3, 0, 0))
+    # Nine keypoints speak for the first alone.
+    assert first.preference == pytest.approx(3.0)
+    assert second.preference == pytest.approx(-3.0)
+    assert first.image is None  # these answers name no retrieved photo
+
+
+def test_keypoints_of_different_features_are_not_compared() -> None:
+    few = replace(localized(150, (3, 0, 0)), scores=np.ones(7, np.float32))
+    many = replace(localized(200), scores=np.ones(8, np.float32))
+
+    answer = judge(of(many, few), one_frame)
+
+    assert isinstance(answer, Refusal)
+    assert [each.preference for each in answer.candidates] == [None, None]
 
 
 def test_a_rival_of_few_inliers_is_no_reason_to_refuse() -> None:
@@ -98,8 +128,8 @@ def test_poses_are_compared_in_one_frame_and_unit() -> None:
     turn = Rotation.from_euler("zyx", [40, -20, 10], degrees=True).as_matrix()
     b_from_a = Similarity(2.5, turn, np.array([30.0, -4.0, 7.0]))
     here = localized(200, (1.0, 2.0, 3.0), turn=0.4)
-    there = answer_in_set(localized(190, (1.2, 2.0, 3.0), turn=0.4), b_from_a)
-    elsewhere = answer_in_set(localized(190, (1.6, 2.0, 3.0), turn=0.4), b_from_a)
+    there = answer_in_set(localized(190, (1.2, 2.0, 3.0), turn=0.4), b_from_a, "set@v1")
+    elsewhere = answer_in_set(localized(190, (1.6, 2.0, 3.0), turn=0.4), b_from_a, "set@v1")
 
     def tied(a: int, _: int) -> Tie:
         return Tie(b_from_a.inverse() if a == 0 else b_from_a, SLACK if a == 0 else 2.5 * SLACK)

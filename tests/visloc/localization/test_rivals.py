@@ -63,6 +63,29 @@ def test_identical_places_are_refused_with_both_named(
     assert answer.message.count("inliers in") == 2
 
 
+@pytest.mark.parametrize("floor", [0, 1])
+def test_candidates_are_the_poses_on_both_floors(room: Localizer, place: Any, floor: int) -> None:
+    building = Building(room, 0.0, 0.0)
+    answer = building.ask(place, floor, NO_PRIORS)
+
+    assert isinstance(answer, NotLocalized)
+    assert len(answer.candidates) == 2
+    places = sorted(answer.candidates, key=lambda each: each.rig_from_world.center[2])
+    for on, each in enumerate(places):
+        expected = Building.pose(on, 2.2)
+        np.testing.assert_allclose(each.rig_from_world.center, expected.center, atol=0.05)
+        np.testing.assert_allclose(each.rig_from_world.rotation, expected.rotation, atol=0.01)
+    first, second = answer.candidates
+    assert first.num_inliers >= second.num_inliers > 30
+    assert first.preference is not None
+    assert first.preference == -second.preference  # type: ignore[operator]
+    assert abs(first.preference) < SURE
+    names = {image.name for image in building.localizer.map.images}
+    assert {first.image, second.image} <= names
+    assert {each.map for each in answer.candidates} == {building.localizer.map.ref}
+    assert {each.tile for each in answer.candidates} == {None}
+
+
 @pytest.mark.parametrize("top_k", [2, 3, 16])
 @pytest.mark.parametrize("floor", [0, 1])
 def test_however_many_photos_are_searched_identical_places_are_told_from_no_other(

@@ -461,6 +461,35 @@ def test_photos_with_evidence_against_their_pose_do_not_pass_together(
     assert {a.refusal.reason for a in answers if a.refusal is not None} == {reason}
 
 
+def test_instants_less_probable_than_asked_for_are_filled_by_those_that_are_not(here: Any) -> None:
+    solving = SequenceSolver(
+        here.geometry,
+        metric=True,
+        options=replace(OPTIONS, min_probability=0.8),
+        time_unit=TimeUnit.MS,
+        max_gap_s=1.0,
+    )
+    answers = []
+    for seen, probability in zip(
+        instants_of(here, "ggggg", moving=True), (0.9, 0.5, 0.79, 0.8, 0.2), strict=True
+    ):
+        solved = solving.solve(seen)
+        pose = solved.answer.pose
+        assert pose is not None
+        judged = replace(solved.answer, pose=replace(pose, probability=probability))
+        answers += solving.take(seen, replace(solved, answer=judged))
+    answers += solving.finish()
+
+    assert sources(answers) == "EMMEM"
+    check_answers(answers, here, [rig_at(i) for i in range(5)])
+    for answer in answers:
+        assert answer.pose is not None
+        if answer.pose.source is PoseSource.MOTION:
+            assert answer.refusal is not None
+            assert answer.refusal.reason is Reason.UNLIKELY_POSE
+            assert answer.pose.probability is None
+
+
 def test_motion_reaches_no_further_than_the_gap(here: Any) -> None:
     answers = answers_to(solver(here, 0.25), instants_of(here, "g....", moving=True))
     assert sources(answers) == "EMM--"

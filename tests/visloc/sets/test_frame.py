@@ -18,10 +18,13 @@ from visloc.priors import NO_PRIORS, GravityPrior, HeightBand, PosePrior, Positi
 from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
 from visloc.types import (
     CameraSource,
+    Candidate,
     Evidence,
     ImageAnswer,
     InstantAnswer,
     PoseSource,
+    Reason,
+    Refusal,
     RigPose,
     Uncertainty,
 )
@@ -50,7 +53,7 @@ POINTS = RANDOM.normal(size=(9, 3))
 
 
 def moved_rig(answer: InstantAnswer, set_from_tile: Similarity = SET_FROM_TILE) -> RigPose:
-    pose = answer_in_set(answer, set_from_tile).pose
+    pose = answer_in_set(answer, set_from_tile, "floors@v1").pose
     assert pose is not None
     return pose
 
@@ -93,20 +96,20 @@ def test_standard_deviations_scale_with_the_unit_and_turn_with_the_axes() -> Non
 
 
 def test_an_answer_moved_there_and_back_is_what_it_was() -> None:
-    back = moved_rig(answer_in_set(ANSWER, SET_FROM_TILE), SET_FROM_TILE.inverse())
+    back = moved_rig(answer_in_set(ANSWER, SET_FROM_TILE, "floors@v1"), SET_FROM_TILE.inverse())
 
     np.testing.assert_allclose(back.rig_from_world.translation, CAM_FROM_TILE.translation)
     np.testing.assert_allclose(back.covariance, COVARIANCE, rtol=1e-6, atol=1e-12)
 
 
 def test_a_rig_moves_with_its_cameras() -> None:
-    moved = answer_in_set(ANSWER, SET_FROM_TILE)
+    moved = answer_in_set(ANSWER, SET_FROM_TILE, "floors@v1")
 
     assert moved.pose is not None
     cam_from_set = moved.images[0].cam_from_rig @ moved.pose.rig_from_world
     expected = SET_FROM_TILE.move(CAM_FROM_RIG @ CAM_FROM_TILE)
     np.testing.assert_allclose(cam_from_set.translation, expected.translation)
-    assert answer_in_set(replace(ANSWER, pose=None), SET_FROM_TILE).pose is None
+    assert answer_in_set(replace(ANSWER, pose=None), SET_FROM_TILE, "floors@v1").pose is None
     # A rig that is sent is in the set's unit.
     sent = scaled_device(moved.images[0].cam_from_rig, SET_FROM_TILE.inverse().scale)
     np.testing.assert_allclose(sent.translation, CAM_FROM_RIG.translation)
@@ -187,3 +190,19 @@ def test_a_height_band_without_any_down_is_refused() -> None:
 
 def test_no_priors_stay_none() -> None:
     assert priors_in_tile(NO_PRIORS, SET_FROM_TILE, None).position is None
+
+
+def test_candidates_of_a_refusal_move_and_name_the_set_and_the_tile() -> None:
+    places = (Candidate(CAM_FROM_TILE, 40, "floor@v1", image="a.jpg", preference=0.5),)
+    refused = replace(
+        ANSWER, pose=None, refusal=Refusal("gate", Reason.AMBIGUOUS, "two doors", places)
+    )
+
+    refusal = answer_in_set(refused, SET_FROM_TILE, "floors@v1").refusal
+
+    assert refusal is not None
+    (moved,) = refusal.candidates
+    np.testing.assert_allclose(
+        moved.rig_from_world.center, SET_FROM_TILE.apply(CAM_FROM_TILE.center), atol=1e-9
+    )
+    assert (moved.map, moved.tile, moved.image) == ("floors@v1", "floor@v1", "a.jpg")

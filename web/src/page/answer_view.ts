@@ -1,12 +1,12 @@
 // The answer to a photo: a pose, or how far the photo came and what to try.
-import type { LocalizeResponse, PoseEstimate } from "../api";
+import { mapRef, type LocalizeResponse, type PoseEstimate } from "../api";
 import { button, element, facts } from "../dom";
 import { ellipsoid95, lengthText, REACH_95 } from "../geometry";
 import { copyText, textsToCopy } from "./copying";
 import type { Entry } from "./photo_queue";
 import { photoPicture } from "./photo_picture";
 import { advice, outcomes, STAGES } from "./refusals";
-import { covarianceOfPosition } from "./shown_pose";
+import { covarianceOfPosition, shownPlaces } from "./shown_pose";
 import { answerJson, curlLine, pythonLines, type Question } from "./snippets";
 import { CAMERA_SOURCES, countText, digits, positionStd, secondsText } from "../words";
 
@@ -21,6 +21,8 @@ export interface AnswerActions {
   announce(text: string): void;
   /** Let these mapping photos stand out; null is those of the answer. */
   highlight(image: string | null): void;
+  /** Look at a candidate in the 3D view, by its row; null when another map is shown. */
+  lookAt: ((place: number) => void) | null;
   takeCamera(): void;
   again(): void;
 }
@@ -36,6 +38,7 @@ export function answerView(
     { class: "stack answer" },
     ...(actions.chooseMap === null ? [] : [ofAnotherMap(answer, actions.chooseMap)]),
     pose === null ? refused(answer, actions.options) : localized(answer, pose, actions.metric),
+    ...candidateList(answer, actions),
     photoPicture(entry.photo, answer),
     ...(pose === null ? [] : [poseTable(pose, actions.metric)]),
     section(
@@ -141,6 +144,37 @@ function refused(answer: LocalizeResponse, options: Record<string, string | numb
     element("h3", {}, "What to try"),
     element("ul", { class: "tries" }, ...tries.map((text) => element("li", {}, text))),
   );
+}
+
+/** The two places of an ambiguous photo. */
+function candidateList(answer: LocalizeResponse, actions: AnswerActions): HTMLElement[] {
+  const candidates = answer.refusal?.candidates ?? [];
+  if (candidates.length === 0) return [];
+  const { lookAt } = actions;
+  const drawn = shownPlaces(answer);
+  const rows = candidates.map(({ map, tile, position, inliers, image, preference }, place) => {
+    const where = position.map((value) => value.toFixed(2)).join(", ");
+    const told = preference === null ? "" : `, preferred by ${signed(preference)} deviations`;
+    const facts = element(
+      "p",
+      {},
+      `${tile ?? mapRef(map)}, at ${where}: ${countText(inliers)} inliers${told}`,
+    );
+    const buttons = element("div", { class: "row" });
+    if (image !== null) {
+      buttons.append(button(image, () => actions.highlight(image), { class: "link name" }));
+    }
+    // Places of another map cannot be drawn in this one.
+    if (lookAt !== null && drawn.length === candidates.length) {
+      buttons.append(button("Look there", () => lookAt(place)));
+    }
+    return element("li", { class: "stack near" }, facts, buttons);
+  });
+  return [section("Either of two places", element("ol", { class: "candidates" }, ...rows))];
+}
+
+function signed(value: number): string {
+  return `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(1)}`;
 }
 
 function percent(answer: LocalizeResponse): string {

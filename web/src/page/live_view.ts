@@ -28,10 +28,10 @@ export class WalkView {
     const now = performance.now();
     const pose = shownPose(answer);
     if (pose === null) {
-      if (now - this.#shownAt > POSE_SHOWN_MS) this.viewer.showPose(null);
+      if (now - this.#shownAt > POSE_SHOWN_MS) this.viewer.showPoses([]);
       return;
     }
-    this.viewer.showPose(pose);
+    this.viewer.showPoses([pose]);
     this.#shownAt = now;
     const leftAlone = now - this.#handsOnAt > HANDS_OFF_MS;
     if (follow && leftAlone && now - this.#flownAt > FLY_EVERY_MS) {
@@ -42,6 +42,6 @@ export class WalkView {
 
   /** The walk is over: its last pose is past. */
   clear(): void {
-    this.viewer.showPose(null);
+    this.viewer.showPoses([]);
   }
 }

@@ -16,7 +16,7 @@ import { jpegHeader } from "./jpeg_header";
 import { createOptionsForm } from "./options_form";
 import { createPhotoQueue, questionOf, type Entry, type Wish } from "./photo_queue";
 import { problemView } from "./problem_view";
-import { shownPose } from "./shown_pose";
+import { shownPlaces } from "./shown_pose";
 import { countText } from "../words";
 
 export interface PhotoPanelParts {
@@ -76,7 +76,7 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
   /** Show each answer as it comes, until another photo is clicked. */
   let follow = true;
   let drawing = true;
-  let drawn: ShownPose | null = null;
+  let drawn: ShownPose[] = [];
 
   const queue = createPhotoQueue(parts.service, parts.hasKey, (entry) => {
     if (entry.state === "running" && follow) selected = entry;
@@ -226,6 +226,13 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
           announce,
           highlight: (image) =>
             viewer.highlight(image === null ? retrievedOf(answer) : new Set([image])),
+          lookAt: isShown(answer)
+            ? (place) => {
+                startDrawing();
+                draw(answer);
+                flyTo(place);
+              }
+            : null,
           takeCamera: () => {
             const { model, width, height, params } = answer.camera;
             camera.set({ model, width, height, params });
@@ -257,18 +264,20 @@ export function createPhotoPanel(host: HTMLElement, parts: PhotoPanelParts): Pho
 
   function draw(answer: LocalizeResponse | null, fly = false): void {
     if (!drawing) return;
-    drawn = answer === null ? null : shownPose(answer);
-    viewer.showPose(drawn);
+    drawn = answer === null ? [] : shownPlaces(answer);
+    viewer.showPoses(drawn);
     viewer.highlight(answer === null ? new Set() : retrievedOf(answer));
-    photoView.hidden = drawn === null;
+    photoView.hidden = answer?.pose == null;
     if (!fly) return;
     // Of a refused photo, where it was looked for.
-    if (drawn !== null) viewer.flyTo(drawn);
+    if (answer?.pose != null) flyTo(0);
     else if (answer !== null) viewer.overview();
   }
-  photoView.addEventListener("click", () => {
-    if (drawn !== null) viewer.flyTo(drawn);
-  });
+  function flyTo(place: number): void {
+    const pose = drawn[place];
+    if (pose !== undefined) viewer.flyTo(pose);
+  }
+  photoView.addEventListener("click", () => flyTo(0));
 
   return {
     camera: camera.camera,

@@ -1,5 +1,11 @@
 // An answer as the 3D view draws it.
-import type { LocalizeResponse, PoseEstimate, Quaternion, Vector3 } from "../api";
+import {
+  mapRef,
+  type LocalizeResponse,
+  type PoseEstimate,
+  type Quaternion,
+  type Vector3,
+} from "../api";
 import { positionCovariance, type Matrix3 } from "../geometry";
 import type { ShownPose } from "../viewer/types";
 
@@ -14,6 +20,22 @@ export function shownPose({ pose, camera, debug }: LocalizeResponse): ShownPose 
     inliers:
       debug?.inliers.flatMap((yes, i) => (yes ? debug.points.slice(3 * i, 3 * i + 3) : [])) ?? [],
   };
+}
+
+/**
+ * The places to draw: that of the pose, or the two of an ambiguous photo, as far as they are in the
+ * frame of the answer's map.
+ */
+export function shownPlaces(answer: LocalizeResponse): ShownPose[] {
+  const pose = shownPose(answer);
+  if (pose !== null) return [pose];
+  return (answer.refusal?.candidates ?? [])
+    .filter(({ map }) => mapRef(map) === mapRef(answer.map))
+    .map(({ position, orientation }) => ({
+      position: position as Vector3,
+      orientation: orientation as Quaternion,
+      camera: answer.camera,
+    }));
 }
 
 /** 3 x 3, row by row, of the camera's centre in the world. */

@@ -10,7 +10,7 @@ export function withoutView(host: HTMLElement, why: string): Viewer {
   return {
     ...{ reset: nothing, addPoints: nothing, setPointColours: nothing, setPointSize: nothing },
     ...{ setMappingCameras: nothing, showMappingCameras: nothing, highlight: nothing },
-    ...{ showPose: nothing, setTrail: nothing, setCoverage: nothing },
+    ...{ showPoses: nothing, setTrail: nothing, setCoverage: nothing },
     ...{ overview: nothing, flyTo: nothing, setTheme: nothing },
     statistics: { pointsLoaded: 0, pointsDrawn: 0, framesPerSecond: null, firstPictureMs: null },
     viewpoint: { position: [0, 0, 0], target: [0, 0, 0] },

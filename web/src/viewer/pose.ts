@@ -20,24 +20,41 @@ import type { ShownPose } from "./types";
 const UNSEEN_PX = 5;
 const DOT_PX = 9;
 
-export class PoseMark {
+export class PoseMarks {
   readonly object = new Group();
-  private parts: Group | null = null;
-  private dot: Object3D | null = null;
-  private reach = 0;
-  private readonly centre = new Vector();
+  private marks: PoseMark[] = [];
 
   set(
-    pose: ShownPose | null,
+    poses: ShownPose[],
     origin: Vector3,
     depth: number,
     palette: Palette,
     pixelRatio: number,
   ): void {
-    discard(this.parts);
-    this.parts = this.dot = null;
-    if (pose === null) return;
-    this.parts = new Group();
+    for (const mark of this.marks) discard(mark.parts);
+    this.marks = poses.map((pose) => new PoseMark(pose, origin, depth, palette, pixelRatio));
+    for (const mark of this.marks) this.object.add(mark.parts);
+  }
+
+  /** Mark each place by a dot where the ellipsoid is too small to be seen. */
+  update(camera: PerspectiveCamera, height: number): void {
+    for (const mark of this.marks) mark.update(this.object, camera, height);
+  }
+}
+
+class PoseMark {
+  readonly parts = new Group();
+  private readonly dot: Object3D;
+  private readonly reach: number;
+  private readonly centre = new Vector();
+
+  constructor(
+    pose: ShownPose,
+    origin: Vector3,
+    depth: number,
+    palette: Palette,
+    pixelRatio: number,
+  ) {
     const centre = subtract(pose.position, origin);
     this.centre.set(...centre);
     const rays = cornerRays(pose.camera);
@@ -51,15 +68,15 @@ export class PoseMark {
     );
     this.parts.add(plane, frame);
     this.addInliers(pose.inliers ?? [], centre, origin, palette, pixelRatio);
-    this.reach = 0;
+    let reach = 0;
     if (pose.positionCovariance !== undefined) {
       const { halfAxes, directions } = ellipsoid95(pose.positionCovariance as Matrix3);
-      this.reach = halfAxes[0];
-      if (this.reach > 0) this.parts.add(ellipsoid(centre, halfAxes, directions, palette));
+      reach = halfAxes[0];
+      if (reach > 0) this.parts.add(ellipsoid(centre, halfAxes, directions, palette));
     }
+    this.reach = reach;
     this.dot = dots(new Float32Array(centre), palette.pose, palette.ground, DOT_PX * pixelRatio);
     this.parts.add(this.dot);
-    this.object.add(this.parts);
     // An answer is seen through everything that stands before it.
     for (const part of [plane, frame, this.dot]) onTop(part);
   }
@@ -85,13 +102,11 @@ export class PoseMark {
     const opacity = Math.min(Math.max(12 / count, 0.08), 0.35);
     const marks = dots(points, palette.pose, palette.ground, 5.5 * pixelRatio);
     onTop(marks);
-    this.parts!.add(thinLines(ends, palette.pose, opacity), marks);
+    this.parts.add(thinLines(ends, palette.pose, opacity), marks);
   }
 
-  /** Mark the place by a dot where the ellipsoid is too small to be seen. */
-  update(camera: PerspectiveCamera, height: number): void {
-    if (this.dot === null) return;
-    const distance = this.object.localToWorld(this.centre.clone()).distanceTo(camera.position);
+  update(world: Object3D, camera: PerspectiveCamera, height: number): void {
+    const distance = world.localToWorld(this.centre.clone()).distanceTo(camera.position);
     const perPixel = (2 * distance * Math.tan((camera.fov / 360) * Math.PI)) / height;
     this.dot.visible = this.reach < UNSEEN_PX * perPixel;
   }

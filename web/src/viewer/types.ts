@@ -63,8 +63,8 @@ export interface Viewer {
   showMappingCameras(shown: boolean): void;
   /** Mapping cameras to stand out, such as those retrieved. */
   highlight(names: ReadonlySet<string>): void;
-  /** Draw a pose and what belongs to it; null takes the last one away. */
-  showPose(pose: ShownPose | null): void;
+  /** Draw poses and what belongs to them, instead of those before; [] draws none. */
+  showPoses(poses: ShownPose[]): void;
   /** Positions of a walk, joined by a line. */
   setTrail(positions: Vector3[]): void;
   setCoverage(arrows: CoverageArrow[]): void;

@@ -10,7 +10,7 @@ import { discard } from "./lines";
 import { MappingCameras } from "./mapping";
 import { Overlay } from "./overlay";
 import { Pace } from "./pace";
-import { PoseMark } from "./pose";
+import { PoseMarks } from "./pose";
 import { Steering } from "./steering";
 import {
   coverageArrows,
@@ -50,8 +50,8 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
   const world = new Group();
   scene.add(world);
   const mapping = new MappingCameras();
-  const mark = new PoseMark();
-  world.add(mapping.object, mark.object);
+  const marks = new PoseMarks();
+  world.add(mapping.object, marks.object);
 
   let palette = PALETTES[theme];
   let origin: Vector3 = [0, 0, 0];
@@ -59,7 +59,7 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
   let metric = false;
   let images: MapImage[] = [];
   let cameras: Record<string, Camera> = {};
-  let pose: ShownPose | null = null;
+  let poses: ShownPose[] = [];
   let trail: Vector3[] = [];
   let coverage: CoverageArrow[] = [];
   let grid: Group | null = null;
@@ -113,7 +113,7 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
       cloud.draw(renderer, camera, view, count, moved);
       cloud.present(renderer, camera, !software || cloud.drawn === cloud.loaded);
     }
-    mark.update(camera, size.height);
+    marks.update(camera, size.height);
     renderer.render(scene, camera);
     const halfHeight = steering.distance * Math.tan((camera.fov / 360) * Math.PI);
     overlay.setScale((2 * halfHeight) / size.height, metric);
@@ -164,8 +164,8 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
     request();
   }
 
-  function showPose(): void {
-    mark.set(pose, origin, 1.6 * depth(), palette, pixelRatio);
+  function showPoses(): void {
+    marks.set(poses, origin, 1.6 * depth(), palette, pixelRatio);
     describe();
     request();
   }
@@ -184,7 +184,8 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
     const parts = [
       counted(cloud.loaded, "landmark"),
       ...(images.length > 0 ? [counted(images.length, "mapping photo")] : []),
-      ...(pose !== null ? ["the camera of the last answer"] : []),
+      ...(poses.length === 1 ? ["the camera of the last answer"] : []),
+      ...(poses.length > 1 ? [`${poses.length} places that the last photo may be of`] : []),
       ...(coverage.length > 0 ? ["where a photo would be localized"] : []),
     ];
     canvas.setAttribute(
@@ -245,9 +246,9 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
       ({ origin, up, metric } = given);
       cloud.clear();
       mapping.clear();
-      mark.set(null, origin, 1, palette, pixelRatio);
+      marks.set([], origin, 1, palette, pixelRatio);
       discard(grid);
-      [images, cameras, pose, trail, coverage] = [[], {}, null, [], []];
+      [images, cameras, poses, trail, coverage] = [[], {}, [], [], []];
       [extent, grid] = [null, null];
       world.quaternion.copy(sceneFromWorld(up));
       world.updateMatrixWorld();
@@ -262,7 +263,7 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
         extent = null; // that of the cameras alone was another one
         measure();
         if (images.length > 0) showCameras();
-        if (pose !== null) showPose();
+        if (poses.length > 0) showPoses();
       }
       describe();
       request();
@@ -287,9 +288,9 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
       mapping.highlight(names, palette);
       request();
     },
-    showPose(given) {
-      pose = given;
-      showPose();
+    showPoses(given) {
+      poses = given;
+      showPoses();
     },
     setTrail(positions) {
       trail = positions;
@@ -322,7 +323,7 @@ export const createViewer: CreateViewer = (host: HTMLElement, theme: Theme): Vie
       discard(grid);
       grid = null;
       if (extent !== null) scene.add((grid = groundGrid(extent, palette)));
-      showPose();
+      showPoses();
       showSurroundings();
       move();
     },
