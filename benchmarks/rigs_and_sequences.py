@@ -141,7 +141,9 @@ class Bench:
         if answer.pose is None:
             return None
         pose = answer.pose
-        return TracedPose(pose.rig_from_world, pose.covariance, pose.source, answer.num_inliers)
+        return TracedPose(
+            pose.rig_from_world, pose.covariance, pose.source, pose.uncertainty, answer.num_inliers
+        )
 
     def instant(self, photos: Sequence[Photo]) -> InstantAnswer:
         """Localize the photos of one instant together."""

@@ -331,7 +331,7 @@ class RigPose:
             instant's own images leaves open; None for a pose that they did not measure.
         uncertainty: what ``covariance`` covers.
         probability: that the pose is right, 0 to 1, judged by the instant's own images; None when
-            they did not measure it.
+            they did not measure it, or only with the help of other instants.
     """
 
     rig_from_world: Pose

@@ -16,17 +16,35 @@ from clients.wire.requests import JsonObject
 from clients.wire.rigs import Rig
 from visloc.geometry import Pose, center_covariance
 from visloc.sequences.filling import TracedPose, fill_rig
-from visloc.types import PoseSource
+from visloc.types import PoseSource, Uncertainty
 from visloc_api.words.answers import PoseEstimate, RigPose
 
 
 def measured(pose: PoseEstimate, num_inliers: int) -> TracedPose:
     """Return the pose of an answer as a measured one."""
-    return TracedPose(pose.cam_from_world, pose.covariance, PoseSource.ESTIMATED, num_inliers)
+    return TracedPose(
+        pose.cam_from_world,
+        pose.covariance,
+        PoseSource.ESTIMATED,
+        uncertainty_of(pose),
+        num_inliers,
+    )
+
+
+def uncertainty_of(pose: PoseEstimate | RigPose) -> Uncertainty:
+    """Return what the covariance of an answer covers; a word that a newer server knows is less."""
+    try:
+        return Uncertainty(pose.uncertainty)
+    except ValueError:
+        return Uncertainty.PHOTO_ONLY
 
 
 def pose_as_json(traced: TracedPose) -> JsonObject:
-    """Return a pose ``cam_from_world`` as a PoseEstimate of the API."""
+    """Return a pose ``cam_from_world`` as a PoseEstimate of the API.
+
+    Without a probability and without a photo's part, which only the photos that measured the pose
+    can tell.
+    """
     pose = traced.pose
     variances = np.diag(center_covariance(pose, traced.covariance))
     stds = np.sqrt(np.maximum(variances, 0.0))
@@ -40,6 +58,9 @@ def pose_as_json(traced: TracedPose) -> JsonObject:
         "covariance": traced.covariance.ravel().tolist(),
         "position_std": stds[3:].tolist(),
         "orientation_std_deg": np.degrees(stds[:3]).tolist(),
+        "photo_covariance": [],
+        "uncertainty": traced.uncertainty.value,
+        "probability": None,
     }
 
 
@@ -69,7 +90,6 @@ def photo_result(result: InstantResult, index: int) -> LocalizeResult:
         pose = pose_as_json(traced) | {
             "cam_from_world": raw["cam_from_world"],
             "photo_covariance": [] if photo is None else (turn @ photo @ turn.T).ravel().tolist(),
-            "uncertainty": result.pose.uncertainty,
             "probability": result.pose.probability,
         }
     elif result.localized:
@@ -141,7 +161,10 @@ def _measured_by(result: InstantResult, image: ImageResult) -> TracedPose | None
         raise ValueError("a photo without a pose in an instant with one")
     turn = _turned_into(image, result.pose)
     covariance = turn @ result.pose.covariance @ turn.T
-    return TracedPose(image.cam_from_world, covariance, PoseSource.ESTIMATED, image.inliers)
+    uncertainty = uncertainty_of(result.pose)
+    return TracedPose(
+        image.cam_from_world, covariance, PoseSource.ESTIMATED, uncertainty, image.inliers
+    )
 
 
 def _turned_into(image: ImageResult, rig: RigPose) -> NDArray[np.float64]:

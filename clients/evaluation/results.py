@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import quote
 
-from clients.evaluation.filling import pose_as_json
+from clients.evaluation.filling import pose_as_json, uncertainty_of
 from clients.evaluation.run import Outcome
 from clients.wire.answers import parse_pose
 from visloc.errors import InvalidInput, refuse
@@ -178,7 +178,8 @@ def _parse_line(
     filled = None
     if status == _FILLED:
         status, other = _before_filling(entry), parse_pose(entry["pose"])
-        filled = TracedPose(other.cam_from_world, other.covariance, PoseSource(entry["source"]))
+        source, uncertainty = PoseSource(entry["source"]), uncertainty_of(other)
+        filled = TracedPose(other.cam_from_world, other.covariance, source, uncertainty)
     if not isinstance(name, str) or status not in (_LOCALIZED, _NOT_LOCALIZED, _ERROR):
         raise ValueError(f"name {name!r}, status {status!r}")
     pose, num_inliers = None, 0

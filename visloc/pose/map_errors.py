@@ -6,6 +6,7 @@ mapping photos, a map that is bent. A map's own test measures them (``mapping.ow
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,13 +39,33 @@ class MapErrors:
         """
         if self.uncertainty is Uncertainty.PHOTO_ONLY:
             return covariance  # to the last bit
-        centred = np.eye(6)
-        centred[3:, 3:] *= -1.0
-        centred[3:, :3] = -cross_matrix(rig_from_world.translation)
-        factors = np.repeat([self.orientation_factor, self.position_factor], 3)
-        widening = centred @ (factors[:, None] * centred)
-        whole = widening @ covariance @ widening.T
-        return np.asarray((whole + whole.T) / 2)
+        factors = self.orientation_factor, self.position_factor
+        return _widened(rig_from_world, covariance, *factors)
+
+    def part(self, rig_from_world: Pose, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the part (6, 6) of the whole covariance that is the map's own.
+
+        Poses next to each other share these errors, which no number of photos averages out. Added
+        to the photo's ``covariance``, it gives the variances that ``whole`` has, of the rotation
+        and of the camera's centre. It is a covariance itself, as their difference not always is.
+        """
+        factors = self.orientation_factor, self.position_factor
+        return _widened(rig_from_world, covariance, *(math.sqrt(f**2 - 1.0) for f in factors))
+
+
+def _widened(
+    rig_from_world: Pose,
+    covariance: NDArray[np.float64],
+    orientation_factor: float,
+    position_factor: float,
+) -> NDArray[np.float64]:
+    centred = np.eye(6)
+    centred[3:, 3:] *= -1.0
+    centred[3:, :3] = -cross_matrix(rig_from_world.translation)
+    factors = np.repeat([orientation_factor, position_factor], 3)
+    widening = centred @ (factors[:, None] * centred)
+    widened = widening @ covariance @ widening.T
+    return np.asarray((widened + widened.T) / 2)
 
 
 # Of maps that were never tested: what is stated is the photo's part alone.

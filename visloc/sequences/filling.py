@@ -25,7 +25,7 @@ from visloc.geometry import (
     propagated,
     rotation_angle,
 )
-from visloc.types import PoseSource
+from visloc.types import PoseSource, Uncertainty
 
 # Unix times of 2001-01-01 and 2100-01-01 in seconds. Between them the unit follows from the size.
 _FIRST_UNIX_S, _LAST_UNIX_S = 978_307_200, 4_102_444_800
@@ -90,12 +90,14 @@ class TracedPose:
         pose: ``device_from_world``: of a camera, or of a rig.
         covariance: (6, 6) of rotation (rad) then translation, for R <- Exp(w) R and t <- t + dt.
         source: what it rests on.
+        uncertainty: what ``covariance`` covers.
         num_inliers: correspondences that agree with it; 0 when it was filled.
     """
 
     pose: Pose
     covariance: NDArray[np.float64]
     source: PoseSource
+    uncertainty: Uncertainty
     num_inliers: int = 0
 
 
@@ -217,7 +219,7 @@ def _carried(giver: TracedPose, cam_from_giver: Pose) -> TracedPose:
         _RIG_ORIENTATION_STD, _RIG_POSITION_STD_M + _RIG_POSITION_STD_PER_M * lever_m
     )
     covariance = propagated(jacobian, giver.covariance) + covariance_from_center(pose, calibration)
-    return TracedPose(pose, covariance, PoseSource.RIG)
+    return TracedPose(pose, covariance, PoseSource.RIG, giver.uncertainty)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -271,7 +273,9 @@ class _Track:
         arc = 4 * share * (1 - share) * sagitta
         between = _independent(min(twist, _UNKNOWN_ANGLE_STD), math.hypot(bend, arc))
         covariance = covariance_from_center(pose, measured + between)
-        return TracedPose(pose, covariance, PoseSource.INTERPOLATED)
+        both_whole = a.uncertainty is b.uncertainty is Uncertainty.WHOLE
+        uncertainty = Uncertainty.WHOLE if both_whole else Uncertainty.PHOTO_ONLY
+        return TracedPose(pose, covariance, PoseSource.INTERPOLATED, uncertainty)
 
     def _beside(self, nearest: int, time_s: float) -> TracedPose:
         known = self.poses[nearest]

@@ -31,9 +31,8 @@ from visloc.localization.solving import (
     solve_instant,
     with_inliers,
 )
-from visloc.options import LocalizeOptions
+from visloc.options import LEAST_PROBABILITY, LocalizeOptions
 from visloc.pose.centre import with_origin
-from visloc.pose.map_errors import MapErrors
 from visloc.pose.motion import RelativeMotion, default_motion_covariance, link_from_motion
 from visloc.priors import Priors
 from visloc.sequences.filling import MAX_GAP_S, Odometry, TimeUnit, TracedPose, fill_sequence
@@ -233,7 +232,7 @@ class SequenceSolver:
         found: list[WindowPose | None] = [None] * len(self._entries)
         if not blind or self._rest == 0:
             found = solve_window(
-                [_window_instant(entry.solved, self._geometry.errors) for entry in self._entries],
+                [self._window_instant(entry.solved) for entry in self._entries],
                 motions,
                 registration=registration,
                 seed=self._options.seed,
@@ -267,12 +266,30 @@ class SequenceSolver:
             answers.append(
                 self._with_pose(
                     replace(alone, images=with_inliers(alone.images, pose.inliers)),
-                    TracedPose(pose.rig_from_world, covariance, source),
+                    TracedPose(
+                        pose.rig_from_world, covariance, source, self._geometry.errors.uncertainty
+                    ),
                     entry.seen.priors,
                     pose.photo_covariance,
                 )
             )
         return answers
+
+    def _window_instant(self, solved: Solved) -> WindowInstant:
+        refusal, errors = solved.answer.refusal, self._geometry.errors
+        if refusal is not None and refusal.reason in _NO_EVIDENCE:
+            # Matches under wrong priors could pass together the gate that refused each alone.
+            # Matches that another map explains as well are no evidence for this one. Pixels of a
+            # wrong camera fit a wrong pose. A print or another floor is as unlikely in the next
+            # photo.
+            return WindowInstant((), None)
+        if any(view.focal_unknown for view in solved.views):
+            # A window takes cameras as they are: such pixels would fit a wrong pose.
+            return WindowInstant((), solved.pose, errors)
+        if solved.pose is None and self._options.least_probability > LEAST_PROBABILITY:
+            # Nobody judges a pose that only the window measures, and the caller asks for more.
+            return WindowInstant((), None)
+        return WindowInstant(solved.views, solved.pose, errors)
 
     def _with_unchecked_motion(
         self, i: int, around: Sequence[int], found: Sequence[WindowPose | None]
@@ -329,7 +346,8 @@ class SequenceSolver:
         pose, covariance = with_origin(
             answer.pose.rig_from_world, answer.pose.covariance, -self._geometry.origin
         )
-        return TracedPose(pose, covariance, answer.pose.source, answer.num_inliers)
+        source, uncertainty = answer.pose.source, answer.pose.uncertainty
+        return TracedPose(pose, covariance, source, uncertainty, answer.num_inliers)
 
     def _with_pose(
         self,
@@ -386,19 +404,6 @@ def check_odometry(odometry: Odometry | None, *, metric: bool) -> None:
     """
     if odometry is not None and not metric:
         raise refuse("sequence.odometry", field="odometry")
-
-
-def _window_instant(solved: Solved, errors: MapErrors) -> WindowInstant:
-    refusal = solved.answer.refusal
-    if refusal is not None and refusal.reason in _NO_EVIDENCE:
-        # Matches under wrong priors could pass together the gate that refused each alone. Matches
-        # that another map explains as well are no evidence for this one. Pixels of a wrong camera
-        # fit a wrong pose. A print or another floor is as unlikely in the next photo.
-        return WindowInstant((), None)
-    if any(view.focal_unknown for view in solved.views):
-        # A window takes cameras as they are: such pixels would fit a wrong pose.
-        return WindowInstant((), solved.pose, errors)
-    return WindowInstant(solved.views, solved.pose, errors)
 
 
 def _way(a: WindowPose | None, b: WindowPose | None) -> tuple[float, float]:

@@ -31,6 +31,7 @@ from visloc.pose.views import MatchedView
 from visloc.sequences.agreement import agreeing_pieces
 from visloc.sequences.group import carried, find_groups
 from visloc.sequences.pose_graph import Chain, error_scale, solve_chain
+from visloc.types import Uncertainty
 
 # Fewer inliers under a pose that others gave are chance: blurred images have such, too.
 _MIN_OWN_INLIERS = 8
@@ -99,8 +100,9 @@ def solve_window(
     2. A part without measured poses is tried as one generalized camera, in groups small enough
        for the motion's drift.
     3. All poses of a part are solved together (``visloc.sequences.pose_graph``): measured ones with
-       their covariance, motion with its own, and the pixels of instants that were not measured
-       but agree with the pose that the others give them.
+       the photo's part of their covariance, motion with its own, and the pixels of instants that
+       were not measured but agree with the pose that the others give them. The errors of the map,
+       which all instants share, are added once at the end.
 
     A wrong motion that no measured pose contradicts, as beyond the last one, cannot be seen:
     there, the covariance is as honest as that of the motion. A motion that claims to be exact and
@@ -143,6 +145,11 @@ def _solve_segment(
     }
     if not measured:
         return _solve_unmeasured(instants, links, registration, seed)
+    photo_parts = {
+        i: UncertainPose.from_additive(pose.rig_from_world, pose.photo_covariance)
+        for i, pose in enumerate(found)
+        if pose is not None and pose.photo_covariance is not None
+    }
     pieces, links = agreeing_pieces(measured, links)
     counted = {i for piece in pieces for i in piece.measured}
     for i in measured.keys() - counted:
@@ -151,7 +158,7 @@ def _solve_segment(
         inside = range(piece.first, piece.last + 1)
         if len(inside) == 1:
             continue
-        known = {i - piece.first: measured[i] for i in piece.measured}
+        known = {i - piece.first: photo_parts[i] for i in piece.measured}
         between = links[piece.first : piece.last]
         start = _propagated({i: pose.pose for i, pose in known.items()}, between)
         some = instants[piece.first : piece.last + 1]
@@ -226,7 +233,8 @@ def _solve_together(
 
     Args:
         instants: N, with N - 1 ``links`` and N poses to ``start`` from.
-        measured: poses that some have, relative to which the others are found.
+        measured: poses that some have, relative to which the others are found; with the photo's
+            part of their covariance, as errors of the map are common to all.
         fewest: inliers that an instant needs to take part with its pixels, where that is not
             ``_MIN_OWN_INLIERS``.
 
@@ -264,7 +272,7 @@ def _solve_together(
         _measured_from(instant, pose, registration)
         or WindowPose(
             pose,
-            _with_map_errors(UncertainPose(pose, covariance).additive(), pose, instant, known),
+            _with_map_errors(i, UncertainPose(pose, covariance), instant.errors, known),
             _inliers(instant.views, pose, registration),
             measured=False,
             supported=i in taking_part,
@@ -283,14 +291,27 @@ def _selected(
 
 
 def _with_map_errors(
-    covariance: NDArray[np.float64], pose: Pose, instant: WindowInstant, known: Chain
+    i: int, found: UncertainPose, errors: MapErrors, known: Chain
 ) -> NDArray[np.float64]:
     """Add the errors of the map to a pose that others support.
 
-    Measured poses brought them along. Where pixels took part beside them or instead of them, the
-    pixels know nothing of these errors: the whole covariance is widened.
+    Instants share these errors, so their number does not make them smaller: they are those of the
+    nearest measured pose, carried along. Where the pixels of many instants together measured the
+    poses, they are those of one instant alone, which leaves as many times the variance open.
+
+    Returns:
+        The covariance (6, 6) for R <- Exp(w) R and t <- t + dt.
     """
-    return instant.errors.whole(pose, covariance) if known.seen else covariance
+    if errors.uncertainty is Uncertainty.PHOTO_ONLY:
+        return found.additive()
+    if not known.measured:
+        alone = len(known.seen) * found.additive()
+        return found.additive() + errors.part(found.pose, alone)
+    nearest = known.measured[min(known.measured, key=lambda k: (abs(k - i), k))]
+    of_map = errors.part(nearest.pose, nearest.additive())
+    carried_here = UncertainPose(found.pose @ nearest.pose.inverse(), np.zeros((6, 6)))
+    shared = carried_here @ UncertainPose.from_additive(nearest.pose, of_map)
+    return UncertainPose(found.pose, found.covariance + shared.covariance).additive()
 
 
 def _measured_from(

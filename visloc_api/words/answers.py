@@ -172,7 +172,8 @@ class RigPose(_PoseWithDigits):
         Field(
             ge=0,
             le=1,
-            description=f"{_PROBABILITY}null when the instant's own images did not measure it",
+            description=f"{_PROBABILITY}null when the instant's own images did not measure it, or "
+            "only with the help of other instants",
         ),
     ] = None
 

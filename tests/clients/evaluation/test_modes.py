@@ -18,7 +18,7 @@ from visloc.errors import DatasetError, InvalidInput, NotFound, VislocError
 from visloc.evaluation import pose_error
 from visloc.geometry import Pose
 from visloc.sequences.filling import TimeUnit, TracedPose
-from visloc.types import PoseSource
+from visloc.types import PoseSource, Uncertainty
 from visloc_api.words.maps import MapInfo, RigInfo
 
 Dataset = Callable[..., Path]
@@ -206,7 +206,9 @@ def test_filling_keeps_nanoseconds_apart(make_rig_dataset: Dataset) -> None:
     queries = read_queries(make_rig_dataset({(time, "left"): HERE for time in times}))
     arrangement = arrange(queries, [Mode.SEQ], INFO)
     ends = [Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 1.0)]
-    first, last = (TracedPose(p, 1e-6 * np.eye(6), PoseSource.ESTIMATED, 50) for p in ends)
+    first, last = (
+        TracedPose(p, 1e-6 * np.eye(6), PoseSource.ESTIMATED, Uncertainty.WHOLE, 50) for p in ends
+    )
     poses = arrangement.fill(Mode.SEQ, [first, None, last])
     assert poses[1] is not None
     assert poses[1].source is PoseSource.INTERPOLATED
@@ -236,6 +238,10 @@ def test_mode_rig_fills_a_camera_from_the_other_one_exactly(
         *("estimated", "rig", None, None, "rig", "estimated")
     ]
     assert lines[1]["refusal"]["reason"] == "too_few_matches"
+    # It covers what the pose that it was filled from covers; nobody judged it.
+    assert lines[1]["pose"]["uncertainty"] == lines[0]["pose"]["uncertainty"]
+    assert lines[1]["pose"]["probability"] is None
+    assert lines[1]["pose"]["photo_covariance"] == []
     assert lines[4]["error"]["code"] == "image.undecodable"
     assert lines[2]["pose"] is None
     # A filled pose is less certain than what it was filled from.

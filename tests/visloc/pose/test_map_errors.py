@@ -40,3 +40,16 @@ def test_another_frame_and_unit_make_no_difference() -> None:
     pose, moved = moved_pose(POSE, COVARIANCE, tie)
     _, expected = moved_pose(POSE, errors.whole(POSE, COVARIANCE), tie)
     assert errors.whole(pose, moved) == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
+def test_the_maps_part_and_the_photos_have_the_variances_of_the_whole() -> None:
+    errors = MapErrors(5.0, 3.0)
+    whole = center_covariance(POSE, errors.whole(POSE, COVARIANCE))
+    part = errors.part(POSE, COVARIANCE)
+    both = center_covariance(POSE, COVARIANCE + part)
+
+    for block in (slice(0, 3), slice(3, 6)):
+        np.testing.assert_allclose(both[block, block], whole[block, block], rtol=1e-9)
+    scale = np.sqrt(np.diag(part))
+    assert np.linalg.eigvalsh(part / np.outer(scale, scale)).min() > -1e-9
+    np.testing.assert_array_equal(PHOTO_ONLY.part(POSE, COVARIANCE), np.zeros((6, 6)))

@@ -24,7 +24,7 @@ from visloc.sequences.filling import (
     guess_time_unit,
     interpolate_pose,
 )
-from visloc.types import PoseSource
+from visloc.types import PoseSource, Uncertainty
 
 # The 99.73 % (3 sigma) quantile of the chi-square distribution with 6 degrees of freedom.
 THREE_SIGMA_OF_SIX = 20.06
@@ -93,7 +93,7 @@ def covariances(seed: int, scale: float = 1e-3) -> NDArray[np.float64]:
 def traced(
     pose: Pose, seed: int = 0, source: PoseSource = PoseSource.ESTIMATED, num_inliers: int = 50
 ) -> TracedPose:
-    return TracedPose(pose, covariances(seed), source, num_inliers)
+    return TracedPose(pose, covariances(seed), source, Uncertainty.WHOLE, num_inliers)
 
 
 def smallest_eigenvalue(covariance: NDArray[np.float64]) -> float:
@@ -418,7 +418,7 @@ def test_an_interpolated_pose_is_less_certain_than_both_its_neighbours(
     b = at(a.center + shift, exp(turn) @ a.rotation)
     ends = (
         traced(a, seed),
-        TracedPose(b, wide * covariances(seed + 1), PoseSource.ESTIMATED),
+        TracedPose(b, wide * covariances(seed + 1), PoseSource.ESTIMATED, Uncertainty.WHOLE),
     )
     _, filled, _ = fill_sequence([0, share, 1], [ends[0], None, ends[1]], max_gap_s=1)
     assert filled is not None
@@ -564,7 +564,9 @@ def test_the_truth_is_within_three_sigma(
             pose = truth(time)
             covariance = covariance_from_center(pose, noise)
             error = np.linalg.cholesky(covariance) @ draw.normal(size=6)
-            measured.append(TracedPose(moved(pose, error), covariance, PoseSource.ESTIMATED))
+            measured.append(
+                TracedPose(moved(pose, error), covariance, PoseSource.ESTIMATED, Uncertainty.WHOLE)
+            )
         filled = fill_sequence(
             times, [None if i == hidden else p for i, p in enumerate(measured)], gap_s
         )[hidden]
@@ -589,7 +591,9 @@ def test_a_real_bend_with_every_second_instant_lost(shared_data: Path) -> None:
     truth = [pose for _, pose in trajectory]
     small = np.diag([math.radians(0.04) ** 2] * 3 + [0.008**2] * 3)
     known = [
-        TracedPose(pose, covariance_from_center(pose, small), PoseSource.ESTIMATED)
+        TracedPose(
+            pose, covariance_from_center(pose, small), PoseSource.ESTIMATED, Uncertainty.WHOLE
+        )
         if i % 2 == 0
         else None
         for i, pose in enumerate(truth)
@@ -726,7 +730,9 @@ def test_a_camera_filled_from_the_rig_is_less_certain_than_its_giver(seed: int) 
         assert pose is not None
         assert_covariance(pose.covariance)
         # In the world's axes, and of the point where the giver is, both tell of the same thing.
-        back = TracedPose(RIG[sensor].inverse() @ pose.pose, np.eye(6), PoseSource.RIG)
+        back = TracedPose(
+            RIG[sensor].inverse() @ pose.pose, np.eye(6), PoseSource.RIG, Uncertainty.WHOLE
+        )
         turn = np.kron(np.eye(2), RIG[sensor].rotation.T)
         same = replace(back, covariance=turn @ pose.covariance @ turn.T)
         excess = in_world(same) - in_world(start)
@@ -739,3 +745,25 @@ def test_rig_then_sequence_fills_what_neither_fills_alone() -> None:
     end = fill_rig({"left": None, "right": seen_by("right")}, RIG)
     filled = fill_sequence([0, 1, 2], [start["left"], None, end["left"]], max_gap_s=2)
     assert [pose and pose.source for pose in filled] == ["estimated", "interpolated", "rig"]
+
+
+@pytest.mark.parametrize("second", Uncertainty)
+@pytest.mark.parametrize("first", Uncertainty)
+def test_a_filled_pose_is_whole_only_if_all_are_that_it_comes_from(
+    first: Uncertainty, second: Uncertainty
+) -> None:
+    a, b = (
+        replace(traced(Pose(np.eye(3), np.array([x, 0.0, 0.0]))), uncertainty=uncertainty)
+        for x, uncertainty in ((0.0, first), (1.0, second))
+    )
+    _, between, _, after = fill_sequence([0.0, 0.5, 1.0, 1.5], [a, None, b, None], 1.0)
+
+    assert between is not None
+    assert after is not None
+    whole = first is second is Uncertainty.WHOLE
+    assert between.uncertainty is (Uncertainty.WHOLE if whole else Uncertainty.PHOTO_ONLY)
+    assert after.uncertainty is second
+    rig = {name: Pose.identity() for name in ("left", "right")}
+    beside = fill_rig({"left": a, "right": None}, rig)["right"]
+    assert beside is not None
+    assert beside.uncertainty is first

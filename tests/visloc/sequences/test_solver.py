@@ -490,6 +490,27 @@ def test_instants_less_probable_than_asked_for_are_filled_by_those_that_are_not(
             assert answer.pose.probability is None
 
 
+def test_poses_that_only_the_window_measures_are_not_judged_and_pass_no_raised_gate(
+    here: Any,
+) -> None:
+    """Weak photos pass together; each alone has too few inliers to be judged."""
+    weak = instants_of(here, "wwwww", moving=True)
+    found = answers_to(solver(here, 1.0), weak)
+    raised = SequenceSolver(
+        here.geometry,
+        metric=True,
+        options=replace(OPTIONS, min_probability=0.8),
+        time_unit=TimeUnit.MS,
+        max_gap_s=1.0,
+    )
+
+    assert all(answer.pose is not None for answer in found)
+    for answer in found:
+        assert answer.pose is not None
+        assert answer.pose.probability is None
+    assert sources(answers_to(raised, weak)) == "-----"
+
+
 def test_motion_reaches_no_further_than_the_gap(here: Any) -> None:
     answers = answers_to(solver(here, 0.25), instants_of(here, "g....", moving=True))
     assert sources(answers) == "EMM--"

@@ -14,11 +14,13 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from visloc.evaluation import pose_error
-from visloc.geometry import Camera, Pose
+from visloc.geometry import Camera, Pose, covariance_from_center
 from visloc.options import PRESETS, RegistrationPreset
+from visloc.pose.centre import position_covariance
 from visloc.pose.colmap import project
 from visloc.pose.covariance import pose_covariance
 from visloc.pose.generalized import GeneralizedPose, refine_generalized_pose
+from visloc.pose.map_errors import PHOTO_ONLY, MapErrors
 from visloc.pose.motion import RelativeMotion, default_motion_covariance
 from visloc.pose.refinement import LOSS_SCALE_PX
 from visloc.pose.views import MatchedView
@@ -390,6 +392,83 @@ def test_covariances_agree_with_monte_carlo() -> None:
     for values in normalized.values():
         assert 4.0 < np.mean(values) < 7.0
         assert np.mean(np.array(values) < chi2.ppf(0.95, 6)) >= 0.91
+
+
+def shared_offset(count: int, errors: MapErrors) -> list[WindowInstant]:
+    """Measured instants with the same photo's part, all off by the same error of the map.
+
+    The one in the middle is blind.
+    """
+    drive = make_drive(count)
+    photo_part = np.diag([1e-3**2] * 3 + [0.02**2] * 3)
+    offset = np.array([0.08, 0.0, 0.0])  # four times what a photo leaves open
+    instants = []
+    for i, pose in enumerate(drive):
+        shifted = Pose(pose.rotation, pose.translation - pose.rotation @ offset)
+        covariance = covariance_from_center(shifted, photo_part)
+        alone = None if i == count // 2 else GeneralizedPose(shifted, (), covariance)
+        instants.append(WindowInstant((), alone, errors))
+    return instants
+
+
+def exact_motions(count: int) -> list[RelativeMotion | None]:
+    drive = make_drive(count)
+    tiny = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)
+    return [RelativeMotion(b @ a.inverse(), tiny) for a, b in itertools.pairwise(drive)]
+
+
+def position_stds(found: WindowPose | None) -> NDArray[np.float64]:
+    assert found is not None
+    return np.sqrt(np.diag(position_covariance(found.rig_from_world, found.covariance)))
+
+
+def test_errors_of_the_map_that_instants_share_do_not_average_out() -> None:
+    factor, of_a_photo = 5.0, 0.02
+    of_the_map = of_a_photo * math.sqrt(factor**2 - 1.0)
+    for count in (3, 9, 25):
+        motions, middle = exact_motions(count), count // 2
+        whole = solve(shared_offset(count, MapErrors(factor, factor)), motions)[middle]
+        photo = solve(shared_offset(count, PHOTO_ONLY), motions)[middle]
+        assert whole is not None
+        assert not whole.measured
+        # Of the photos' parts, many are less.
+        np.testing.assert_allclose(
+            position_stds(photo), of_a_photo / math.sqrt(count - 1), rtol=0.15
+        )
+        expected = np.hypot(position_stds(photo), of_the_map)
+        np.testing.assert_allclose(position_stds(whole), expected, rtol=0.05)
+        off = np.linalg.norm(whole.rig_from_world.center - make_drive(count)[middle].center)
+        assert off == pytest.approx(0.08, rel=0.05)  # which is within the stated deviation
+        assert off < position_stds(whole)[0]
+
+
+def test_a_pose_from_one_neighbour_has_its_whole_uncertainty() -> None:
+    instants = shared_offset(3, MapErrors(5.0, 4.0))
+    found = solve([replace(instants[0]), instants[1]], exact_motions(3)[:1])
+
+    stds = [position_stds(each) for each in found]
+    np.testing.assert_allclose(stds[1], stds[0], rtol=0.02)
+
+
+def test_pixels_of_many_instants_share_the_errors_of_the_map() -> None:
+    """None is found alone; more of them leave the photo's part smaller, and the map's as it is."""
+    weak = replace(GATE, min_inliers=60)
+    stds = {}
+    for count in (5, 15):
+        rng = np.random.default_rng(3)
+        street, drive = make_street(rng), make_drive(count)
+        instants = [
+            WindowInstant(look(rng, street, pose, 25, 10, MONO), None, MapErrors(5.0, 5.0))
+            for pose in drive
+        ]
+        found = solve(instants, exact_motions(count), weak)
+        without = [replace(each, errors=PHOTO_ONLY) for each in instants]
+        photo = solve(without, exact_motions(count), weak)
+        middle = count // 2
+        stds[count] = np.linalg.norm(position_stds(found[middle]))
+        alone = math.sqrt(count) * np.linalg.norm(position_stds(photo[middle]))
+        assert stds[count] >= 0.95 * alone * math.sqrt(5.0**2 - 1.0)
+    assert stds[15] > 0.7 * stds[5]
 
 
 def test_equal_seeds_give_equal_bits() -> None:
