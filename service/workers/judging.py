@@ -9,13 +9,13 @@ from dataclasses import replace
 from service.values import Localization
 from visloc.archive.places import similarity_on_earth
 from visloc.geometry import Similarity
-from visloc.localization.gates import not_probable_enough
 from visloc.localization.judge import (
     STDS,
     TIE_REACH_SHARE,
     Tie,
     judge,
     measured_pose,
+    not_probable_enough,
 )
 from visloc.options import LocalizeOptions
 from visloc.priors import NO_PRIORS, Priors

@@ -129,6 +129,7 @@ class CannedService:
         if image.startswith(b"refuse"):
             pose = None
             refusal = {"stage": "matching", "reason": "too_few_matches", "message": "3 [matches]"}
+            refusal |= {"candidates": []}
         return {
             "request_id": asked["request_id"] or "made-up",
             "status": "localized" if refusal is None else "not_localized",
@@ -216,6 +217,7 @@ class CannedService:
                 if image["image"].startswith(b"blank"):
                     answer["inliers"] = 0
         refusal = {"stage": "matching", "reason": "too_few_matches", "message": "3 [matches]"}
+        refusal |= {"candidates": []}
         num_inliers = sum(answer["inliers"] for answer in answers)
         num_correspondences = sum(answer["correspondences"] for answer in answers)
         return {

@@ -33,7 +33,7 @@ from visloc.pose.generalized import (
     refine_generalized_pose,
 )
 from visloc.pose.views import MatchedView
-from visloc.types import CameraSource, InstantAnswer, Reason, Refusal
+from visloc.types import CameraSource, Reason, Refusal
 
 # The default max_error_px applies to photos whose longer side has at least this many pixels, and
 # shrinks with smaller ones. In a photo of 256 px, 12 px let wrong poses explain up to 10 % of the
@@ -248,8 +248,9 @@ def cameras_agree(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
 def likely(problem: Problem, pose: GeneralizedPose) -> tuple[GeneralizedPose, Refusal | None]:
     """Add the probability that a pose is right, and refuse one that is probably wrong.
 
-    A raised ``min_probability`` counts once rivals were compared (``not_probable_enough``). A pose
-    has no probability when no image may be compared with the map.
+    A raised ``min_probability`` counts once rivals were compared
+    (``visloc.localization.judge.not_probable_enough``). A pose has no probability when no image may
+    be compared with the map.
     """
     seen = [
         (view if pose.camera is None else replace(view, camera=pose.camera), shown, inliers)
@@ -274,21 +275,6 @@ def likely(problem: Problem, pose: GeneralizedPose) -> tuple[GeneralizedPose, Re
         f"the best pose explains {pose.num_inliers} matches, but is right with a probability of "
         f"{probability:.2f} only: {against(features)}. Is this a print, a screen or a mirror, or "
         "another place that looks alike?",
-    )
-
-
-def not_probable_enough(answer: InstantAnswer, options: LocalizeOptions) -> Refusal | None:
-    """Refuse a pose that is less probable than the caller asks for, after rivals were compared.
-
-    A pose without a probability, such as one from motion, is not judged.
-    """
-    probability = None if answer.pose is None else answer.pose.probability
-    if probability is None or probability >= options.least_probability:
-        return None
-    return _refused(
-        Reason.UNLIKELY_POSE,
-        f"the best pose is right with a probability of {probability:.2f}, but min_probability asks "
-        f"for {options.least_probability:g}",
     )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from visloc.geometry import Similarity, rotation_angle
 from visloc.localization.preference import preference
+from visloc.options import LocalizeOptions
 from visloc.pose.centre import largest_std, moved_pose, position_covariance
 from visloc.types import Candidate, InstantAnswer, Reason, Refusal, RigPose
 
@@ -132,6 +133,22 @@ def _preference(first: InstantAnswer, second: InstantAnswer) -> float | None:
     if not len(first.scores) == len(second.scores) > 0:
         return None
     return preference(first.scores, second.scores)
+
+
+def not_probable_enough(answer: InstantAnswer, options: LocalizeOptions) -> Refusal | None:
+    """Refuse a pose that is less probable than the caller asks for, after rivals were compared.
+
+    A pose without a probability, such as one from motion, is not judged.
+    """
+    probability = None if answer.pose is None else answer.pose.probability
+    if probability is None or probability >= options.least_probability:
+        return None
+    return Refusal(
+        "gate",
+        Reason.UNLIKELY_POSE,
+        f"the best pose is right with a probability of {probability:.2f}, but min_probability asks "
+        f"for {options.least_probability:g}",
+    )
 
 
 def measured_pose(answer: InstantAnswer) -> RigPose | None:

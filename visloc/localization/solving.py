@@ -13,12 +13,8 @@ from visloc.geometry import Camera, Pose
 from visloc.localization.camera_check import only_focal_length_contradicts
 from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.evidence import Shown
-from visloc.localization.gates import (
-    Problem,
-    accepted,
-    not_better_elsewhere,
-    not_probable_enough,
-)
+from visloc.localization.gates import Problem, accepted, not_better_elsewhere
+from visloc.localization.judge import not_probable_enough
 from visloc.localization.rivals import Proposed, stronger_place
 from visloc.options import LocalizeOptions, ReadAs, Solver
 from visloc.pose.centre import position_covariance, with_origin

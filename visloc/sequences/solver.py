@@ -19,11 +19,8 @@ from numpy.typing import NDArray
 from visloc.errors import refuse
 from visloc.geometry import center_covariance, covariance_from_center, rotation_angle
 from visloc.localization.constraints import Constraints, MapGeometry
-from visloc.localization.gates import (
-    contradicts_priors,
-    not_probable_enough,
-    registration_for,
-)
+from visloc.localization.gates import contradicts_priors, registration_for
+from visloc.localization.judge import not_probable_enough
 from visloc.localization.solving import (
     SeenImage,
     Solved,

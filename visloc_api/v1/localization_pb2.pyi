@@ -84,6 +84,7 @@ class LocalizeOptions(_message.Message):
     MAX_ERROR_PX_FIELD_NUMBER: _builtins.int
     MIN_INLIERS_FIELD_NUMBER: _builtins.int
     MIN_INLIER_RATIO_FIELD_NUMBER: _builtins.int
+    MIN_PROBABILITY_FIELD_NUMBER: _builtins.int
     READ_AS_FIELD_NUMBER: _builtins.int
     EXTRACTION_FIELD_NUMBER: _builtins.int
     FUSION_FIELD_NUMBER: _builtins.int
@@ -91,7 +92,6 @@ class LocalizeOptions(_message.Message):
     MATCHER_FIELD_NUMBER: _builtins.int
     SOLVER_FIELD_NUMBER: _builtins.int
     SEED_FIELD_NUMBER: _builtins.int
-    MIN_PROBABILITY_FIELD_NUMBER: _builtins.int
     preset: _builtins.str
     """thresholds to start from"""
     top_k: _builtins.int
@@ -102,6 +102,8 @@ class LocalizeOptions(_message.Message):
     """fewest inliers of an accepted pose"""
     min_inlier_ratio: _builtins.float
     """0 to 1"""
+    min_probability: _builtins.float
+    """smallest probability of an accepted pose, 0 to 1"""
     read_as: _builtins.str
     """Orientation in which features are found: the photo's as stored, or rotated by its EXIF
     orientation. Camera, keypoints and pose refer to the stored pixels either way.
@@ -116,8 +118,6 @@ class LocalizeOptions(_message.Message):
     """of the pose"""
     seed: _builtins.int
     """of RANSAC"""
-    min_probability: _builtins.float
-    """smallest probability of an accepted pose, 0 to 1"""
     @_builtins.property
     def fusion_weights(self) -> _containers.ScalarMap[_builtins.str, _builtins.float]:
         """Weight by global descriptor; descriptors without a weight are not used. When empty, the map's
@@ -132,6 +132,7 @@ class LocalizeOptions(_message.Message):
         max_error_px: _builtins.float | None = ...,
         min_inliers: _builtins.int | None = ...,
         min_inlier_ratio: _builtins.float | None = ...,
+        min_probability: _builtins.float | None = ...,
         read_as: _builtins.str | None = ...,
         extraction: _builtins.str | None = ...,
         fusion: _builtins.str | None = ...,
@@ -139,7 +140,6 @@ class LocalizeOptions(_message.Message):
         matcher: _builtins.str | None = ...,
         solver: _builtins.str | None = ...,
         seed: _builtins.int | None = ...,
-        min_probability: _builtins.float | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_extraction", b"_extraction", "_fusion", b"_fusion", "_matcher", b"_matcher", "_max_error_px", b"_max_error_px", "_min_inlier_ratio", b"_min_inlier_ratio", "_min_inliers", b"_min_inliers", "_min_probability", b"_min_probability", "_preset", b"_preset", "_read_as", b"_read_as", "_seed", b"_seed", "_solver", b"_solver", "_top_k", b"_top_k", "extraction", b"extraction", "fusion", b"fusion", "matcher", b"matcher", "max_error_px", b"max_error_px", "min_inlier_ratio", b"min_inlier_ratio", "min_inliers", b"min_inliers", "min_probability", b"min_probability", "preset", b"preset", "read_as", b"read_as", "seed", b"seed", "solver", b"solver", "top_k", b"top_k"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...

@@ -44,6 +44,7 @@ def test_a_full_request_becomes_the_job_that_it_says() -> None:
         "max_error_px": 8,
         "min_inliers": 12,
         "min_inlier_ratio": 0.5,
+        "min_probability": 0.8,
         "read_as": "upright",
         "extraction": "fast",
         "fusion": "mean",
@@ -61,7 +62,7 @@ def test_a_full_request_becomes_the_job_that_it_says() -> None:
     assert job.images[0].camera is not None
     assert job.images[0].camera.params == (525.0, 525.5, 320.0, 240.0)
     assert job.options == CoreOptions(
-        *("config1", 5, 8.0, 12, 0.5, ReadAs.UPRIGHT, Extraction.FAST, Fusion.MEAN),
+        *("config1", 5, 8.0, 12, 0.5, 0.8, ReadAs.UPRIGHT, Extraction.FAST, Fusion.MEAN),
         fusion_weights={"densevlad": 1.0, "kapture:AP-GeM": 0.5},
         matcher=Matcher.RATIO,
         solver=Solver.POSELIB,
@@ -104,8 +105,8 @@ def test_options_may_be_text() -> None:
             request(options={"topk": 1}),
             "request.unknown_field",
             "options.topk",
-            "one of preset, top_k, max_error_px, min_inliers, min_inlier_ratio, read_as, "
-            "extraction, fusion, fusion_weights, matcher, solver, seed",
+            "one of preset, top_k, max_error_px, min_inliers, min_inlier_ratio, min_probability, "
+            "read_as, extraction, fusion, fusion_weights, matcher, solver, seed",
         ),
         (
             request(camera=CAMERA | {"fov": 60}),
