@@ -212,6 +212,13 @@ def _poses(modes: Mapping[str, Mapping[str, Any]], num_with_truth: int, unit: st
                 f"  their std ({unit})",
                 ("-" if of is None else f"{of['median_position_std_m']:.4f}" for of in of_modes),
             )
+    table.add_section()
+    row("uncertainty", (f["uncertainty"] or "-" for f in figures))
+    for name in ("p50", "p10", "min"):
+        row(
+            f"probability {name}",
+            ("-" if f["probability"] is None else f"{f['probability'][name]:.3f}" for f in figures),
+        )
     if not has_truth:
         return table
     table.add_section()

@@ -25,9 +25,11 @@ from visloc.evaluation import (
     recall,
 )
 from visloc.sequences.filling import TracedPose
-from visloc.types import PoseSource
+from visloc.types import PoseSource, Uncertainty
 from visloc_api.words.maps import MapInfo
 
+# Of probabilities, the low ones matter.
+_PROBABILITY_PERCENTILES = {"p50": 50, "p10": 10, "min": 0}
 _ERROR_PERCENTILES = {"p50": 50, "p75": 75, "p90": 90, "max": 100}
 
 
@@ -163,6 +165,8 @@ def figures_of(
         "position_error_m": _error_percentiles([position for position, _ in errors]),
         "orientation_error_deg": _error_percentiles([orientation for _, orientation in errors]),
         "calibration": _calibration(run.outcomes, poses),
+        "uncertainty": _uncertainty(poses),
+        "probability": _probability(run.outcomes),
         "recall": _recall(errors, num_with_truth, thresholds),
         "latency_s": {f"p{q}": _finite(percentile(run.latencies_s, q)) for q in (50, 90, 99)},
         "throughput_qps": len(run.latencies_s) / run.wall_s if run.wall_s > 0 else None,
@@ -193,6 +197,28 @@ def _calibration(
         ]
     )
     return None if held is None else asdict(held)
+
+
+def _uncertainty(poses: Sequence[TracedPose | None]) -> str | None:
+    """Return what all stated uncertainties cover: the least that one of them does."""
+    words = {pose.uncertainty for pose in poses if pose is not None}
+    if not words:
+        return None
+    return (Uncertainty.WHOLE if words == {Uncertainty.WHOLE} else Uncertainty.PHOTO_ONLY).value
+
+
+def _probability(outcomes: Sequence[Outcome]) -> dict[str, float] | None:
+    """Return percentiles of the probability that a pose is right, over the poses that have one."""
+    stated = [
+        outcome.result.pose.probability
+        for outcome in outcomes
+        if outcome.result is not None
+        and outcome.result.pose is not None
+        and outcome.result.pose.probability is not None
+    ]
+    if not stated:
+        return None
+    return {name: float(np.percentile(stated, q)) for name, q in _PROBABILITY_PERCENTILES.items()}
 
 
 def _sources(poses: Sequence[TracedPose | None]) -> dict[str, dict[str, float]]:

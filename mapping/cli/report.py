@@ -37,6 +37,7 @@ from visloc_web import report_parts
 MAX_POINTS = 150_000
 # More names than anyone reads in a terminal; the file has them all.
 _SHOWN_NAMES = 20
+_NOT_TESTABLE = "not testable: all photos share one place"
 
 
 def report(
@@ -172,6 +173,7 @@ def summary_of_report(data: Mapping[str, Any]) -> dict[str, Any]:
         "unlikely": sum(chance < 0.1 for chance in chances) / len(chances) if chances else None,
         "weak_spots": data["coverage"]["weak_spots"],
         "look_alikes": data["look_alikes"],
+        "look_alikes_asked": data["look_alikes_asked"],
     }
 
 
@@ -248,6 +250,9 @@ def _print_summary(summary: Mapping[str, Any], *, metric: bool, decimals: int) -
         say("looking: as a clock on the plan of the report, where 12 is up")
     for pair in summary["look_alikes"]:
         say(f"look-alikes: {pair['told']}")
+    if not summary["look_alikes"]:
+        asked = summary["look_alikes_asked"]
+        say(f"look-alikes: {f'none, of {asked} photos asked' if asked else _NOT_TESTABLE}")
     if summary["up"] != "gravity":
         say(f"note: {UP_IS_A_GUESS}")
     say(f"report: {summary['output']}")

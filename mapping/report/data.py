@@ -75,7 +75,8 @@ def make_report_data(
         "images": _images(opened, viewpoints, origin, digits),
         "statistics": statistics_of(opened),
         "held_out": _held_out(runs, learned, digits),
-        "look_alikes": [_look_alike(one, opened, digits) for one in alike],
+        "look_alikes": [_look_alike(one, opened, digits) for one in alike.found],
+        "look_alikes_asked": alike.asked,
         "coverage": {
             "within": {"position": within.position, "orientation_deg": within.orientation_deg},
             "cell": grid.side,

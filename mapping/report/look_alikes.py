@@ -24,7 +24,7 @@ from visloc.archive import Map
 from visloc.localization.constraints import MapGeometry
 from visloc.options import LocalizeOptions
 
-_REVISION = 1
+_REVISION = 2
 _MOST = 12
 # Every second held-out photo is asked, in maps of few photos every one. This adds 3 to 17 % to the
 # time of a report.
@@ -61,6 +61,20 @@ class LookAlike:
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Search:
+    """What asking a map for places that look alike gave.
+
+    Attributes:
+        found: pairs of places.
+        asked: the number of photos that were asked. A photo that shares its place with all others
+            cannot be.
+    """
+
+    found: tuple[LookAlike, ...]
+    asked: int
+
+
 def shares_place(opened: Map, viewpoints: Viewpoints, image: int) -> NDArray[np.bool_]:
     """Which photos (n,) are of the same place as one, itself among them.
 
@@ -79,7 +93,7 @@ def find_look_alikes(
     work: WorkFolder,
     workers: Workers,
     progress: Callable[[int, int], None],
-) -> list[LookAlike]:
+) -> Search:
     """Find places that look alike; each pair of places once, at most a dozen.
 
     Args:
@@ -107,7 +121,8 @@ def find_look_alikes(
         )
     ]
     found.sort(key=lambda one: -one.inliers)
-    return _pairs_of_places(opened, viewpoints, found)
+    asked = sum(bool(item["asked"].all()) for item in items)
+    return Search(tuple(_pairs_of_places(opened, viewpoints, found)), asked)
 
 
 def _pairs_of_places(
@@ -145,7 +160,10 @@ def _keep(folder: Path, work: WorkFolder, image: int) -> None:
 
 
 def _ask(opened: Map, viewpoints: Viewpoints, image: int) -> Item:
-    """Look for one photo where it was not taken; arrays of one row if it is found, else of none."""
+    """Look for one photo where it was not taken; arrays of one row if it is found, else of none.
+
+    A photo that shares its place with all others is not asked.
+    """
     own_place, options = shares_place(opened, viewpoints, image), LocalizeOptions()
     twin, position, inliers = np.empty(0, np.int64), np.empty((0, 3)), np.empty(0, np.int64)
     if not own_place.all():
@@ -158,4 +176,5 @@ def _ask(opened: Map, viewpoints: Viewpoints, image: int) -> Item:
             if apart[image] >= _OTHER_PLACE:
                 twin = np.array([np.where(own_place, np.inf, apart).argmin()])
                 position, inliers = pose.center[None], np.array([solved.pose.num_inliers])
-    return {"twin": twin, "position": position, "inliers": inliers}
+    asked = np.array([not own_place.all()])
+    return {"asked": asked, "twin": twin, "position": position, "inliers": inliers}

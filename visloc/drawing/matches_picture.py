@@ -292,7 +292,11 @@ def _headline(
         _write(canvas, f"localized: {counts} the pose", (_MARGIN, 40), _INLIER, 0.9, room)
         unit = "m" if opened.manifest.world.metric else "units"
         stds = ", ".join(f"{value:.2g}" for value in answer.position_std)
-        detail = f"standard deviation of the position in x, y, z: {stds} {unit}"
+        detail = (
+            f"standard deviation of the position in x, y, z: {stds} {unit}, {answer.uncertainty}"
+        )
+        if answer.probability is not None:
+            detail += f"; right with a probability of {answer.probability:.2f}"
     _write(canvas, detail, (_MARGIN, 68), _TEXT, 0.5, room)
     evidence = look.evidence
     facts = f"map {opened.ref}; {evidence.num_keypoints} keypoints; {len(evidence.retrieved)} "

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from pydantic import FailFast, Field
+from pydantic import BeforeValidator, FailFast, Field
 
 import visloc.types
 from visloc.errors import inside, refuse
@@ -163,24 +163,29 @@ class RigImage(IncomingMessage):
     ] = None
 
 
-def _few_images(images: object, limits: object) -> None:
-    if (
-        isinstance(limits, BatchLimits)
-        and isinstance(images, list)
-        and len(images) > limits.max_images
-    ):
-        raise refuse(
-            "rig.too_many_images",
-            field="images",
-            expected=f"at most {limits.max_images}",
-            got=len(images),
-        )
+def at_most(limit: str, code: str, field: str) -> BeforeValidator:
+    """Refuse a list that is longer than a limit of ``BatchLimits`` before its parts are validated.
+
+    Args:
+        limit: its name.
+        code: of the refusal.
+        field: the list.
+    """
+
+    def check(parts: object, limits: object) -> None:
+        if not isinstance(limits, BatchLimits) or not isinstance(parts, list):
+            return
+        most = getattr(limits, limit)
+        if len(parts) > most:
+            raise refuse(code, field=field, expected=f"at most {most}", got=len(parts))
+
+    return counted(check)
 
 
 Images = Annotated[
     list[RigImage],
     FailFast(),
-    counted(_few_images),
+    at_most("max_images", "rig.too_many_images", "images"),
     Field(description="each of another sensor, all of one instant"),
 ]
 

@@ -9,12 +9,12 @@ from pydantic import FailFast, Field
 import visloc.sequences.filling
 from visloc.errors import refuse
 from visloc_api.words.geometry import Numbers, Transform, covariance_from_core, covariance_to_core
-from visloc_api.words.message import IncomingMessage, converted, counted
+from visloc_api.words.message import IncomingMessage, converted
 from visloc_api.words.near import GivenNear
 from visloc_api.words.options import GivenOptions, LocalizeOptions
 from visloc_api.words.photo import GivenMaps, GivenYpr
 from visloc_api.words.priors import GivenPriors
-from visloc_api.words.rigs import BatchLimits, GivenRig, Images, Timestamp
+from visloc_api.words.rigs import GivenRig, Images, Timestamp, at_most
 
 
 class Odometry(IncomingMessage):
@@ -105,26 +105,12 @@ class SequenceStart(IncomingMessage):
     ypr: GivenYpr = None
 
 
-def _few_instants(instants: object, limits: object) -> None:
-    if (
-        isinstance(limits, BatchLimits)
-        and isinstance(instants, list)
-        and len(instants) > limits.max_instants
-    ):
-        raise refuse(
-            "sequence.too_many_instants",
-            field="instants",
-            expected=f"at most {limits.max_instants}",
-            got=len(instants),
-        )
-
-
 class LocalizeSequenceRequest(SequenceStart):
     """A whole sequence, as HTTP takes it; gRPC takes the same as a stream."""
 
     instants: Annotated[
         list[Instant],
         FailFast(),
-        counted(_few_instants),
+        at_most("max_instants", "sequence.too_many_instants", "instants"),
         Field(description="in the order of time"),
     ]

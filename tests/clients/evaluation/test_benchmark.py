@@ -79,6 +79,9 @@ def test_the_report_holds_what_was_measured(
     assert list(figures["recall"][0]) == [
         *("max_position_error_m", "max_orientation_error_deg", "fraction")
     ]
+    single = figures["modes"]["single"]
+    assert single["uncertainty"] == "whole"
+    assert single["probability"] == dict.fromkeys(("p50", "p10", "min"), pytest.approx(1 / 3))
     latency = figures["latency_s"]
     assert 0 < latency["p50"] <= latency["p90"] <= latency["p99"] < 5
     assert figures["throughput_qps"] > 0
@@ -119,6 +122,8 @@ def test_without_any_answer_nothing_is_made_up(
     assert figures["median_position_error_m"] is None
     assert figures["throughput_qps"] == 0.0
     assert figures["stage_seconds"] == {}
+    single = figures["modes"]["single"]
+    assert (single["uncertainty"], single["probability"]) == (None, None)
 
 
 def test_both_transports_write_the_same_poses(

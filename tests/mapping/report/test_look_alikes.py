@@ -9,7 +9,7 @@ import pytest
 from mapping.cluster.workers import Workers
 from mapping.report import look_alikes
 from mapping.report.held_out import HeldOut, hold_out
-from mapping.report.look_alikes import LookAlike, find_look_alikes, shares_place
+from mapping.report.look_alikes import Search, find_look_alikes, shares_place
 from mapping.report.viewpoints import Viewpoints
 from mapping.stages.work_folder import WorkFolder
 from visloc.archive import Map
@@ -37,7 +37,7 @@ def rooms(make_map: Any, looking: Any, room: Any) -> Any:
     return make
 
 
-def found_in(opened: Map, folder: Any) -> tuple[list[LookAlike], list[HeldOut]]:
+def found_in(opened: Map, folder: Any) -> tuple[Search, list[HeldOut]]:
     work, told = WorkFolder(folder), list[tuple[int, int]]()
     with Workers(1) as workers:
         runs = hold_out(opened, work, workers, lambda *_: None)
@@ -51,7 +51,8 @@ def found_in(opened: Map, folder: Any) -> tuple[list[LookAlike], list[HeldOut]]:
 def test_two_rooms_that_look_alike_are_named_once(rooms: Any, tmp_path: Any) -> None:
     opened = rooms([0, 1, 0])
     found, runs = found_in(opened, tmp_path)
-    (pair,) = found
+    (pair,) = found.found
+    assert found.asked == len(opened.images)
     assert {pair.image // _PER_ROOM, pair.twin // _PER_ROOM} == {0, 2}
     viewpoints = Viewpoints.of(opened)
     away = viewpoints.centers[pair.twin] - viewpoints.centers[pair.image]
@@ -71,19 +72,22 @@ def test_two_rooms_that_look_alike_are_named_once(rooms: Any, tmp_path: Any) -> 
 
 def test_what_was_found_is_found_again(rooms: Any, tmp_path: Any, monkeypatch: Any) -> None:
     opened = rooms([0, 0])
-    (first,), _ = found_in(opened, tmp_path)
+    (first,) = found_in(opened, tmp_path)[0].found
     monkeypatch.setattr(look_alikes, "_ask", None)  # would fail if anything were asked
-    (again,), _ = found_in(opened, tmp_path)
+    (again,) = found_in(opened, tmp_path)[0].found
     assert again.told(opened) == first.told(opened)
     assert again.position.tolist() == first.position.tolist()
 
 
 def test_rooms_that_look_different_are_not_named(rooms: Any, tmp_path: Any) -> None:
-    assert found_in(rooms([0, 1, 2]), tmp_path)[0] == []
+    opened = rooms([0, 1, 2])
+    search, _ = found_in(opened, tmp_path)
+    assert (search.found, search.asked) == ((), len(opened.images))
 
 
-def test_a_map_of_one_place_has_no_look_alikes(half_mapped_room: Map, tmp_path: Any) -> None:
-    assert found_in(half_mapped_room, tmp_path)[0] == []
+def test_of_a_map_of_one_place_no_photo_can_be_asked(half_mapped_room: Map, tmp_path: Any) -> None:
+    search, _ = found_in(half_mapped_room, tmp_path)
+    assert (search.found, search.asked) == ((), 0)
 
 
 def test_more_pairs_than_anyone_reads_are_not_told(
@@ -91,7 +95,7 @@ def test_more_pairs_than_anyone_reads_are_not_told(
 ) -> None:
     monkeypatch.setattr(look_alikes, "_MOST", 1)
     found, _ = found_in(rooms([0, 1, 0, 1]), tmp_path)
-    assert len(found) == 1
+    assert len(found.found) == 1
 
 
 def test_photos_that_share_a_landmark_share_a_place_however_far_they_are_apart(

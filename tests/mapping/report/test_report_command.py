@@ -57,6 +57,7 @@ def _data(**changes: Any) -> dict[str, Any]:
             *(_run(2, 1, 0.2), _run(2, 5, 0.3)),
         ],
         "look_alikes": [{"told": "photos around a.jpg look like those around [b].jpg"}],
+        "look_alikes_asked": 6,
         "coverage": {
             "within": {"position": 0.05, "orientation_deg": 5.0},
             "cell": 0.3,

@@ -48,6 +48,7 @@ def test_the_report_has_the_shape_that_the_page_reads(half_mapped):
     assert set(data) == {
         *("map", "made_by", "up", "cameras", "images", "statistics", "held_out", "coverage"),
         "look_alikes",
+        "look_alikes_asked",
     }
     assert set(data["coverage"]) == {
         *("within", "cell", "right", "ahead", "directions_deg", "pitch_deg", "camera", "cells"),

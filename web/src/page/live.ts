@@ -305,7 +305,9 @@ function answerInWords(
   if (pose === null) return sentence(refusal?.message ?? "no reason was given");
   const std = lengthText(Math.hypot(...pose.position_std), metric, 2);
   const alone = pose.uncertainty === "photo only" ? " by scatter alone" : "";
-  return `± ${std}${alone}; ${countText(inliers)} of ${countText(correspondences)} matches agree.`;
+  const sure = pose.probability === null ? "" : ` Right with ${pose.probability.toFixed(2)}.`;
+  const agree = `${countText(inliers)} of ${countText(correspondences)} matches agree.`;
+  return `± ${std}${alone}; ${agree}${sure}`;
 }
 
 /** Of the box around the map's landmarks. */

@@ -91,6 +91,8 @@ export interface ReportData {
   };
   held_out: HeldOutRun[];
   look_alikes: LookAlike[];
+  /** Photos that were asked; one that shares its place with all others cannot be. */
+  look_alikes_asked: number;
   coverage: {
     /** What counts as localized: within so far and so many degrees of where it was taken. */
     within: { position: number; orientation_deg: number };

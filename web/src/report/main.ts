@@ -12,7 +12,14 @@ import { aboutSection } from "./about";
 import { onPlan } from "./plan";
 import { createScene } from "./scene";
 import { trials } from "./trials";
-import { kindestRuns, percent, sharesOfChance, succeeded, verdict } from "./words";
+import {
+  kindestRuns,
+  percent,
+  sharesOfChance,
+  succeeded,
+  verdict,
+  lookAlikesInWords,
+} from "./words";
 
 function main(): void {
   const data = JSON.parse(document.getElementById("report")?.textContent ?? "") as ReportData;
@@ -88,10 +95,11 @@ function heading(data: ReportData): HTMLElement[] {
   ];
 }
 
-function lookAlikes({ look_alikes: pairs }: ReportData): HTMLElement {
-  return pairs.length > 0
-    ? element("ul", {}, ...pairs.map(({ told }) => element("li", {}, told)))
-    : element("p", {}, "None were found.");
+function lookAlikes({ look_alikes: pairs, look_alikes_asked: asked }: ReportData): HTMLElement {
+  if (pairs.length > 0) {
+    return element("ul", {}, ...pairs.map(({ told }) => element("li", {}, told)));
+  }
+  return element("p", {}, lookAlikesInWords(asked));
 }
 
 function statistics({ statistics: all }: ReportData): HTMLElement {

@@ -134,3 +134,10 @@ export function verdict(data: ReportData): string[] {
   }
   return sentences;
 }
+
+/** No pair of places was found to look alike: why. */
+export function lookAlikesInWords(asked: number): string {
+  return asked === 0
+    ? "Not testable: all photos share one place, so that none can be looked for elsewhere."
+    : `None were found: ${counted(asked, "photo")} looked for elsewhere.`;
+}
