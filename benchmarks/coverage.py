@@ -32,7 +32,6 @@ from mapping.build.settings import BuildSettings
 from mapping.cluster.workers import Workers
 from mapping.report.held_out import hold_out
 from mapping.report.model import CoverageModel, Within, learn, tolerance_of
-from mapping.report.viewpoints import Viewpoints
 from mapping.stages.work_folder import WorkFolder
 from samples.render import render_depth, render_photo
 from samples.scene import ROOM_SIZE_M, Scene, make_room
@@ -42,6 +41,7 @@ from visloc.features import make_global_descriptor, make_local_features
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo_file
 from visloc.kapture import Dataset, FileRecord, Sensor, read_dataset, write_dataset
+from visloc.localization.constraints import MapGeometry
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
 from visloc.types import Localized
@@ -272,7 +272,7 @@ def _auc(values: NDArray[np.float64], failed: NDArray[np.bool_]) -> str:
 
 def learn_of(opened: Map, work: Path, workers: int) -> tuple[CoverageModel, Within]:
     """The model that the report of a map uses."""
-    viewpoints = Viewpoints.of(opened)
+    viewpoints = MapGeometry(opened).viewpoints
     within = tolerance_of(opened, viewpoints)
     with Workers(workers) as pool:
         runs = hold_out(opened, WorkFolder(work), pool, lambda *_: None)

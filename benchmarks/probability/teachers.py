@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from benchmarks.probability.disguises import DISGUISES, Image, printed, resembling
 from benchmarks.probability.held_out_maps import without
 from mapping.report.look_alikes import shares_place
-from mapping.report.viewpoints import Viewpoints
 from samples.render import render_photo
 from samples.scene import NUM_SURFACES, make_room
 from samples.trajectories import query_trajectory, stereo_rig
@@ -26,7 +25,7 @@ from visloc.evaluation import pose_error
 from visloc.features.base import LocalFeatureExtractor
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo, read_photo_file
-from visloc.localization.constraints import Constraints
+from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.evidence import SeenView, evidence_of
 from visloc.localization.gates import CONFIRMATIONS, GATES, Problem, first_refusal
 from visloc.localization.localizer import Localizer
@@ -87,7 +86,7 @@ class Teacher:
     ) -> None:
         self._full, self._photos, self._extractor = full, photos, extractor
         self._foreign, self._random = foreign, np.random.default_rng(seed)
-        self._viewpoints = Viewpoints.of(full)
+        self._viewpoints = MapGeometry(full).viewpoints
         stamps = np.array([image.timestamp for image in full.images])
         _, self._instants = np.unique(stamps, return_inverse=True)
 

@@ -16,12 +16,12 @@ from mapping.cluster.workers import one_thread_here
 from mapping.frames.stored_queries import solve_stored
 from mapping.own_test.error_model import fitted_factor, mahalanobis2
 from mapping.report.held_out import match_held_out, spread_photos, taken_with
-from mapping.report.viewpoints import Viewpoints
 from visloc.archive import Map
 from visloc.archive.schema import MAX_FACTOR, MAX_WRONG_SCORES, OwnTest, Score
 from visloc.geometry import Pose, center_covariance
 from visloc.localization.constraints import MapGeometry
 from visloc.localization.judge import TIE_ANGLE, TIE_REACH_SHARE
+from visloc.localization.viewpoints import Viewpoints
 from visloc.options import LocalizeOptions
 
 # Photos that are tried: so many of a small map, a fifth of a larger one, up to a limit. The test
@@ -60,7 +60,7 @@ def own_test(opened: Map) -> OwnTest:
     The photos are spread evenly and every random choice has a seed, so that equal maps have equal
     tests.
     """
-    viewpoints, geometry = Viewpoints.of(opened), MapGeometry(opened)
+    viewpoints, geometry = MapGeometry(opened).viewpoints, MapGeometry(opened)
     most = min(max(_LEAST_PHOTOS, len(opened.images) // _SHARE_OF_PHOTOS), _MOST_PHOTOS)
     images = spread_photos(len(opened.images), most)
     tested, trials = 0, []

@@ -17,12 +17,13 @@ from mapping.report.held_out import HeldOut, hold_out
 from mapping.report.look_alikes import LookAlike, find_look_alikes
 from mapping.report.model import Forecast, Learned, Within, learn, tolerance_of
 from mapping.report.statistics import statistics_of
-from mapping.report.viewpoints import Viewpoints
 from mapping.report.weak_spots import WeakSpot, find_weak_spots
 from mapping.stages.work_folder import WorkFolder
 from visloc import __version__
 from visloc.archive import Map
 from visloc.geometry import Camera
+from visloc.localization.constraints import MapGeometry
+from visloc.localization.viewpoints import Viewpoints
 
 _MAX_CALIBRATION_BINS, _RUNS_PER_BIN = 10, 10
 # With fewer runs that failed, or succeeded, than this, what tells both apart is a guess.
@@ -53,7 +54,7 @@ def make_report_data(
     Returns:
         JSON values as ``ReportData`` of web/src/report/data.ts, but for ``points``.
     """
-    viewpoints = Viewpoints.of(opened)
+    viewpoints = MapGeometry(opened).viewpoints
     within = tolerance_of(opened, viewpoints)
     runs = hold_out(opened, work, workers, partial(progress, "held-out photos"))
     told = partial(progress, "look-alikes")

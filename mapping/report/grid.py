@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mapping.report.model import CoverageModel, Forecast
-from mapping.report.viewpoints import Viewpoints
 from visloc.archive import Map
 from visloc.geometry import Camera, Pose
+from visloc.localization.viewpoints import Viewpoints
 
 NUM_DIRECTIONS = 12
 _NUM_CELLS = 320

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from mapping.cluster.workers import Workers
 from mapping.frames.stored_queries import match_stored, solve_stored
-from mapping.report.viewpoints import Viewpoints
 from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc import __version__
 from visloc.archive import Map, open_map
@@ -26,6 +25,7 @@ from visloc.evaluation import pose_error
 from visloc.geometry import Pose
 from visloc.localization.constraints import MapGeometry
 from visloc.localization.gates import registration_for
+from visloc.localization.viewpoints import Viewpoints
 from visloc.matching.correspondences import Correspondences
 from visloc.options import LocalizeOptions
 from visloc.pose.reprojection import reprojection_errors
@@ -260,7 +260,7 @@ def _key(opened: Map, image: int) -> str:
 def opened_once(folder: Path) -> tuple[Map, Viewpoints]:
     """A map, once per process: its arrays must not travel to workers with every photo."""
     opened = open_map(folder)
-    return opened, Viewpoints.of(opened)
+    return opened, MapGeometry(opened).viewpoints
 
 
 def _keep_runs(folder: Path, work: WorkFolder, image: int) -> None:

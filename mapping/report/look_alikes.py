@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from mapping.cluster.workers import Workers
 from mapping.frames.stored_queries import solve_stored
 from mapping.report.held_out import HeldOut, ask_photos, match_held_out, opened_once
-from mapping.report.viewpoints import Viewpoints
 from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc import __version__
 from visloc.archive import Map
 from visloc.localization.constraints import MapGeometry
+from visloc.localization.viewpoints import Viewpoints
 from visloc.options import LocalizeOptions
 
 _REVISION = 2

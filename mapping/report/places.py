@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.report.viewpoints import Viewpoints
 from visloc.archive import Map
+from visloc.localization.viewpoints import Viewpoints
 
 # Side of a cell, of the distance from which photos see: at it, half a degree, some pixels.
 _CELL_OF_REACH = 0.01

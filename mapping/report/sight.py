@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.report.places import Places
-from mapping.report.viewpoints import Viewpoints
 from visloc.geometry import Camera, Pose
+from visloc.localization.viewpoints import Viewpoints
 from visloc.options import LocalizeOptions
 from visloc.pose.colmap import normalized_rays, project
 

@@ -17,10 +17,11 @@ from scipy.spatial.transform import Rotation
 from visloc.archive import Map
 from visloc.errors import refuse
 from visloc.geometry import Pose
+from visloc.localization.viewpoints import Viewpoints
 from visloc.matching.products import EightBitRows
 from visloc.pose.centre import largest_std, with_origin
 from visloc.pose.colmap import normalized_rays
-from visloc.pose.distance import mahalanobis2, viewpoints_apart
+from visloc.pose.distance import mahalanobis2
 from visloc.pose.generalized import MAX_FOCAL, MIN_FOCAL
 from visloc.pose.gravity import KnownGravity, gravity_deviation
 from visloc.pose.map_errors import PHOTO_ONLY, MapErrors
@@ -76,9 +77,15 @@ class MapGeometry:
 
     def nearest_photos(self, row: int, count: int) -> NDArray[np.int64]:
         """Return the photos taken most like one of them, itself first."""
-        rotation = self.rotations[int(row)]
-        pose = Pose(rotation, -rotation @ self.centers[int(row)])
-        return np.argsort(self.apart_from(pose), kind="stable")[:count]
+        viewpoints = self.viewpoints
+        apart = viewpoints.apart_from(viewpoints.pose(int(row)))
+        return np.argsort(apart, kind="stable")[:count]
+
+    @cached_property
+    def viewpoints(self) -> Viewpoints:
+        """Where the photos were taken, and which way they look, relative to the origin."""
+        rotations = Rotation.from_quat(self.opened.image_poses[:, :4], scalar_first=True)
+        return Viewpoints(self.centers, rotations.as_matrix(), max(self.reach, _LEAST_REACH))
 
     @cached_property
     def centers(self) -> NDArray[np.float64]:
@@ -86,17 +93,6 @@ class MapGeometry:
         poses = self.opened.image_poses
         rotations = Rotation.from_quat(poses[:, :4], scalar_first=True)
         return np.asarray(-rotations.inv().apply(poses[:, 4:]) - self.origin)
-
-    @cached_property
-    def rotations(self) -> NDArray[np.float64]:
-        """(n, 3, 3) ``cam_from_world`` of the photos."""
-        quaternions = self.opened.image_poses[:, :4]
-        return np.asarray(Rotation.from_quat(quaternions, scalar_first=True).as_matrix())
-
-    def apart_from(self, cam_from_local: Pose) -> NDArray[np.float64]:
-        """How far each photo (n,) is from a pose, radians, as ``viewpoints_apart``."""
-        reach = max(self.reach, _LEAST_REACH)
-        return viewpoints_apart(self.rotations, self.centers, cam_from_local, reach)
 
     @cached_property
     def reach(self) -> float:

@@ -317,7 +317,7 @@ def _expected(
 
     A landmark counts if a photo near the pose sees it from about the same side and distance.
     """
-    opened, apart = geometry.opened, geometry.apart_from(cam_from_world)
+    opened, apart = geometry.opened, geometry.viewpoints.apart_from(cam_from_world)
     nearest = np.argpartition(apart, min(_NUM_PHOTOS, len(apart)) - 1)[:_NUM_PHOTOS]
     nearest = nearest[np.lexsort((nearest, apart[nearest]))]
     seen = [_some_rows(opened.observation_offsets, image) for image in nearest.tolist()]

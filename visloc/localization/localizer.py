@@ -294,19 +294,16 @@ class Localizer:
             was refused.
         """
         solved = self.solve([SeenImage("camera", Pose.identity(), look)], options, priors)
-        answer, pose = solved.answer, solved.answer.pose
+        answer, pose, refusal = solved.answer, solved.answer.pose, solved.answer.refusal
         none = np.zeros(len(look.matches.pixels), dtype=np.bool_)
         inliers = solved.inliers[0] if solved.inliers else none
         (image,) = answer.images
         assert image.evidence is not None  # it was looked at
         evidence = replace(image.evidence, seconds=answer.seconds)
-        if answer.refusal is not None or pose is None or pose.photo_covariance is None:
-            assert answer.refusal is not None  # without a pose there is a reason
-            refusal = answer.refusal
-            refused = NotLocalized(
-                evidence, refusal.stage, refusal.reason, refusal.message, refusal.candidates
-            )
-            return refused, inliers
+        if refusal is not None or pose is None or pose.photo_covariance is None:
+            assert refusal is not None  # without a pose there is a reason
+            told = (refusal.stage, refusal.reason, refusal.message, refusal.candidates)
+            return NotLocalized(evidence, *told), inliers
         localized = Localized(
             evidence=evidence,
             cam_from_world=pose.rig_from_world,
@@ -363,9 +360,10 @@ class Localizer:
         evidence = replace(evidence, retrieved=tuple(self._describe_retrieved(retrieved)))
         with timed(seconds, "matching"):
             shown = Shown(local.keypoints, round_descriptors(local.descriptors))
-            pairs = self._match_photos(shown, retrieved.images, options, rematching)
-            others = self._match_photos(shown, elsewhere, options, rematching)
-        matched = pairs.settled()
+            ratio = CLEAR_RATIO if options.matcher is Matcher.RATIO else None
+            pairs = self._match_photos(shown, retrieved.images, ratio, rematching)
+            others = self._match_photos(shown, elsewhere, ratio, rematching)
+        matched, points = pairs.settled(), self.map.landmarks[pairs.landmarks]
         matches = self._matches(shown, matched)
         evidence = replace(evidence, num_correspondences=len(matches.pixels))
         return Look(
@@ -374,21 +372,21 @@ class Localizer:
             matched.landmarks,
             self._matches(shown, others.settled()),
             shown=shown,
-            proposed=Proposed(shown, pairs, self.map.landmarks[pairs.landmarks], retrieved.images),
+            proposed=Proposed(shown, pairs, points, retrieved.images, ratio),
         )
 
     def _match_photos(
         self,
         shown: Shown,
         photos: NDArray[np.int64],
-        options: LocalizeOptions,
+        ratio: float | None,
         rematching: Rematching | None,
     ) -> Proposals:
         """Match with the landmarks that these photos see, best photo first."""
         return propose_landmarks(
             shown.descriptors,
             (self.geometry.observed(photo) for photo in photos),
-            CLEAR_RATIO if options.matcher is Matcher.RATIO else None,
+            ratio,
             None if rematching is None else lambda rank: rematching.match(int(photos[rank])),
         )
 

@@ -60,12 +60,14 @@ class Proposed:
         pairs: of keypoints and landmarks; ranks are rows of ``photos``.
         points: (n, 3) float32 landmarks of the pairs, relative to the map's origin.
         photos: (r,) int64 rows of the map's photos.
+        ratio: with which the pairs were tested; None when they were not.
     """
 
     shown: Shown
     pairs: Proposals
     points: NDArray[np.float32]
     photos: NDArray[np.int64]
+    ratio: float | None = None
 
     @staticmethod
     def none(features: LocalFeatures) -> Proposed:
@@ -76,10 +78,14 @@ class Proposed:
         )
 
     def matched_with(self, photos: NDArray[np.int64], geometry: MapGeometry) -> Proposed:
-        """Add the pairs that further photos propose."""
+        """Add the pairs that further photos propose.
+
+        They are matched as the others were, except those of LightGlue: its network does not travel
+        with what was seen from one process to the next, so they are mutual nearest neighbours.
+        """
         further = photos[~np.isin(photos, self.photos)]
         found = propose_landmarks(
-            self.shown.descriptors, [geometry.observed(photo) for photo in further]
+            self.shown.descriptors, [geometry.observed(photo) for photo in further], self.ratio
         )
         return replace(
             self,
@@ -329,6 +335,8 @@ def _is_rival(
     if best.covariance is None or other.covariance is None:
         return False  # without an uncertainty, nothing says that they differ
     a, b = best.rig_from_world, other.rig_from_world
+    # The photo's part alone: both poses share the errors of one map, and the wider whole would take
+    # a twin next door for the same place.
     std = math.hypot(largest_std(a, best.covariance), largest_std(b, other.covariance))
     away = float(np.linalg.norm(a.center - b.center))
     turned = rotation_angle(a.rotation @ b.rotation.T)

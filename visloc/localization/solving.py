@@ -345,6 +345,8 @@ def _without_exif(problem: Problem, pose: GeneralizedPose) -> Problem | None:
     if problem.sources != (CameraSource.EXIF,) or problem.options.solver is Solver.REGISTRATION:
         return None
     (view,) = problem.views
+    # The gate may have found these intrinsics already, if no prior refused the pose before. To find
+    # them again takes little beside the second search, which only such photos get.
     if not only_focal_length_contradicts(
         view, CameraSource.EXIF, pose.rig_from_world, problem.registration.max_error_px
     ):

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from mapping.frames.stored_queries import match_stored, solve_stored
 from mapping.maps.pruning.choosing import Kept
 from mapping.report.held_out import left_out_sets, vanishing
-from mapping.report.viewpoints import Viewpoints
 from mapping.stages.photos import read_in_frame
 from visloc.archive import Map
 from visloc.errors import refuse
@@ -115,7 +114,7 @@ def of_held_out_photos(
     stays[before.observation_landmarks[kept.observations]] = True
     photo_rows = np.where(kept.images, np.cumsum(kept.images) - 1, -1)
     landmark_rows = np.where(stays, np.cumsum(stays) - 1, -1)
-    viewpoints = Viewpoints.of(before)
+    viewpoints = MapGeometry(before).viewpoints
     geometries = MapGeometry(before), MapGeometry(after)
     chosen = np.linspace(0, len(photo_rows) - 1, min(len(photo_rows), _MAX_HELD_OUT)).astype(int)
     count = 0

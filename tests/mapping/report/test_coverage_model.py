@@ -9,9 +9,9 @@ from mapping.report.held_out import HeldOut, hold_out
 from mapping.report.model import Within, learn, tolerance_of
 from mapping.report.rematch import Rematch, count, fit_rematch
 from mapping.report.sight import Sight
-from mapping.report.viewpoints import Viewpoints
 from mapping.stages.work_folder import WorkFolder
 from visloc.geometry import Camera
+from visloc.localization.constraints import MapGeometry
 from visloc.options import LocalizeOptions
 
 CAMERA = Camera("PINHOLE", 320, 240, (220.0, 220.0, 160.0, 120.0))
@@ -162,9 +162,9 @@ def test_a_map_in_no_unit_has_a_tolerance_relative_to_what_is_seen(make_map, loo
     points = room(np.random.default_rng(0), 400)
     poses = [looking((0.0, 0.0, 0.0), 90.0 * i) for i in range(3)]
     metric, other = make_map(points, poses), make_map(points, poses, metric=False)
-    assert tolerance_of(metric, Viewpoints.of(metric)) == Within(0.25, 2.0)
-    reach = Viewpoints.of(other).reach
-    assert tolerance_of(other, Viewpoints.of(other)) == Within(0.05 * reach, 2.0)
+    assert tolerance_of(metric, MapGeometry(metric).viewpoints) == Within(0.25, 2.0)
+    reach = MapGeometry(other).viewpoints.reach
+    assert tolerance_of(other, MapGeometry(other).viewpoints) == Within(0.05 * reach, 2.0)
 
 
 def test_a_run_is_judged_by_position_and_orientation():
@@ -181,7 +181,7 @@ def test_a_run_is_judged_by_position_and_orientation():
 
 @pytest.fixture(scope="module")
 def learned(half_mapped_room, tmp_path_factory):
-    viewpoints = Viewpoints.of(half_mapped_room)
+    viewpoints = MapGeometry(half_mapped_room).viewpoints
     with Workers(1) as workers:
         work = WorkFolder(tmp_path_factory.mktemp("work"))
         runs = hold_out(half_mapped_room, work, workers, lambda *_: None)
@@ -206,7 +206,7 @@ def test_predictions_of_a_run_do_not_know_its_photo(half_mapped_room, learned):
         else r
         for r in runs
     ]
-    viewpoints = Viewpoints.of(half_mapped_room)
+    viewpoints = MapGeometry(half_mapped_room).viewpoints
     within = tolerance_of(half_mapped_room, viewpoints)
     again = learn(half_mapped_room, viewpoints, lying, within, lambda *_: None)
     of_photo = np.array([run.image == 3 for run in runs])

@@ -14,8 +14,8 @@ from mapping.report.held_out import (
     localize_held_out,
     vanishing,
 )
-from mapping.report.viewpoints import Viewpoints
 from mapping.stages.work_folder import WorkFolder
+from visloc.localization.constraints import MapGeometry
 from visloc.options import LocalizeOptions
 
 
@@ -31,7 +31,7 @@ def runs_of(opened, folder):
 def test_each_photo_is_left_out_first_alone_and_then_with_ever_more_of_its_neighbours(
     half_mapped_room,
 ):
-    viewpoints = Viewpoints.of(half_mapped_room)
+    viewpoints = MapGeometry(half_mapped_room).viewpoints
     sets = left_out_sets(half_mapped_room, viewpoints, 4)
     assert sets[0].tolist() == [4]
     assert all(set(a) < set(b) for a, b in itertools.pairwise(sets))
@@ -51,7 +51,7 @@ def test_photos_of_the_same_instant_of_a_rig_go_together(make_map, looking, room
         timestamps=[0, 0, 1, 1],
         rigs={"rig": {"left": poses[0], "right": poses[0]}},
     )
-    first = left_out_sets(opened, Viewpoints.of(opened), 2)[0]
+    first = left_out_sets(opened, MapGeometry(opened).viewpoints, 2)[0]
     assert first.tolist() == [2, 3]
 
 
@@ -60,7 +60,7 @@ def test_photos_of_one_camera_do_not_go_together_for_a_clock_that_stands_still(
 ):
     poses = [looking((0.0, 0.0, 0.0), 90.0 * i) for i in range(3)]
     opened = make_map(room(np.random.default_rng(0), 400), poses, timestamps=[7, 7, 7])
-    assert left_out_sets(opened, Viewpoints.of(opened), 0)[0].tolist() == [0]
+    assert left_out_sets(opened, MapGeometry(opened).viewpoints, 0)[0].tolist() == [0]
 
 
 def test_landmarks_that_too_few_remaining_photos_see_vanish(make_map, looking):
@@ -98,7 +98,7 @@ def test_nothing_is_matched_that_only_photos_left_out_saw(make_map, looking):
     there = here + np.array([0.0, 50.0, 0.0])
     poses = [looking((0.0, 0.0, 0.0), 0.0)] * 2 + [looking((0.0, 50.0, 0.0), 0.0)]
     opened = make_map(np.concatenate([here, there]), poses)
-    viewpoints = Viewpoints.of(opened)
+    viewpoints = MapGeometry(opened).viewpoints
     with_its_double = localize_held_out(opened, viewpoints, 0, np.array([0]))
     assert with_its_double.localized
     assert with_its_double.position_error < 0.05
@@ -112,7 +112,7 @@ def test_nothing_is_matched_that_only_photos_left_out_saw(make_map, looking):
 def test_a_duplicate_of_a_photo_is_left_out_with_it_in_the_second_run(make_map, looking, room):
     poses = [looking((0.0, 0.0, 0.0), yaw) for yaw in (0.0, 0.0, 180.0)]
     opened = make_map(room(np.random.default_rng(0), 800), poses)
-    sets = left_out_sets(opened, Viewpoints.of(opened), 0)
+    sets = left_out_sets(opened, MapGeometry(opened).viewpoints, 0)
     assert [s.tolist() for s in sets] == [[0], [0, 1]]
 
 

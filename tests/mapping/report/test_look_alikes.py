@@ -10,9 +10,9 @@ from mapping.cluster.workers import Workers
 from mapping.report import look_alikes
 from mapping.report.held_out import HeldOut, hold_out
 from mapping.report.look_alikes import Search, find_look_alikes, shares_place
-from mapping.report.viewpoints import Viewpoints
 from mapping.stages.work_folder import WorkFolder
 from visloc.archive import Map
+from visloc.localization.constraints import MapGeometry
 
 _BETWEEN = 50.0  # from one room to the next; they look past each other
 _PER_ROOM = 6
@@ -42,7 +42,12 @@ def found_in(opened: Map, folder: Any) -> tuple[Search, list[HeldOut]]:
     with Workers(1) as workers:
         runs = hold_out(opened, work, workers, lambda *_: None)
         found = find_look_alikes(
-            opened, Viewpoints.of(opened), runs, work, workers, lambda *now: told.append(now)
+            opened,
+            MapGeometry(opened).viewpoints,
+            runs,
+            work,
+            workers,
+            lambda *now: told.append(now),
         )
     assert told[-1] == (len(opened.images),) * 2
     return found, runs
@@ -54,7 +59,7 @@ def test_two_rooms_that_look_alike_are_named_once(rooms: Any, tmp_path: Any) -> 
     (pair,) = found.found
     assert found.asked == len(opened.images)
     assert {pair.image // _PER_ROOM, pair.twin // _PER_ROOM} == {0, 2}
-    viewpoints = Viewpoints.of(opened)
+    viewpoints = MapGeometry(opened).viewpoints
     away = viewpoints.centers[pair.twin] - viewpoints.centers[pair.image]
     assert abs(away[1]) == pytest.approx(2 * _BETWEEN, abs=2.0)
     expected = viewpoints.centers[pair.image] + np.array(
@@ -85,9 +90,17 @@ def test_rooms_that_look_different_are_not_named(rooms: Any, tmp_path: Any) -> N
     assert (search.found, search.asked) == ((), len(opened.images))
 
 
-def test_of_a_map_of_one_place_no_photo_can_be_asked(half_mapped_room: Map, tmp_path: Any) -> None:
-    search, _ = found_in(half_mapped_room, tmp_path)
+def test_of_a_map_of_one_place_no_photo_can_be_asked(rooms: Any, tmp_path: Any) -> None:
+    search, _ = found_in(rooms([0]), tmp_path)
     assert (search.found, search.asked) == ((), 0)
+
+
+def test_a_room_that_is_half_mapped_does_not_look_like_itself(
+    half_mapped_room: Map, tmp_path: Any
+) -> None:
+    search, _ = found_in(half_mapped_room, tmp_path)
+    assert search.found == ()
+    assert search.asked > 0
 
 
 def test_more_pairs_than_anyone_reads_are_not_told(
@@ -105,6 +118,6 @@ def test_photos_that_share_a_landmark_share_a_place_however_far_they_are_apart(
     points = np.concatenate([points, points + np.array([0.0, 50.0, 0.0])])
     places = [((0, 0, 0), 0), ((-2.5, 1.8, 0), -35), ((0, 0, 0), 80), ((0, 50, 0), 0)]
     opened = make_map(points, [looking(position, yaw) for position, yaw in places])
-    viewpoints = Viewpoints.of(opened)
+    viewpoints = MapGeometry(opened).viewpoints
     assert viewpoints.apart_from(viewpoints.pose(0))[1:].min() > 1.2
     assert shares_place(opened, viewpoints, 0).tolist() == [True, True, False, False]

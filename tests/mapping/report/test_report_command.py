@@ -211,6 +211,17 @@ def test_people_are_told_when_up_is_a_guess(
     assert "--gravity" in out
 
 
+@pytest.mark.usefixtures("computed")
+def test_no_look_alikes_and_none_that_can_be_tested_are_told_apart(
+    run: Run, built_maps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = ("room", "--maps-dir", built_maps, "--output", tmp_path / "room.html")
+    for number, said in ((6, "none, of 6 photos asked"), (0, "not testable")):
+        data = _data(look_alikes=[], look_alikes_asked=number)
+        monkeypatch.setattr(command, "make_report_data", lambda *_, data=data, **__: data)
+        assert f"look-alikes: {said}" in run(*asked)[1]
+
+
 @pytest.mark.parametrize(
     ("cell", "shown"),
     [(0.3, "1.23, 0.04, 100.00"), (1e-4, "1.23400, 0.03600"), (50.0, "1, 0, 100")],

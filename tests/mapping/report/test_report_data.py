@@ -12,10 +12,10 @@ from mapping.report.grid import Plan, make_grid
 from mapping.report.held_out import HeldOut
 from mapping.report.model import Within
 from mapping.report.statistics import statistics_of
-from mapping.report.viewpoints import Viewpoints
 from mapping.stages.work_folder import WorkFolder
 from visloc.archive import MapStore
 from visloc.geometry import Pose
+from visloc.localization.constraints import MapGeometry
 
 
 def report_of(opened, folder):
@@ -190,7 +190,7 @@ def test_up_is_a_direction_even_where_no_row_tells_which_way_round(make_map):
     poses = [Pose(turn @ axes, np.zeros(3)) for turn in (np.eye(3), np.diag([-1.0, 1, -1]))]
     points = np.random.default_rng(0).uniform(-3, 3, (400, 3))
     opened = make_map(points, poses, gravity=None)
-    plan = Plan.of(opened, Viewpoints.of(opened))
+    plan = Plan.of(opened, MapGeometry(opened).viewpoints)
     for axis in (plan.up, plan.right, plan.ahead):
         assert np.linalg.norm(axis) == pytest.approx(1.0)
 
@@ -214,7 +214,7 @@ def test_places_of_a_small_world_keep_their_digits(make_map, looking, room, tmp_
 def test_without_gravity_up_is_that_of_the_cameras(make_map, looking, room):
     points = room(np.random.default_rng(0), 200)
     opened = make_map(points, [looking((0, 0, 0), 40.0 * i) for i in range(3)], gravity=None)
-    plan = Plan.of(opened, Viewpoints.of(opened))
+    plan = Plan.of(opened, MapGeometry(opened).viewpoints)
     assert plan.up_source == "cameras"
     assert plan.up == pytest.approx([0.0, 0.0, 1.0], abs=1e-9)
     assert np.cross(plan.right, plan.ahead) == pytest.approx(plan.up)
@@ -231,7 +231,7 @@ def test_the_plan_holds_the_camera_as_the_mapping_photos_did(
         level = looking((0, 0, 0), yaw)
         poses.append(type(level)(turn @ level.rotation, turn @ level.translation))
     opened = make_map(room(np.random.default_rng(0), 800), poses)
-    plan = Plan.of(opened, Viewpoints.of(opened))
+    plan = Plan.of(opened, MapGeometry(opened).viewpoints)
     made = plan.pose(np.zeros(3), 30.0)
     assert made.rotation == pytest.approx(poses[1].rotation, abs=1e-9)
     assert np.linalg.det(made.rotation) == pytest.approx(1.0)
@@ -239,7 +239,7 @@ def test_the_plan_holds_the_camera_as_the_mapping_photos_did(
 
 def test_a_pose_of_the_plan_looks_where_it_says(make_map, looking, room):
     opened = make_map(room(np.random.default_rng(0), 200), [looking((0, 0, 0), 0.0)])
-    plan = Plan.of(opened, Viewpoints.of(opened))
+    plan = Plan.of(opened, MapGeometry(opened).viewpoints)
     position = np.array([1.0, 2.0, 0.3])
     pose = plan.pose(position, 90.0)
     assert pose.center == pytest.approx(position)
@@ -247,7 +247,7 @@ def test_a_pose_of_the_plan_looks_where_it_says(make_map, looking, room):
 
 
 def test_the_grid_stays_near_the_photos_and_at_their_height(half_mapped_room):
-    viewpoints = Viewpoints.of(half_mapped_room)
+    viewpoints = MapGeometry(half_mapped_room).viewpoints
     grid = make_grid(Plan.of(half_mapped_room, viewpoints), viewpoints)
     assert 20 <= len(grid.positions) <= 40
     assert grid.away.max() <= 0.5 * viewpoints.reach + 1e-9
@@ -259,7 +259,7 @@ def test_a_long_street_has_no_more_cells_than_a_room(make_map, looking, room):
     street = np.concatenate([points + np.array([200.0 * i, 0.0, 0.0]) for i in range(3)])
     poses = [looking((200.0 * i, 0.0, 0.0), 0.0) for i in range(3)]
     opened = make_map(street, poses)
-    viewpoints = Viewpoints.of(opened)
+    viewpoints = MapGeometry(opened).viewpoints
     grid = make_grid(Plan.of(opened, viewpoints), viewpoints)
     assert 0 < len(grid.positions) <= 40
 

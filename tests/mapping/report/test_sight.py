@@ -5,8 +5,8 @@ import pytest
 
 from mapping.report.places import sample_places
 from mapping.report.sight import Absent, look_around
-from mapping.report.viewpoints import Viewpoints
 from visloc.geometry import Camera
+from visloc.localization.constraints import MapGeometry
 
 CAMERA = Camera("PINHOLE", 320, 240, (220.0, 220.0, 160.0, 120.0))
 
@@ -20,13 +20,13 @@ def wall_map(make_map, looking):
 
 
 def sight_at(opened, pose, camera=CAMERA, absent=None):
-    viewpoints = Viewpoints.of(opened)
+    viewpoints = MapGeometry(opened).viewpoints
     return look_around(sample_places(opened, viewpoints), viewpoints, pose, camera, absent)
 
 
 def test_a_camera_that_faces_the_wall_has_it_in_view(wall_map, looking):
     sight = sight_at(wall_map, looking((0.0, 0.0, 0.0), 0.0))
-    assert len(sight) == len(sample_places(wall_map, Viewpoints.of(wall_map)).points)
+    assert len(sight) == len(sample_places(wall_map, MapGeometry(wall_map).viewpoints).points)
     assert sight.angles_deg == pytest.approx(0.0, abs=1e-4)
     assert sight.octaves == pytest.approx(0.0, abs=1e-6)
     assert (sight.observers >= 1).all()
@@ -84,17 +84,17 @@ def test_points_beyond_the_border_do_not_come_back_by_distortion(make_map, looki
 def test_landmarks_of_one_corner_are_one_place(make_map, looking):
     corner = np.array([[3.0, 0.0, 0.0], [3.0, 0.0005, 0.0], [3.0, 0.5, 0.0]])
     opened = make_map(corner + 0.001, [looking((0.0, 0.0, 0.0), 0.0)])
-    assert len(sample_places(opened, Viewpoints.of(opened)).points) == 2
+    assert len(sample_places(opened, MapGeometry(opened).viewpoints).points) == 2
 
 
 def test_a_sample_of_places_stands_for_all(make_map, looking, room):
     points = room(np.random.default_rng(0), 9000)
     opened = make_map(points, [looking((0.0, 0.0, 0.0), 90.0 * i) for i in range(4)])
-    places = sample_places(opened, Viewpoints.of(opened))
+    places = sample_places(opened, MapGeometry(opened).viewpoints)
     assert places.share < 0.5
     everything = len(np.unique(np.floor(opened.landmarks / 0.03), axis=0))
     assert len(places.points) / places.share == pytest.approx(everything, rel=0.25)
-    again = sample_places(opened, Viewpoints.of(opened))
+    again = sample_places(opened, MapGeometry(opened).viewpoints)
     assert again.points.tolist() == places.points.tolist()
     rows, photos = places.rows(np.array([2, 0]))
     assert photos.tolist() == sorted(photos.tolist(), reverse=True)

@@ -272,6 +272,28 @@ def test_a_rig_is_localized_in_a_set(
     assert alone.images[0].error is not None
 
 
+def test_a_rig_in_one_of_two_tiles_that_look_alike_is_refused_with_both(
+    client: Client, sample: Path
+) -> None:
+    dataset = read_dataset(sample / "query")
+    first = [r for r in dataset.images if r.timestamp == dataset.images[0].timestamp]
+    images = [RigImage(r.sensor_id, dataset.path_of(r).read_bytes()) for r in first]
+
+    found = client.localize_rig(images, "twice", "rig")
+
+    assert found.pose is None
+    assert found.refusal is not None
+    assert found.refusal.reason == "ambiguous"
+    assert len(found.refusal.candidates) == 2
+    for place in found.refusal.candidates:
+        assert place.tile is not None
+        tile = Priors(maps=(place.tile,))
+        alone = client.localize_rig(images, "twice", "rig", priors=tile)
+        assert alone.pose is not None
+        assert place.position == pytest.approx(alone.pose.position, abs=1e-6)
+        assert place.orientation == pytest.approx(alone.pose.orientation, abs=1e-6)
+
+
 def test_a_sequence_goes_from_tile_to_tile_in_legs(
     client: Client, queries: list[Any], in_study: list[Any]
 ) -> None:

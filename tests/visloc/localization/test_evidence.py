@@ -48,8 +48,7 @@ def seen_from(localizer: Localizer, photo: int, shown_share: float = 1.0) -> tup
     """
     opened, geometry = localizer.map, localizer.geometry
     camera = opened.cameras[opened.images[photo].camera]
-    rotation = geometry.rotations[photo]
-    pose = Pose(rotation, -rotation @ geometry.centers[photo])
+    pose = geometry.viewpoints.pose(photo)
     landmarks, descriptors = opened.observations(photo)
     points = opened.landmarks[landmarks].astype(np.float64)
     pixels = project(camera, pose.apply(points))

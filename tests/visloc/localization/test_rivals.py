@@ -13,7 +13,7 @@ from visloc.localization.localizer import Localizer
 from visloc.localization.preference import SURE, preference
 from visloc.localization.rivals import score
 from visloc.localization.solving import SeenImage, Solved
-from visloc.options import LocalizeOptions
+from visloc.options import LocalizeOptions, Matcher
 from visloc.priors import NO_PRIORS, Priors
 from visloc.types import CameraSource, NotLocalized, Reason
 
@@ -165,3 +165,77 @@ def test_a_camera_that_was_left_out_speaks_for_no_place(room: Localizer, place: 
 
 def test_a_single_keypoint_decides_nothing() -> None:
     assert preference(np.array([1.0]), np.array([0.0])) < SURE
+
+
+def rig_of_two(building: Building, place: Any, floor: int, *, signs: bool) -> Solved:
+    """Two cameras that look apart by a right angle; the first one sees no sign."""
+    options = LocalizeOptions(top_k=4, min_inliers=15)
+    rig_from_world = building.pose(0, 2.2)
+    images = []
+    for sensor, photo in (("cam0", 2.2), ("cam1", 4.2)):
+        features = building.features(place, floor, photo, signs=signs and sensor == "cam1")
+        look = building.localizer.look_at_features(features, place.camera, options)
+        cam_from_rig = building.pose(0, photo) @ rig_from_world.inverse()
+        images.append(SeenImage(sensor, cam_from_rig, look))
+    return building.localizer.solve(images, options)
+
+
+@pytest.mark.parametrize("floor", [0, 1])
+def test_a_rig_in_one_of_two_identical_rooms_is_refused_with_both_poses_of_the_rig(
+    room: Localizer, place: Any, floor: int
+) -> None:
+    refusal = rig_of_two(Building(room, 0.0, 0.0), place, floor, signs=True).answer.refusal
+
+    assert refusal is not None
+    assert refusal.reason is Reason.AMBIGUOUS
+    places = sorted(refusal.candidates, key=lambda each: each.rig_from_world.center[2])
+    assert len(places) == 2
+    for on, each in enumerate(places):
+        expected = Building.pose(on, 2.2)
+        np.testing.assert_allclose(each.rig_from_world.center, expected.center, atol=0.05)
+        np.testing.assert_allclose(each.rig_from_world.rotation, expected.rotation, atol=0.01)
+    # Keypoints of both cameras count.
+    alone = Building(room, 0.0, 0.0).ask(place, floor, NO_PRIORS)
+    assert isinstance(alone, NotLocalized)
+    assert places[0].num_inliers > alone.candidates[0].num_inliers
+
+
+@pytest.mark.parametrize("floor", [0, 1])
+def test_a_sign_that_one_camera_of_a_rig_sees_decides_for_both(
+    room: Localizer, place: Any, floor: int
+) -> None:
+    building = Building(room, 0.6, 0.0)
+
+    unsigned = rig_of_two(building, place, floor, signs=False).answer
+    signed = rig_of_two(building, place, floor, signs=True).answer
+
+    assert unsigned.refusal is not None
+    assert unsigned.refusal.reason is Reason.AMBIGUOUS
+    assert signed.pose is not None, signed.refusal
+    expected = Building.pose(floor, 2.2).center
+    np.testing.assert_allclose(signed.pose.rig_from_world.center, expected, atol=0.05)
+
+
+def test_further_photos_are_matched_with_the_ratio_of_the_query(
+    room: Localizer, place: Any
+) -> None:
+    building = Building(room, 0.0, 0.0)
+    features, other = building.features(place, 0), np.array([1, 2, 9, 10])
+    # Each keypoint looks nearly as much like the next one's landmark.
+    mixed = features.descriptors + 0.95 * np.roll(features.descriptors, 1, axis=0)
+    features = replace(features, descriptors=mixed)
+    found = {}
+    for matcher in (Matcher.MUTUAL, Matcher.RATIO):
+        options = LocalizeOptions(top_k=1, matcher=matcher)
+        proposed = building.localizer.look_at_features(features, place.camera, options).proposed
+        assert proposed is not None
+        more = proposed.matched_with(other, building.localizer.geometry)
+        all_of_them = LocalizeOptions(top_k=16, matcher=matcher)
+        whole = building.localizer.look_at_features(features, place.camera, all_of_them).proposed
+        assert whole is not None
+        for row, photo in enumerate(more.photos):
+            (rank,) = np.flatnonzero(whole.photos == photo)
+            ours, theirs = more.pairs.ranks == row, whole.pairs.ranks == rank
+            assert set(more.pairs.keypoints[ours]) == set(whole.pairs.keypoints[theirs])
+        found[matcher] = len(more.pairs.keypoints)
+    assert found[Matcher.RATIO] < found[Matcher.MUTUAL]

@@ -6,14 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from visloc.archive import Map
 from visloc.geometry import Pose
-from visloc.localization.constraints import MapGeometry
 from visloc.pose.distance import viewpoints_apart
-
-_LEAST_REACH = 1e-9  # of a map whose photos see nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,14 +24,6 @@ class Viewpoints:
     centers: NDArray[np.float64]
     rotations: NDArray[np.float64]
     reach: float
-
-    @staticmethod
-    def of(opened: Map) -> Viewpoints:
-        """Read them from a map."""
-        geometry = MapGeometry(opened)
-        rotations = Rotation.from_quat(opened.image_poses[:, :4], scalar_first=True)
-        reach = max(geometry.reach, _LEAST_REACH)
-        return Viewpoints(geometry.centers, rotations.as_matrix(), reach)
 
     def __len__(self) -> int:
         return len(self.centers)
