@@ -76,8 +76,14 @@ def read_in_frame(path: Path, size: tuple[int, int], sensor_id: str) -> Photo:
         return photo
     if photo.is_on_its_side and stored[::-1] == size:
         return replace(photo, rgb=upright(photo.rgb, photo.exif_orientation), exif_orientation=1)
+    message = (
+        "photos of so many pixels are reduced while they are decoded; give their camera in "
+        f"sensors.txt {photo.width} x {photo.height} pixels, and divide its lengths in pixels by "
+        f"{photo.reduced}"
+    )
     raise refuse(
         "dataset.photo_size",
+        message if size == photo.file_size else None,
         field=str(path),
         expected=f"{size[0]} x {size[1]} as sensors.txt has it for {sensor_id}",
         got=f"{stored[0]} x {stored[1]}",
