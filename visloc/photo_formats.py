@@ -25,7 +25,14 @@ from PIL.BmpImagePlugin import BmpImageFile
 from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
-from PIL.TiffImagePlugin import BITSPERSAMPLE, SAMPLEFORMAT, TiffImageFile
+from PIL.TiffImagePlugin import (
+    BITSPERSAMPLE,
+    ROWSPERSTRIP,
+    SAMPLEFORMAT,
+    TILELENGTH,
+    TILEWIDTH,
+    TiffImageFile,
+)
 from PIL.WebPImagePlugin import WebPImageFile
 
 from visloc.errors import refuse
@@ -62,6 +69,8 @@ _REDUCED_FLAGS = {
     4: cv2.IMREAD_REDUCED_COLOR_4,
     8: cv2.IMREAD_REDUCED_COLOR_8,
 }
+_ONE_STRIP = 2**32 - 1  # of TIFF: all rows are in one
+_LEAST_PIECE = 2**20  # pixels of a strip or tile of TIFF that may always be
 # Segments of a JPEG or chunks of a PNG. 20 MiB of image data in the usual pieces are 2 600 chunks.
 MAX_PARTS = 100_000
 # JPEG markers that begin a segment with a length, and the end of the image (ITU T.81, table B.1).
@@ -186,6 +195,8 @@ def _check_tiff(header: TiffImageFile, field: str) -> None:
     kinds = header.tag_v2.get(SAMPLEFORMAT, (1,))
     if not set(bits) <= {1, 2, 4, 8, 16} or not set(kinds) <= {1}:
         problem = f"{bits} bits per sample, sample format {kinds}"
+    elif _piece_of_tiff(header) > max(_LEAST_PIECE, 4 * header.size[0] * header.size[1]):
+        problem = "strips or tiles much larger than the photo"  # OpenCV allocates what they say
     else:
         return
     raise refuse(
@@ -195,6 +206,13 @@ def _check_tiff(header: TiffImageFile, field: str) -> None:
         expected="grey, palette or colour with up to 16 bits per sample",
         got=problem,
     )
+
+
+def _piece_of_tiff(header: TiffImageFile) -> int:
+    """Return how many pixels a strip or tile has."""
+    rows = header.tag_v2.get(ROWSPERSTRIP, _ONE_STRIP)
+    strip = 0 if rows == _ONE_STRIP else rows * max(header.size)
+    return max(strip, header.tag_v2.get(TILEWIDTH, 0) * header.tag_v2.get(TILELENGTH, 0))
 
 
 def _only_pixels(png: bytes) -> bytes:
