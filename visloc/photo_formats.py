@@ -212,7 +212,8 @@ def _piece_of_tiff(header: TiffImageFile) -> int:
     """Return how many pixels a strip or tile has."""
     rows = header.tag_v2.get(ROWSPERSTRIP, _ONE_STRIP)
     strip = 0 if rows == _ONE_STRIP else rows * max(header.size)
-    return max(strip, header.tag_v2.get(TILEWIDTH, 0) * header.tag_v2.get(TILELENGTH, 0))
+    tile = header.tag_v2.get(TILEWIDTH, 0) * header.tag_v2.get(TILELENGTH, 0)
+    return int(max(strip, tile))
 
 
 def _only_pixels(png: bytes) -> bytes:

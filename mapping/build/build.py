@@ -50,7 +50,7 @@ from visloc.options import Inference
 
 
 def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None = None) -> Path:
-    """Build a map and publish it as the current version.
+    """Build a map and publish it, as the current version unless its own test speaks against it.
 
     If it is killed, the same call finds its finished work again. The version that was current
     before stays current until the new one is complete and verified.
@@ -168,7 +168,9 @@ class _Job:
             made,
             (*self.dataset.notes, *notes),
         )
-        return self._publish(content, made, placed if settings.keep_photos else [])
+        there = set(made.photos.tolist())
+        left_out = [photo.name for row, photo in enumerate(photos) if row not in there]
+        return self._publish(content, made, placed if settings.keep_photos else [], left_out)
 
     def _collect(self) -> tuple[list[MappingPhoto], list[str]]:
         settings, features = self.settings, self.context.features
@@ -198,7 +200,11 @@ class _Job:
         return landmarks_from_matches(*inputs, global_features, settings.sfm, metric=metric)
 
     def _publish(
-        self, content: MapContent, made: MadeLandmarks, kept: Sequence[MappingPhoto]
+        self,
+        content: MapContent,
+        made: MadeLandmarks,
+        kept: Sequence[MappingPhoto],
+        left_out: Sequence[str],
     ) -> Path:
         incoming = self.scratch / "incoming"
         shutil.rmtree(incoming, ignore_errors=True)  # of a build that was killed here
@@ -211,7 +217,14 @@ class _Job:
                     write_pairs(incoming / PAIRS, *made.pairs)
                 if made.imported is not None:
                     made.imported.write(incoming)
-                folder = publish_content(self.store, incoming, content, self.settings.map_id)
+                folder = publish_content(
+                    self.store,
+                    incoming,
+                    content,
+                    self.settings.map_id,
+                    left_out=left_out,
+                    accept=self.settings.accept,
+                )
                 wrote(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
             return folder
         finally:

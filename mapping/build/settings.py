@@ -16,6 +16,7 @@ from mapping.methods.rgbd import DepthSettings
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.options import (
     CLUSTER_PANEL,
+    AcceptOption,
     AnyLocalFeaturesOption,
     DepthSensorOption,
     FeaturesDirOption,
@@ -127,6 +128,7 @@ class BuildSettings:
             "The colours of an imported model are always stored.",
         ),
     ] = False
+    accept: AcceptOption = False
     workers: WorkersOption = 1
     executor: Annotated[
         str,
