@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ from visloc.photo_formats import (
     open_header,
 )
 
+Pixel = TypeVar("Pixel", bound=np.generic)
 # CIPA DCG-001: the 35 mm equivalent compares diagonals; that of a 36 mm x 24 mm frame.
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
@@ -73,6 +75,8 @@ class Photo:
             (2, 4 or 8) each side of a pixel of ``rgb`` spans. (u, v) in the file is
             (u / reduced, v / reduced) in ``rgb``; columns and rows that fill no pixel are left out.
         file_size: width and height of the file's pixels; None when they are those of ``rgb``.
+        mask: (h, w) bool, pixels as stored, False where the picture does not count; of any size of
+            the same aspect. None when all of it counts.
     """
 
     rgb: NDArray[np.uint8]
@@ -80,6 +84,7 @@ class Photo:
     focal_length_px: float | None = None
     reduced: int = 1
     file_size: tuple[int, int] | None = None
+    mask: NDArray[np.bool_] | None = None
 
     @property
     def width(self) -> int:
@@ -95,6 +100,18 @@ class Photo:
     def is_on_its_side(self) -> bool:
         """Whether width and height are those of the upright picture swapped."""
         return self.exif_orientation >= 5
+
+    def counts(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Tell which points (N, 2), in pixels of ``rgb``, lie where the mask lets them count."""
+        if self.mask is None:
+            return np.ones(len(points), dtype=np.bool_)
+        height, width = self.mask.shape
+        size = self.file_size or (self.width, self.height)
+        scale = self.reduced * np.array([width / size[0], height / size[1]])
+        # Points may lie on the far edge.
+        places = np.floor(points * scale).astype(np.int64)
+        x, y = np.clip(places, 0, [width - 1, height - 1]).T
+        return np.asarray(self.mask[y, x])
 
 
 _DEFAULT_LIMITS = ImageLimits()
@@ -129,6 +146,38 @@ def read_photo_file(path: Path, limits: ImageLimits = FILE_LIMITS) -> Photo:
     return _read(data, limits, field=str(path))
 
 
+def with_mask(
+    photo: Photo, data: bytes, limits: ImageLimits = _DEFAULT_LIMITS, field: str = "mask"
+) -> Photo:
+    """Decode the mask of a photo: black pixels do not count, all others do (COLMAP's convention).
+
+    A mask has the photo's size or aspect, exactly: of its pixels as stored, or, where these lie on
+    their side, of the upright picture. An orientation in the mask's own EXIF is ignored.
+
+    Args:
+        photo: without a mask.
+        data: an image of any format that is read.
+        limits: of the mask.
+        field: for errors.
+
+    Raises:
+        InvalidInput: ``mask.size``, and what ``read_photo`` raises.
+    """
+    shown: NDArray[np.bool_] = np.asarray(_read(data, limits, field).rgb.any(axis=2))
+    height, width = shown.shape
+    stored = photo.file_size or (photo.width, photo.height)
+    if width * stored[1] == height * stored[0]:
+        return replace(photo, mask=shown)
+    if photo.is_on_its_side and width * stored[0] == height * stored[1]:
+        return replace(photo, mask=_unturned(shown, photo.exif_orientation))
+    raise refuse(
+        "mask.size",
+        field=field,
+        expected=f"{stored[0]} x {stored[1]} pixels, or exactly the same aspect",
+        got=f"{width} x {height}",
+    )
+
+
 def read_exif(data: bytes) -> Image.Exif:
     """Return the EXIF of a photo that ``read_photo`` reads; empty when it has none or it is broken.
 
@@ -160,8 +209,8 @@ def turn_of(exif_orientation: int) -> int:
     return {2: 1, 4: 3, 5: 6, 7: 8}.get(exif_orientation, exif_orientation)
 
 
-def upright(rgb: NDArray[np.uint8], exif_orientation: int) -> NDArray[np.uint8]:
-    """Turn stored pixels (H, W, 3) the way their EXIF orientation (1 to 8) asks for."""
+def upright(rgb: NDArray[Pixel], exif_orientation: int) -> NDArray[Pixel]:
+    """Turn stored pixels (H, W) or (H, W, 3) the way their EXIF orientation (1 to 8) asks for."""
     flip_x, flip_y, transpose = _turn(exif_orientation)
     turned = rgb[:: -1 if flip_y else 1, :: -1 if flip_x else 1]
     return np.ascontiguousarray(turned.swapaxes(0, 1) if transpose else turned)
@@ -194,7 +243,7 @@ def upright_from_stored(
     return np.column_stack(turned[::-1] if transpose else turned).astype(points.dtype, copy=False)
 
 
-def _unturned(rgb: NDArray[np.uint8], exif_orientation: int) -> NDArray[np.uint8]:
+def _unturned(rgb: NDArray[Pixel], exif_orientation: int) -> NDArray[Pixel]:
     """Undo ``upright``. The quarter turns 6 and 8 are each other's inverse."""
     return upright(rgb, {6: 8, 8: 6}.get(exif_orientation, exif_orientation))
 

@@ -37,7 +37,7 @@ from mapping.stages.local_features import (
     local_features_source,
 )
 from mapping.stages.networks import Networks
-from mapping.stages.photos import MappingPhoto, collect_photos
+from mapping.stages.photos import MappingPhoto, collect_photos, masked
 from mapping.stages.previews import keep_photos
 from mapping.stages.publishing import PAIRS
 from mapping.stages.work_folder import WorkFolder, exclusive
@@ -141,6 +141,9 @@ class _Job:
     def run(self) -> Path:
         settings, context = self.settings, self.context
         photos, notes = self._collect()
+        if settings.masks is not None:
+            photos, more = masked(photos, settings.masks)
+            notes = [*notes, *more]
         # Inputs that cannot give a map are refused before the long work begins.
         ready_made = {
             name: read_global_features(self.dataset, name, settings.features_dir, photos)

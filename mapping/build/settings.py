@@ -112,6 +112,13 @@ class BuildSettings:
             "z is up. A map anchored to GNSS does not need it.",
         ),
     ] = None
+    masks: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of masks: that of the photo a/b.jpg is a/b.jpg.png, of the same size, and "
+            "black where there is what moves or mirrors. No landmarks are made there.",
+        ),
+    ] = None
     keep_photos: Annotated[
         bool,
         typer.Option(
