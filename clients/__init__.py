@@ -6,7 +6,7 @@ from clients.wire.features import Features
 from clients.wire.rigs import Instant, Rig, RigImage
 from visloc.priors import GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
 from visloc.sequences.filling import Odometry
-from visloc.types import Near, PoseSource, RigSensor
+from visloc.types import MaskedImage, Near, PoseSource, RigSensor
 from visloc_api.words.answers import (
     CameraUsed,
     Debug,
@@ -42,6 +42,7 @@ __all__ = [
     "LocalizeResult",
     "MapInfo",
     "MapVersion",
+    "MaskedImage",
     "Near",
     "Odometry",
     "Orientation",

@@ -124,8 +124,8 @@ class AsyncClient:
         A photo that cannot be localized is an answer without a pose, not an error.
 
         Args:
-            query: the encoded photo (JPEG, PNG, ...), the path of its file, or the features that
-                were found in it, which need a camera.
+            query: the encoded photo (JPEG, PNG, ...), the path of its file, a ``MaskedImage``, or
+                the features that were found in it, which need a camera.
             map: ``id`` or ``id@version``, or several: one of them answers, and a photo that fits
                 two of them is refused as ambiguous. Or ``Near``: the anchored maps around a place.
             camera: intrinsics. Without them the server uses EXIF, estimates or guesses; the answer

@@ -82,6 +82,12 @@ PlacedMapsDirOption = Annotated[
 ForceOption = Annotated[
     bool, typer.Option("--force", help="Publish a new version of a map that exists.")
 ]
+AcceptOption = Annotated[
+    bool,
+    typer.Option(
+        "--accept", help="Put the new version into use even if its own test speaks against it."
+    ),
+]
 WorkersOption = Annotated[
     int,
     typer.Option(

@@ -18,7 +18,7 @@ from visloc.options import Inference, LocalizeOptions
 from visloc.priors import NO_PRIORS, Priors
 from visloc.sequences.filling import Odometry, TimeUnit
 from visloc.sets.choosing import TileScore
-from visloc.types import InstantAnswer, Near, QueryFeatures, RigPose, RigSensor
+from visloc.types import InstantAnswer, MaskedImage, Near, QueryFeatures, RigPose, RigSensor
 
 # The sensor of a photo that comes without a rig.
 ONLY_SENSOR = "camera"
@@ -37,7 +37,7 @@ class PackedQuery:
 
 
 # An encoded photo, or features that were sent instead of it; packed once tiles were ranked by it.
-Query = bytes | QueryFeatures | PackedQuery
+Query = bytes | MaskedImage | QueryFeatures | PackedQuery
 
 
 # The id of a rig that the map knows, or the cameras by sensor id.

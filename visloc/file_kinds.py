@@ -51,8 +51,7 @@ def _video(name: str) -> FileKind:
     )
 
 
-_BY_HEIF = "convert them to JPEG, such as with: heif-convert PHOTO PHOTO.jpg"
-_HEIC, _AVIF = _photos("HEIC", _BY_HEIF), _photos("AVIF", _BY_HEIF)
+_HEIC, _AVIF = _photos("HEIC"), _photos("AVIF")
 _RAW = _photos("raw", "develop them to JPEG, such as with: darktable-cli PHOTO PHOTO.jpg")
 _JPEG_XL = _photos("JPEG XL", "convert them to JPEG, such as with: djxl PHOTO PHOTO.jpg")
 _TIFF = _photos("TIFF")

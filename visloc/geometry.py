@@ -271,7 +271,16 @@ class Camera:
         (u, v) goes to (u * width / self.width, v * height / self.height), which is exact
         because pixel coordinates start at the corner of the image, not at a pixel centre.
         """
-        sx, sy = width / self.width, height / self.height
+        return self._times(width / self.width, height / self.height, width, height)
+
+    def reduced(self, by: int) -> Camera:
+        """Return this camera for its image with sides divided by a whole number.
+
+        (u, v) goes to (u / by, v / by). Columns and rows that fill no pixel are left out.
+        """
+        return self._times(1 / by, 1 / by, self.width // by, self.height // by)
+
+    def _times(self, sx: float, sy: float, width: int, height: int) -> Camera:
         factors = dict.fromkeys(_SCALES_WITH_WIDTH, sx) | dict.fromkeys(_SCALES_WITH_HEIGHT, sy)
         params = tuple(
             value * factors.get(name, 1.0)

@@ -1,69 +1,47 @@
 """Bytes to pixels, safely.
 
 Everything here assumes that the bytes are hostile: size limits are checked on the header, before
-any pixel is decoded. Pillow reads the header and EXIF, OpenCV decodes.
+any pixel is decoded.
 """
 
 from __future__ import annotations
 
-import io
 import math
-import os
-import re
-import struct
-import zlib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
-from PIL.BmpImagePlugin import BmpImageFile
-from PIL.ImageFile import ImageFile
-from PIL.JpegImagePlugin import JpegImageFile
-from PIL.PngImagePlugin import PngImageFile
-from PIL.TiffImagePlugin import BITSPERSAMPLE, SAMPLEFORMAT, TiffImageFile
-from PIL.WebPImagePlugin import WebPImageFile
 
 from visloc.errors import VislocError, refuse
-from visloc.file_kinds import HEAD_BYTES, file_kind
-
-FORMATS = "JPEG, PNG, WebP, TIFF or BMP"
-_READERS: Mapping[str, Callable[[io.BytesIO], ImageFile]] = {
-    "JPEG": JpegImageFile,
-    "PNG": PngImageFile,
-    "WebP": WebPImageFile,
-    "TIFF": TiffImageFile,
-    "BMP": BmpImageFile,
-}
-_JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
-# What Pillow's parsers raise on malformed files. It is not documented; this is what fuzzing and
-# reading them showed.
-_MALFORMED = (
-    *(OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, AttributeError),
-    *(EOFError, OverflowError, ZeroDivisionError, RuntimeError, struct.error, zlib.error),
+from visloc.photo_formats import (
+    FORMATS,
+    MALFORMED,
+    MAX_PARTS,
+    MAX_SCANS,
+    MAX_SCANS_OF_LARGEST,
+    REDUCTIONS,
+    Passes,
+    PhotoHeader,
+    count_passes,
+    open_header,
 )
+
+Pixel = TypeVar("Pixel", bound=np.generic)
 # CIPA DCG-001: the 35 mm equivalent compares diagonals; that of a 36 mm x 24 mm frame.
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
 # In units of the longer side: from a 127 degree lens to a long telescope. What lies outside was
 # written by mistake.
 _PLAUSIBLE_FOCAL = (0.25, 50.0)
-# A decoder goes over all pixels once per scan of a JPEG. libjpeg's own script has 10 scans for
-# colour and 18 for CMYK; libtiff refuses more than 100 in the JPEGs that it holds.
-_MAX_SCANS = 100
-# The largest photo may have so many. Photos with fewer pixels may have more, up to _MAX_SCANS.
-_MAX_SCANS_OF_LARGEST = 20
-# libtiff counts the scans of a JPEG within a TIFF itself, and reads its limit when it decodes.
-os.environ.setdefault("LIBTIFF_JPEG_MAX_ALLOWED_SCAN_NUMBER", f"{_MAX_SCANS_OF_LARGEST}")
-# Segments of a JPEG or chunks of a PNG. 20 MiB of image data in the usual pieces are 2 600 chunks.
-_MAX_PARTS = 100_000
-# JPEG markers that begin a segment with a length, and the end of the image (ITU T.81, table B.1).
-# Decoders pass over the others byte by byte, or refuse the file.
-_JPEG_MARKER = re.compile(rb"\xff[\xc0-\xc7\xc9-\xcf\xd9-\xef\xfe]")
-_END_OF_IMAGE, _START_OF_SCAN = 0xD9, 0xDA
+# libjpeg makes a JPEG smaller while it decodes, and then needs no memory for all of its pixels:
+# four times max_pixels are read so. The photos of phones have up to 200 megapixels.
+_MOST_REDUCED_AREA = 4
+# A reduced photo has at most so many pixels. Features are found in fewer.
+_REDUCED_PIXELS = 16_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,11 +50,16 @@ class ImageLimits:
 
     Attributes:
         max_bytes: size of the encoded photo.
-        max_pixels: width times height, read from the header.
+        max_pixels: width times height, read from the header. Ordinary JPEGs may have four times as
+            many: they are reduced while they are decoded.
     """
 
     max_bytes: int = 20 * 2**20
     max_pixels: int = 50_000_000
+
+
+# Photos of 200 megapixels have up to about 100 MB.
+FILE_LIMITS = ImageLimits(max_bytes=128 * 2**20)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,13 +68,23 @@ class Photo:
 
     Attributes:
         rgb: (H, W, 3) uint8, pixels as stored: the EXIF orientation is not applied.
-        exif_orientation: 1 to 8; 1 when absent or invalid.
+        exif_orientation: 1 to 8; 1 when absent or invalid. For HEIC and AVIF, what their container
+            asks for.
         focal_length_px: from EXIF, in pixels of ``rgb``; None when absent or implausible.
+        reduced: 1; for a photo that was reduced while it was decoded, how many pixels of the file
+            (2, 4 or 8) each side of a pixel of ``rgb`` spans. (u, v) in the file is
+            (u / reduced, v / reduced) in ``rgb``; columns and rows that fill no pixel are left out.
+        file_size: width and height of the file's pixels; None when they are those of ``rgb``.
+        mask: (h, w) bool, pixels as stored, False where the picture does not count; of any size of
+            the same aspect. None when all of it counts.
     """
 
     rgb: NDArray[np.uint8]
     exif_orientation: int = 1
     focal_length_px: float | None = None
+    reduced: int = 1
+    file_size: tuple[int, int] | None = None
+    mask: NDArray[np.bool_] | None = None
 
     @property
     def width(self) -> int:
@@ -108,6 +101,18 @@ class Photo:
         """Whether width and height are those of the upright picture swapped."""
         return self.exif_orientation >= 5
 
+    def counts(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Tell which points (N, 2), in pixels of ``rgb``, lie where the mask lets them count."""
+        if self.mask is None:
+            return np.ones(len(points), dtype=np.bool_)
+        height, width = self.mask.shape
+        size = self.file_size or (self.width, self.height)
+        scale = self.reduced * np.array([width / size[0], height / size[1]])
+        # Points may lie on the far edge.
+        places = np.floor(points * scale).astype(np.int64)
+        x, y = np.clip(places, 0, [width - 1, height - 1]).T
+        return np.asarray(self.mask[y, x])
+
 
 _DEFAULT_LIMITS = ImageLimits()
 
@@ -123,7 +128,7 @@ def read_photo(data: bytes, limits: ImageLimits = _DEFAULT_LIMITS) -> Photo:
     return _read(data, limits, field="image")
 
 
-def read_photo_file(path: Path, limits: ImageLimits = _DEFAULT_LIMITS) -> Photo:
+def read_photo_file(path: Path, limits: ImageLimits = FILE_LIMITS) -> Photo:
     """Decode a photo file. At most ``limits.max_bytes`` + 1 bytes of it are read.
 
     Raises:
@@ -141,6 +146,60 @@ def read_photo_file(path: Path, limits: ImageLimits = _DEFAULT_LIMITS) -> Photo:
     return _read(data, limits, field=str(path))
 
 
+def with_mask(
+    photo: Photo, data: bytes, limits: ImageLimits = _DEFAULT_LIMITS, field: str = "mask"
+) -> Photo:
+    """Decode the mask of a photo: black pixels do not count, all others do (COLMAP's convention).
+
+    A mask has the photo's size or aspect, exactly: of its pixels as stored, or, where these lie on
+    their side, of the upright picture. An orientation in the mask's own EXIF is ignored.
+
+    Args:
+        photo: without a mask.
+        data: an image of any format that is read.
+        limits: of the mask.
+        field: for errors.
+
+    Raises:
+        InvalidInput: ``mask.size``, and what ``read_photo`` raises.
+    """
+    shown: NDArray[np.bool_] = np.asarray(_read(data, limits, field).rgb.any(axis=2))
+    height, width = shown.shape
+    stored = photo.file_size or (photo.width, photo.height)
+    if width * stored[1] == height * stored[0]:
+        return replace(photo, mask=shown)
+    if photo.is_on_its_side and width * stored[0] == height * stored[1]:
+        return replace(photo, mask=_unturned(shown, photo.exif_orientation))
+    raise refuse(
+        "mask.size",
+        field=field,
+        expected=f"{stored[0]} x {stored[1]} pixels, or exactly the same aspect",
+        got=f"{width} x {height}",
+    )
+
+
+def read_exif(data: bytes) -> Image.Exif:
+    """Return the EXIF of a photo that ``read_photo`` reads; empty when it has none or it is broken.
+
+    Raises:
+        InvalidInput: ``image.format`` or ``image.undecodable``.
+    """
+    return open_header(data, "image").exif
+
+
+def size_as_read(path: Path, limits: ImageLimits = FILE_LIMITS) -> tuple[int, int]:
+    """Return the width and height that ``read_photo_file`` gives a photo, from its header.
+
+    Raises:
+        OSError: when the file cannot be read.
+        InvalidInput: ``image.format`` or ``image.undecodable``, with the path as field.
+        TooLarge: ``image.too_many_pixels``.
+    """
+    header = open_header(path.read_bytes(), str(path))
+    reduced = _reduction(header, limits, str(path))
+    return header.size[0] // reduced, header.size[1] // reduced
+
+
 def turn_of(exif_orientation: int) -> int:
     """Return the orientation (1, 3, 6 or 8) that turns as this one (1 to 8) without mirroring.
 
@@ -150,8 +209,8 @@ def turn_of(exif_orientation: int) -> int:
     return {2: 1, 4: 3, 5: 6, 7: 8}.get(exif_orientation, exif_orientation)
 
 
-def upright(rgb: NDArray[np.uint8], exif_orientation: int) -> NDArray[np.uint8]:
-    """Turn stored pixels (H, W, 3) the way their EXIF orientation (1 to 8) asks for."""
+def upright(rgb: NDArray[Pixel], exif_orientation: int) -> NDArray[Pixel]:
+    """Turn stored pixels (H, W) or (H, W, 3) the way their EXIF orientation (1 to 8) asks for."""
     flip_x, flip_y, transpose = _turn(exif_orientation)
     turned = rgb[:: -1 if flip_y else 1, :: -1 if flip_x else 1]
     return np.ascontiguousarray(turned.swapaxes(0, 1) if transpose else turned)
@@ -184,6 +243,11 @@ def upright_from_stored(
     return np.column_stack(turned[::-1] if transpose else turned).astype(points.dtype, copy=False)
 
 
+def _unturned(rgb: NDArray[Pixel], exif_orientation: int) -> NDArray[Pixel]:
+    """Undo ``upright``. The quarter turns 6 and 8 are each other's inverse."""
+    return upright(rgb, {6: 8, 8: 6}.get(exif_orientation, exif_orientation))
+
+
 def _turn(exif_orientation: int) -> tuple[bool, bool, bool]:
     """Return what leads from stored to upright: mirror x, mirror y, and then transpose."""
     return exif_orientation in (2, 3, 7, 8), exif_orientation in (3, 4, 6, 7), exif_orientation >= 5
@@ -199,41 +263,79 @@ def _read(data: bytes, limits: ImageLimits, field: str) -> Photo:
             expected=f"at most {limits.max_bytes} bytes",
             got=f"{len(data)} bytes" if field == "image" else "more",
         )
-    scans = _count_passes(data, field)
+    passes = count_passes(data)
+    if passes.parts > MAX_PARTS:
+        raise _too_complex(field, f"at most {MAX_PARTS} segments or chunks", "more")
     try:
-        header = _open_header(data, field)
-    except Image.DecompressionBombError as error:  # Pillow's own limit, checked for WebP only
-        raise _too_many_pixels(field, limits, str(error)) from None
+        header = open_header(data, field)
+    except Image.DecompressionBombError as error:
+        raise _too_many_pixels(field, limits.max_pixels, str(error)) from None
     width, height = header.size
-    if width * height > limits.max_pixels:
-        raise _too_many_pixels(field, limits, f"{width} x {height}")
-    max_scans = min(_MAX_SCANS, _MAX_SCANS_OF_LARGEST * limits.max_pixels // (width * height))
-    if scans > max_scans:
-        raise _too_complex(
-            field, f"at most {max_scans} scans of {width} x {height} pixels", f"{scans} scans"
-        )
-    rgb = _decode(_only_pixels(data) if isinstance(header, PngImageFile) else data)
-    if rgb is None or rgb.shape != (height, width, 3):
+    reduced = _reduction(header, limits, field)
+    _check_passes(passes, header, reduced, limits, field)
+    focal_length_px = _focal_length_px(header.exif, width, height)
+    rgb = header.decode(reduced)
+    expected = (-(-height // reduced), -(-width // reduced), 3)
+    if rgb is not None and rgb.ndim == len(expected):
+        rgb = _unturned(rgb, header.turned)
+    if rgb is None or rgb.shape != expected:
         raise refuse(
             "image.undecodable",
             field=field,
             expected=f"{width} x {height} pixels of {header.format}",
             got="pixels that cannot be decoded",
         )
-    orientation, focal_length_px = _exif(header)
-    if isinstance(header, TiffImageFile):
-        # OpenCV's TIFF reader applies the tag whatever its flags say, and Pillow gives the
-        # turned size: undo it. The quarter turns 6 and 8 are each other's inverse.
-        applied = _valid_orientation(header.tag_v2.get(ExifTags.Base.Orientation))
-        rgb = upright(rgb, {6: 8, 8: 6}.get(applied, applied))
-    return Photo(rgb, orientation, focal_length_px)
+    if reduced == 1:
+        return Photo(rgb, header.exif_orientation, focal_length_px)
+    whole = np.ascontiguousarray(rgb[: height // reduced, : width // reduced])
+    focal_length_px = focal_length_px and focal_length_px / reduced
+    return Photo(whole, header.exif_orientation, focal_length_px, reduced, (width, height))
 
 
-def _too_many_pixels(field: str, limits: ImageLimits, got: str) -> VislocError:
+def _reduction(header: PhotoHeader, limits: ImageLimits, field: str) -> int:
+    """Return by how much to reduce a photo while it is decoded: 1, 2, 4 or 8.
+
+    Raises:
+        TooLarge: ``image.too_many_pixels``.
+    """
+    pixels = header.most_pixels
+    if pixels <= limits.max_pixels:
+        return 1
+    most = limits.max_pixels
+    if header.format == "JPEG":
+        most *= _MOST_REDUCED_AREA
+        target = min(_REDUCED_PIXELS, limits.max_pixels)
+        fitting = (by for by in REDUCTIONS if pixels <= target * by**2 and min(header.size) >= by)
+        if pixels <= most and (reduced := next(fitting, None)):
+            return reduced
+    width, height = header.size
+    raise _too_many_pixels(field, most, f"{width} x {height}")
+
+
+def _check_passes(
+    passes: Passes, header: PhotoHeader, reduced: int, limits: ImageLimits, field: str
+) -> None:
+    """Refuse a JPEG that takes too long, or memory for all pixels although it is reduced.
+
+    Raises:
+        TooLarge: ``image.too_complex``.
+    """
+    width, height = header.size
+    if reduced > 1 and (passes.scans > 1 or passes.progressive):
+        kind = "a progressive JPEG" if passes.progressive else f"{passes.scans} scans"
+        raise _too_complex(field, f"one scan of {width} x {height} pixels, not progressive", kind)
+    most = min(MAX_SCANS, MAX_SCANS_OF_LARGEST * limits.max_pixels // (width * height))
+    if reduced == 1 and passes.scans > most:
+        raise _too_complex(
+            field, f"at most {most} scans of {width} x {height} pixels", f"{passes.scans} scans"
+        )
+
+
+def _too_many_pixels(field: str, most: int, got: str) -> VislocError:
     return refuse(
         "image.too_many_pixels",
         field=field,
-        expected=f"at most {limits.max_pixels} pixels",
+        expected=f"at most {most} pixels",
         got=got,
     )
 
@@ -242,153 +344,15 @@ def _too_complex(field: str, expected: str, got: str) -> VislocError:
     return refuse("image.too_complex", field=field, expected=expected, got=got)
 
 
-def _count_passes(data: bytes, field: str) -> int:
-    """Return the scans of a JPEG; 0 for other formats.
-
-    Raises:
-        TooLarge: ``image.too_complex`` for too many segments or chunks: Pillow takes microseconds
-            for each.
-    """
-    scans = parts = 0
-    if data.startswith(_JPEG):
-        scans, parts = _jpeg_scans(data)
-    elif data.startswith(_PNG):
-        parts = _png_chunks(data)
-    if parts > _MAX_PARTS:
-        raise _too_complex(field, f"at most {_MAX_PARTS} segments or chunks", "more")
-    return scans
-
-
-def _jpeg_scans(jpeg: bytes) -> tuple[int, int]:
-    """Count the scans of the first image, and its segments with the bytes lost between them.
-
-    Segments are found as libjpeg finds them, so that it decodes no scan that is not counted here.
-    Thumbnails are within segments; what a camera appends comes after the end of the image. Stops
-    once ``_MAX_PARTS`` is exceeded.
-    """
-    scans = parts = 0
-    position = 2
-    while parts <= _MAX_PARTS and (marker := _JPEG_MARKER.search(jpeg, position)):
-        kind = jpeg[marker.start() + 1]
-        if kind == _END_OF_IMAGE and scans:
-            break
-        parts += 1
-        if scans == 0:  # later, image data lies between segments
-            parts += marker.start() - position
-        scans += kind == _START_OF_SCAN
-        position = marker.end()
-        if kind != _END_OF_IMAGE:  # Pillow passes over one that comes before any scan
-            # The length counts its own two bytes.
-            position += max(2, int.from_bytes(jpeg[position : position + 2], "big"))
-    return scans, parts
-
-
-def _png_chunks(png: bytes) -> int:
-    """Count the chunks; stops once ``_MAX_PARTS`` is exceeded."""
-    position, chunks = len(_PNG), 0
-    while chunks <= _MAX_PARTS and position + 12 <= len(png):
-        position += 12 + int.from_bytes(png[position : position + 4], "big")
-        chunks += 1
-    return chunks
-
-
-def _open_header(data: bytes, field: str) -> ImageFile:
-    # The classes instead of Image.open: that one has a pixel limit of its own, a process-wide
-    # variable, and warns or raises before ours can be compared.
-    kind = file_kind(data[:HEAD_BYTES])
-    if kind is None or not kind.is_read:
-        raise refuse(
-            "image.format",
-            "the server does not read this image format" if kind is None else kind.refusal,
-            field=field,
-            expected=FORMATS,
-            got=f"bytes that begin with {data[:12].hex(' ')}" if kind is None else kind.name,
-        )
+def _focal_length_px(exif: Image.Exif, width: int, height: int) -> float | None:
     try:
-        header = _READERS[kind.name](io.BytesIO(data))
-    except _MALFORMED as error:
-        raise refuse(
-            "image.undecodable",
-            "the header of the photo is damaged or cut off",
-            field=field,
-            expected=FORMATS,
-            got=str(error) or type(error).__name__,
-        ) from error
-    if isinstance(header, TiffImageFile):
-        _check_tiff(header, field)
-    return header
-
-
-def _check_tiff(header: TiffImageFile, field: str) -> None:
-    """Refuse those of TIFF's many kinds that would come out wrong without a word."""
-    bits = header.tag_v2.get(BITSPERSAMPLE, (1,))
-    kinds = header.tag_v2.get(SAMPLEFORMAT, (1,))
-    if header.mode in ("RGBA", "LA", "PA"):  # OpenCV blends the colours with black
-        problem = "transparency"
-    elif not set(bits) <= {1, 2, 4, 8, 16} or not set(kinds) <= {1}:
-        problem = f"{bits} bits per sample, sample format {kinds}"
-    else:
-        return
-    raise refuse(
-        "image.format",
-        "the server does not read this kind of TIFF; save it as PNG",
-        field=field,
-        expected="grey, palette or colour with up to 16 bits per sample, without transparency",
-        got=problem,
-    )
-
-
-def _only_pixels(png: bytes) -> bytes:
-    """Return the PNG with nothing but its pixels, or no bytes when it is malformed.
-
-    OpenCV 5 allocates what a chunk says its length is, before it looks whether the file is that
-    long: 2 kB take 4 GB. Animation, profiles and texts stay away from it as well.
-    """
-    chunks = [png[:8]]
-    position = 8
-    while position + 12 <= len(png):
-        length, kind = struct.unpack_from(">I4s", png, position)
-        end = position + 12 + length
-        if end > len(png) or (kind == b"IHDR") != (position == 8):
-            break
-        if kind in (b"IHDR", b"PLTE", b"IDAT", b"IEND"):
-            chunks.append(png[position:end])
-        if kind == b"IEND":
-            return b"".join(chunks)
-        position = end
-    return b""
-
-
-def _decode(data: bytes) -> NDArray[np.uint8] | None:
-    if not data:
+        tag = exif.get_ifd(ExifTags.IFD.Exif).get
+        return _from_tags(tag, width, height)
+    except MALFORMED:
         return None
-    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        # Typed as never None; it is None for what cannot be decoded.
-        rgb: NDArray[np.uint8] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)  # type: ignore[assignment]
-    except cv2.error:
-        return None
-    return rgb
 
 
-def _exif(header: ImageFile) -> tuple[int, float | None]:
-    """Return the orientation and the focal length in pixels; broken EXIF counts as none."""
-    try:
-        # The base class's method: PngImageFile's would decode all pixels to look behind them.
-        exif = Image.Image.getexif(header)
-        orientation = _valid_orientation(exif.get(ExifTags.Base.Orientation))
-        details = exif.get_ifd(ExifTags.IFD.Exif)
-        focal_length_px = _focal_length_px(details.get, *header.size)
-    except _MALFORMED:
-        return 1, None
-    return orientation, focal_length_px
-
-
-def _valid_orientation(value: object) -> int:
-    return value if isinstance(value, int) and 1 <= value <= 8 else 1
-
-
-def _focal_length_px(tag: Callable[[int], object], width: int, height: int) -> float | None:
+def _from_tags(tag: Callable[[int], object], width: int, height: int) -> float | None:
     longer_side = max(width, height)
     equivalent_mm = _positive(tag(ExifTags.Base.FocalLengthIn35mmFilm))
     focal_length_mm = _positive(tag(ExifTags.Base.FocalLength))

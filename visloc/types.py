@@ -54,6 +54,19 @@ class Fingerprint:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MaskedImage:
+    """A photo of which only a part counts.
+
+    Attributes:
+        image: the encoded photo.
+        mask: an encoded picture of its size or aspect; black pixels do not count.
+    """
+
+    image: bytes
+    mask: bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class QueryFeatures:
     """The features of one photo, sent instead of it; nothing in them is checked yet.
 

@@ -19,8 +19,10 @@ from clients.cli.options import Connection, MapRef, QueryOptions, priors_from_te
 from clients.client import Client
 from clients.errors import not_understood
 from clients.evaluation.results import check_can_be_written, write_whole
+from clients.wire.requests import read_image
 from visloc.errors import VislocError
 from visloc.geometry import Camera
+from visloc.types import MaskedImage
 
 EXIT_ERROR = 1  # 2 is wrong usage, by convention
 EXIT_NOT_LOCALIZED = 3
@@ -70,6 +72,12 @@ def image(
             help="What is known of the pose: position, height, pose or gravity, as in the API.",
         ),
     ] = None,
+    mask: Annotated[
+        Path | None,
+        typer.Option(
+            help="A picture of the photo's size or aspect, black where the photo does not count."
+        ),
+    ] = None,
     debug: Annotated[
         Path | None,
         typer.Option(
@@ -86,9 +94,10 @@ def image(
     intrinsics = None if camera is None else Camera.from_text(camera)
     known = None if priors is None else priors_from_text(priors)
     check_can_be_written([] if debug is None else [debug])
+    sent = photo if mask is None else MaskedImage(read_image(photo), read_image(mask))
     with connection.client() as client:
         result = client.localize(
-            photo, map_ref, intrinsics, options, priors=known, debug=debug is not None
+            sent, map_ref, intrinsics, options, priors=known, debug=debug is not None
         )
         if as_json:
             typer.echo(json.dumps(result.raw, indent=2))

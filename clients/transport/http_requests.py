@@ -98,7 +98,7 @@ class _Files:
     def parts(self, images: Iterable[rigs.RigImage]) -> list[rigs.RigImage]:
         """Add photos, and return the images that name them instead."""
         return [
-            image if image.image is None else self._part(image, image.image) for image in images
+            image if image.image is None else self._as_parts(image, image.image) for image in images
         ]
 
     def form(self, body: JsonObject, headers: Mapping[str, str]) -> dict[str, Any]:
@@ -107,19 +107,28 @@ class _Files:
         files = {"request": (None, text, "application/json"), **self._parts}
         return {"files": files, "headers": headers}
 
-    def _part(self, image: rigs.RigImage, photo: bytes) -> rigs.RigImage:
+    def _as_parts(self, image: rigs.RigImage, photo: bytes) -> rigs.RigImage:
+        named: dict[str, str | None] = {"image": None, "part": self._add(photo)}
+        if image.mask is not None:
+            named |= {"mask": None, "mask_part": self._add(image.mask)}
+        return image.model_copy(update=named)
+
+    def _add(self, photo: bytes) -> str:
         name = f"image{len(self._parts)}"
         self._parts[name] = ("photo", photo, "application/octet-stream")
-        return image.model_copy(update={"image": None, "part": name})
+        return name
 
 
 def _photo_form(words: LocalizeRequest) -> dict[str, Any]:
     """Return the form for one photo: a file, and texts."""
-    rest = words.model_copy(update={"image": None, "features": None}).as_json()
+    rest = words.model_copy(update={"image": None, "features": None, "mask": None}).as_json()
     texts = {name: value if name == "map" else json.dumps(value) for name, value in rest.items()}
     if words.features is None:
         file = ("photo", words.image, "application/octet-stream")
-        return {"data": texts, "files": {"image": file}}
+        files = {"image": file}
+        if words.mask is not None:
+            files["mask"] = ("mask", words.mask, "application/octet-stream")
+        return {"data": texts, "files": files}
     text = json.dumps(words.features.as_json()).encode()
     return {"data": texts, "files": {"features": ("features.json", text, "application/json")}}
 

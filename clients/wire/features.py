@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import visloc_api.words.features
 from visloc.errors import VislocError, refuse
-from visloc.types import QueryFeatures
+from visloc.types import MaskedImage, QueryFeatures
 from visloc_api.words.wire import ARRAY_DTYPES
 
 
@@ -51,8 +51,8 @@ class Features(QueryFeatures):
         return visloc_api.words.features.Features.from_core(self).as_json()
 
 
-# The encoded photo, the path of the file that holds it, or what was found in it.
-PhotoOrFeatures = bytes | str | Path | Features
+# The encoded photo, also with a mask, the path of the file that holds it, or what was found in it.
+PhotoOrFeatures = bytes | str | Path | MaskedImage | Features
 
 
 def _array(part: str, values: ArrayLike, name: str | None = None) -> NDArray[Any]:

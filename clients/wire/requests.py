@@ -21,7 +21,7 @@ from visloc.errors import VislocError, inside, refuse
 from visloc.geometry import Camera
 from visloc.priors import Priors
 from visloc.sequences.filling import TimeUnit, guess_time_unit
-from visloc.types import Near, RigSensor
+from visloc.types import MaskedImage, Near, RigSensor
 from visloc_api.words import geometry, rigs, sequences
 from visloc_api.words.options import LocalizeOptions
 from visloc_api.words.photo import LocalizeRequest
@@ -286,6 +286,8 @@ def _photo(query: PhotoOrFeatures, camera: Camera | None) -> dict[str, Any]:
     said = {"camera": None if camera is None else geometry.Camera.from_core(camera)}
     if isinstance(content, Features):
         return said | {"features": visloc_api.words.features.Features.from_core(content)}
+    if isinstance(content, MaskedImage):
+        return said | {"image": content.image, "mask": content.mask}
     return said | {"image": content}
 
 
@@ -321,7 +323,7 @@ def checked_version(map_id: str, version: str) -> tuple[str, str]:
     return map_id, version
 
 
-def read_query(query: PhotoOrFeatures) -> bytes | Features:
+def read_query(query: PhotoOrFeatures) -> bytes | MaskedImage | Features:
     """Return what is sent of a photo.
 
     Raises:

@@ -21,8 +21,8 @@ class RigImage:
 
     Attributes:
         sensor: the camera of the rig that took it.
-        query: the encoded photo, the path of the file that holds it, or the features that were
-            found in it.
+        query: the encoded photo, the path of the file that holds it, a ``MaskedImage``, or the
+            features that were found in it.
         camera: its intrinsics, instead of those of the rig.
         timestamp: the same for all photos of a rig.
     """

@@ -37,7 +37,7 @@ from mapping.stages.local_features import (
     local_features_source,
 )
 from mapping.stages.networks import Networks
-from mapping.stages.photos import MappingPhoto, collect_photos
+from mapping.stages.photos import MappingPhoto, collect_photos, masked
 from mapping.stages.previews import keep_photos
 from mapping.stages.publishing import PAIRS
 from mapping.stages.work_folder import WorkFolder, exclusive
@@ -50,7 +50,7 @@ from visloc.options import Inference
 
 
 def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None = None) -> Path:
-    """Build a map and publish it as the current version.
+    """Build a map and publish it, as the current version unless its own test speaks against it.
 
     If it is killed, the same call finds its finished work again. The version that was current
     before stays current until the new one is complete and verified.
@@ -141,6 +141,9 @@ class _Job:
     def run(self) -> Path:
         settings, context = self.settings, self.context
         photos, notes = self._collect()
+        if settings.masks is not None:
+            photos, more = masked(photos, settings.masks)
+            notes = [*notes, *more]
         # Inputs that cannot give a map are refused before the long work begins.
         ready_made = {
             name: read_global_features(self.dataset, name, settings.features_dir, photos)
@@ -168,7 +171,9 @@ class _Job:
             made,
             (*self.dataset.notes, *notes),
         )
-        return self._publish(content, made, placed if settings.keep_photos else [])
+        there = set(made.photos.tolist())
+        left_out = [photo.name for row, photo in enumerate(photos) if row not in there]
+        return self._publish(content, made, placed if settings.keep_photos else [], left_out)
 
     def _collect(self) -> tuple[list[MappingPhoto], list[str]]:
         settings, features = self.settings, self.context.features
@@ -198,7 +203,11 @@ class _Job:
         return landmarks_from_matches(*inputs, global_features, settings.sfm, metric=metric)
 
     def _publish(
-        self, content: MapContent, made: MadeLandmarks, kept: Sequence[MappingPhoto]
+        self,
+        content: MapContent,
+        made: MadeLandmarks,
+        kept: Sequence[MappingPhoto],
+        left_out: Sequence[str],
     ) -> Path:
         incoming = self.scratch / "incoming"
         shutil.rmtree(incoming, ignore_errors=True)  # of a build that was killed here
@@ -211,7 +220,14 @@ class _Job:
                     write_pairs(incoming / PAIRS, *made.pairs)
                 if made.imported is not None:
                     made.imported.write(incoming)
-                folder = publish_content(self.store, incoming, content, self.settings.map_id)
+                folder = publish_content(
+                    self.store,
+                    incoming,
+                    content,
+                    self.settings.map_id,
+                    left_out=left_out,
+                    accept=self.settings.accept,
+                )
                 wrote(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
             return folder
         finally:

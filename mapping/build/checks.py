@@ -38,6 +38,8 @@ def check_settings(settings: BuildSettings) -> None:
     if settings.method not in METHODS:
         raise refuse("build.method", field="--method", expected=METHODS, got=settings.method)
     check_names("--executor", (settings.executor,), EXECUTORS)
+    if settings.masks is not None and is_ready_made(settings.local_features):
+        raise refuse("masks.ready_made", field="--masks", got=settings.local_features)
     _refuse_mixed_places(settings)
     _refuse_remote_features(settings)
     _check_global_features(settings)

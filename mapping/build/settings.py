@@ -16,6 +16,7 @@ from mapping.methods.rgbd import DepthSettings
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.options import (
     CLUSTER_PANEL,
+    AcceptOption,
     AnyLocalFeaturesOption,
     DepthSensorOption,
     FeaturesDirOption,
@@ -111,6 +112,13 @@ class BuildSettings:
             "z is up. A map anchored to GNSS does not need it.",
         ),
     ] = None
+    masks: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of masks: that of the photo a/b.jpg is a/b.jpg.png, of the same size, and "
+            "black where there is what moves or mirrors. No landmarks are made there.",
+        ),
+    ] = None
     keep_photos: Annotated[
         bool,
         typer.Option(
@@ -127,6 +135,7 @@ class BuildSettings:
             "The colours of an imported model are always stored.",
         ),
     ] = False
+    accept: AcceptOption = False
     workers: WorkersOption = 1
     executor: Annotated[
         str,

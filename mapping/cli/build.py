@@ -11,6 +11,7 @@ import typer
 
 from mapping.build.build import build_map
 from mapping.build.settings import BuildSettings
+from mapping.cli.acceptance import require_acceptance
 from mapping.cli.display import (
     ERR,
     OUT,
@@ -22,11 +23,12 @@ from mapping.cli.display import (
 )
 from mapping.cli.progress import StageProgress
 from mapping.cluster.stage_timings import Costs
-from mapping.cluster.storage import is_map_folder, open_store
+from mapping.cluster.storage import is_map_folder, open_store, scratch_folder
 from mapping.importers import IMPORTERS, ImportSummary, import_dataset, imported
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.options import (
     SFM_PANEL,
+    AcceptOption,
     AnyLocalFeaturesOption,
     ForceOption,
     GlobalFeaturesOption,
@@ -83,6 +85,7 @@ class ImportSettings:
     max_keypoints: MaxKeypointsOption = 5000
     workers: WorkersOption = 1
     force: ForceOption = False
+    accept: AcceptOption = False
 
 
 def build(settings: BuildSettings, covisible_in: CovisibleInOption = None) -> None:
@@ -161,6 +164,7 @@ def _import_map(settings: ImportSettings, map_id: str) -> None:
                 sfm=sfm,
                 workers=settings.workers,
                 force=settings.force,
+                accept=settings.accept,
             )
         )
 
@@ -184,3 +188,5 @@ def _build(settings: BuildSettings) -> None:
     print_map(open_map(folder))
     print_costs(OUT, costs.table())
     say_peak_memory()
+    pictures = scratch_folder(settings.maps_dir, settings.cache_dir, ".doubts")
+    require_acceptance(open_map(folder), accept=settings.accept, pictures=pictures)

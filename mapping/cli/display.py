@@ -76,6 +76,12 @@ def _own_test(opened: Map) -> str:
     return text if test.independent else f"{text}; their poses are not independent of the map"
 
 
+def _doubts(opened: Map) -> dict[str, str]:
+    """Return why the version was not put into use by itself, if so."""
+    doubts = opened.manifest.parts.doubts
+    return {"doubts": "\n".join(doubt.message for doubt in doubts)} if doubts else {}
+
+
 def print_map(opened: Map) -> None:
     """Print the contents of a map."""
     summary = summary_of(opened)
@@ -105,6 +111,7 @@ def print_map(opened: Map) -> None:
         "place": place_text(opened.place) + _scale(opened),
         "method": summary["method"]["name"],
         "own test": _own_test(opened),
+        **_doubts(opened),
         "keeps": ", ".join(summary["keeps"]) or "neither photos nor colours",
         "size": f"{summary['size_bytes'] / 2**20:.1f} MiB, "
         f"{summary['bytes_per_observation']:.0f} bytes per observation",

@@ -9,6 +9,7 @@ from typing import NoReturn
 
 import typer
 
+from mapping.cli.acceptance import use
 from mapping.cli.build import build, import_
 from mapping.cli.datasets import calibrate_rig_command, export_features_command, pairs, sample
 from mapping.cli.display import ERR
@@ -32,6 +33,7 @@ COMMANDS: Mapping[str, Callable[..., None]] = {
     "pack": pack,
     "inspect": inspect,
     "verify": verify,
+    "use": use,
     "report": report,
     "prune": prune,
     "merge": merge,

@@ -8,11 +8,12 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from mapping.cli.acceptance import require_acceptance
 from mapping.cli.display import ERR, say, say_notes
 from mapping.cli.progress import StageProgress
 from mapping.maps.merging.job import MIN_OVERLAP, Merged, join_as_set, merge_maps
-from mapping.options import MapsDirOption
-from visloc.archive import MapStore
+from mapping.options import AcceptOption, MapsDirOption
+from visloc.archive import MapStore, open_map
 from visloc.geometry import Pose
 
 
@@ -28,14 +29,22 @@ def merge(
         float,
         typer.Option(help="Least share of B's photos that must be localized in A, 0 to 1."),
     ] = MIN_OVERLAP,
+    accept: AcceptOption = False,
     maps_dir: MapsDirOption = Path("maps"),
 ) -> None:
     """Register a map in another map of the same place, and make one map of both."""
     store = MapStore(maps_dir)
-    join = join_as_set if as_set else merge_maps
     with StageProgress(ERR, if_stopped="nothing was published") as progress:
-        merged = join(store, a, b, map_id, progress, min_overlap=min_overlap)
+        if as_set:
+            merged = join_as_set(store, a, b, map_id, progress, min_overlap=min_overlap)
+        else:
+            merged = merge_maps(
+                store, a, b, map_id, progress, min_overlap=min_overlap, accept=accept
+            )
     print_merged(merged, map_id)
+    if not as_set:
+        pictures = maps_dir / ".work" / ".doubts"
+        require_acceptance(open_map(merged.folder), accept=accept, pictures=pictures)
 
 
 def print_merged(merged: Merged, map_id: str) -> None:

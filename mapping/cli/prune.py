@@ -10,11 +10,12 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from mapping.cli.acceptance import require_acceptance
 from mapping.cli.display import ERR, OUT, say
 from mapping.cli.progress import StageProgress
 from mapping.maps.pruning.accuracy import BINS, Accuracy, lost, of_queries
 from mapping.maps.pruning.job import Pruned, prune_map
-from mapping.options import MapsDirOption, WeightsDirOption
+from mapping.options import AcceptOption, MapsDirOption, WeightsDirOption
 from visloc.archive import Map, MapStore
 from visloc.errors import refuse
 from visloc.features import make_global_descriptor, make_local_features
@@ -41,6 +42,7 @@ def prune(
             "Default: photos of the map, each localized in the rest of it."
         ),
     ] = None,
+    accept: AcceptOption = False,
     maps_dir: MapsDirOption = Path("maps"),
     weights_dir: WeightsDirOption = None,
 ) -> None:
@@ -73,9 +75,11 @@ def prune(
             max_bytes=None if max_bytes is None else parse_size(max_bytes, opened.size_bytes),
             max_landmarks=max_landmarks,
             measure=measure,
+            accept=accept,
             progress=progress,
         )
     print_pruned(pruned, "queries" if queries is not None else "photos of the map")
+    require_acceptance(pruned.after, accept=accept, pictures=maps_dir / ".work" / ".doubts")
 
 
 def parse_size(text: str, whole: int) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mapping.cli.acceptance import require_acceptance
 from mapping.cli.display import ERR, say, say_notes
 from mapping.cli.progress import StageProgress
 from mapping.maps.updating.job import Updated, update_map
@@ -18,6 +19,11 @@ def update(settings: UpdateSettings) -> None:
     with StageProgress(ERR) as progress:
         updated = update_map(settings, progress)
     print_update(updated)
+    require_acceptance(
+        open_map(updated.folder),
+        accept=settings.accept,
+        pictures=settings.maps_dir / ".work" / ".doubts",
+    )
 
 
 def print_update(updated: Updated) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mapping.importers.left_out import list_path, notes_on, write_list
 from mapping.importers.model import ImportedImage, ImportedModel
-from mapping.importers.reading.photo_names import is_stored_turned, photo_size
+from mapping.importers.reading.photo_names import is_stored_turned, photo_size_as_read
 from mapping.stages.outputs import complete_output
 from visloc.errors import refuse
 from visloc.kapture import (
@@ -315,7 +315,7 @@ def _check_sizes(model: ImportedModel) -> None:
     wrong = []
     for image in model.images:
         path = model.photos / image.name
-        size, expected = photo_size(path), model.sensors[image.sensor].image_size
+        size, expected = photo_size_as_read(path), model.sensors[image.sensor].image_size
         assert expected is not None  # what a camera has
         if size in (None, expected) or (size == expected[::-1] and is_stored_turned(path)):
             continue

@@ -5,14 +5,13 @@ The photo's rank takes the place of a timestamp: by EXIF time if every photo has
 
 from __future__ import annotations
 
-import io
 import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from PIL import ExifTags, Image
+from PIL import ExifTags
 
 from mapping.importers.left_out import notes_on
 from mapping.importers.model import ImportedImage, ImportedModel
@@ -20,13 +19,16 @@ from mapping.methods.intrinsics import FROM_EXIF
 from visloc.errors import InvalidInput, NotFound, TooLarge, VislocError, refuse
 from visloc.file_kinds import HEAD_BYTES, FileKind, file_kind
 from visloc.geometry import Camera
-from visloc.images import FORMATS, ImageLimits, read_photo
+from visloc.images import FILE_LIMITS, read_exif, read_photo
 from visloc.kapture import GnssRecord, Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
 from visloc.kapture.text import has_control_characters
+from visloc.photo_formats import FORMATS
 
-_SUFFIXES = {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
-_LIMITS = ImageLimits()
+_SUFFIXES = {
+    *(".avif", ".bmp", ".heic", ".heif", ".hif", ".jpeg", ".jpg", ".png", ".tif", ".tiff"),
+    ".webp",
+}
 _GNSS = "gnss"
 # Beside what begins with a dot: what Windows, macOS and network storage put among photos.
 _SYSTEM_NAMES = {"thumbs.db", "desktop.ini", "@eadir", "__macosx", "$recycle.bin"}
@@ -249,8 +251,8 @@ def _read_photo(folder: Path, name: str) -> _Found:
     path = folder / name
     try:
         with path.open("rb") as file:
-            data = file.read(_LIMITS.max_bytes + 1)
-        photo = read_photo(data, _LIMITS)  # decodes, as a build will
+            data = file.read(FILE_LIMITS.max_bytes + 1)
+        photo = read_photo(data, FILE_LIMITS)  # decodes, as a build will
     except OSError as error:
         raise refuse("image.unreadable", field=name, got=error.strerror) from error
     except InvalidInput as error:
@@ -326,14 +328,12 @@ _Tags = dict[int, object]
 def _exif(data: bytes) -> tuple[_Tags, _Tags, _Tags]:
     """Return the tags of a photo at the top, in the Exif part and of GPS; none if broken."""
     try:
-        # Its size is within our limits, which are below those that Pillow warns at.
-        with Image.open(io.BytesIO(data)) as image:
-            exif = Image.Image.getexif(image)  # that of PNGs would decode all pixels first
-            return (
-                dict(exif),
-                dict(exif.get_ifd(ExifTags.IFD.Exif)),
-                dict(exif.get_ifd(ExifTags.IFD.GPSInfo)),
-            )
+        exif = read_exif(data)
+        return (
+            dict(exif),
+            dict(exif.get_ifd(ExifTags.IFD.Exif)),
+            dict(exif.get_ifd(ExifTags.IFD.GPSInfo)),
+        )
     except _MALFORMED:
         return {}, {}, {}
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from mapping.own_test.trials import own_test
+from mapping.own_test.trials import run_own_test
+from mapping.own_test.verdict import doubts_about
 from mapping.stages.publishing import link_photos, new_version
 from visloc.archive import MapContent, MapStore, add_own_test, open_map, write_map
+from visloc.archive.checks import read_manifest
 
 
 def publish_edited(
@@ -17,8 +19,9 @@ def publish_edited(
     *,
     photos: Sequence[Path] = (),
     based_on: str | None = None,
+    accept: bool = False,
 ) -> Path:
-    """Publish content made from maps as the current version of a map.
+    """Publish content made from maps as a version of a map, as ``publish_content``.
 
     Args:
         photos: small copies of all photos, in their order; or none.
@@ -34,7 +37,7 @@ def publish_edited(
         raise AssertionError(f"{len(photos)} pictures of {len(content.images)} photos")
     with store.incoming() as incoming:
         link_photos(incoming, photos)
-        return publish_content(store, incoming, content, map_id, based_on=based_on)
+        return publish_content(store, incoming, content, map_id, based_on=based_on, accept=accept)
 
 
 def publish_content(
@@ -44,21 +47,50 @@ def publish_content(
     map_id: str,
     *,
     based_on: str | None = None,
+    left_out: Sequence[str] = (),
+    accept: bool = False,
 ) -> Path:
-    """Write content beside the files that a folder has already, and publish it.
+    """Write content beside the files that a folder has already, test it, and publish it.
+
+    A version that its own test speaks against is published, but not made current.
+
+    Args:
+        left_out: photos that found no place, as for ``doubts_about``.
+        accept: make it current all the same.
 
     Raises:
         Conflict: ``map.outdated``.
     """
-    version = write_content(incoming, content, map_id)
-    return store.publish(incoming, map_id, version, based_on=based_on)
+    version = write_content(incoming, content, map_id, left_out)
+    return publish_tested(store, incoming, map_id, version, based_on=based_on, accept=accept)
 
 
-def write_content(folder: Path, content: MapContent, map_id: str) -> str:
+def publish_tested(
+    store: MapStore,
+    incoming: Path,
+    map_id: str,
+    version: str,
+    *,
+    based_on: str | None = None,
+    accept: bool = False,
+) -> Path:
+    """Publish what ``write_content`` wrote; make it current unless there are doubts."""
+    is_doubtful = bool(read_manifest(incoming).parts.doubts)
+    return store.publish(
+        incoming, map_id, version, based_on=based_on, make_current=accept or not is_doubtful
+    )
+
+
+def write_content(
+    folder: Path, content: MapContent, map_id: str, left_out: Sequence[str] = ()
+) -> str:
     """Write content beside the files that a folder has already, test it, and return its version.
 
     What the content knows of the map it was made from is learned anew.
     """
     version, created = new_version()
     write_map(folder, content, map_id=map_id, version=version, created=created)
-    return add_own_test(folder, own_test(open_map(folder)), version=version)
+    opened = open_map(folder)
+    run = run_own_test(opened)
+    doubts = doubts_about(opened, run, left_out)
+    return add_own_test(folder, run.test, version=version, doubts=doubts)

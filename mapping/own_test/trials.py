@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from mapping.cluster.workers import one_thread_here
@@ -54,7 +54,26 @@ class Trial:
     score: Score
 
 
+@dataclass(frozen=True, slots=True)
+class OwnTestRun:
+    """The own test of a map, photo by photo.
+
+    Attributes:
+        wrong: rows of the photos that were localized at another place.
+        refused: rows of those that got no pose.
+    """
+
+    test: OwnTest
+    wrong: tuple[int, ...] = ()
+    refused: tuple[int, ...] = ()
+
+
 def own_test(opened: Map) -> OwnTest:
+    """Test a map; see ``run_own_test``."""
+    return run_own_test(opened).test
+
+
+def run_own_test(opened: Map) -> OwnTestRun:
     """Test a map with what it stores of its own photos.
 
     The photos are spread evenly and every random choice has a seed, so that equal maps have equal
@@ -63,7 +82,7 @@ def own_test(opened: Map) -> OwnTest:
     viewpoints, geometry = MapGeometry(opened).viewpoints, MapGeometry(opened)
     most = min(max(_LEAST_PHOTOS, len(opened.images) // _SHARE_OF_PHOTOS), _MOST_PHOTOS)
     images = spread_photos(len(opened.images), most)
-    tested, trials = 0, []
+    tested, trials, localized, refused = 0, [], [], []
     with one_thread_here():
         for image in images:
             left_out = _left_out(opened, viewpoints, image)
@@ -71,9 +90,15 @@ def own_test(opened: Map) -> OwnTest:
                 continue
             tested += 1
             trial = _trial(opened, geometry, viewpoints, image, left_out)
-            if trial is not None:
+            if trial is None:
+                refused.append(image)
+            else:
                 trials.append(trial)
-    return learned(trials, tested, geometry.reach, independent=_independent(opened))
+                localized.append(image)
+    test = learned(trials, tested, geometry.reach, independent=_independent(opened))
+    are_wrong = _are_wrong([trial.error for trial in trials], geometry.reach)
+    wrong = [image for image, is_wrong in zip(localized, are_wrong, strict=True) if is_wrong]
+    return OwnTestRun(test, tuple(wrong), tuple(refused))
 
 
 def learned(trials: Sequence[Trial], tested: int, reach: float, *, independent: bool) -> OwnTest:
@@ -90,8 +115,7 @@ def learned(trials: Sequence[Trial], tested: int, reach: float, *, independent: 
     """
     errors = np.array([trial.error for trial in trials]).reshape(-1, 6)
     covariances = np.array([trial.photo_covariance for trial in trials]).reshape(-1, 6, 6)
-    turned, moved = np.linalg.norm(errors[:, :3], axis=1), np.linalg.norm(errors[:, 3:], axis=1)
-    wrong = (turned > TIE_ANGLE) | (moved > TIE_REACH_SHARE * reach)
+    wrong = _are_wrong(errors, reach)
     errors, covariances = errors[~wrong], covariances[~wrong]
     scores = [trial.score for trial, is_wrong in zip(trials, wrong, strict=True) if is_wrong]
     scores.sort(key=lambda score: (-score.inliers, -score.inlier_ratio))
@@ -104,6 +128,13 @@ def learned(trials: Sequence[Trial], tested: int, reach: float, *, independent: 
         independent=independent,
         wrong_at=tuple(scores[:MAX_WRONG_SCORES]),
     )
+
+
+def _are_wrong(errors: ArrayLike, reach: float) -> NDArray[np.bool_]:
+    """Tell which errors (n, 6) are of poses at another place."""
+    both = np.asarray(errors, dtype=np.float64).reshape(-1, 6)
+    turned, moved = np.linalg.norm(both[:, :3], axis=1), np.linalg.norm(both[:, 3:], axis=1)
+    return np.asarray((turned > TIE_ANGLE) | (moved > TIE_REACH_SHARE * reach))
 
 
 def _factor(

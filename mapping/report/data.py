@@ -99,7 +99,8 @@ def make_report_data(
 
 def _notes(opened: Map, plan: Plan, runs: Sequence[HeldOut], within: Within) -> list[str]:
     guess = [] if plan.up_source == "gravity" else [UP_IS_A_GUESS]
-    return [*opened.manifest.notes, *_doubts(runs, within), *guess]
+    against = [f"not put into use by itself: {d.message}" for d in opened.manifest.parts.doubts]
+    return [*against, *opened.manifest.notes, *_doubts(runs, within), *guess]
 
 
 def calibration_of(

@@ -64,6 +64,7 @@ class ExtractedFeatures:
             fingerprint=FingerprintRecord.of(self.fingerprint).model_dump(),
             computed_with=self.computed_with,
             max_keypoints=self.max_keypoints,
+            **({} if photo.mask_sha256 is None else {"mask": photo.mask_sha256}),
         )
 
     def prepare(self, photo: MappingPhoto) -> None:

@@ -11,7 +11,7 @@ from mapping.stages.depth import DepthMatch, DepthMatcher
 from visloc.archive import sha256_of
 from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
-from visloc.images import Photo, read_photo_file, upright
+from visloc.images import FILE_LIMITS, Photo, read_photo_file, upright, with_mask
 from visloc.kapture import Dataset, FileRecord
 from visloc.localization.query_camera import GUESSED_FOCAL
 
@@ -27,6 +27,7 @@ class MappingPhoto:
         path: the file; it exists when ``sha256`` is not None.
         sha256: of the file; for a dataset at a URL, the storage's own tag of the content.
         camera_known: whether the intrinsics are the dataset's; else they are a guess.
+        mask: the file of its mask, if any.
     """
 
     record: FileRecord
@@ -37,6 +38,8 @@ class MappingPhoto:
     cam_from_world: Pose | None
     depth: DepthMatch | None
     depth_sha256: str | None
+    mask: Path | None = None
+    mask_sha256: str | None = None
 
     @property
     def name(self) -> str:
@@ -52,10 +55,12 @@ class MappingPhoto:
     def read(self) -> Photo:
         """Decode the file in the frame of its camera, as ``read_in_frame``."""
         size = self.camera.width, self.camera.height
-        return read_in_frame(self.path, size, self.record.sensor_id)
+        return read_in_frame(self.path, size, self.record.sensor_id, self.mask)
 
 
-def read_in_frame(path: Path, size: tuple[int, int], sensor_id: str) -> Photo:
+def read_in_frame(
+    path: Path, size: tuple[int, int], sensor_id: str, mask: Path | None = None
+) -> Photo:
     """Decode a photo of a dataset in the frame of its camera: the pixels as stored.
 
     If the camera has the size of a photo on its side (width and height swapped, EXIF orientation 5
@@ -65,19 +70,30 @@ def read_in_frame(path: Path, size: tuple[int, int], sensor_id: str) -> Photo:
     Args:
         size: width and height of the camera, pixels.
         sensor_id: of the camera, for the error.
+        mask: file of its mask, if any.
 
     Raises:
         DatasetError: ``dataset.photo_size``.
         VislocError: what ``read_photo_file`` raises.
     """
     photo = read_photo_file(path)
+    if mask is not None:
+        photo = with_mask(photo, mask.read_bytes(), FILE_LIMITS, str(mask))
     stored = photo.width, photo.height
     if stored == size:
         return photo
     if photo.is_on_its_side and stored[::-1] == size:
-        return replace(photo, rgb=upright(photo.rgb, photo.exif_orientation), exif_orientation=1)
+        turn = photo.exif_orientation
+        turned = replace(photo, rgb=upright(photo.rgb, turn), exif_orientation=1)
+        return turned if photo.mask is None else replace(turned, mask=upright(photo.mask, turn))
+    message = (
+        "photos of so many pixels are reduced while they are decoded; give their camera in "
+        f"sensors.txt {photo.width} x {photo.height} pixels, and divide its lengths in pixels by "
+        f"{photo.reduced}"
+    )
     raise refuse(
         "dataset.photo_size",
+        message if size == photo.file_size else None,
         field=str(path),
         expected=f"{size[0]} x {size[1]} as sensors.txt has it for {sensor_id}",
         got=f"{stored[0]} x {stored[1]}",
@@ -165,6 +181,38 @@ class _Wanted:
             *(["ready-made features"] if self.has_features is not None else []),
             *(["a camera of a known model", "a pose"] if self.posed else []),
         ]
+
+
+def masked(
+    photos: Sequence[MappingPhoto], folder: Path
+) -> tuple[list[MappingPhoto], tuple[str, ...]]:
+    """Give photos their masks, in COLMAP's convention: that of ``a/b.jpg`` is ``a/b.jpg.png``.
+
+    Photos without a mask count as a whole.
+
+    Returns:
+        The photos, and a note.
+
+    Raises:
+        DatasetError: ``masks.none``; ``dataset.unreadable``.
+    """
+    found = []
+    for photo in photos:
+        path = folder / f"{photo.name}.png"
+        if not path.is_file():
+            found.append(photo)
+            continue
+        try:
+            found.append(replace(photo, mask=path, mask_sha256=sha256_of(path)))
+        except OSError as error:
+            raise refuse("dataset.unreadable", field=str(path), got=error.strerror) from error
+    without = [photo.name for photo in found if photo.mask is None]
+    if len(without) == len(photos):
+        raise refuse("masks.none", field="--masks", got=str(folder))
+    if not without:
+        return found, ()
+    note = f"{len(without)} of {len(photos)} photos have no mask and count as a whole"
+    return found, (f"{note}: {some(without)}",)
 
 
 def some(names: Sequence[str]) -> str:

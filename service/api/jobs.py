@@ -79,7 +79,7 @@ def photo_job_of(request: LocalizeRequest) -> RigJob:
         raise refuse("debug.needs_photo", field="debug", got="true")
     return photo_job(
         _where(request),
-        query_to_core(request.image, request.features),
+        query_to_core(request.image, request.features, request.mask),
         None if request.camera is None else request.camera.to_core(),
         request.options.to_core(),
         priors_to_core(request.priors),
@@ -233,8 +233,13 @@ def _image(image: RigImage, parts: Parts, *, has_rig: bool) -> ImageJob:
                 got="part and another",
             )
         content = parts.take(image.part)
+    mask = image.mask
+    if image.mask_part is not None:
+        if mask is not None:
+            raise refuse("request.query", field="mask", got="mask and mask_part")
+        mask = parts.take(image.mask_part)
     return ImageJob(
         image.sensor or ONLY_SENSOR,
-        query_to_core(content, image.features),
+        query_to_core(content, image.features, mask),
         None if image.camera is None else image.camera.to_core(),
     )

@@ -23,7 +23,8 @@ from visloc_api.words.rigs import BatchLimits, LocalizeRigRequest
 from visloc_api.words.sequences import LocalizeSequenceRequest
 
 # The parts of the form of one photo that are files, and the file names in curl's examples.
-_FILES = {"image": "photo.jpg", "features": "photo.json"}
+_FILES_PER_IMAGE = 2  # a photo and its mask
+_FILES = {"image": "photo.jpg", "features": "photo.json", "mask": "mask.png"}
 _FORM, _JSON = "multipart/form-data", "application/json"
 # Values in a sequence: each takes about a microsecond and 100 bytes to parse. A photo needs 16 for
 # its pinhole camera and its share of the instant's. An instant of few photos needs more: odometry
@@ -114,7 +115,7 @@ async def read_rig_job(request: Request) -> RigJob:
             LocalizeRigRequest.read_json(text, limits, MAX_INSTANT_VALUES), files
         )
 
-    return await _read_batch(request, to_job, max_files=settings.max_rig_images)
+    return await _read_batch(request, to_job, max_files=_FILES_PER_IMAGE * settings.max_rig_images)
 
 
 async def read_sequence_jobs(request: Request) -> tuple[SequenceJob, list[InstantJob]]:
@@ -136,7 +137,7 @@ async def read_sequence_jobs(request: Request) -> tuple[SequenceJob, list[Instan
             LocalizeSequenceRequest.read_json(text, limits, max_values), files
         )
 
-    max_files = settings.max_rig_images * settings.max_instants
+    max_files = _FILES_PER_IMAGE * settings.max_rig_images * settings.max_instants
     return await _read_batch(request, to_jobs, max_files=max_files)
 
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 from service.values import PackedQuery, Query
 from visloc.features import LocalFeatureExtractor
-from visloc.images import ImageLimits, Photo, read_photo
+from visloc.images import ImageLimits, Photo, read_photo, with_mask
 from visloc.localization.feature_cache import FeatureCache
 from visloc.timing import timed
-from visloc.types import QueryFeatures
+from visloc.types import MaskedImage, QueryFeatures
 
 # Returns the extractor of local features with this name.
 ExtractorOf = Callable[[str], LocalFeatureExtractor]
@@ -35,7 +35,7 @@ def decode(query: Query, limits: ImageLimits, extractor_of: ExtractorOf) -> Deco
     """Decode an encoded photo, or unpack what ``pack`` returned in this service.
 
     Raises:
-        InvalidInput: ``image.*``.
+        InvalidInput: ``image.*`` or ``mask.size``.
         TooLarge: ``image.too_large``.
     """
     if isinstance(query, PackedQuery):
@@ -46,7 +46,10 @@ def decode(query: Query, limits: ImageLimits, extractor_of: ExtractorOf) -> Deco
         return DecodedQuery(query, {}, {})
     spent: dict[str, float] = {}
     with timed(spent, "decode"):
-        photo = read_photo(query, limits)
+        if isinstance(query, MaskedImage):
+            photo = with_mask(read_photo(query.image, limits), query.mask, limits)
+        else:
+            photo = read_photo(query, limits)
     return DecodedQuery(photo, {}, spent)
 
 

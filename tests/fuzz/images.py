@@ -1,4 +1,4 @@
-"""Photos: JPEG, PNG, WebP, TIFF and BMP, with EXIF."""
+"""Photos of all formats that are read, with EXIF."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from PIL import ExifTags, Image, PngImagePlugin
 
 from tests.fuzz.target import refusal
+from tests.heic import heic
 from visloc.errors import InvalidInput
 from visloc.images import ImageLimits, read_photo, stored_from_upright, upright
 
@@ -107,6 +108,10 @@ class Images:
             (rgb.convert("I;16"), "TIFF", {"big_tiff": False}),
             (palette, "TIFF", {}),
             (rgb.convert("CMYK"), "TIFF", {}),
+            (alpha, "TIFF", {}),
+            (rgb, "AVIF", {"exif": exif, "quality": 40}),
+            (alpha, "AVIF", {"quality": 40}),
+            (rgb, "AVIF", {"save_all": True, "append_images": [second]}),
             (rgb, "BMP", {}),
             (palette, "BMP", {}),
             (rgb.convert("1"), "BMP", {}),
@@ -119,4 +124,9 @@ class Images:
                 jpeg = file.getvalue()  # its last scan again, nearly as often as it may be
                 last, end = jpeg.rindex(b"\xff\xda"), jpeg.rindex(b"\xff\xd9")
                 yield jpeg[:end] + jpeg[last:end] * 85 + jpeg[end:]
+        for orientation in range(1, 9):
+            yield heic(noise, orientation, exif=exif.tobytes(), ten_bits=orientation == 8)
+        large = cv2.resize(noise, (801, 601))  # is reduced while it is decoded
+        yield cv2.imencode(".jpg", large, [cv2.IMWRITE_JPEG_QUALITY, 50])[1].tobytes()
+        yield b"GIF89a" + bytes(20)  # is not read
         yield cv2.imencode(".png", noise.astype(np.uint16) << 8)[1].tobytes()

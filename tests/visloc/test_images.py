@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps, TiffImagePlugin
 
+from tests.heic import heic
 from visloc.errors import InvalidInput, NotFound, TooLarge
 from visloc.images import (
     ImageLimits,
@@ -82,7 +83,7 @@ def test_every_colour_kind_of_every_format_gives_its_rgb_pixels(
     np.testing.assert_array_equal(photo.rgb, np.asarray(image.convert("RGB")))
 
 
-@pytest.mark.parametrize("file_format", ["PNG", "WEBP", "BMP"])
+@pytest.mark.parametrize("file_format", ["PNG", "WEBP", "BMP", "TIFF"])
 def test_transparency_is_ignored_and_colours_stay(file_format: str) -> None:
     image = Image.fromarray(texture())
     image.putalpha(Image.fromarray(texture(seed=1)[..., 0]))
@@ -294,14 +295,15 @@ def test_what_is_not_an_image_is_refused_with_the_formats_that_are_read(data: by
     error = refusal(data)
 
     assert error.code == "image.format"
-    assert error.expected == "JPEG, PNG, WebP, TIFF or BMP"
+    assert error.expected == "JPEG, HEIC, PNG, WebP, AVIF, TIFF or BMP"
 
 
 @pytest.mark.parametrize(
     ("data", "name", "part"),
     [
-        (b"\0\0\0\x18ftypheic\0\0\0\0mif1heic", "HEIC", "convert them to JPEG"),
-        (b"\0\0\0\x1cftypmif1\0\0\0\0mif1avif", "AVIF", "convert them to JPEG"),
+        (b"\0\0\0\x0cJXL \r\n\x87\n", "JPEG XL", "convert them to JPEG"),
+        (b"II*\0\x10\0\0\0CR\2\0", "raw", "develop them to JPEG"),
+        (b"\0\0\0\x14ftypqt  \0\0\0\0qt  ", "MOV", "take frames out of them"),
         (b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom", "MP4", "take frames out of them"),
         (b"GIF89a" + bytes(100), "GIF", "save them as PNG"),
     ],
@@ -409,7 +411,9 @@ def progressive(
 def test_a_jpeg_of_very_many_scans_is_refused_before_it_is_decoded(
     before_each: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("visloc.images._decode", lambda _: pytest.fail("it was decoded"))
+    monkeypatch.setattr(
+        "visloc.photo_formats._decode_with_opencv", lambda *_: pytest.fail("it was decoded")
+    )
 
     error = refusal(progressive(more=before_each, times=300))
 
@@ -518,13 +522,89 @@ def test_the_limits_themselves_are_allowed() -> None:
     assert refusal(data, ImageLimits(max_pixels=48 * 32 - 1)).code == "image.too_many_pixels"
 
 
-def test_a_transparent_tiff_is_refused_because_its_colours_would_be_blended() -> None:
-    image = Image.fromarray(texture())
-    image.putalpha(128)
+def test_a_tiff_whose_strips_claim_gigabytes_never_reaches_the_decoder(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    data = encode(Image.fromarray(texture()), "TIFF", tiffinfo={278: 8_000_000})
+    assert TiffImagePlugin.TiffImageFile(io.BytesIO(data)).tag_v2[278] == 8_000_000
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
 
-    error = refusal(encode(image, "TIFF"))
+    assert refusal(data).code == "image.format"
 
-    assert (error.code, error.got) == ("image.format", "transparency")
+
+def test_exif_that_points_at_itself_counts_as_none() -> None:
+    # One directory whose entry for the Exif part, and whose next directory, is itself.
+    entry = struct.pack("<HHII", ExifTags.IFD.Exif, 4, 1, 8)
+    looped = b"Exif\0\0II*\0" + struct.pack("<IH", 8, 1) + entry + struct.pack("<I", 8)
+
+    for file_format in ("JPEG", "PNG", "WEBP", "AVIF"):
+        photo = read_photo(encode(Image.fromarray(texture()), file_format, exif=looped))
+        assert (photo.exif_orientation, photo.focal_length_px) == (1, None)
+    assert read_photo(heic(texture(), exif=looped)).exif_orientation == 1
+
+
+@pytest.mark.parametrize("kept", [0.05, 0.3, 0.6, 0.95])
+@pytest.mark.parametrize("file_format", ["HEIC", "AVIF"])
+def test_a_photo_of_boxes_that_is_cut_off_is_refused(file_format: str, kept: float) -> None:
+    rgb = texture(200, 152)
+    data = heic(rgb) if file_format == "HEIC" else encode(Image.fromarray(rgb), "AVIF")
+
+    assert refusal(data[: int(len(data) * kept)]).code == "image.undecodable"
+
+
+@pytest.mark.parametrize("declared", [(48, 34), (8, 8), (4000, 4000)])
+def test_a_heic_photo_of_another_size_than_it_declares_is_refused(
+    declared: tuple[int, int],
+) -> None:
+    assert refusal(heic(texture(), size=declared)).code == "image.undecodable"
+
+
+def test_a_heic_photo_that_declares_too_many_pixels_is_refused_from_its_header() -> None:
+    error = refusal(heic(texture(), size=(20_000, 20_000)))
+
+    assert (error.code, error.got) == ("image.too_many_pixels", "20000 x 20000")
+
+
+# Photos of very many pixels
+
+
+def test_a_large_jpeg_is_reduced_while_it_is_decoded() -> None:
+    smooth = cv2.GaussianBlur(texture(403, 301), (0, 0), 8)
+    data = encode(Image.fromarray(smooth), "JPEG", quality=95, subsampling=0)
+
+    photo = read_photo(data, ImageLimits(max_pixels=403 * 301 // 2))
+
+    assert (photo.reduced, photo.file_size) == (2, (403, 301))
+    assert (photo.width, photo.height) == (201, 150)
+    # A pixel is the mean of those that it spans, so that (u, v) becomes (u / 2, v / 2).
+    spanned = smooth[:300, :402].reshape(150, 2, 201, 2, 3).mean(axis=(1, 3))
+    assert np.abs(photo.rgb - spanned).mean() < 1
+
+
+def test_the_focal_length_of_a_reduced_photo_is_in_its_pixels() -> None:
+    data = encode(Image.new("RGB", (400, 300)), "JPEG", exif=exif_with(FocalLengthIn35mmFilm=26))
+
+    reduced = read_photo(data, ImageLimits(max_pixels=30_000))
+
+    assert (reduced.reduced, reduced.width) == (2, 200)
+    assert reduced.focal_length_px == pytest.approx(26 / math.hypot(36, 24) * 250)
+
+
+def test_a_large_jpeg_that_would_take_memory_for_all_its_pixels_is_refused() -> None:
+    data = encode(Image.fromarray(texture(400, 300)), "JPEG", progressive=True)
+
+    assert refusal(data, ImageLimits(max_pixels=60_000)).code == "image.too_complex"
+
+
+@pytest.mark.parametrize("file_format", ["JPEG", "PNG", "WEBP", "AVIF", "TIFF", "BMP"])
+def test_only_jpegs_may_have_more_pixels_than_the_limit(file_format: str) -> None:
+    data = encode(Image.fromarray(texture(400, 300)), file_format)
+    few = ImageLimits(max_pixels=(30_000 if file_format == "JPEG" else 120_000) - 1)
+
+    error = refusal(data, few)
+
+    most = few.max_pixels * (4 if file_format == "JPEG" else 1)
+    assert (error.code, error.expected) == ("image.too_many_pixels", f"at most {most} pixels")
 
 
 def test_a_tiff_of_floats_is_refused() -> None:

@@ -3,28 +3,34 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 from visloc.archive.anchoring import link_or_copy
 from visloc.archive.reader import Map
-from visloc.archive.schema import FORMAT_MAJOR, FORMAT_MINOR, OwnTest
+from visloc.archive.schema import FORMAT_MAJOR, FORMAT_MINOR, Doubt, OwnTest
 from visloc.archive.writer import Files
 
 
-def add_own_test(folder: Path, test: OwnTest, *, version: str) -> str:
+def add_own_test(folder: Path, test: OwnTest, *, version: str, doubts: Sequence[Doubt] = ()) -> str:
     """Write the own test of a map into its manifest, before the map is published.
 
     Args:
         folder: the map.
         test: replaces one that the map has.
         version: as for ``write_map``.
+        doubts: why the map is not put into use by itself; replaces those that it has.
 
     Returns:
         The version.
     """
     manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
     manifest["format_version"] = f"{FORMAT_MAJOR}.{FORMAT_MINOR}"
-    manifest["parts"] = {**manifest.get("parts", {}), "own_test": test.model_dump(mode="json")}
+    manifest["parts"] = {
+        **manifest.get("parts", {}),
+        "own_test": test.model_dump(mode="json"),
+        "doubts": [doubt.model_dump(mode="json") for doubt in doubts],
+    }
     return Files(folder).finish(manifest, version)
 
 

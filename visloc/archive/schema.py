@@ -248,10 +248,25 @@ class OwnTest(Record):
         return self
 
 
+class Doubt(Record):
+    """A reason why a version was not put into use by itself.
+
+    Attributes:
+        kind: ``own_test``, ``left_out`` or ``pieces``.
+        message: a sentence for people.
+        photos: names of those that it is about, or of the first of them.
+    """
+
+    kind: Annotated[str, Field(max_length=100)]
+    message: Annotated[str, Field(max_length=1000)]
+    photos: Annotated[tuple[str, ...], Field(max_length=100)] = ()
+
+
 class Parts(Record):
     """Parts that a map may have or not; a reader ignores those that it does not know."""
 
     own_test: OwnTest | None = None
+    doubts: Annotated[tuple[Doubt, ...], Field(max_length=100)] = ()
 
 
 class Manifest(Record):

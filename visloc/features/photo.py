@@ -34,11 +34,18 @@ def extract_features(
         extraction: how much effort goes into it.
 
     Returns:
-        Features with keypoints in the stored pixels, and the picture (H, W, 3) that they were
+        Features with keypoints in the stored pixels, where the photo's mask lets them count, and
+        the picture (H, W, 3) that they were
         found in, which global descriptors are to describe.
     """
     turn = turn_of(photo.exif_orientation) if read_as is ReadAs.UPRIGHT else 1
     rgb = photo.rgb if turn == 1 else upright(photo.rgb, turn)
     local = extractor.extract(rgb, max_keypoints=max_keypoints, extraction=extraction)
     keypoints = stored_from_upright(local.keypoints, turn, photo.width, photo.height)
-    return replace(local, keypoints=keypoints), rgb
+    local = replace(local, keypoints=keypoints)
+    if photo.mask is not None:
+        counts = photo.counts(keypoints)
+        local = LocalFeatures(
+            keypoints[counts], local.descriptors[counts], local.scores[counts], local.scales[counts]
+        )
+    return local, rgb

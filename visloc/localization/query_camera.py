@@ -15,7 +15,8 @@ GUESSED_FOCAL = 1.2
 def resolve_camera(photo: Photo, given: Camera | None) -> tuple[Camera, CameraSource]:
     """Choose the intrinsics of a photo: given, else EXIF's focal length, else a guess.
 
-    A camera given for another size of the same aspect is scaled to the photo. For a photo on its
+    A camera given for another size of the same aspect is scaled to the photo; that of a photo that
+    was reduced while it was decoded is reduced with it. For a photo on its
     own, the search for the focal length starts from the guess (``visloc.localization.solving``).
 
     Raises:
@@ -29,6 +30,8 @@ def resolve_camera(photo: Photo, given: Camera | None) -> tuple[Camera, CameraSo
         return camera, CameraSource.EXIF if known else CameraSource.GUESS
     if (given.width, given.height) == (width, height):
         return given, CameraSource.GIVEN
+    if (given.width, given.height) == photo.file_size:
+        return given.reduced(photo.reduced), CameraSource.GIVEN_SCALED
     if given.has_aspect_of(width, height):
         return given.scaled(width, height), CameraSource.GIVEN_SCALED
     turned = photo.is_on_its_side and given.has_aspect_of(height, width)

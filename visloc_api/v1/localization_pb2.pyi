@@ -518,16 +518,19 @@ class LocalizeRequest(_message.Message):
     NEAR_FIELD_NUMBER: _builtins.int
     YPR_FIELD_NUMBER: _builtins.int
     DEBUG_FIELD_NUMBER: _builtins.int
+    MASK_FIELD_NUMBER: _builtins.int
     map: _builtins.str
     """id, or id@version"""
     image: _builtins.bytes
-    """the encoded photo (JPEG, PNG, WebP, TIFF, BMP)"""
+    """the encoded photo (JPEG, HEIC, PNG, WebP, AVIF, TIFF, BMP)"""
     request_id: _builtins.str
     """chosen by the caller for the logs; made by the server when empty"""
     ypr: _builtins.bool
     """also say the GeoPose in yaw, pitch and roll"""
     debug: _builtins.bool
     """also return the matches and a picture of them; needs a photo"""
+    mask: _builtins.bytes
+    """A picture of the photo's size or aspect, black where the photo does not count."""
     @_builtins.property
     def features(self) -> Global___Features:
         """needs a camera"""
@@ -564,13 +567,16 @@ class LocalizeRequest(_message.Message):
         near: Global___Near | None = ...,
         ypr: _builtins.bool | None = ...,
         debug: _builtins.bool | None = ...,
+        mask: _builtins.bytes | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_near", b"_near", "_ypr", b"_ypr", "camera", b"camera", "debug", b"debug", "features", b"features", "image", b"image", "near", b"near", "options", b"options", "priors", b"priors", "query", b"query", "ypr", b"ypr"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_mask", b"_mask", "_near", b"_near", "_ypr", b"_ypr", "camera", b"camera", "debug", b"debug", "features", b"features", "image", b"image", "mask", b"mask", "near", b"near", "options", b"options", "priors", b"priors", "query", b"query", "ypr", b"ypr"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_near", b"_near", "_ypr", b"_ypr", "camera", b"camera", "debug", b"debug", "features", b"features", "image", b"image", "map", b"map", "maps", b"maps", "near", b"near", "options", b"options", "priors", b"priors", "query", b"query", "request_id", b"request_id", "ypr", b"ypr"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_mask", b"_mask", "_near", b"_near", "_ypr", b"_ypr", "camera", b"camera", "debug", b"debug", "features", b"features", "image", b"image", "map", b"map", "maps", b"maps", "mask", b"mask", "near", b"near", "options", b"options", "priors", b"priors", "query", b"query", "request_id", b"request_id", "ypr", b"ypr"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__debug: _TypeAlias = _typing.Literal["debug"]  # noqa: Y015
     _WhichOneofArgType__debug: _TypeAlias = _typing.Literal["_debug", b"_debug"]  # noqa: Y015
+    _WhichOneofReturnType__mask: _TypeAlias = _typing.Literal["mask"]  # noqa: Y015
+    _WhichOneofArgType__mask: _TypeAlias = _typing.Literal["_mask", b"_mask"]  # noqa: Y015
     _WhichOneofReturnType__near: _TypeAlias = _typing.Literal["near"]  # noqa: Y015
     _WhichOneofArgType__near: _TypeAlias = _typing.Literal["_near", b"_near"]  # noqa: Y015
     _WhichOneofReturnType__ypr: _TypeAlias = _typing.Literal["ypr"]  # noqa: Y015
@@ -579,6 +585,8 @@ class LocalizeRequest(_message.Message):
     _WhichOneofArgType_query: _TypeAlias = _typing.Literal["query", b"query"]  # noqa: Y015
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__debug) -> _WhichOneofReturnType__debug | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__mask) -> _WhichOneofReturnType__mask | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__near) -> _WhichOneofReturnType__near | None: ...
     @_typing.overload
@@ -666,11 +674,14 @@ class RigImage(_message.Message):
     FEATURES_FIELD_NUMBER: _builtins.int
     CAMERA_FIELD_NUMBER: _builtins.int
     TIMESTAMP_FIELD_NUMBER: _builtins.int
+    MASK_FIELD_NUMBER: _builtins.int
     sensor: _builtins.str
     """a camera of the rig"""
     image: _builtins.bytes
     timestamp: _builtins.int
     """equal for all images of an instant"""
+    mask: _builtins.bytes
+    """of the image, as in LocalizeRequest"""
     @_builtins.property
     def features(self) -> Global___Features: ...
     @_builtins.property
@@ -688,15 +699,20 @@ class RigImage(_message.Message):
         features: Global___Features | None = ...,
         camera: Global___Camera | None = ...,
         timestamp: _builtins.int | None = ...,
+        mask: _builtins.bytes | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_timestamp", b"_timestamp", "camera", b"camera", "features", b"features", "image", b"image", "query", b"query", "timestamp", b"timestamp"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_mask", b"_mask", "_timestamp", b"_timestamp", "camera", b"camera", "features", b"features", "image", b"image", "mask", b"mask", "query", b"query", "timestamp", b"timestamp"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_timestamp", b"_timestamp", "camera", b"camera", "features", b"features", "image", b"image", "query", b"query", "sensor", b"sensor", "timestamp", b"timestamp"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_mask", b"_mask", "_timestamp", b"_timestamp", "camera", b"camera", "features", b"features", "image", b"image", "mask", b"mask", "query", b"query", "sensor", b"sensor", "timestamp", b"timestamp"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__mask: _TypeAlias = _typing.Literal["mask"]  # noqa: Y015
+    _WhichOneofArgType__mask: _TypeAlias = _typing.Literal["_mask", b"_mask"]  # noqa: Y015
     _WhichOneofReturnType__timestamp: _TypeAlias = _typing.Literal["timestamp"]  # noqa: Y015
     _WhichOneofArgType__timestamp: _TypeAlias = _typing.Literal["_timestamp", b"_timestamp"]  # noqa: Y015
     _WhichOneofReturnType_query: _TypeAlias = _typing.Literal["image", "features"]  # noqa: Y015
     _WhichOneofArgType_query: _TypeAlias = _typing.Literal["query", b"query"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__mask) -> _WhichOneofReturnType__mask | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__timestamp) -> _WhichOneofReturnType__timestamp | None: ...
     @_typing.overload

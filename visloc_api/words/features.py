@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import math
+from functools import partial
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -24,7 +25,7 @@ MAX_GLOBAL_DESCRIPTORS = 32
 _MAX_ARRAY_SIDE = 2**31 - 1
 
 
-def _bytes_from_base64(value: object) -> object:
+def _bytes_from_base64(value: object, field: str) -> object:
     if not isinstance(value, str):
         return value
     try:
@@ -32,18 +33,19 @@ def _bytes_from_base64(value: object) -> object:
     except (binascii.Error, ValueError) as error:  # ValueError: letters outside ASCII
         raise refuse(
             "image.base64",
-            field="image",
+            field=field,
             expected="the encoded photo in standard base64",
             got=str(error),
         ) from None
 
 
-# An encoded photo, in JSON as base64.
+_AS_TEXT = WithJsonSchema({"type": "string", "contentEncoding": "base64"})
+# An encoded photo, or its mask, in JSON as base64.
 GivenImage = Annotated[
-    bytes | None,
-    converted(_bytes_from_base64),
-    AS_BASE64,
-    WithJsonSchema({"type": "string", "contentEncoding": "base64"}),
+    bytes | None, converted(partial(_bytes_from_base64, field="image")), AS_BASE64, _AS_TEXT
+]
+GivenMask = Annotated[
+    bytes | None, converted(partial(_bytes_from_base64, field="mask")), AS_BASE64, _AS_TEXT
 ]
 
 
@@ -174,15 +176,17 @@ GivenFeatures = Annotated[Features | None, converted(_features_from_text)]
 
 
 def query_to_core(
-    image: bytes | None, features: Features | None
-) -> bytes | visloc.types.QueryFeatures:
-    """Return the photo or the features, whichever was sent.
+    image: bytes | None, features: Features | None, mask: bytes | None = None
+) -> bytes | visloc.types.MaskedImage | visloc.types.QueryFeatures:
+    """Return the photo, with its mask if it has one, or the features, whichever was sent.
 
     Raises:
-        InvalidInput: ``request.query``, or a code of the features.
+        InvalidInput: ``request.query``, ``mask.needs_photo``, or a code of the features.
     """
+    if mask is not None and image is None:
+        raise refuse("mask.needs_photo", field="mask")
     if image is not None and features is None:
-        return image
+        return image if mask is None else visloc.types.MaskedImage(image, mask)
     if features is not None and image is None:
         return features.to_core()
     raise refuse("request.query", field="image", got="neither" if image is None else "both")

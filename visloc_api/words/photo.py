@@ -9,7 +9,7 @@ from pydantic import FailFast, Field
 
 from visloc.errors import refuse
 from visloc.options import MAX_MAPS
-from visloc_api.words.features import GivenFeatures, GivenImage
+from visloc_api.words.features import GivenFeatures, GivenImage, GivenMask
 from visloc_api.words.geometry import GivenCamera
 from visloc_api.words.message import IncomingMessage, converted
 from visloc_api.words.near import GivenNear
@@ -17,7 +17,14 @@ from visloc_api.words.options import GivenOptions, LocalizeOptions
 from visloc_api.words.priors import GivenPriors
 
 PhotoField = Annotated[
-    GivenImage, Field(description="the encoded photo: JPEG, PNG, WebP, TIFF or BMP")
+    GivenImage, Field(description="the encoded photo: JPEG, HEIC, PNG, WebP, AVIF, TIFF or BMP")
+]
+MaskField = Annotated[
+    GivenMask,
+    Field(
+        description="a picture of the photo's size or aspect, black where the photo does not "
+        "count: people, screens, mirrors"
+    ),
 ]
 FeaturesField = Annotated[
     GivenFeatures, Field(description="the photo's features, instead of the photo; need a camera")
@@ -87,3 +94,4 @@ class LocalizeRequest(IncomingMessage):
     near: GivenNear = None
     ypr: GivenYpr = None
     debug: GivenDebug = None
+    mask: MaskField = None

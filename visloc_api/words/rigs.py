@@ -14,7 +14,7 @@ from visloc_api.words.geometry import Camera, GivenCamera, Transform
 from visloc_api.words.message import IncomingMessage, converted, counted
 from visloc_api.words.near import GivenNear
 from visloc_api.words.options import GivenOptions, LocalizeOptions
-from visloc_api.words.photo import FeaturesField, GivenMaps, GivenYpr, PhotoField
+from visloc_api.words.photo import FeaturesField, GivenMaps, GivenYpr, MaskField, PhotoField
 from visloc_api.words.priors import GivenPriors
 
 # More than any rig has: it bounds what a request can make the server look at.
@@ -158,8 +158,12 @@ class RigImage(IncomingMessage):
     timestamp: Annotated[
         Timestamp | None, Field(description="equal for all images of an instant")
     ] = None
+    mask: MaskField = None
     part: Annotated[
         str | None, Field(description="in a form, instead of image: the name of the file's part")
+    ] = None
+    mask_part: Annotated[
+        str | None, Field(description="in a form, instead of mask: the name of the file's part")
     ] = None
 
 

@@ -8,18 +8,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
-from PIL import ExifTags, Image
+from PIL import Image
 
-from visloc.errors import refuse
-from visloc.file_kinds import HEAD_BYTES, file_kind
+from visloc.errors import InvalidInput, refuse
+from visloc.images import size_as_read
 from visloc.kapture.text import has_control_characters, is_field
+from visloc.photo_formats import PhotoHeader, open_header
 
 T = TypeVar("T")
 
 _SWAPPING = (5, 6, 7, 8)  # EXIF orientations
 _WINDOWS_DRIVE = re.compile(r"[A-Za-z]:/")
-# What Pillow's parsers raise on malformed files beside OSError.
-_MALFORMED = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, OverflowError)
 
 
 def photo_names(
@@ -90,9 +89,18 @@ def photo_size(path: Path) -> tuple[int, int] | None:
     Raises:
         DatasetError: ``import.photo`` if it is not a readable image.
     """
-    if not _is_file(path):
-        return None
-    return _from_header(path, lambda image: image.size)
+    return _header(path).size if _is_file(path) else None
+
+
+def photo_size_as_read(path: Path) -> tuple[int, int] | None:
+    """Return the size in which a build reads a photo, None if there is no such file.
+
+    It is smaller than ``photo_size`` for a photo of very many pixels.
+
+    Raises:
+        DatasetError: ``import.photo`` if it is not a readable image.
+    """
+    return _told(path, lambda: size_as_read(path)) if _is_file(path) else None
 
 
 def is_stored_turned(path: Path) -> bool:
@@ -101,19 +109,19 @@ def is_stored_turned(path: Path) -> bool:
     Raises:
         DatasetError: ``import.photo`` if it is not a readable image.
     """
-    # The base class's method: that of PNGs would decode all pixels to look behind them.
-    return _from_header(path, Image.Image.getexif).get(ExifTags.Base.Orientation) in _SWAPPING
+    return _header(path).exif_orientation in _SWAPPING
 
 
-def _from_header(path: Path, look: Callable[[Image.Image], T]) -> T:
+def _header(path: Path) -> PhotoHeader:
+    return _told(path, lambda: open_header(path.read_bytes(), str(path)))
+
+
+def _told(path: Path, look: Callable[[], T]) -> T:
     try:
-        with path.open("rb") as file:
-            kind = file_kind(file.read(HEAD_BYTES))
-        if kind is not None and not kind.is_read:
-            raise refuse("import.photo", kind.refusal, field=str(path), got=kind.name)
-        with Image.open(path) as image:
-            return look(image)
-    except (*_MALFORMED, Image.DecompressionBombError) as error:
+        return look()
+    except InvalidInput as error:
+        raise refuse("import.photo", error.message, field=str(path), got=error.got) from error
+    except (OSError, Image.DecompressionBombError) as error:
         raise refuse("import.photo", field=str(path), got=str(error)) from error
 
 

@@ -53,6 +53,7 @@ def merge_maps(
     progress: Progress,
     *,
     min_overlap: float = MIN_OVERLAP,
+    accept: bool = False,
 ) -> Merged:
     """Publish one map of two that overlap, in the frame of the first; both stay.
 
@@ -63,6 +64,7 @@ def merge_maps(
         map_id: of the new map; there must be none of this name.
         progress: told the stage, how much is done, and how much there is.
         min_overlap: least part of the photos of B that must be tied to A.
+        accept: put it into use even if its own test speaks against it.
 
     Raises:
         Conflict: ``merge.overlap``, ``merge.unit``, ``merge.features``, ``merge.photos``;
@@ -80,7 +82,7 @@ def merge_maps(
         second = moved(second, found.tie.there_from_here, metric=first.metric)
         content, pictures, notes = _joined(a, b, first, second, found)
         _refuse_name(store, map_id)  # one may have been uploaded meanwhile
-        folder = publish_edited(store, content, map_id, photos=pictures)
+        folder = publish_edited(store, content, map_id, photos=pictures, accept=accept)
         progress("archive", 1, 1)
         return Merged(folder, a, b, found, notes)
 

@@ -9,7 +9,7 @@ from functools import partial
 from mapping.maps.editing import content_of, selected
 from mapping.maps.pruning.accuracy import Accuracy, of_held_out_photos
 from mapping.maps.pruning.choosing import LEFT_OUT, Kept, choose, least, num_landmarks, size_with
-from mapping.own_test.publishing import write_content
+from mapping.own_test.publishing import publish_tested, write_content
 from mapping.stages.publishing import link_photos, photo_files
 from mapping.stages.work_folder import exclusive
 from visloc.archive import Map, MapContent, MapStore, open_map
@@ -41,6 +41,7 @@ def prune_map(
     max_bytes: int | None = None,
     max_landmarks: int | None = None,
     measure: Measure | None = None,
+    accept: bool = False,
     progress: Callable[[str, int, int], None],
 ) -> Pruned:
     """Publish a version of a map that is as large as it may be; the one before stays.
@@ -50,6 +51,7 @@ def prune_map(
         max_bytes: most that its files take, manifest aside; or None.
         max_landmarks: most landmarks; or None.
         measure: compares the accuracy of both versions; None: by photos of the map.
+        accept: put it into use even if its own test speaks against it.
         progress: told the stage, how much is done, and how much there is.
 
     Raises:
@@ -83,7 +85,7 @@ def prune_map(
                 if measure is None
                 else measure(before, after)
             )
-            folder = store.publish(incoming, map_id, version, based_on=named)
+            folder = publish_tested(store, incoming, map_id, version, based_on=named, accept=accept)
         return Pruned(before, open_map(folder), accuracy)
 
 

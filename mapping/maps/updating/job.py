@@ -114,7 +114,9 @@ class Updated:
 
 
 def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
-    """Add a new capture to a map, as a new version, which becomes current.
+    """Add a new capture to a map, as a new version.
+
+    It becomes current unless its own test speaks against it.
 
     If it is killed, the same call finds its finished work again. The version that was current
     before stays current until the new one is complete and verified.
@@ -146,7 +148,14 @@ def update_map(settings: UpdateSettings, progress: Progress) -> Updated:
                     settings, opened, dataset, method, context
                 ).run()
             with one_step(progress, "archive"):
-                folder = publish_edited(store, content, map_id, photos=pictures, based_on=version)
+                folder = publish_edited(
+                    store,
+                    content,
+                    map_id,
+                    photos=pictures,
+                    based_on=version,
+                    accept=settings.accept,
+                )
             shutil.rmtree(work.root, ignore_errors=True)
     except OSError as error:
         raise refuse(

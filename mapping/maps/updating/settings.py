@@ -11,6 +11,7 @@ import typer
 
 from mapping.methods.rgbd import DepthSettings
 from mapping.options import (
+    AcceptOption,
     DatasetArgument,
     DepthScaleOption,
     DepthSensorOption,
@@ -75,6 +76,7 @@ class UpdateSettings:
     workers: WorkersOption = 1
     depth_sensor: DepthSensorOption = None
     depth_scale: DepthScaleOption = DepthSettings().depth_scale
+    accept: AcceptOption = False
 
 
 def check_settings(settings: UpdateSettings) -> None:

@@ -63,7 +63,7 @@ def _batch_body(model: str, photos: dict[str, Any]) -> dict[str, Any]:
                             "type": "string",
                             "contentMediaType": "application/json",
                             "description": f"{model} as JSON, a text; an image names its file "
-                            "in part instead of bringing it in image",
+                            "in part (its mask in mask_part) instead of bringing it in image",
                         }
                     },
                     "additionalProperties": {

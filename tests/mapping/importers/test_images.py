@@ -32,7 +32,7 @@ def write_photo(
     Image.new("RGB", size, "gray").save(path, exif=exif)
 
 
-HEIC = b"\0\0\0\x18ftypheic\0\0\0\0mif1heic"
+JPEG_XL = b"\0\0\0\x0cJXL \r\n\x87\n"
 PHONE = {int(ExifTags.Base.Make): "Maker, Inc.", int(ExifTags.Base.Model): "One"}
 FOCAL = {int(ExifTags.Base.FocalLengthIn35mmFilm): 27}
 FOCAL_PX = 27 / 43.266615 * 80  # diagonals of 36 x 24 mm and 64 x 48 px
@@ -142,9 +142,10 @@ def test_every_file_is_used_or_left_out_with_its_reason(tmp_path: Path) -> None:
         "cut.jpg": content[: len(content) // 4],
         "text.png": b"not a photo",
         "notes.txt": b"not looked at",
-        "sub/a.HEIC": HEIC,
-        "sub/phone.jpg": HEIC,
-        "b.avif": b"\0\0\0\x1cftypavif\0\0\0\0mif1miafavif",
+        "sub/a.jxl": JPEG_XL,
+        "sub/phone.jpg": JPEG_XL,
+        "b.cr2": b"II*\0\x10\0\0\0CR\2\0",
+        "cut.heic": b"\0\0\0\x18ftypheic\0\0\0\0mif1heic",
         "walk.mp4": b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom",
         "walk.MOV": b"\0\0\0\x14ftypqt  \0\0\0\0qt  ",
         "anim.gif": b"GIF89a" + bytes(20),
@@ -167,9 +168,10 @@ def test_every_file_is_used_or_left_out_with_its_reason(tmp_path: Path) -> None:
         "cut.jpg": "damaged or cut off",
         "text.png": "does not read this image format",
         "notes.txt": "not photos",
-        "sub/a.HEIC": "HEIC photos are not read here; convert them to JPEG, such as with: heif-con",
-        "sub/phone.jpg": reasons["sub/a.HEIC"],
-        "b.avif": "AVIF photos",
+        "sub/a.jxl": "JPEG XL photos are not read here; convert them to JPEG, such as with: djxl",
+        "sub/phone.jpg": reasons["sub/a.jxl"],
+        "b.cr2": "raw photos are not read here; develop them",
+        "cut.heic": "damaged or cut off",
         "walk.mp4": "MP4 videos are not read here; take frames out of them, into a folder that",
         "walk.MOV": "MOV videos",
         "anim.gif": "GIF pictures",
@@ -184,16 +186,16 @@ def test_every_file_is_used_or_left_out_with_its_reason(tmp_path: Path) -> None:
 def test_what_is_left_out_is_counted_in_notes_and_listed_beside_the_dataset(tmp_path: Path) -> None:
     write_photo(tmp_path / "in" / "a.jpg")
     for number in range(5):
-        (tmp_path / "in" / f"{number}.heic").write_bytes(HEIC)
+        (tmp_path / "in" / f"{number}.jxl").write_bytes(JPEG_XL)
     (tmp_path / "in" / "line\nbreak.txt").write_text("x")
     notes = import_dataset("images", tmp_path / "in", tmp_path / "out").notes
-    (note,) = (note for note in notes if "HEIC" in note)
-    assert note.startswith("5 left out (HEIC photos are not read here; ")
-    assert note.endswith("): 0.heic, 1.heic, 2.heic, ...")
+    (note,) = (note for note in notes if "JPEG XL" in note)
+    assert note.startswith("5 left out (JPEG XL photos are not read here; ")
+    assert note.endswith("): 0.jxl, 1.jxl, 2.jxl, ...")
     listed = tmp_path / "out.left-out.txt"
     assert any(note.endswith(str(listed)) for note in notes)
     lines = [line.split("\t") for line in listed.read_text().splitlines()]
-    assert [name for name, _ in lines] == [*(f"{n}.heic" for n in range(5)), "'line\\nbreak.txt'"]
+    assert [name for name, _ in lines] == [*(f"{n}.jxl" for n in range(5)), "'line\\nbreak.txt'"]
 
 
 def test_without_anything_left_out_there_is_no_list(tmp_path: Path) -> None:
@@ -222,10 +224,10 @@ def test_a_file_instead_of_a_folder_says_what_to_do(
     assert (caught.value.code, caught.value.field) == ("import.folder", str(tmp_path / name))
 
 
-def test_a_folder_of_nothing_but_heic_says_what_to_do(tmp_path: Path) -> None:
+def test_a_folder_of_nothing_but_jpeg_xl_says_what_to_do(tmp_path: Path) -> None:
     for number in range(8):
-        (tmp_path / f"{number}.HEIC").write_bytes(HEIC)
-    with pytest.raises(DatasetError, match=r"8 left out .HEIC photos .* heif-convert") as caught:
+        (tmp_path / f"{number}.jxl").write_bytes(JPEG_XL)
+    with pytest.raises(DatasetError, match=r"8 left out .JPEG XL photos .* djxl") as caught:
         read(tmp_path)
     assert caught.value.code == "import.empty"
 

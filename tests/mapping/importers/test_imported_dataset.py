@@ -303,7 +303,7 @@ def test_a_photo_that_is_stored_turned_may_have_the_upright_size(
 def test_a_photo_of_a_kind_that_is_not_read_is_refused_with_advice(
     model: ImportedModel, photos: Path, tmp_path: Path
 ) -> None:
-    (photos / "a.jpg").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic")
-    with pytest.raises(DatasetError, match="HEIC photos are not read here; convert") as caught:
+    (photos / "a.jpg").write_bytes(b"\0\0\0\x0cJXL \r\n\x87\n")
+    with pytest.raises(DatasetError, match="JPEG XL photos are not read here; convert") as caught:
         write_imported(model, tmp_path / "dataset")
     assert (caught.value.code, caught.value.field) == ("import.photo", str(photos / "a.jpg"))

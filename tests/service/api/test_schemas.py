@@ -24,7 +24,7 @@ from visloc_api.words.photo import LocalizeRequest
 CAMERA = {"model": "PINHOLE", "width": 640, "height": 480, "params": [525, 525.5, 320, 240]}
 
 
-FIELDS = "map, image, features, camera, options, maps, priors, near, ypr, debug"
+FIELDS = "map, image, features, camera, options, maps, priors, near, ypr, debug, mask"
 
 
 def request(**fields: object) -> dict[str, Any]:
@@ -397,7 +397,7 @@ def fields_of(message: Descriptor) -> list[str]:
         fields.remove("calibration")
         fields[fields.index("rig_id")] = "rig"
     if message.name == "RigImage":
-        fields.append("part")  # of a form
+        fields.extend(("part", "mask_part"))  # of a form
     return fields
 
 

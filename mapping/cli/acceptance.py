@@ -1,0 +1,53 @@
+"""What the commands say of a version that its own test speaks against, and ``mapping use``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mapping.cli.display import say
+from mapping.options import MapsDirOption
+from mapping.own_test.picture import draw_doubts
+from visloc.archive import Map, MapStore
+from visloc.errors import refuse
+
+_SHOWN_NAMES = 10
+
+
+def use(
+    map_ref: Annotated[str, typer.Argument(metavar="MAP@VERSION", help="A published version.")],
+    maps_dir: MapsDirOption = Path("maps"),
+) -> None:
+    """Put a published version of a map into use, also one that its own test speaks against."""
+    map_id, _, version = map_ref.partition("@")
+    if not version:
+        raise refuse("map.use", field="MAP@VERSION", got=map_ref)
+    MapStore(maps_dir).set_current(map_id, version)
+    say(f"in use: {map_ref}")
+
+
+def require_acceptance(opened: Map, *, accept: bool, pictures: Path) -> None:
+    """Explain a new version's doubts, and fail unless a person accepted them beforehand.
+
+    Args:
+        accept: whether the version was put into use all the same.
+        pictures: folder for a picture of where the photos in question lie.
+
+    Raises:
+        Conflict: ``map.doubtful``.
+    """
+    doubts = opened.manifest.parts.doubts
+    if not doubts:
+        return
+    for doubt in doubts:
+        names = ", ".join(doubt.photos[:_SHOWN_NAMES])
+        more = len(doubt.photos) - _SHOWN_NAMES
+        say(f"doubt: {doubt.message}: {names}" + (f" and {more} more" if more > 0 else ""))
+    pictures.mkdir(parents=True, exist_ok=True)
+    picture = pictures / f"{opened.manifest.id}-{opened.manifest.version}.png"
+    picture.write_bytes(draw_doubts(opened))
+    say(f"picture: {picture}")
+    if not accept:
+        raise refuse("map.doubtful", field="--accept", ref=opened.ref)

@@ -1,0 +1,99 @@
+"""Whether a new version of a map may be used without a person saying so."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from mapping.own_test.trials import OwnTestRun
+from visloc.archive import Map
+from visloc.archive.schema import Doubt
+
+# Shares that no map at hand that localizes well comes near: of 17, those with exact poses have all
+# photos back, and the weakest of look-alike hallways one wrong photo of 12. The painted sample with
+# every tenth pose exchanged has more (docs/decisions/0032-the-own-test-decides.md).
+MOST_WRONG = 0.15
+LEAST_BACK = 0.4
+# Fewer photos tell too little.
+LEAST_TESTED = 8
+# Photos that find no place when poses are estimated, or lie in another piece than the most.
+MOST_LEFT_OUT = 0.4
+MOST_APART = 0.1
+# A pose needs at least as many landmarks by default (``RegistrationPreset.min_inliers``).
+_LINKING_LANDMARKS = 30
+MAX_NAMES = 100
+
+
+def doubts_about(opened: Map, run: OwnTestRun, left_out: Sequence[str] = ()) -> tuple[Doubt, ...]:
+    """Return what speaks against using a map: nothing for one that passed.
+
+    Args:
+        opened: the map.
+        run: its own test.
+        left_out: names of photos that found no place while poses were estimated.
+    """
+    return tuple(
+        doubt
+        for doubt in (_not_back(opened, run), _without_place(opened, left_out), _apart(opened))
+        if doubt is not None
+    )
+
+
+def _not_back(opened: Map, run: OwnTestRun) -> Doubt | None:
+    test = run.test
+    if test.tested < LEAST_TESTED:
+        return None
+    right = test.localized - test.wrong
+    if test.wrong <= MOST_WRONG * test.tested and right >= LEAST_BACK * test.tested:
+        return None
+    names = [opened.images[row].name for row in (*run.wrong, *run.refused)]
+    message = (
+        f"of {test.tested} photos that were localized in the map without themselves, {right} came "
+        f"back where they were, {test.wrong} elsewhere, and {test.tested - test.localized} found "
+        "no place"
+    )
+    return Doubt(kind="own_test", message=message, photos=tuple(names[:MAX_NAMES]))
+
+
+def _without_place(opened: Map, left_out: Sequence[str]) -> Doubt | None:
+    total = len(opened.images) + len(left_out)
+    if len(left_out) <= MOST_LEFT_OUT * total:
+        return None
+    message = f"{len(left_out)} of {total} photos found no place beside the others"
+    return Doubt(kind="left_out", message=message, photos=tuple(left_out[:MAX_NAMES]))
+
+
+def _apart(opened: Map) -> Doubt | None:
+    """Doubt a map whose photos, placed by its landmarks alone, hang together by too few of them."""
+    if opened.manifest.method.settings.get("poses") != "estimate":
+        return None  # pieces that do not see each other may have known poses
+    pieces = _pieces(opened)
+    sizes = np.bincount(pieces)
+    outside = np.flatnonzero(pieces != np.argmax(sizes))
+    if len(outside) <= MOST_APART * len(pieces):
+        return None
+    names = [opened.images[row].name for row in outside[:MAX_NAMES]]
+    message = (
+        f"the photos fell apart into {len(sizes)} pieces that share fewer than "
+        f"{_LINKING_LANDMARKS} landmarks; {len(outside)} of {len(pieces)} photos lie outside the "
+        "largest"
+    )
+    return Doubt(kind="pieces", message=message, photos=tuple(names))
+
+
+def _pieces(opened: Map) -> NDArray[np.int64]:
+    """Return the number of the piece (n,) that each photo belongs to."""
+    num = len(opened.images)
+    photos = np.repeat(np.arange(num), np.diff(opened.observation_offsets))
+    landmarks = opened.observation_landmarks.astype(np.int64)
+    ones = np.ones(len(photos), np.int32)
+    seen = coo_array((ones, (photos, landmarks)), (num, len(opened.landmarks))).tocsr()
+    seen.data[:] = 1  # a photo may see a landmark twice
+    shared = seen @ seen.T
+    shared.data = (shared.data >= _LINKING_LANDMARKS).astype(np.int32)
+    shared.eliminate_zeros()
+    return np.asarray(connected_components(shared, directed=False)[1])

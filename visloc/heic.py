@@ -1,0 +1,148 @@
+"""HEIC photos: pixels as the sensor saw them, and how their container turns them.
+
+libheif decodes, through pi-heif. It turns and mirrors as the container says (ISO/IEC 23008-12,
+``irot`` and ``imir``), and ignores the orientation in EXIF, as the standard asks for. Here the
+turning is undone, so that a HEIC photo is like the JPEG of the same camera: pixels as stored, and
+an orientation in EXIF's words.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pi_heif
+from numpy.typing import NDArray
+
+# Photos within a photo (gain maps, thumbnails, depth) are not looked at.
+pi_heif.options.THUMBNAILS = False
+pi_heif.options.DEPTH_IMAGES = False
+pi_heif.options.AUX_IMAGES = False
+# A process of the service or of a build has one core.
+pi_heif.options.DECODE_THREADS = 1
+
+_MAX_BOXES = 10_000
+# EXIF's orientation by the quarter turns clockwise that it asks for, and by whether the picture is
+# mirrored left and right afterwards.
+_ORIENTATIONS = {
+    (0, False): 1,
+    (1, False): 6,
+    (2, False): 3,
+    (3, False): 8,
+    (0, True): 2,
+    (1, True): 5,
+    (2, True): 4,
+    (3, True): 7,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class HeicOutline:
+    """What the boxes of a HEIC file say, before anything is decoded.
+
+    Attributes:
+        orientation: 1 to 8, what ``irot`` and ``imir`` of the main picture do.
+        most_pixels: width times height of the largest picture in the file: also tiles, thumbnails
+            and masks of transparency, all of which a decoder may allocate.
+    """
+
+    orientation: int
+    most_pixels: int
+
+
+def heic_outline(data: bytes) -> HeicOutline:
+    """Read the boxes of a HEIC file.
+
+    Raises:
+        ValueError: when they are malformed or cut off.
+    """
+    meta = _only(data, 0, len(data), b"meta")
+    parts = {kind: (start, end) for kind, start, end in _boxes(data, meta[0] + 4, meta[1])}
+    if not parts.keys() >= {b"pitm", b"iprp"}:
+        raise ValueError("the file names no main picture or none of its properties")
+    properties = list(_boxes(data, *_only(data, *parts[b"iprp"], b"ipco")))
+    sizes = [
+        _number(data, start + 4, 4) * _number(data, start + 8, 4)
+        for kind, start, _ in properties
+        if kind == b"ispe"
+    ]
+    start = parts[b"pitm"][0]
+    main = _number(data, start + 4, 4 if data[start] else 2)
+    linked = _links(data, _only(data, *parts[b"iprp"], b"ipma")).get(main, [])
+    turns, mirrored = 0, False
+    for index in linked:
+        if not 1 <= index <= len(properties):
+            continue
+        kind, start, _ = properties[index - 1]
+        if kind == b"irot":
+            clockwise = -(_number(data, start, 1) & 3)
+            # Turning what is mirrored is mirroring what is turned the other way.
+            turns += -clockwise if mirrored else clockwise
+        elif kind == b"imir":
+            # Top and bottom is left and right, and half a turn.
+            turns += 0 if _number(data, start, 1) & 1 else 2
+            mirrored = not mirrored
+    return HeicOutline(_ORIENTATIONS[turns % 4, mirrored], max(sizes, default=0))
+
+
+def decode_heic(opened: pi_heif.HeifFile) -> NDArray[np.uint8]:
+    """Decode the main picture as its container turns it: (H, W, 3) RGB, without transparency."""
+    pixels = np.asarray(opened[opened.primary_index])
+    if pixels.dtype == np.uint16:  # grey of 10 bits, moved up to 16
+        pixels = (pixels >> 8).astype(np.uint8)
+    if pixels.ndim == 2 or pixels.shape[2] < 3:
+        grey = pixels if pixels.ndim == 2 else pixels[..., 0]
+        pixels = np.repeat(grey[..., None], 3, axis=2)
+    return np.ascontiguousarray(pixels[..., :3])
+
+
+def _only(data: bytes, start: int, end: int, wanted: bytes) -> tuple[int, int]:
+    """Return where the content of the first box of a kind starts and ends."""
+    for kind, first, last in _boxes(data, start, end):
+        if kind == wanted:
+            return first, last
+    raise ValueError(f"the file has no box {wanted.decode()}")
+
+
+def _boxes(data: bytes, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
+    """Yield kind, start and end of the content of each box (ISO/IEC 14496-12, 4.2)."""
+    for _ in range(_MAX_BOXES):
+        if start + 8 > end:
+            return
+        size, kind, head = _number(data, start, 4), data[start + 4 : start + 8], 8
+        if size == 1:
+            size, head = _number(data, start + 8, 8), 16
+        elif size == 0:
+            size = end - start
+        if size < head or start + size > end:
+            raise ValueError(f"the box at byte {start} is longer than what holds it")
+        yield kind, start + head, start + size
+        start += size
+    raise ValueError(f"the file has more than {_MAX_BOXES} boxes")
+
+
+def _links(data: bytes, box: tuple[int, int]) -> dict[int, list[int]]:
+    """Return the properties of each item, numbered from 1 (ISO/IEC 23008-12, 9.3)."""
+    start, end = box
+    wide_items, wide_links = data[start] > 0, data[start + 3] & 1
+    found: dict[int, list[int]] = {}
+    position = start + 8
+    for _ in range(min(_number(data, start + 4, 4), _MAX_BOXES)):
+        if position >= end:
+            break
+        item = _number(data, position, 4 if wide_items else 2)
+        position += 4 if wide_items else 2
+        count = _number(data, position, 1)
+        position += 1
+        size = 2 if wide_links else 1
+        numbers = [_number(data, position + size * row, size) for row in range(count)]
+        found.setdefault(item, []).extend(n & (0x7FFF if wide_links else 0x7F) for n in numbers)
+        position += size * count
+    return found
+
+
+def _number(data: bytes, start: int, size: int) -> int:
+    if start + size > len(data):
+        raise ValueError("the file is cut off")
+    return int.from_bytes(data[start : start + size])
