@@ -18,6 +18,7 @@ from mapping.capture.sources import Sources, find_sources, read_capture, study_v
 from mapping.cluster.stage_timings import Costs
 from mapping.importers import ImportedModel, write_imported
 from mapping.methods.sfm_settings import SfmSettings
+from mapping.pairing import PairSettings
 from mapping.progress import Progress
 from mapping.stages.photos import collect_photos
 from mapping.stages.work_folder import WorkFolder, exclusive
@@ -29,6 +30,8 @@ from visloc.kapture import read_dataset
 # core from its features to its place in the map, and bytes in the work folder and in memory.
 _S_PER_PHOTO, _S_PER_PHOTO_SQUARED = 3.0, 0.004
 _DISK_PER_PHOTO, _MEMORY, _MEMORY_PER_PHOTO = 5 * 2**20, 2**30, 4 * 2**20
+# Frames are chosen so that each overlaps its nearest six on either side.
+_TOP_K = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +124,12 @@ def _build_settings(
         # Neighbours in a film overlap; retrieval closes loops and joins several films.
         pairs = ("sequence", "retrieval") if _has_sequence(model) else ("retrieval",)
         # A focal length from EXIF or a container is a start, not a calibration.
-        sfm = SfmSettings(pairs=pairs, poses="estimate", refine=("intrinsics",))
+        sfm = SfmSettings(
+            pairs=pairs,
+            pairing=PairSettings(top_k=_TOP_K),
+            poses="estimate",
+            refine=("intrinsics",),
+        )
     return BuildSettings(
         dataset=dataset,
         map_id=settings.map_id,

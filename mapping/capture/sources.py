@@ -15,7 +15,7 @@ from mapping.importers.reading.photo_names import photo_size
 from mapping.methods.intrinsics import FROM_EXIF
 from mapping.progress import Progress
 from mapping.stages.work_folder import WorkFolder
-from visloc.errors import DatasetError, NotFound, refuse
+from visloc.errors import DatasetError, refuse
 from visloc.geometry import Camera
 from visloc.kapture import GnssRecord, Sensor
 from visloc.kapture.dataset import UNKNOWN_CAMERA
@@ -52,7 +52,7 @@ def find_sources(paths: Sequence[Path]) -> Sources:
     taken: set[str] = set()
     for path in paths:
         if not path.exists():
-            raise refuse("capture.source", field=str(path), kind=NotFound)
+            raise refuse("capture.source", field=str(path))
         if path.is_dir() and (path / _EXPORT).is_file():
             exports[_new_name(path.resolve().name, taken)] = path
         elif path.is_dir():
