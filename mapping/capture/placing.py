@@ -60,28 +60,28 @@ def place(
 ) -> MadeLandmarks:
     """Give landmarks their size and turn the world so that z points up.
 
-    Where positions or GPS fixed the world already, the size that the yardstick tells is only
-    compared.
+    Where the unit of the world is a metre already, by GPS or a scan, the size that the yardstick
+    tells is only compared. A world that something else fixed is not turned.
     """
     views = {photos[row].name: v for row, v in zip(made.photos.tolist(), made.views, strict=True)}
     scale = _scale(yardstick, views)
-    if made.anchor.kind != "none":
-        if scale is None or scale.metres is None:
-            return made if scale is None else replace(made, notes=(*made.notes, scale.note))
+    if made.metric:
         return replace(made, notes=(*made.notes, *_disagreement(scale, made)))
-    up = up_of_cameras(np.array([view.cam_from_world.rotation for view in made.views]))
-    turn = np.eye(3) if up is None else _turned_up(up)
     metres = 1.0 if scale is None or scale.metres is None else scale.metres
-    centers = np.array([view.cam_from_world.center for view in made.views])
-    similarity = Similarity(metres, turn, -metres * turn @ centers.mean(axis=0))
+    up = None
+    if made.anchor.kind == "none":
+        up = up_of_cameras(np.array([view.cam_from_world.rotation for view in made.views]))
+    turn = np.eye(3) if up is None else _turned_up(up)
     notes = [*made.notes]
     if scale is not None:
         notes.append(scale.note)
     if up is not None:
         notes.append("z points up as the cameras were held; it was not measured")
+    rms = made.anchor.rms
     return replace(
-        _moved(made, similarity),
-        metric=made.metric or (scale is not None and scale.metres is not None),
+        _moved(made, Similarity(metres, turn, np.zeros(3))),
+        metric=scale is not None and scale.metres is not None,
+        anchor=made.anchor.model_copy(update={"rms": None if rms is None else rms * metres}),
         settings={**made.settings, **({} if scale is None else {"scale": dict(scale.record)})},
         notes=tuple(notes),
     )
@@ -89,11 +89,12 @@ def place(
 
 def _moved(made: MadeLandmarks, similarity: Similarity) -> MadeLandmarks:
     landmarks = made.landmarks
-    points = similarity.apply(landmarks.points.astype(np.float64) + landmarks.origin)
+    origin = similarity.apply(landmarks.origin)
+    points = similarity.apply(landmarks.points.astype(np.float64) + landmarks.origin) - origin
     return replace(
         made,
         views=tuple(View(v.camera, similarity.move(v.cam_from_world)) for v in made.views),
-        landmarks=replace(landmarks, origin=np.zeros(3), points=points.astype(np.float32)),
+        landmarks=replace(landmarks, origin=origin, points=points.astype(np.float32)),
         rig_scale=None if made.rig_scale is None else made.rig_scale * similarity.scale,
     )
 
@@ -133,8 +134,12 @@ def _scale_of_markers(
     return Scale(metres, note, record)
 
 
-def _disagreement(scale: Scale, made: MadeLandmarks) -> list[str]:
-    if not made.metric or scale.metres is None or abs(scale.metres - 1.0) <= _DISAGREES:
+def _disagreement(scale: Scale | None, made: MadeLandmarks) -> list[str]:
+    if scale is None:
+        return []
+    if scale.metres is None:
+        return [scale.note]
+    if abs(scale.metres - 1.0) <= _DISAGREES:
         return []
     return [
         f"the scale by {made.anchor.kind} was kept, though what was said of lengths makes a metre "

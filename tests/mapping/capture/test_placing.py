@@ -116,3 +116,12 @@ def test_a_world_that_gps_fixed_is_kept_and_a_contradiction_told() -> None:
     contradicting = place(Yardstick(("0.jpg", "7.jpg", 2.0 * units)), photos, before)
     assert contradicting.views == before.views
     assert "2.00 m" in contradicting.notes[0]
+
+
+def test_a_scan_without_metres_gets_its_size_and_keeps_its_axes() -> None:
+    photos, before = made("dataset")
+    result = place(Yardstick(("0.jpg", "7.jpg", 2 * apart(before, 0, 7))), photos, before)
+    assert result.metric
+    assert apart(result, 2, 5) == pytest.approx(2 * apart(before, 2, 5))
+    for old, new in zip(before.views, result.views, strict=True):
+        assert np.allclose(old.cam_from_world.rotation, new.cam_from_world.rotation)
