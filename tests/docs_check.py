@@ -28,9 +28,15 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
+import cv2
 import numpy as np
 import typer
 from typer.core import TyperGroup
+
+from samples.film import film_walk
+from samples.render import render_photo
+from samples.scene import make_room
+from samples.trajectories import mapping_trajectory, stereo_rig
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (
@@ -140,6 +146,8 @@ RULES = (
     Rule(Tier.PARSED, r"", r"([A-Z]+=\S+ |[A-Z]+=\".*\" )?make ", "a target of its own"),
     Rule(Tier.PARSED, r"examples/plugin", r"", "needs it installed; tests/examples/test_plugin.py"),
     Rule(Tier.PARSED, r"map-sets", r"mapping (set|split)", _PLACES),
+    Rule(Tier.PARSED, r"mapping\.md", r"mapping capture", "the tutorial runs it"),
+    Rule(Tier.PARSED, r"your-room", r".* PHOTOS ", "minutes more; tests/mapping/capture"),
     Rule(
         Tier.PARSED,
         r"mapping\.md",
@@ -431,6 +439,18 @@ def prepare(base: Path) -> None:
         copy_renamed(base / "small" / "mapping", base / "small" / name)
     call(base, ["mapping", "build", "small/mapping", "--map", "kitchen"])
     call(base, ["mapping", "build", "small/query", "--map", "hall", "--method", "sfm"])
+    film_ten_seconds(base)
+
+
+def film_ten_seconds(folder: Path) -> None:
+    """Make ``walk.mp4``, a clip of a walk through the sample's room, and ``photo.jpg`` of it."""
+    rig = stereo_rig(320, 240)["left"]
+    # A third of the loop through the room.
+    poses = [rig.cam_from_rig @ pose for pose in mapping_trajectory(150)[:50]]
+    scene = make_room(0)
+    film_walk(folder / "walk.mp4", scene, rig.camera, poses, rate=5)
+    photo = render_photo(scene, rig.camera, poses[12], np.random.default_rng(1))
+    cv2.imwrite(str(folder / "photo.jpg"), cv2.cvtColor(photo, cv2.COLOR_RGB2BGR))
 
 
 def copy_renamed(source: Path, target: Path) -> None:
@@ -463,6 +483,8 @@ def desk_of(base: Path, page: str) -> Desk:
         links["lund_door"] = DATA / "import_samples" / "lund_door"
     for name, target in links.items():
         (folder / name).symlink_to(target)
+    for name in ("walk.mp4", "photo.jpg"):
+        shutil.copy(base / name, folder)
     recording = folder / "RECORDING"
     recording.mkdir()
     shutil.copy(folder / ".demo" / "photo.jpg", recording)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -48,12 +48,26 @@ from visloc.features.local.readymade import is_ready_made
 from visloc.kapture import Dataset
 from visloc.options import Inference
 
+Finish = Callable[[Sequence[MappingPhoto], MadeLandmarks], MadeLandmarks]
+"""A last change of landmarks, given all photos of the dataset, before they become a map."""
 
-def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None = None) -> Path:
+
+def build_map(
+    settings: BuildSettings,
+    progress: Progress,
+    costs: Costs | None = None,
+    finish: Finish | None = None,
+) -> Path:
     """Build a map and publish it, as the current version unless its own test speaks against it.
 
     If it is killed, the same call finds its finished work again. The version that was current
     before stays current until the new one is complete and verified.
+
+    Args:
+        settings: of the build.
+        progress: told the stages.
+        costs: gathers what they cost.
+        finish: changes the landmarks at the end.
 
     Returns:
         The folder of the new version; for maps at a URL, of the local copy.
@@ -68,7 +82,7 @@ def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None =
         settings = replace(settings, inference=choose_inference(settings.inference))
     check_settings(settings)
     store = open_store(settings.maps_dir, settings.cache_dir)
-    _refuse_existing_map(settings, store)
+    refuse_existing_map(settings.map_id, store, force=settings.force)
     if not is_ready_made(settings.local_features):  # raises when it cannot
         Networks(settings.weights_dir, settings.inference).extractor(settings.local_features)
     scratch = scratch_folder(settings.maps_dir, settings.cache_dir, settings.map_id)
@@ -88,7 +102,7 @@ def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None =
                 with one_thread_here():  # so that processors do not change the result
                     context = _context(settings, work, workers, progress)
                     dataset = dataset.with_pixels_from(settings.pixel_origin)
-                    folder = _Job(settings, dataset, store, scratch, context).run()
+                    folder = _Job(settings, dataset, store, scratch, context, finish).run()
             work.remove()
             shutil.rmtree(scratch, ignore_errors=True)
     except storage_errors() as error:
@@ -100,13 +114,18 @@ def build_map(settings: BuildSettings, progress: Progress, costs: Costs | None =
     return folder
 
 
-def _refuse_existing_map(settings: BuildSettings, store: MapStore) -> None:
-    versions = store.versions(settings.map_id)
+def refuse_existing_map(map_id: str, store: MapStore, *, force: bool) -> None:
+    """Refuse to build a map that exists, unless a new version is wanted.
+
+    Raises:
+        Conflict: ``map.exists``.
+    """
+    versions = store.versions(map_id)
     # A build that was killed while it published leaves versions of which none is current.
-    if versions and settings.map_id in store.ids() and not settings.force:
+    if versions and map_id in store.ids() and not force:
         raise refuse(
             "map.exists",
-            f"map {settings.map_id!r} exists (version {versions[-1]}); --force publishes "
+            f"map {map_id!r} exists (version {versions[-1]}); --force publishes "
             "a new version and keeps the old one",
             field="--map",
         )
@@ -137,6 +156,7 @@ class _Job:
     store: MapStore
     scratch: Path
     context: BuildContext
+    finish: Finish | None
 
     def run(self) -> Path:
         settings, context = self.settings, self.context
@@ -158,6 +178,8 @@ class _Job:
             for name in settings.global_features
         ]
         made = self._landmarks(photos, global_features)
+        if self.finish is not None:
+            made = self.finish(photos, made)
         placed = [photos[row] for row in made.photos]
         if settings.keep_colours and made.landmarks.colors is None:
             colours = landmark_colours(context, placed, made.landmarks)

@@ -11,6 +11,7 @@ import typer
 
 from mapping.cli.acceptance import use
 from mapping.cli.build import build, import_
+from mapping.cli.capture import capture
 from mapping.cli.datasets import calibrate_rig_command, export_features_command, pairs, sample
 from mapping.cli.display import ERR
 from mapping.cli.from_settings import from_settings
@@ -23,6 +24,7 @@ from mapping.cli.update import update
 from visloc.errors import VislocError
 
 COMMANDS: Mapping[str, Callable[..., None]] = {
+    "capture": capture,
     "build": build,
     "pairs": pairs,
     "calibrate-rig": calibrate_rig_command,

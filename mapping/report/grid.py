@@ -145,23 +145,36 @@ def probabilities_of(forecasts: Sequence[Sequence[Forecast]]) -> NDArray[np.floa
 
 
 def _up(opened: Map, viewpoints: Viewpoints) -> tuple[NDArray[np.float64], str]:
-    """Gravity's, else the direction to which the rows of the pictures are most nearly level.
+    """Gravity's, else as the cameras were held."""
+    if opened.gravity is not None:
+        return -opened.gravity, "gravity"
+    up = up_of_cameras(viewpoints.rotations)
+    # Photos in all orientations: any plan is as good.
+    return np.array([0.0, 0.0, 1.0]) if up is None else up, "cameras"
+
+
+def up_of_cameras(rotations: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """The direction (3,) to which the rows of the pictures are most nearly level.
 
     Whoever takes a photo holds it level, but looks up or down as they like: the mean of where the
     pictures have their upper edge leans. It decides which way round, and where all look one way.
     Of cameras that look straight down, and photos stored on their side, it is wrong.
+
+    Args:
+        rotations: (n, 3, 3) camera from world.
+
+    Returns:
+        A unit vector; None for photos in all orientations.
     """
-    if opened.gravity is not None:
-        return -opened.gravity, "gravity"
-    mean = -viewpoints.rotations[:, 1].mean(axis=0)
+    mean = -rotations[:, 1].mean(axis=0)
     length = float(np.linalg.norm(mean))
-    if length < _LEAST_MEAN:  # photos in all orientations: any plan is as good
-        return np.array([0.0, 0.0, 1.0]), "cameras"
+    if length < _LEAST_MEAN:
+        return None
     mean /= length
-    rows = viewpoints.rotations[:, 0]
+    rows = rotations[:, 0]
     tilts = rows.T @ rows / len(rows) + _MEAN_WEIGHT * (np.eye(3) - np.outer(mean, mean))
     up = np.linalg.eigh(tilts)[1][:, 0]
-    return np.asarray(up if up @ mean >= 0 else -up), "cameras"
+    return np.asarray(up if up @ mean >= 0 else -up)
 
 
 def _num_cells(photos: NDArray[np.float64], margin: float, side: float) -> float:

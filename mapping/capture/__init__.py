@@ -1,0 +1,1 @@
+"""`mapping capture`: from a phone's videos and photos to a published map."""

@@ -1,0 +1,158 @@
+"""What became of each photo and each second of video, how good the map is, what to film again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.capture.frames import FilmedVideo
+from mapping.capture.job import Captured
+from mapping.progress import ItemProgress
+from mapping.report.held_out import left_out_sets, localize_held_out, spread_photos
+from mapping.report.model import tolerance_of
+from mapping.report.viewpoints import Viewpoints
+from visloc.archive import Map
+
+USED, NOT_CONNECTED, BLURRED = "used", "not connected", "too blurred"
+STILL, SKIPPED = "camera did not move", "skipped: its neighbours show it"
+_STILL = 0.02  # longer sides of the picture in a second
+_MOST_TRIED = 60
+_GOOD, _USABLE = 0.9, 0.7
+# Names that a line lists.
+_NAMED = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trials:
+    """Photos of the map, each localized without itself and its nearest neighbours.
+
+    Attributes:
+        images: (t,) rows of the map's photos, in their order.
+        right: (t,) whether it came back where it was.
+    """
+
+    images: NDArray[np.int64]
+    right: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Consecutive seconds of a video, or photos of a folder, of one fate."""
+
+    source: str
+    what: str
+    fate: str
+
+
+def try_photos(opened: Map, progress: ItemProgress) -> Trials:
+    """Ask the map for some of its photos, as if they and those beside them had not been taken."""
+    viewpoints = Viewpoints.of(opened)
+    within = tolerance_of(opened, viewpoints)
+    images = spread_photos(len(opened.images), _MOST_TRIED)
+    right = []
+    for done, image in enumerate(images):
+        progress(done, len(images))
+        sets = left_out_sets(opened, viewpoints, image)[:2]
+        right.append(
+            bool(sets) and within.holds(localize_held_out(opened, viewpoints, image, sets[-1]))
+        )
+    progress(len(images), len(images))
+    return Trials(np.array(images, np.int64), np.array(right, np.bool_))
+
+
+def fates(captured: Captured, opened: Map) -> list[Stretch]:
+    """What became of each second of each video, and of each photo of each folder."""
+    placed = {image.name for image in opened.images}
+    stretches = []
+    for source, video in captured.videos.items():
+        stretches += _joined(source, _fates_of_seconds(source, video, placed))
+    films = tuple(f"{source}/" for source in captured.videos)
+    photos = [name for name in captured.photos if not name.startswith(films)]
+    for source in dict.fromkeys(name.partition("/")[0] for name in photos):
+        own = [name for name in photos if name.partition("/")[0] == source]
+        for fate, names in (
+            (USED, [name for name in own if name in placed]),
+            (NOT_CONNECTED, [name for name in own if name not in placed]),
+        ):
+            if names:
+                shown = ", ".join(name.partition("/")[2] for name in names[:_NAMED])
+                more = ", ..." if len(names) > _NAMED else ""
+                stretches.append(Stretch(source, f"{len(names)} photos: {shown}{more}", fate))
+    return stretches
+
+
+def _fates_of_seconds(source: str, video: FilmedVideo, placed: set[str]) -> list[str]:
+    motion = video.motion
+    photos = dict(zip(video.chosen.rows.tolist(), video.names, strict=True))
+    found = []
+    for second in range(int(motion.seconds[-1]) + 1):
+        rows = np.flatnonzero((motion.seconds >= second) & (motion.seconds < second + 1))
+        names = [photos[row] for row in rows.tolist() if row in photos]
+        if any(f"{source}/{name}" in placed for name in names):
+            found.append(USED)
+        elif len(rows) and video.chosen.blurred[rows].all():
+            found.append(BLURRED)
+        elif names:
+            found.append(NOT_CONNECTED)
+        elif len(rows) == 0 or np.ptp(motion.path[rows]) < _STILL:
+            found.append(STILL)
+        else:
+            found.append(SKIPPED)
+    return found
+
+
+def _joined(source: str, by_second: Sequence[str]) -> list[Stretch]:
+    stretches, start = [], 0
+    for end in range(1, len(by_second) + 1):
+        if end == len(by_second) or by_second[end] != by_second[start]:
+            stretches.append(Stretch(source, f"second {start} to {end}", by_second[start]))
+            start = end
+    return stretches
+
+
+def verdict(trials: Trials, captured: Captured, opened: Map) -> str:
+    """How good the map is, in a sentence or two for everybody."""
+    share = float(trials.right.mean()) if len(trials.right) else 0.0
+    grade = "good" if share >= _GOOD else ("usable" if share >= _USABLE else "poor")
+    if len(opened.images) < len(captured.photos) / 2:
+        grade = "poor"
+    size = (
+        "its unit is a metre"
+        if opened.manifest.world.metric
+        else "its size is not known: give --scale or --marker-size, or photos with GPS"
+    )
+    return (
+        f"the map is {grade}: {len(opened.images)} of {len(captured.photos)} photos are in it, and "
+        f"{int(trials.right.sum())} of {len(trials.right)} photos that were tried came back where "
+        f"they were taken, without themselves and those beside them; {size}"
+    )
+
+
+def film_again(trials: Trials, stretches: Sequence[Stretch], opened: Map) -> list[str]:
+    """What to film again, and how."""
+    advice = {
+        NOT_CONNECTED: "was not connected to the rest: film it again, beginning and ending where "
+        "the map is good",
+        BLURRED: "was too blurred: film it again, slower or with more light",
+    }
+    lines = [f"{s.source}, {s.what}: {advice[s.fate]}" for s in stretches if s.fate in advice]
+    names = [opened.images[image].name for image in trials.images.tolist()]
+    return lines + [
+        f"around {first if first == last else f'{first} to {last}'}: photos there do not "
+        "come back; film it again from more places, both ways"
+        for first, last in _runs(names, trials.right.tolist())
+    ]
+
+
+def _runs(names: Sequence[str], right: Sequence[bool]) -> Iterable[tuple[str, str]]:
+    """First and last names of runs of photos that did not come back."""
+    start: int | None = None
+    for place, holds in enumerate([*right, True]):
+        if not holds and start is None:
+            start = place
+        elif holds and start is not None:
+            yield names[start], names[place - 1]
+            start = None

@@ -1,0 +1,224 @@
+"""From videos, photos and exports to a published map: existing stages, one after another."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from mapping.build.build import build_map, refuse_existing_map
+from mapping.build.settings import BuildSettings
+from mapping.capture.frames import FilmedVideo, photo_name
+from mapping.capture.markers import find_markers, grey_photos
+from mapping.capture.placing import Yardstick, place
+from mapping.capture.settings import CaptureSettings, KnownLength
+from mapping.capture.sources import Sources, find_sources, read_capture, study_videos
+from mapping.cluster.stage_timings import Costs
+from mapping.importers import ImportedModel, write_imported
+from mapping.methods.sfm_settings import SfmSettings
+from mapping.pairing import PairSettings
+from mapping.progress import Progress
+from mapping.stages.photos import collect_photos
+from mapping.stages.work_folder import WorkFolder, exclusive
+from visloc.archive import MapStore
+from visloc.errors import refuse
+from visloc.kapture import read_dataset
+
+# Measured on two cores with 640 x 480 and 1280 x 720 (docs/mapping.md): seconds of a photo on one
+# core from its features to its place in the map, and bytes in the work folder and in memory.
+_S_PER_PHOTO, _S_PER_PHOTO_SQUARED = 3.0, 0.004
+_DISK_PER_PHOTO, _MEMORY, _MEMORY_PER_PHOTO = 5 * 2**20, 2**30, 4 * 2**20
+# Frames are chosen so that each overlaps its nearest six on either side.
+_TOP_K = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Outlook:
+    """What a capture will take, told before the long work.
+
+    Attributes:
+        photos: that will be matched.
+        minutes: an estimate.
+        memory_bytes: an estimate of the peak.
+        disk_bytes: an estimate of the work folder, which is removed at the end.
+        free_bytes: of the disk.
+    """
+
+    photos: int
+    minutes: float
+    memory_bytes: int
+    disk_bytes: int
+    free_bytes: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Captured:
+    """A capture that became a map.
+
+    Attributes:
+        folder: of the new version.
+        videos: by the name that their photos have in the map.
+        photos: names of all photos that were tried.
+        notes: on what was left out of the sources or assumed.
+    """
+
+    folder: Path
+    videos: Mapping[str, FilmedVideo]
+    photos: Sequence[str]
+    notes: Sequence[str]
+
+
+def capture_map(
+    settings: CaptureSettings,
+    progress: Progress,
+    announce: Callable[[Outlook], None],
+    costs: Costs | None = None,
+) -> Captured:
+    """Make a map of videos, photos and exports, and publish it.
+
+    If it is killed, the same call finds its finished work again.
+
+    Args:
+        announce: told before the long work.
+
+    Raises:
+        Conflict: ``map.exists`` without ``force``; ``build.running``.
+        InvalidInput: ``capture.*`` for sources and lengths that cannot be used; what importers and
+            builds raise.
+    """
+    length, marker_m = settings.known_length, settings.marker_m
+    if length is not None and marker_m is not None:
+        raise refuse("capture.two_scales", field="--marker-size")
+    refuse_existing_map(settings.map_id, MapStore(settings.maps_dir), force=settings.force)
+    sources = find_sources(settings.sources)
+    # Ids begin with a letter or digit: no work folder of a build has this name.
+    root = settings.maps_dir / ".work" / f".capture-{settings.map_id}"
+    with exclusive(root.with_name(f"{root.name}.lock")):
+        wanted = _wanted_seconds(length, sources)
+        studied = study_videos(sources, WorkFolder(root), settings.photos, wanted, progress)
+        model = read_capture(sources, studied, root, progress)
+        names = tuple(image.name for image in model.images)
+        yardstick = Yardstick(_resolved(length, sources, studied, names), marker_m=marker_m)
+        announce(_outlook(len(names), settings.workers, root))
+        dataset = root / "dataset"
+        shutil.rmtree(dataset, ignore_errors=True)  # of a capture that was killed
+        notes = write_imported(model, dataset)
+        if marker_m is not None:
+            yardstick = _with_markers(dataset, marker_m, progress)
+        folder = build_map(
+            _build_settings(settings, model, dataset), progress, costs, partial(place, yardstick)
+        )
+        shutil.rmtree(root, ignore_errors=True)
+    return Captured(folder, studied, names, notes)
+
+
+def _build_settings(
+    settings: CaptureSettings, model: ImportedModel, dataset: Path
+) -> BuildSettings:
+    method, sfm, metric = "sfm", SfmSettings(), model.metric
+    if all(image.cam_from_world is not None for image in model.images):
+        method = "rgbd" if any(image.depth is not None for image in model.images) else "sfm"
+    else:
+        # Neighbours in a film overlap; retrieval closes loops and joins several films.
+        pairs = ("sequence", "retrieval") if _has_sequence(model) else ("retrieval",)
+        # A focal length from EXIF or a container is a start, not a calibration.
+        sfm = SfmSettings(
+            pairs=pairs,
+            pairing=PairSettings(top_k=_TOP_K),
+            poses="estimate",
+            refine=("intrinsics",),
+        )
+    return BuildSettings(
+        dataset=dataset,
+        map_id=settings.map_id,
+        maps_dir=settings.maps_dir,
+        method=method,
+        local_features=settings.local_features,
+        global_features=settings.global_features,
+        weights_dir=settings.weights_dir,
+        max_keypoints=settings.max_keypoints,
+        metric=metric,
+        sfm=sfm,
+        workers=settings.workers,
+        force=settings.force,
+    )
+
+
+def _has_sequence(model: ImportedModel) -> bool:
+    """Whether some camera took two photos."""
+    sensors = [image.sensor for image in model.images]
+    return len(set(sensors)) < len(sensors)
+
+
+def _wanted_seconds(length: KnownLength | None, sources: Sources) -> dict[str, list[float]]:
+    """Seconds of videos whose frames ``--scale`` names, by the video's name."""
+    wanted: dict[str, list[float]] = {}
+    for text in () if length is None else length.photos:
+        if (found := _moment(text, sources)) is not None:
+            wanted.setdefault(found[0], []).append(found[1])
+    return wanted
+
+
+def _moment(text: str, sources: Sources) -> tuple[str, float] | None:
+    """The video's name and the seconds of ``VIDEO@SECONDS``; None for another text."""
+    video, at, seconds = text.rpartition("@")
+    names = [n for n, path in sources.videos.items() if video in (n, path.name, str(path))]
+    try:
+        return (names[0], float(seconds)) if at and len(names) == 1 else None
+    except ValueError:
+        return None
+
+
+def _resolved(
+    length: KnownLength | None,
+    sources: Sources,
+    videos: Mapping[str, FilmedVideo],
+    names: Sequence[str],
+) -> tuple[str, str, float] | None:
+    """The photos that ``--scale`` names.
+
+    Raises:
+        InvalidInput: ``capture.photo``.
+    """
+    if length is None:
+        return None
+    found = []
+    for text in length.photos:
+        if (moment := _moment(text, sources)) is not None:
+            name, second = moment
+            times = videos[name].motion.seconds[videos[name].chosen.rows]
+            found.append(f"{name}/{photo_name(float(times[abs(times - second).argmin()]))}")
+            continue
+        ends = [one for one in names if one == text or one.endswith(f"/{text}")]
+        if len(ends) != 1:
+            raise refuse("capture.photo", field="--scale", got=f"{text}: {len(ends)} photos")
+        found.append(ends[0])
+    return found[0], found[1], length.metres
+
+
+def _with_markers(dataset: Path, marker_m: float, progress: Progress) -> Yardstick:
+    """Look for markers before the long work.
+
+    Raises:
+        InvalidInput: ``capture.no_markers``.
+    """
+    photos, _ = collect_photos(
+        read_dataset(dataset), posed=False, progress=partial(progress, "photos")
+    )
+    sightings = find_markers(grey_photos(photos), len(photos), partial(progress, "markers"))
+    if not sightings:
+        raise refuse("capture.no_markers", field="--marker-size")
+    return Yardstick(sightings=sightings, marker_m=marker_m)
+
+
+def _outlook(photos: int, workers: int, folder: Path) -> Outlook:
+    seconds = photos * _S_PER_PHOTO / workers + photos**2 * _S_PER_PHOTO_SQUARED
+    return Outlook(
+        photos=photos,
+        minutes=seconds / 60.0,
+        memory_bytes=_MEMORY + photos * _MEMORY_PER_PHOTO,
+        disk_bytes=photos * _DISK_PER_PHOTO,
+        free_bytes=shutil.disk_usage(folder).free,
+    )

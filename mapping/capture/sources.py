@@ -1,0 +1,228 @@
+"""Videos, folders of photos and exports of scanning apps as one dataset."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from mapping.capture.frames import FilmedVideo, study_video, write_photos
+from mapping.capture.video import SUFFIXES, is_video
+from mapping.importers import ImportedImage, ImportedModel, read_model
+from mapping.importers.reading.photo_names import photo_size
+from mapping.methods.intrinsics import FROM_EXIF
+from mapping.progress import Progress
+from mapping.stages.work_folder import WorkFolder
+from visloc.errors import DatasetError, refuse
+from visloc.geometry import Camera
+from visloc.kapture import GnssRecord, Sensor
+from visloc.kapture.dataset import UNKNOWN_CAMERA
+
+_EXPORT = "transforms.json"
+_GNSS = "gnss"
+
+
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """What was named, by kind; each by the name that its photos have in the map.
+
+    Attributes:
+        videos: files.
+        folders: of photos.
+        exports: folders or files of nerfstudio's format.
+    """
+
+    videos: Mapping[str, Path]
+    folders: Mapping[str, Path]
+    exports: Mapping[str, Path]
+
+
+def find_sources(paths: Sequence[Path]) -> Sources:
+    """Tell videos, folders of photos, and exports apart; videos in folders count too.
+
+    Raises:
+        NotFound: ``capture.source`` for what is not there.
+        InvalidInput: ``capture.video`` for a file that is neither a video nor an export.
+    """
+    videos: dict[str, Path] = {}
+    folders: dict[str, Path] = {}
+    exports: dict[str, Path] = {}
+    taken: set[str] = set()
+    for path in paths:
+        if not path.exists():
+            raise refuse("capture.source", field=str(path))
+        if path.is_dir() and (path / _EXPORT).is_file():
+            exports[_new_name(path.resolve().name, taken)] = path
+        elif path.is_dir():
+            folders[_new_name(path.resolve().name, taken)] = path
+            for file in sorted(path.iterdir()):
+                if file.suffix.lower() in SUFFIXES and _is_plain(file) and is_video(file):
+                    videos[_new_name(file.stem, taken)] = file
+        elif path.suffix.lower() == ".json":
+            exports[_new_name(path.resolve().parent.name, taken)] = path
+        elif path.is_file() and is_video(path):
+            videos[_new_name(path.stem, taken)] = path
+        else:
+            raise refuse("capture.video", field=str(path), got="another kind of file")
+    return Sources(videos, folders, exports)
+
+
+def study_videos(
+    sources: Sources,
+    work: WorkFolder,
+    most: int,
+    wanted: Mapping[str, Sequence[float]],
+    progress: Progress,
+) -> dict[str, FilmedVideo]:
+    """Look through all videos, and choose frames.
+
+    Args:
+        most: frames of each video.
+        wanted: seconds by name of the video whose frames are taken in any case.
+
+    Raises:
+        InvalidInput, TooLarge: as ``study_video``.
+    """
+    return {
+        name: study_video(
+            path, work, most, wanted.get(name, ()), partial(progress, f"look through {name}")
+        )
+        for name, path in sources.videos.items()
+    }
+
+
+def read_capture(
+    sources: Sources, videos: Mapping[str, FilmedVideo], work: Path, progress: Progress
+) -> ImportedModel:
+    """Write the frames of videos, and join all sources into one model with one folder of photos.
+
+    Args:
+        videos: by name, as ``sources.videos``.
+        work: a folder; ``photos`` in it is made anew.
+
+    Raises:
+        InvalidInput, DatasetError: what importers raise.
+    """
+    photos = work / "photos"
+    shutil.rmtree(photos, ignore_errors=True)  # links only
+    photos.mkdir(parents=True)
+    parts: dict[str, ImportedModel] = {}
+    for name, video in videos.items():
+        folder = work / "frames" / video.sha256[:32]
+        write_photos(video, folder, partial(progress, f"frames of {name}"))
+        parts[name] = _video_model(video, folder)
+    for name, path in sources.folders.items():
+        if (model := _read_folder(path, progress, has_videos=bool(videos))) is not None:
+            parts[name] = model
+    for name, path in sources.exports.items():
+        parts[name] = read_model("nerfstudio", path, None, progress)
+    for name, model in parts.items():
+        assert model.photos is not None
+        (photos / name).symlink_to(model.photos.resolve())
+    return _joined(parts, photos)
+
+
+def _read_folder(path: Path, progress: Progress, *, has_videos: bool) -> ImportedModel | None:
+    try:
+        model = read_model("images", path, None, progress)
+    except DatasetError as error:
+        if error.code == "import.empty" and has_videos:
+            return None  # a folder of videos
+        raise
+    left_out = {}
+    for reason, names in model.left_out.items():
+        others = [n for n in names if "/" in n or not n.lower().endswith(SUFFIXES)]
+        if others:
+            left_out[reason] = others
+    return replace(model, left_out=left_out)
+
+
+def _video_model(video: FilmedVideo, folder: Path) -> ImportedModel:
+    size = photo_size(folder / video.names[0])  # upright, unlike the video's
+    assert size is not None  # it was written here
+    width, height = size
+    focal = video.facts.focal_length_px
+    if focal is None:
+        params = (UNKNOWN_CAMERA, str(width), str(height))
+        sensor = Sensor("camera", video.facts.device, "camera", params, None)
+    else:
+        camera = Camera("SIMPLE_RADIAL", width, height, (focal, width / 2, height / 2, 0.0))
+        name = f"{video.facts.device} {FROM_EXIF}".lstrip()
+        sensor = Sensor.with_camera("camera", camera, name=name)
+    images = tuple(ImportedImage(name, "camera", i, None) for i, name in enumerate(video.names))
+    return ImportedModel({"camera": sensor}, images, folder, notes=_notes_on_place(video))
+
+
+def _notes_on_place(video: FilmedVideo) -> tuple[str, ...]:
+    if video.facts.position is None:
+        return ()
+    latitude, longitude, _ = video.facts.position
+    return (
+        f"{video.path.name} says where it began ({latitude:.5f}, {longitude:.5f}); one position "
+        "does not tell how the map lies on Earth",
+    )
+
+
+def _joined(parts: Mapping[str, ImportedModel], photos: Path) -> ImportedModel:
+    """Join models: names below the part's, sensors with its name, timestamps one after another."""
+    sensors: dict[str, Sensor] = {}
+    images: list[ImportedImage] = []
+    gnss: list[GnssRecord] = []
+    left_out: dict[str, list[str]] = {}
+    notes: list[str] = []
+    start, posed = 0, ""
+    for name, model in parts.items():
+        for sensor in model.sensors.values():
+            new_id = _GNSS if sensor.kind == "gnss" else f"{name}-{sensor.id}"
+            sensors[new_id] = replace(sensor, id=new_id)
+        has_poses = any(image.cam_from_world is not None for image in model.images)
+        if has_poses and posed:
+            notes.append(f"the poses of {name} are in another frame than those of {posed}: unused")
+        keeps = has_poses and not posed
+        posed = name if keeps else posed
+        images += [
+            replace(
+                image,
+                name=f"{name}/{image.name}",
+                sensor=f"{name}-{image.sensor}",
+                timestamp=image.timestamp + start,
+                cam_from_world=image.cam_from_world if keeps else None,
+                depth=None if image.depth is None else f"{name}/{image.depth}",
+            )
+            for image in model.images
+        ]
+        gnss += [
+            replace(fix, timestamp=fix.timestamp + start, sensor_id=_GNSS) for fix in model.gnss
+        ]
+        left_out |= {
+            reason: [*left_out.get(reason, ()), *(f"{name}/{one}" for one in names)]
+            for reason, names in model.left_out.items()
+        }
+        notes += model.notes
+        start += max(image.timestamp for image in model.images) + 1
+    metric = bool(posed) and parts[posed].metric
+    return ImportedModel(
+        sensors,
+        tuple(images),
+        photos,
+        gnss=tuple(gnss),
+        metric=metric,
+        notes=tuple(notes),
+        left_out=left_out,
+    )
+
+
+def _is_plain(path: Path) -> bool:
+    return path.is_file() and not path.is_symlink() and not path.name.startswith(".")
+
+
+def _new_name(name: str, taken: set[str]) -> str:
+    """A name that is not taken, of letters that names of photos and sensors may have."""
+    clean = "".join(c if c.isalnum() or c in "-_." else "_" for c in name).strip(".") or "source"
+    new, number = clean, 2
+    while new.lower() in taken:
+        new, number = f"{clean}-{number}", number + 1
+    taken.add(new.lower())
+    return new

@@ -1,0 +1,236 @@
+"""Videos, safely: frames one after the other, upright, with what the container tells of the camera.
+
+Files are hostile. The demuxer is chosen by the first bytes and reads from an open file, so that no
+playlist or reference leads elsewhere; sizes are refused before a frame is decoded; frames are
+counted. At most a few decoded frames are in memory at a time.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import numpy as np
+from av.container import InputContainer
+from av.error import FFmpegError
+from av.video.stream import VideoStream
+from numpy.typing import NDArray
+
+from mapping.capture.tone import is_high_range, to_standard_range
+from visloc.errors import VislocError, refuse
+from visloc.file_kinds import HEAD_BYTES, file_kind
+from visloc.images import ImageLimits
+
+SUFFIXES = (".mp4", ".m4v", ".mov", ".webm", ".mkv")
+# Demuxers by kind of file (visloc.file_kinds).
+_DEMUXERS = {"MP4": "mov", "MOV": "mov", "Matroska or WebM": "matroska"}
+_MAX_PIXELS = ImageLimits().max_pixels
+_MIN_SIDE = 64
+# More than an hour at 60 frames a second: of one place, nobody films as long.
+_MAX_FRAMES, _MAX_SECONDS = 250_000, 4 * 3600.0
+# Damaged packets are passed over up to this number in a row.
+_MAX_DAMAGED = 300
+_ISO6709 = re.compile(r"([+-]\d{2}(?:\.\d+)?)([+-]\d{3}(?:\.\d+)?)([+-]\d+(?:\.\d+)?)?")
+# CIPA DCG-001, as visloc.images: the 35 mm equivalent compares diagonals.
+_DIAGONAL_35MM = math.hypot(36.0, 24.0)
+# Of the longer side, as for EXIF: what lies outside was written by mistake.
+_PLAUSIBLE_FOCAL = (0.25, 50.0)
+_APPLE = "com.apple.quicktime."
+_MAKE, _MODEL = (
+    (f"{_APPLE}make", "make", "com.android.manufacturer"),
+    (
+        f"{_APPLE}model",
+        "model",
+        "com.android.model",
+    ),
+)
+_PLACE = (f"{_APPLE}location.ISO6709", "location", "location-eng")
+_FOCAL_35MM = (f"{_APPLE}camera.focal_length.35mm_equivalent",)
+
+
+@dataclass(frozen=True, slots=True)
+class VideoFacts:
+    """What a container tells of its video before a frame is decoded.
+
+    Attributes:
+        width: of the stored pixels, before they are turned upright.
+        height: of the stored pixels.
+        seconds: as the container says; 0 when it does not.
+        device: make and model; may be empty.
+        focal_length_px: None when the container does not tell it, as most do not.
+        position: latitude, longitude (degrees) and altitude (m, None when unknown); None without.
+    """
+
+    width: int
+    height: int
+    seconds: float
+    device: str
+    focal_length_px: float | None
+    position: tuple[float, float, float | None] | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One frame.
+
+    Attributes:
+        seconds: its presentation time, counted from the video's first frame.
+        decoded: the pixels as stored.
+    """
+
+    seconds: float
+    decoded: av.VideoFrame
+
+    @property
+    def quarter_turns(self) -> int:
+        """How many quarter turns to the left make it upright, by the container's matrix.
+
+        Mirroring is left out: a mirrored picture has no camera.
+        """
+        return round(self.decoded.rotation / 90.0) % 4
+
+    def grey(self, longer_side: int) -> NDArray[np.uint8]:
+        """(h, w) as stored, scaled so that its longer side is at most so long."""
+        width, height = self.decoded.width, self.decoded.height
+        scale = min(1.0, longer_side / max(width, height))
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        small = self.decoded.reformat(*size, format="gray8", interpolation="AREA")
+        return np.asarray(small.to_ndarray(), dtype=np.uint8)
+
+    def upright_rgb(self) -> NDArray[np.uint8]:
+        """(H, W, 3) upright; HDR as a standard picture."""
+        if is_high_range(self.decoded):
+            rgb = to_standard_range(self.decoded)
+        else:
+            rgb = np.asarray(self.decoded.to_ndarray(format="rgb24"), dtype=np.uint8)
+        return np.ascontiguousarray(np.rot90(rgb, self.quarter_turns))
+
+
+def is_video(path: Path) -> bool:
+    """Tell a video that is read here by its first bytes."""
+    try:
+        with path.open("rb") as file:
+            kind = file_kind(file.read(HEAD_BYTES))
+    except OSError:
+        return False
+    return kind is not None and kind.name in _DEMUXERS
+
+
+def video_facts(path: Path) -> VideoFacts:
+    """Read what the container tells.
+
+    Raises:
+        InvalidInput, TooLarge: as ``frames_of``.
+    """
+    with _opened(path) as (container, stream):
+        tags = {**container.metadata, **stream.metadata}
+        width, height = stream.codec_context.width, stream.codec_context.height
+        return VideoFacts(
+            width=width,
+            height=height,
+            seconds=max(0.0, (container.duration or 0) / av.time_base),
+            device=" ".join(filter(None, (_text(tags, _MAKE), _text(tags, _MODEL)))),
+            focal_length_px=_focal_length_px(_text(tags, _FOCAL_35MM), width, height),
+            position=_position(_text(tags, _PLACE)),
+        )
+
+
+def frames_of(path: Path) -> Iterator[Frame]:
+    """Decode a video's frames in the order in which they are shown.
+
+    Frames without a time or not later than the one before, and damaged ones, are passed over.
+
+    Raises:
+        InvalidInput: ``capture.video`` for what is no video or has no video track, or is damaged
+            throughout.
+        TooLarge: ``capture.video_size``, ``capture.video_length``.
+    """
+    first, last, count, damaged = None, -math.inf, 0, 0
+    with _opened(path) as (container, stream):
+        size = stream.codec_context.width, stream.codec_context.height
+        for packet in container.demux(stream):
+            try:
+                decoded = packet.decode()
+            except FFmpegError as error:
+                damaged += 1
+                if damaged > _MAX_DAMAGED:
+                    raise _unreadable(path, error) from error
+                continue
+            damaged = 0
+            for frame in decoded:
+                count += 1
+                time = frame.time
+                if time is None or time <= last or (frame.width, frame.height) != size:
+                    continue
+                first = time if first is None else first
+                last = time
+                if count > _MAX_FRAMES or time - first > _MAX_SECONDS:
+                    raise refuse("capture.video_length", field=str(path), got="more")
+                yield Frame(time - first, frame)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
+    with path.open("rb") as file:
+        kind = file_kind(file.read(HEAD_BYTES))
+        file.seek(0)
+        demuxer = None if kind is None else _DEMUXERS.get(kind.name)
+        if demuxer is None:
+            raise refuse("capture.video", field=str(path), got=kind.name if kind else "other bytes")
+        try:
+            container = av.open(file, "r", format=demuxer)
+        except (FFmpegError, ValueError, UnicodeError) as error:
+            raise _unreadable(path, error) from error
+        with container:
+            if not container.streams.video:
+                raise refuse("capture.video", field=str(path), got="no video track")
+            stream = container.streams.video[0]
+            _check_size(path, stream)
+            stream.thread_type = "AUTO"
+            try:
+                yield container, stream
+            except FFmpegError as error:
+                raise _unreadable(path, error) from error
+
+
+def _check_size(path: Path, stream: VideoStream) -> None:
+    context = stream.codec_context
+    if min(context.width, context.height) < _MIN_SIDE:
+        raise refuse("capture.video", field=str(path), got=f"{context.width} x {context.height}")
+    if context.width * context.height > _MAX_PIXELS:
+        raise refuse("capture.video_size", field=str(path), got=f"{context.width}x{context.height}")
+    # A frame may claim another size than its track; the decoder then refuses it.
+    context.options = {"max_pixels": str(_MAX_PIXELS)}
+
+
+def _unreadable(path: Path, error: Exception) -> VislocError:
+    return refuse("capture.video", field=str(path), got=str(error) or type(error).__name__)
+
+
+def _text(tags: dict[str, str], names: tuple[str, ...]) -> str:
+    found = next((tags[name] for name in names if tags.get(name)), "")
+    return " ".join(found.replace(",", " ").split()) if found.isprintable() else ""
+
+
+def _focal_length_px(text: str, width: int, height: int) -> float | None:
+    try:
+        focal = float(text) * math.hypot(width, height) / _DIAGONAL_35MM
+    except ValueError:
+        return None
+    low, high = (share * max(width, height) for share in _PLAUSIBLE_FOCAL)
+    return focal if low <= focal <= high else None  # False for NaN
+
+
+def _position(text: str) -> tuple[float, float, float | None] | None:
+    found = _ISO6709.match(text)
+    if found is None:
+        return None
+    latitude, longitude = float(found[1]), float(found[2])
+    if abs(latitude) > 90 or abs(longitude) > 180 or (latitude, longitude) == (0.0, 0.0):
+        return None
+    return latitude, longitude, None if found[3] is None else float(found[3])

@@ -1,0 +1,73 @@
+"""The command ``mapping capture``."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from mapping.capture.account import Trials, fates, film_again, try_photos, verdict
+from mapping.capture.job import Captured, Outlook, capture_map
+from mapping.capture.picture import draw_walk
+from mapping.capture.settings import CaptureSettings
+from mapping.cli.display import ERR, OUT, print_costs, print_map, say, say_notes, say_peak_memory
+from mapping.cli.progress import StageProgress
+from mapping.cluster.stage_timings import Costs
+from visloc.archive import Map, open_map
+
+
+def capture(
+    settings: CaptureSettings,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            help="PNG of the walk from above; an existing file is replaced. Default: "
+            "ID-capture.png here.",
+        ),
+    ] = None,
+) -> None:
+    """Make a map of videos, photos or scans of one place.
+
+    Tells beforehand how long it takes. Tells afterwards what became of each second and photo, how
+    good the map is, and what to film again. Killed, the same command resumes.
+    """
+    costs = Costs()
+    with StageProgress(ERR) as progress:
+        captured = capture_map(settings, progress, _announce, costs)
+        opened = open_map(captured.folder)
+        trials = try_photos(opened, partial(progress, "trying the map"))
+    picture = Path(f"{settings.map_id}-capture.png") if output is None else output
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    draw_walk(opened, trials, picture)
+    print_map(opened)
+    print_costs(OUT, costs.table())
+    say_peak_memory()
+    say_notes(captured.notes)
+    _print_account(captured, opened, trials)
+    say(f"picture: {picture}")
+
+
+def _announce(outlook: Outlook) -> None:
+    say(
+        f"{outlook.photos} photos to match: about {max(1, round(outlook.minutes))} minutes, "
+        f"{outlook.memory_bytes / 2**30:.1f} GiB of memory, {outlook.disk_bytes / 2**30:.1f} GiB "
+        f"of disk for the time being ({outlook.free_bytes / 2**30:.0f} GiB are free)"
+    )
+
+
+def _print_account(captured: Captured, opened: Map, trials: Trials) -> None:
+    stretches = fates(captured, opened)
+    table = Table(box=None)
+    for name in ("source", "part", "what became of it"):
+        table.add_column(name)
+    for stretch in stretches:
+        table.add_row(*(escape(text) for text in (stretch.source, stretch.what, stretch.fate)))
+    OUT.print(table)
+    say(verdict(trials, captured, opened))
+    for line in film_again(trials, stretches, opened):
+        say(f"film again: {line}")

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mapping.capture.account import Trials, fates, film_again, try_photos, verdict
+from mapping.capture.choosing import ChosenFrames
+from mapping.capture.frames import FilmedVideo
+from mapping.capture.job import Captured
+from mapping.capture.motion import Motion
+from mapping.capture.picture import draw_walk
+from mapping.capture.video import VideoFacts
+
+
+class _Image:
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+
+class _Opened:
+    """The parts of a map that an account asks for."""
+
+    def __init__(self, names: list[str]) -> None:
+        self.images = [_Image(name) for name in names]
+
+
+def captured() -> Captured:
+    """Ten seconds at 2 frames a second: used, still, blurred, not connected."""
+    seconds = np.arange(20) / 2
+    path = np.where(seconds < 4, seconds / 10, np.where(seconds < 6, 0.4, seconds / 10 - 0.2))
+    blurred = (seconds >= 6) & (seconds < 8)
+    rows = np.array([0, 2, 4, 6, 16, 18])
+    facts = VideoFacts(640, 480, 10.0, "", None, None)
+    video = FilmedVideo(
+        Path("walk.mp4"), "", facts, Motion(seconds, np.ones(20), path), ChosenFrames(rows, blurred)
+    )
+    return Captured(
+        Path("map"), {"walk": video}, [*(f"walk/{n}" for n in video.names), "photos/a.jpg"], ()
+    )
+
+
+def test_every_second_has_a_fate() -> None:
+    names = [f"walk/0000{i}.000s.jpg" for i in range(4)]
+    opened: Any = _Opened([*names, "photos/a.jpg"])
+    assert [(s.source, s.what, s.fate) for s in fates(captured(), opened)] == [
+        ("walk", "second 0 to 4", "used"),
+        ("walk", "second 4 to 6", "camera did not move"),
+        ("walk", "second 6 to 8", "too blurred"),
+        ("walk", "second 8 to 10", "not connected"),
+        ("photos", "1 photos: a.jpg", "used"),
+    ]
+
+
+def test_what_to_film_again() -> None:
+    opened: Any = _Opened([f"{i}.jpg" for i in range(6)])
+    trials = Trials(np.arange(6), np.array([True, False, False, True, True, False]))
+    lines = film_again(trials, fates(captured(), opened), opened)
+    assert any("second 6 to 8: was too blurred" in line for line in lines)
+    assert any("second 8 to 10: was not connected" in line for line in lines)
+    assert any("1.jpg to 2.jpg" in line for line in lines)
+    assert any("around 5.jpg:" in line for line in lines)
+
+
+def test_a_map_of_the_sample_is_judged_and_drawn(build_sample: Any, tmp_path: Path) -> None:
+    opened = build_sample()
+    trials = try_photos(opened, lambda *_: None)
+    # Of eight photos around a room, those with good neighbours come back, and others do not.
+    assert len(trials.images) == len(opened.images)
+    assert 0 < trials.right.sum() < len(trials.right)
+    names = [image.name for image in opened.images]
+    text = verdict(trials, Captured(opened.path, {}, names, ()), opened)
+    assert f"{len(names)} of {len(names)} photos are in it" in text
+    assert f"{trials.right.sum()} of {len(names)} photos that were tried came back" in text
+    assert "its unit is a metre" in text
+    target = tmp_path / "walk.png"
+    draw_walk(opened, trials, target)
+    picture = cv2.imread(str(target))
+    assert picture is not None
+    for colour in ((115, 158, 0), (0, 94, 213)):
+        assert (picture[:1000] == colour).all(axis=2).sum() > 100
+
+
+def test_a_map_that_lost_most_photos_is_poor() -> None:
+    opened: Any = _Opened(["a.jpg"])
+    opened.manifest = SimpleNamespace(world=SimpleNamespace(metric=False))
+    trials = Trials(np.array([0]), np.array([True]))
+    text = verdict(trials, Captured(Path("map"), {}, ["a.jpg", "b.jpg", "c.jpg"], ()), opened)
+    assert "the map is poor: 1 of 3 photos" in text
+    assert "its size is not known" in text

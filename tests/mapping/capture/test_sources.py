@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mapping.capture.frames import study_video, write_photos
+from mapping.capture.sources import find_sources, read_capture, study_videos
+from mapping.importers import write_imported
+from mapping.stages.work_folder import WorkFolder
+from tests.mapping.capture.conftest import panned
+from visloc.errors import InvalidInput, NotFound
+from visloc.kapture import read_dataset
+
+MakeVideo = Callable[..., Path]
+
+
+def quiet(*_: object) -> None:
+    pass
+
+
+def save_photos(folder: Path, count: int = 3) -> Path:
+    folder.mkdir(parents=True)
+    for i in range(count):
+        Image.new("RGB", (320, 240), (i, 90, 40)).save(folder / f"{i}.jpg")
+    return folder
+
+
+def test_videos_and_folders_become_one_dataset(make_video: MakeVideo, tmp_path: Path) -> None:
+    film = make_video(panned(20, step=8), "walk.mp4")
+    folder = save_photos(tmp_path / "photos of the hall")
+    shutil.copy(film, folder / "second.mp4")
+    sources = find_sources([film, folder])
+    assert set(sources.videos) == {"walk", "second"}
+    work = tmp_path / "work"
+    videos = study_videos(sources, WorkFolder(work), 10, {}, quiet)
+    model = read_capture(sources, videos, work, quiet)
+    write_imported(model, tmp_path / "dataset")
+    dataset = read_dataset(tmp_path / "dataset")
+    assert {r.path.split("/")[0] for r in dataset.images} == {
+        "walk", "second", "photos_of_the_hall",
+    }  # fmt: skip
+    assert all(dataset.has_file(record) for record in dataset.images)
+    # One camera for each video and each kind of photos; no time twice.
+    assert len(dataset.sensors) == 3
+    assert len({record.timestamp for record in dataset.images}) == len(dataset.images)
+    assert model.left_out == {}  # the video in the folder is used
+
+
+def test_photos_are_named_by_their_time(make_video: MakeVideo, tmp_path: Path) -> None:
+    film = make_video(panned(20, step=8))
+    video = study_video(film, WorkFolder(tmp_path / "work"), 100, [], quiet)
+    assert video.names[:2] == ["00000.000s.jpg", "00000.100s.jpg"]
+
+
+def test_a_killed_capture_keeps_what_was_complete(make_video: MakeVideo, tmp_path: Path) -> None:
+    film = make_video(panned(20, step=8))
+    work = WorkFolder(tmp_path / "work")
+    video = study_video(film, work, 100, [], quiet)
+    folder = tmp_path / "frames"
+    write_photos(video, folder, quiet)
+    whole = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert sorted(whole) == video.names
+    (folder / video.names[5]).unlink()
+    untouched = (folder / video.names[0]).stat().st_mtime_ns
+    steps: list[tuple[int, int]] = []
+    again = study_video(film, work, 100, [], lambda d, t: steps.append((d, t)))
+    assert steps == []  # the pass over the video is kept
+    write_photos(again, folder, lambda d, t: steps.append((d, t)))
+    assert steps[0] == (len(whole) - 1, len(whole))
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == whole
+    assert (folder / video.names[0]).stat().st_mtime_ns == untouched
+
+
+def test_a_camera_that_stands_still_makes_no_map(make_video: MakeVideo, tmp_path: Path) -> None:
+    film = make_video([panned(1, step=0)[0]] * 20)
+    with pytest.raises(InvalidInput) as refused:
+        study_video(film, WorkFolder(tmp_path / "work"), 100, [], quiet)
+    assert refused.value.code == "capture.still"
+
+
+def test_what_is_not_there_or_no_video(tmp_path: Path) -> None:
+    with pytest.raises(NotFound, match="no such file"):
+        find_sources([tmp_path / "gone.mp4"])
+    (tmp_path / "text.mp4").write_text("hello")
+    with pytest.raises(InvalidInput) as refused:
+        find_sources([tmp_path / "text.mp4"])
+    assert refused.value.code == "capture.video"
+
+
+def test_wanted_moments_become_photos(make_video: MakeVideo, tmp_path: Path) -> None:
+    film = make_video(panned(40, step=8))
+    sources = find_sources([film])
+    videos = study_videos(sources, WorkFolder(tmp_path / "w"), 4, {"walk": [1.7]}, quiet)
+    assert "00001.700s.jpg" in videos["walk"].names
+    assert np.isclose(videos["walk"].motion.seconds[-1], 3.9)

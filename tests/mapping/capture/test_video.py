@@ -1,0 +1,198 @@
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapping.capture import video
+from mapping.capture.video import frames_of, is_video, video_facts
+from tests.mapping.capture.conftest import Picture, panned
+from visloc.errors import InvalidInput, TooLarge
+
+MakeVideo = Callable[..., Path]
+# tkhd's matrix, rows (a, b, u), (c, d, v), (x, y, w): p' = (a x + c y, b x + d y), y down.
+_PLAIN = (1, 0, 0, 1)
+# What shows right (1, 0) down (0, 1) turns the picture clockwise: a phone held upright.
+_CLOCKWISE, _HALF, _ANTICLOCKWISE = (0, 1, -1, 0), (-1, 0, 0, -1), (0, -1, 1, 0)
+
+
+def turned(path: Path, matrix: tuple[int, int, int, int]) -> Path:
+    """Write a display matrix into an MP4's track header."""
+
+    def packed(a: int, b: int, c: int, d: int) -> bytes:
+        one = 1 << 16
+        return struct.pack(">9i", a * one, b * one, 0, c * one, d * one, 0, 0, 0, 1 << 30)
+
+    data = path.read_bytes()
+    at = data.index(b"tkhd")
+    place = data.index(packed(*_PLAIN), at)
+    path.write_bytes(data[:place] + packed(*matrix) + data[place + 36 :])
+    return path
+
+
+def corner_marked(width: int = 320, height: int = 240) -> Picture:
+    """Grey, with a red top-left quarter."""
+    picture = np.full((height, width, 3), 90, np.uint8)
+    picture[: height // 2, : width // 2] = (250, 20, 20)
+    return picture
+
+
+def red_corner(rgb: Picture) -> tuple[bool, bool]:
+    """Whether the red quarter is at the bottom, and at the right."""
+    red = rgb[..., 0].astype(int) - rgb[..., 2]
+    rows, columns = np.nonzero(red > 100)
+    return bool(rows.mean() > rgb.shape[0] / 2), bool(columns.mean() > rgb.shape[1] / 2)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "size", "corner"),
+    [
+        (_PLAIN, (240, 320), (False, False)),
+        (_CLOCKWISE, (320, 240), (False, True)),
+        (_HALF, (240, 320), (True, True)),
+        (_ANTICLOCKWISE, (320, 240), (True, False)),
+    ],
+)
+def test_frames_are_turned_as_the_container_says(
+    make_video: MakeVideo,
+    matrix: tuple[int, int, int, int],
+    size: tuple[int, int],
+    corner: tuple[bool, bool],
+) -> None:
+    path = turned(make_video([corner_marked()] * 3), matrix)
+    rgb = next(frames_of(path)).upright_rgb()
+    assert rgb.shape == (*size, 3)
+    assert red_corner(rgb) == corner
+
+
+@pytest.mark.parametrize(
+    ("name", "codec"),
+    [("a.mp4", "libx264"), ("a.mov", "libx265"), ("a.webm", "libvpx-vp9"), ("a.mp4", "libsvtav1")],
+)
+def test_usual_kinds_are_read(make_video: MakeVideo, name: str, codec: str) -> None:
+    pictures = panned(8, step=4)
+    path = make_video(pictures, name, codec=codec)
+    assert is_video(path)
+    frames = [frame.upright_rgb() for frame in frames_of(path)]
+    assert len(frames) == 8
+    for shown, made in zip(frames, pictures, strict=True):
+        assert np.abs(shown.astype(int) - made).mean() < 12
+
+
+def test_times_are_those_of_presentation(make_video: MakeVideo) -> None:
+    times_ms = [0, 33, 67, 500, 533, 1200]
+    path = make_video(panned(6, step=2), times_ms=times_ms)
+    seconds = [frame.seconds for frame in frames_of(path)]
+    assert np.allclose(seconds, np.array(times_ms) / 1000, atol=0.002)
+
+
+def test_ten_bits_and_hdr_become_standard_pictures(make_video: MakeVideo) -> None:
+    ramp = np.repeat(np.linspace(20, 235, 320).astype(np.uint8)[None, :, None], 240, axis=0)
+    pictures = [np.repeat(ramp, 3, axis=2)] * 3
+    for transfer in (1, 16, 18):  # BT.709, PQ, HLG
+        path = make_video(
+            pictures, f"{transfer}.mp4", codec="libx265", pix_fmt="yuv420p10le",
+            color_trc=transfer, options={"x265-params": f"transfer={transfer}:log-level=none"},
+        )  # fmt: skip
+        frame = next(frames_of(path))
+        assert int(frame.decoded.color_trc) == transfer
+        columns = frame.upright_rgb().astype(int).mean(axis=(0, 2))
+        assert (np.diff(np.convolve(columns, np.ones(9) / 9, "valid")) > -0.5).all()
+        assert columns[-1] - columns[0] > 150
+
+
+def test_what_the_container_tells(make_video: MakeVideo) -> None:
+    tags = {
+        "com.apple.quicktime.make": "Apple",
+        "com.apple.quicktime.model": "iPhone 15",
+        "com.apple.quicktime.location.ISO6709": "+45.2178+005.8083+310.5/",
+        "com.apple.quicktime.camera.focal_length.35mm_equivalent": "26",
+    }
+    facts = video_facts(make_video(panned(3, step=4), "a.mov", tags=tags))
+    assert facts.device == "Apple iPhone 15"
+    assert facts.position == (45.2178, 5.8083, 310.5)
+    assert facts.focal_length_px == pytest.approx(26 * 400 / 43.2666, rel=1e-4)
+
+
+@pytest.mark.parametrize("place", ["+91.0+005.0/", "+00.0000+000.0000/", "somewhere", "+9" * 500])
+def test_places_that_are_none(make_video: MakeVideo, place: str) -> None:
+    tags = {"com.apple.quicktime.location.ISO6709": place}
+    assert video_facts(make_video(panned(2, step=4), "a.mov", tags=tags)).position is None
+
+
+# Hostile files
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"#EXTM3U\nhttp://127.0.0.1/secret.ts\n",
+        b"ffconcat version 1.0\nfile /etc/passwd\n",
+        b"\0\0\0\x18ftypisom" + bytes(12),
+        b"\0\0\0\x18ftypisom" + bytes(range(256)) * 50,
+        b"\x1aE\xdf\xa3" + bytes(range(256)) * 50,
+    ],
+)
+def test_what_is_no_video_is_refused_by_name(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "walk.mp4"
+    path.write_bytes(data)
+    with pytest.raises(InvalidInput) as refused:
+        list(frames_of(path))
+    assert refused.value.code == "capture.video"
+    assert refused.value.field == str(path)
+
+
+def test_a_video_that_is_cut_off(make_video: MakeVideo) -> None:
+    whole = make_video(panned(40, step=4), "whole.webm", codec="libvpx-vp9")
+    data = whole.read_bytes()
+    cut = whole.with_name("cut.webm")
+    cut.write_bytes(data[: len(data) // 2])
+    assert 0 < len(list(frames_of(cut))) < 40
+
+
+def test_damage_within_is_passed_over_or_refused(make_video: MakeVideo) -> None:
+    path = make_video(panned(30, step=4))
+    data = bytearray(path.read_bytes())
+    noise = np.random.default_rng(0)
+    for at in noise.integers(200, len(data) - 200, 40).tolist():
+        data[at] = int(noise.integers(256))
+    path.write_bytes(bytes(data))
+    try:
+        assert len(list(frames_of(path))) <= 30
+    except InvalidInput as refused:
+        assert refused.code == "capture.video"  # noqa: PT017  both are right
+
+
+def test_sound_alone_is_refused(tmp_path: Path) -> None:
+    import av
+
+    path = tmp_path / "sound.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("aac", rate=44100, layout="mono")
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
+        frame.sample_rate = 44100
+        for packet in (*stream.encode(frame), *stream.encode()):  # type: ignore[call-overload]
+            container.mux(packet)
+    with pytest.raises(InvalidInput, match="no video track"):
+        video_facts(path)
+
+
+def test_frames_that_are_too_large(make_video: MakeVideo, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = make_video(panned(3, step=4))
+    monkeypatch.setattr(video, "_MAX_PIXELS", 320 * 240 - 1)
+    with pytest.raises(TooLarge) as refused:
+        next(frames_of(path))
+    assert refused.value.code == "capture.video_size"
+
+
+def test_a_video_without_end(make_video: MakeVideo, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = make_video(panned(20, step=4))
+    monkeypatch.setattr(video, "_MAX_FRAMES", 10)
+    frames = frames_of(path)
+    with pytest.raises(TooLarge) as refused:
+        list(frames)
+    assert refused.value.code == "capture.video_length"
