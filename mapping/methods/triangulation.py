@@ -21,6 +21,7 @@ from mapping.methods.intrinsics import (
     names_by_sensor,
     no_lens,
 )
+from mapping.methods.look_alikes import without_look_alikes
 from mapping.methods.matching import Matches
 from mapping.methods.sparse_model import MapperConfig, SfmPhoto, SparseModel, without_bad_points
 from mapping.progress import ItemProgress
@@ -83,12 +84,14 @@ def reconstruct(
     """Find poses and points by incremental mapping, in an arbitrary frame and unit.
 
     Known intrinsics stay unless ``refine`` names them, and also if they are in doubt
-    (``SparseModel.doubts``). Of several models that do not connect, the largest is taken.
+    (``SparseModel.doubts``). Pairs that seem to show two places are not used
+    (``mapping.methods.look_alikes``). Of several models that do not connect, the largest is taken.
     ``progress`` is called with the number of photos in the current model, and of all photos.
 
     Raises:
         InvalidInput: ``sfm.no_matches``, ``sfm.no_model``, ``sfm.camera``, ``sfm.no_points``.
     """
+    matches = without_look_alikes(photos, matches)
     with colmap_database(photos, rigs, matches, work) as (path, scene):
         known = {photo.sensor for photo in photos if photo.camera_known}
         constant = set() if "intrinsics" in refine else known
