@@ -2,9 +2,9 @@
 
 Photos of two hallways of one design have hundreds of matches that fit one geometry: the doors, the
 lamps, the ceiling. What gives them away are the matches that are missing (Zach, Irschara and
-Bischof, "What can missing correspondences tell us about 3D structure and motion?", 2008). A keypoint
-that other photos of its place confirm should be found again in every photo that shows the place
-from nearby: in another hallway the pictures, the numbers and the furniture are not.
+Bischof, "What can missing correspondences tell us about 3D structure and motion?", 2008). A
+keypoint that other photos of its place confirm should be found again in every photo that shows the
+place from nearby: in another hallway the pictures, the numbers and the furniture are not.
 
 Between photos of one place that share is low too, if they are taken far apart. Such a pair is no
 loss where photos between them link both. In order of time, photos next to each other are likely to
@@ -32,6 +32,10 @@ _LEAST_NEAR, _LEAST_FAR = 0.1, 0.3
 _MIN_EXPECTED = 20
 _FIT_ROUNDS = 5
 _FIT_SCALE_PX = 2.0
+# Matches on a line do not fix an affine map.
+_DAMPING = 1e-6
+# Matches that are enough for a fit.
+_MAX_FITTED = 200
 
 
 def without_look_alikes(photos: Sequence[SfmPhoto], matches: Sequence[Matches]) -> list[Matches]:
@@ -88,7 +92,8 @@ def _share_found(photos: Sequence[SfmPhoto], confirmed: _Confirmed, pair: Matche
         matched = pair.rows[:, side]
         ours = photos[own].keypoints.astype(np.float64)
         theirs = photos[other].keypoints[pair.rows[:, 1 - side]].astype(np.float64)
-        moved = _with_one(ours[rows]) @ _affine_fit(ours[matched], theirs)
+        some = slice(None, None, -(-len(matched) // _MAX_FITTED))
+        moved = _with_one(ours[rows]) @ _affine_fit(ours[matched[some]], theirs[some])
         camera = photos[other].camera
         inside = ((moved > 0) & (moved < (camera.width, camera.height))).all(axis=1)
         found = np.zeros(len(ours), dtype=bool)
@@ -106,10 +111,12 @@ def _affine_fit(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> NDArr
     """
     design = _with_one(ours)
     weights = np.ones(len(ours))
+    damping = _DAMPING * np.eye(3)
     for _ in range(_FIT_ROUNDS):
-        fit = np.linalg.lstsq(design * weights[:, None], theirs * weights[:, None], rcond=None)[0]
+        weighted = design.T * weights
+        fit = np.linalg.solve(weighted @ design + damping, weighted @ theirs)
         errors = np.linalg.norm(design @ fit - theirs, axis=1)
-        weights = 1 / np.sqrt(np.maximum(errors, _FIT_SCALE_PX))
+        weights = 1 / np.maximum(errors, _FIT_SCALE_PX)
     return np.asarray(fit)
 
 

@@ -1,7 +1,7 @@
 """The matching stages: mutual nearest neighbours of paired photos, then geometric verification.
 
-With known poses, a match must fit their epipolar geometry. Without, the two-view geometry of the pair
-is estimated (``mapping.methods.two_views``).
+With known poses, a match must fit their epipolar geometry. Without, the two-view geometry of the
+pair is estimated (``mapping.methods.two_views``).
 """
 
 from __future__ import annotations
