@@ -183,7 +183,7 @@ RULES = (
         )
     ),
     Rule(Tier.PARSED, r"results|rigs-and|scale\.md|performance", r"", _HOURS),
-    Rule(Tier.PARSED, r"living-maps|map-sets", r"python ", _HOURS),
+    Rule(Tier.PARSED, r"living-maps|map-sets|mapping\.md", r"python ", _HOURS),
     Rule(Tier.PARSED, r"models/", r"", "hours of training; tests/training"),
 )
 PROGRAMS = (

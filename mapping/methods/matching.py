@@ -1,7 +1,7 @@
 """The matching stages: mutual nearest neighbours of paired photos, then geometric verification.
 
-With known poses, a match must fit their epipolar geometry. Without, pycolmap estimates the two-view
-geometry of the pair.
+With known poses, a match must fit their epipolar geometry. Without, the two-view geometry of the
+pair is estimated (``mapping.methods.two_views``).
 """
 
 from __future__ import annotations
@@ -10,10 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
-import pycolmap
 from numpy.typing import NDArray
 
+from mapping.methods.two_views import fits_two_views
 from mapping.stages.context import BuildContext
 from mapping.stages.landmarks import View
 from mapping.stages.local_features import LocalFeaturesSource
@@ -23,10 +22,10 @@ from visloc.geometry import Camera, Pose
 from visloc.matching.correspondences import mutual_nearest_neighbours
 from visloc.matching.products import round_descriptors
 from visloc.matching.verification import epipolar_errors
-from visloc.pose.colmap import colmap_camera, normalized_rays
+from visloc.pose.colmap import normalized_rays
 
 # Raised when the code of a stage here changes what comes out.
-_REVISION = {"matches": 2, "verified": 1}
+_REVISION = {"matches": 2, "verified": 2}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,7 +171,13 @@ class _MatchTask:
         if self.verification.poses_known:
             views = View(a.camera, a.pose), View(b.camera, b.pose)
             return fits_poses(views, pixels_a, pixels_b, self.verification.max_error_px)
-        return _fits_two_views(a, b, pixels_a, pixels_b, self.verification)
+        return fits_two_views(
+            (a.camera, b.camera),
+            pixels_a,
+            pixels_b,
+            self.verification.max_error_px,
+            calibrated=a.camera_known and b.camera_known,
+        )
 
 
 def fits_poses(
@@ -190,39 +195,6 @@ def fits_poses(
     )
     focal = max(a.camera.focal_length, b.camera.focal_length)
     return np.asarray(errors * focal <= max_error_px)
-
-
-def _fits_two_views(
-    a: MappingPhoto,
-    b: MappingPhoto,
-    pixels_a: NDArray[np.float32],
-    pixels_b: NDArray[np.float32],
-    verification: Verification,
-) -> NDArray[np.bool_]:
-    count = len(pixels_a)
-    fits = np.zeros(count, dtype=bool)
-    if count == 0:
-        return fits
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.max_error, options.ransac.random_seed = verification.max_error_px, 0
-    options.min_num_inliers = verification.min_matches
-    every = np.repeat(np.arange(count, dtype=np.uint32)[:, None], 2, axis=1)
-    geometry = pycolmap.estimate_two_view_geometry(
-        _with_prior(a),
-        pixels_a.astype(np.float64),
-        _with_prior(b),
-        pixels_b.astype(np.float64),
-        every,
-        options,
-    )
-    fits[geometry.inlier_matches[:, 0]] = True
-    return fits
-
-
-def _with_prior(photo: MappingPhoto) -> pycolmap.Camera:
-    camera = colmap_camera(photo.camera)
-    camera.has_prior_focal_length = photo.camera_known
-    return camera
 
 
 def _rows_by_partner(item: Item) -> list[NDArray[np.uint32]]:

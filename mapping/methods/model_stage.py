@@ -23,7 +23,7 @@ from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc.geometry import Camera, Pose
 
 # Raised when the code of the stage changes what comes out.
-_REVISION = 3
+_REVISION = 4
 
 
 def make_model(
@@ -134,6 +134,7 @@ def _to_item(model: SparseModel) -> Item:
         "doubt_sensors": np.array(list(model.doubts), dtype=np.str_),
         "doubt_reasons": np.array([doubt.reason for doubt in model.doubts.values()], dtype=np.str_),
         "doubt_px": np.array([doubt.focal_length_px for doubt in model.doubts.values()]),
+        "apart": np.array(model.apart, dtype=np.int64),
         **{f"observed_{name}": array for name, array in asdict(model.observations).items()},
     }
 
@@ -160,4 +161,5 @@ def _from_item(item: Item, photos: Sequence[MappingPhoto]) -> SparseModel:
         item["angles_deg"],
         bool(item["on_rigs"]),
         {sensor: Doubt(reason, focal) for sensor, reason, focal in doubts},
+        tuple(item["apart"].tolist()),
     )

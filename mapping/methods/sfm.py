@@ -122,7 +122,15 @@ def _notes_on_absent(photos: Sequence[MappingPhoto], model: SparseModel) -> list
     absent = [photo.name for photo, v in zip(photos, model.views, strict=True) if v is None]
     if not absent:
         return []
-    return [f"{len(absent)} of {len(photos)} photos found no place: {some(absent)}"]
+    notes = [f"{len(absent)} of {len(photos)} photos found no place: {some(absent)}"]
+    if model.apart:
+        pieces = ", ".join(map(str, model.apart))
+        notes.append(
+            f"the photos fell apart into {len(model.apart) + 1} pieces that nothing links for "
+            f"sure: the map is of the largest, without others of {pieces} photos. Photos of the "
+            "way between them would link them"
+        )
+    return notes
 
 
 def _origins_record(

@@ -85,6 +85,7 @@ class SparseModel:
         on_rigs: whether known rigs held cameras together; the model then has their unit.
         doubts: by sensor, why refined intrinsics are not believed. Known intrinsics in doubt stayed
             as they were. Photos whose estimated camera is implausible were left out.
+        apart: numbers of photos that make other models, which nothing links to this one.
     """
 
     views: tuple[View | None, ...]
@@ -93,6 +94,7 @@ class SparseModel:
     angles_deg: NDArray[np.float32]
     on_rigs: bool
     doubts: Mapping[str, Doubt]
+    apart: tuple[int, ...] = ()
 
 
 # Stands in for a photo without a pose, which observes nothing.

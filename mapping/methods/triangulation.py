@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 
+import numpy as np
 import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
 
@@ -21,13 +22,17 @@ from mapping.methods.intrinsics import (
     names_by_sensor,
     no_lens,
 )
+from mapping.methods.look_alikes import without_look_alikes
 from mapping.methods.matching import Matches
 from mapping.methods.sparse_model import MapperConfig, SfmPhoto, SparseModel, without_bad_points
+from mapping.methods.thinning import thin
 from mapping.progress import ItemProgress
 from visloc.errors import refuse
 
 # After so many models that put cameras in doubt, no camera with a prior is refined any more.
 _MAX_JUDGEMENTS = 3
+# Photos of another model that are worth telling.
+_MIN_PIECE = 3
 
 
 def triangulate(
@@ -83,16 +88,19 @@ def reconstruct(
     """Find poses and points by incremental mapping, in an arbitrary frame and unit.
 
     Known intrinsics stay unless ``refine`` names them, and also if they are in doubt
-    (``SparseModel.doubts``). Of several models that do not connect, the largest is taken.
+    (``SparseModel.doubts``). Pairs that seem to show two places are not used
+    (``mapping.methods.look_alikes``). Of several models that do not connect, the largest is taken.
     ``progress`` is called with the number of photos in the current model, and of all photos.
 
     Raises:
         InvalidInput: ``sfm.no_matches``, ``sfm.no_model``, ``sfm.camera``, ``sfm.no_points``.
     """
-    with colmap_database(photos, rigs, matches, work) as (path, scene):
+    matches = without_look_alikes(photos, matches)
+    with colmap_database(photos, rigs, thin(photos, matches), work) as (path, scene):
         known = {photo.sensor for photo in photos if photo.camera_known}
         constant = set() if "intrinsics" in refine else known
         placed = _Placed(len(photos), progress)
+        apart: list[int] = []
 
         def solve(doubts: Mapping[str, Doubt]) -> pycolmap.Reconstruction:
             left_out = doubts.keys() - known
@@ -103,7 +111,9 @@ def reconstruct(
             options.image_names = [p.name for p in photos if p.sensor not in left_out]
             models = _map_incrementally(path, options, placed)
             if models:
-                return max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()))
+                largest = max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()))
+                apart[:] = _photos_apart(models.values(), largest)
+                return largest
             if left_out:
                 names = names_by_sensor((photo.sensor, photo.name) for photo in photos)
                 raise no_lens({sensor: doubts[sensor] for sensor in left_out}, names)
@@ -119,7 +129,57 @@ def reconstruct(
 
         refined = scene.cameras.keys() - constant
         result, doubts = solve_with_priors(solve, scene, photos, refined, poses=True)
-    return without_bad_points(scene.read(result, photos, ("poses", "intrinsics"), doubts), config)
+        found = scene.read(result, photos, ("poses", "intrinsics"), doubts)
+        found = replace(found, apart=tuple(apart))
+    return _with_all_points(found, photos, rigs, matches, config, work)
+
+
+def _with_all_points(
+    found: SparseModel,
+    photos: Sequence[SfmPhoto],
+    rigs: Rigs,
+    matches: Sequence[Matches],
+    config: MapperConfig,
+    work: Path,
+) -> SparseModel:
+    """Triangulate all matches with the poses and cameras that a part of them gave."""
+    rows = [row for row, view in enumerate(found.views) if view is not None]
+    number = {row: order for order, row in enumerate(rows)}
+    placed = [
+        replace(photos[row], camera=view.camera, cam_from_world=view.cam_from_world)
+        for row, view in enumerate(found.views)
+        if view is not None
+    ]
+    among = [
+        Matches(number[pair.first], number[pair.second], pair.rows)
+        for pair in matches
+        if pair.first in number and pair.second in number
+    ]
+    # On rigs, if at all, as in the model: they have its unit.
+    made = triangulate(placed, rigs if found.on_rigs else {}, among, config, (), work)
+    views = np.array(rows)[made.observations.views]
+    return replace(
+        made,
+        views=found.views,
+        observations=replace(made.observations, views=views),
+        on_rigs=found.on_rigs,
+        doubts=found.doubts,
+        apart=found.apart,
+    )
+
+
+def _photos_apart(
+    models: Iterable[pycolmap.Reconstruction], largest: pycolmap.Reconstruction
+) -> list[int]:
+    """Return how many photos each of the other models adds, in descending order."""
+    known = set(largest.reg_image_ids())
+    counts = []
+    for model in sorted(models, key=lambda m: -m.num_reg_images()):
+        new = set(model.reg_image_ids()) - known
+        known |= new
+        if len(new) >= _MIN_PIECE:
+            counts.append(len(new))
+    return sorted(counts, reverse=True)
 
 
 @dataclass(slots=True)

@@ -1,0 +1,217 @@
+"""Poses from photos alone: which photos come into one model, and how long that takes.
+
+    python -m benchmarks.joining hallways DATA/ie_tower --floor floor11
+    python -m benchmarks.joining walk DATA/gardenspoint/mapping
+    python -m benchmarks.joining speed --images 500
+
+``hallways`` puts the photos of both hallways of a floor into one folder. ``walk`` takes a dataset
+whose photos were taken in order, and whose poses lie in pieces 1000 units apart. Both make all
+models that there are: one of all photos, then one of those that are left, and so on. ``speed``
+builds a map of photos of the sample in a process of its own, without its poses, rigs and positions.
+"""
+
+from __future__ import annotations
+
+import re
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from mapping.cluster.executors import open_executor
+from mapping.cluster.workers import one_thread_here
+from mapping.frames.anchor import align_poses
+from mapping.importers.dataset import write_imported
+from mapping.importers.images import read as read_photos
+from mapping.methods.matching import Matches, Verification, match_pairs
+from mapping.methods.scenes import find_pairs, make_scene
+from mapping.methods.sfm_settings import SfmSettings
+from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto
+from mapping.methods.triangulation import reconstruct
+from mapping.sample import write_sample
+from mapping.stages.context import BuildContext
+from mapping.stages.global_features import describe_photos
+from mapping.stages.local_features import local_features_source
+from mapping.stages.networks import Networks
+from mapping.stages.photos import collect_photos
+from mapping.stages.work_folder import WorkFolder
+from visloc.errors import InvalidInput
+from visloc.features import DEFAULT_GLOBAL_FEATURES, DEFAULT_LOCAL_FEATURES
+from visloc.geometry import PixelOrigin, Pose
+from visloc.kapture import read_dataset
+from visloc.options import Inference
+
+Model = dict[str, Pose]
+CONFIG = MAPPER_CONFIGS["config1"]
+# Of the poses of one dataset.
+PIECES_APART = 1000.0
+SETTINGS = SfmSettings(pairs=("retrieval", "sequence"), poses="estimate")
+WorkOption = Annotated[Path, typer.Option(help="Features and matches, kept for the next run.")]
+app = typer.Typer(add_completion=False, help=__doc__)
+
+
+def all_models(root: Path, work: Path) -> tuple[int, list[Model]]:
+    """Return how many photos a dataset has, and cam_from_world by name in each of its models."""
+    networks = Networks(None, Inference.AUTO)
+    dataset = read_dataset(root)
+    with open_executor("local", 2, "") as workers, one_thread_here():
+        folder = WorkFolder(work)
+        source = local_features_source(
+            folder,
+            root,
+            DEFAULT_LOCAL_FEATURES,
+            networks=networks,
+            max_keypoints=5000,
+            features_dir=None,
+            pixel_origin=PixelOrigin.CORNER,
+        )
+        context = BuildContext(folder, source, networks, workers, lambda *_: None)
+        photos, _ = collect_photos(dataset, posed=False, with_files=True, progress=lambda *_: None)
+        context.run("local features", source.prepare, photos)
+        described = [describe_photos(context, photos, name) for name in DEFAULT_GLOBAL_FEATURES]
+        pairs = find_pairs(make_scene(dataset, photos, described, SETTINGS), SETTINGS)
+        verification = Verification(CONFIG.filter_max_reproj_error, CONFIG.min_num_matches, False)
+        matches, _ = match_pairs(context, photos, pairs.rows, verification)
+        given = [
+            SfmPhoto(
+                photo.name,
+                photo.record.sensor_id,
+                photo.record.timestamp,
+                photo.camera,
+                photo.camera_known,
+                None,
+                source.read(photo).keypoints,
+            )
+            for photo in photos
+        ]
+    models = []
+    left = list(range(len(given)))
+    while found := _model_of(given, matches, left):
+        models.append({given[row].name: pose for row, pose in found.items()})
+        left = [row for row in left if row not in found]
+    return len(given), models
+
+
+def _model_of(photos: list[SfmPhoto], matches: list[Matches], rows: list[int]) -> dict[int, Pose]:
+    """Return the poses of the largest model of some photos; nothing without one."""
+    number = {row: order for order, row in enumerate(rows)}
+    among = [
+        Matches(number[pair.first], number[pair.second], pair.rows)
+        for pair in matches
+        if pair.first in number and pair.second in number
+    ]
+    some = [photos[row] for row in rows]
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            model = reconstruct(some, {}, among, CONFIG, (), Path(folder), lambda *_: None)
+        except InvalidInput as error:
+            typer.echo(f"{len(rows)} photos are in no model: {error.code}")
+            return {}
+    return {
+        row: view.cam_from_world
+        for row, view in zip(rows, model.views, strict=True)
+        if view is not None
+    }
+
+
+def _print(total: int, models: list[Model], place: Callable[[str], str]) -> None:
+    for model in models:
+        typer.echo(f"model: {dict(Counter(map(place, model)))}")
+    mixed = sum(len({place(name) for name in model}) > 1 for model in models)
+    typer.echo(
+        f"{sum(map(len, models))} of {total} photos in models; {mixed} models hold two places"
+    )
+
+
+@app.command()
+def hallways(
+    data: Path, floor: str = "floor11", work: WorkOption = Path("work/joining/hallways")
+) -> None:
+    """Put the photos of both hallways of a floor into one folder."""
+    photos, dataset = work / "photos", work / "dataset"
+    for folder in (photos, dataset):
+        shutil.rmtree(folder, ignore_errors=True)
+    photos.mkdir(parents=True)
+    for file in sorted((data / "lookalike").rglob(f"{floor}/*_hallway_*.jpg")):
+        shutil.copy(file, photos)
+    write_imported(read_photos(photos), dataset)
+    total, models = all_models(dataset, work / "kept")
+    _print(total, models, lambda name: re.sub(r"_frame.*", "", Path(name).name))
+
+
+@app.command()
+def walk(root: Path, work: WorkOption = Path("work/joining/walk")) -> None:
+    """Take the photos of a walk in order, and compare with its poses, in pieces far apart."""
+    dataset = read_dataset(root)
+    posed, _ = collect_photos(dataset, posed=True, with_files=False, progress=lambda *_: None)
+    truth = {photo.name: photo.pose for photo in posed}
+    piece = {name: str(round(pose.center[0] / PIECES_APART)) for name, pose in truth.items()}
+    total, models = all_models(root, work / "kept")
+    _print(total, models, piece.__getitem__)
+    errors = []
+    for model in models:
+        for which in sorted({piece[name] for name in model}):
+            names = [name for name in model if piece[name] == which]
+            if len(names) < 3:
+                continue
+            given = [truth[name] for name in names]
+            moved = align_poses([model[name] for name in names], given)
+            errors += [
+                float(np.linalg.norm(moved.apply(model[name].center[None])[0] - pose.center))
+                for name, pose in zip(names, given, strict=True)
+            ]
+    near = np.array(errors)
+    typer.echo(
+        f"after alignment {(near <= 1).sum()} of {len(near)} are within 1 unit, the median "
+        f"within {np.median(near):.2f}"
+    )
+
+
+@app.command()
+def speed(images: int = 500, work: WorkOption = Path("work/joining/speed")) -> None:
+    """Build a map of photos of the sample without poses; print seconds, GiB, silence."""
+    shutil.rmtree(work, ignore_errors=True)
+    write_sample(work / "sample", images=images)
+    sensors = work / "sample" / "mapping" / "sensors"
+    for name in ("trajectories.txt", "rigs.txt", "records_gnss.txt", "records_depth.txt"):
+        (sensors / name).unlink()
+    listed = (sensors / "sensors.txt").read_text().splitlines(keepends=True)
+    cameras = [line for line in listed if ", depth," not in line and ", gnss," not in line]
+    (sensors / "sensors.txt").write_text("".join(cameras))
+    arguments = ["build", str(sensors.parent), "--map", "speed", "--maps-dir", str(work / "maps")]
+    command = Path(sys.executable).with_name("mapping")
+    started = last = time.perf_counter()
+    silence, counts = 0.0, ""
+    with subprocess.Popen(
+        [command, *arguments, "--method", "sfm", "--poses", "estimate"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            typer.echo(line.rstrip())
+            # A line that only tells that time has passed is no sign of progress.
+            told = line.split(" after ")[0]
+            if told != counts:
+                now = time.perf_counter()
+                silence, last, counts = max(silence, now - last), now, told
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    typer.echo(
+        f"{images} photos: {(time.perf_counter() - started) / 60:.1f} min, "
+        f"{(used.ru_utime + used.ru_stime) / 60:.1f} min of processors, "
+        f"{used.ru_maxrss / 2**20:.1f} GiB in the largest process, longest silence {silence:.0f} s"
+    )
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,59 @@
+"""Fewer keypoints to find poses with, spread over each photo.
+
+Thousands of keypoints of a photo make good landmarks, and its pose no better than a thousand: the
+adjustments, most of the time of incremental mapping, take as many times as long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.methods.matching import Matches
+from mapping.methods.sparse_model import SfmPhoto
+from visloc.geometry import Camera
+
+# Keypoints of a photo that take part.
+MOST = 1000
+# The longer side of a photo is divided into so many cells, which have equal parts of them.
+_CELLS = 8
+
+
+def thin(photos: Sequence[SfmPhoto], matches: Sequence[Matches]) -> list[Matches]:
+    """Return the pairs with the matches between the ``MOST`` best keypoints of both photos.
+
+    The best of a cell are those matched in most pairs, which make the longest tracks.
+    """
+    counts = [np.zeros(len(photo.keypoints), dtype=np.int64) for photo in photos]
+    for pair in matches:
+        counts[pair.first][pair.rows[:, 0]] += 1
+        counts[pair.second][pair.rows[:, 1]] += 1
+    kept = [
+        _best_of_cells(photo.camera, photo.keypoints, count)
+        for photo, count in zip(photos, counts, strict=True)
+    ]
+    thinned = []
+    for pair in matches:
+        both = kept[pair.first][pair.rows[:, 0]] & kept[pair.second][pair.rows[:, 1]]
+        thinned.append(Matches(pair.first, pair.second, pair.rows[both]))
+    return thinned
+
+
+def _best_of_cells(
+    camera: Camera, keypoints: NDArray[np.float32], counts: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Return (n,) which keypoints are kept: the first of all cells, then the second of all, ..."""
+    side = max(camera.width, camera.height) / _CELLS
+    column, row = np.floor_divide(keypoints.T, side).astype(np.int64)
+    cells = row * (_CELLS + 1) + column
+    order = np.lexsort((-counts, cells))
+    grouped = cells[order]
+    rank = np.arange(len(order)) - np.searchsorted(grouped, grouped)
+    matched = counts[order] > 0
+    order, rank = order[matched], rank[matched]
+    best = order[np.lexsort((-counts[order], rank))[:MOST]]
+    kept = np.zeros(len(keypoints), dtype=bool)
+    kept[best] = True
+    return kept

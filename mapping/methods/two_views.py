@@ -1,0 +1,106 @@
+"""Matches that fit one geometry of two photos, and whether so many could do so by chance."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from visloc.geometry import Camera
+from visloc.pose.colmap import normalized_rays
+
+# Inliers are believed when chance gives so many at most once in 10^10 pairs with as many matches.
+MAX_LOG10_CHANCE = -10.0
+# Matches that fix an essential matrix, and a fundamental one.
+_SAMPLE = {True: 5, False: 7}
+_MIN_TRIALS, _MAX_TRIALS, _CONFIDENCE = 100, 2000, 0.999
+# PoseLib returns identity for fewer, or is not sure to end.
+_FEWEST = 8
+
+
+def fits_two_views(
+    cameras: tuple[Camera, Camera],
+    pixels_a: NDArray[np.floating],
+    pixels_b: NDArray[np.floating],
+    max_error_px: float,
+    *,
+    calibrated: bool,
+) -> NDArray[np.bool_]:
+    """Tell which matched pixels (n, 2) fit the relative pose of two photos.
+
+    LO-RANSAC by PoseLib, seeded. Nothing fits when as many matches would by chance
+    (``log10_chance``): with thousands of matches, the best of all geometries has dozens of inliers
+    between photos of different places.
+
+    Args:
+        calibrated: whether the intrinsics are known; else a fundamental matrix is estimated of the
+            pixels, whatever their distortion.
+        max_error_px: largest distance to the epipolar line.
+    """
+    fits = np.zeros(len(pixels_a), dtype=bool)
+    if calibrated:
+        # PoseLib does not know all camera models.
+        focal = math.sqrt(cameras[0].focal_length * cameras[1].focal_length)
+        seen = [
+            focal * normalized_rays(camera, pixels)[:, :2]
+            for camera, pixels in zip(cameras, (pixels_a, pixels_b), strict=True)
+        ]
+    else:
+        seen = [pixels_a.astype(np.float64), pixels_b.astype(np.float64)]
+    usable = np.flatnonzero(np.isfinite(np.concatenate(seen, axis=1)).all(axis=1))
+    if len(usable) < _FEWEST:
+        return fits
+    options = {
+        "max_epipolar_error": max_error_px,
+        "min_iterations": _MIN_TRIALS,
+        "max_iterations": _MAX_TRIALS,
+        "success_prob": _CONFIDENCE,
+        "seed": 0,
+    }
+    a, b = (points[usable] for points in seen)
+    if calibrated:
+        pinhole = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
+        _, told = poselib.estimate_relative_pose(a, b, pinhole, pinhole, options, {})
+    else:
+        _, told = poselib.estimate_fundamental(a, b, options, {})
+    found = np.array(told["inliers"], dtype=bool)
+    # Without a model, the mask is not all false.
+    if told["num_inliers"] < _FEWEST or len(found) != len(usable):
+        return fits
+    share = max(_share_near_a_line(camera, max_error_px) for camera in cameras)
+    chance = log10_chance(len(usable), int(found.sum()), share, calibrated=calibrated)
+    if chance <= MAX_LOG10_CHANCE:
+        fits[usable[found]] = True
+    return fits
+
+
+def log10_chance(num_matches: int, num_inliers: int, share: float, *, calibrated: bool) -> float:
+    """Return the logarithm of how often chance gives so many inliers among wrong matches.
+
+    The number of false alarms of Moisan and Stival, "A probabilistic criterion to detect rigid
+    point matches between two images" (2004): over all samples that fix a geometry,
+    and all sets of so many matches.
+
+    Args:
+        share: of the photo that lies as near to a line as an inlier.
+    """
+    sample = _SAMPLE[calibrated]
+    if num_inliers <= sample:
+        return math.inf
+    return (
+        math.log10(max(num_matches - sample, 1))
+        + _log10_choose(num_matches, num_inliers)
+        + _log10_choose(num_inliers, sample)
+        + (num_inliers - sample) * math.log10(min(share, 1.0))
+    )
+
+
+def _share_near_a_line(camera: Camera, max_error_px: float) -> float:
+    longest = math.hypot(camera.width, camera.height)
+    return 2 * max_error_px * longest / (camera.width * camera.height)
+
+
+def _log10_choose(n: int, k: int) -> float:
+    return (math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)) / math.log(10)

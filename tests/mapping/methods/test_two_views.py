@@ -1,0 +1,59 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mapping.methods.two_views import fits_two_views, log10_chance
+from visloc.geometry import Camera, Pose
+from visloc.pose.colmap import project
+
+CAMERA = Camera("OPENCV", 640, 480, (500.0, 510.0, 321.0, 242.0, -0.1, 0.02, 0.001, -0.002))
+SECOND = Pose(np.eye(3), np.array([-0.6, 0.1, 0.05]))
+
+
+def two_photos(num_right: int, num_wrong: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    random = np.random.default_rng(0)
+    points = random.uniform([-2, -1.5, 4], [2, 1.5, 8], (num_right, 3))
+    wrong = random.uniform([0, 0], [640, 480], (2, num_wrong, 2))
+    return (
+        np.concatenate([project(CAMERA, points), wrong[0]]).astype(np.float32),
+        np.concatenate([project(CAMERA, SECOND.apply(points)), wrong[1]]).astype(np.float32),
+    )
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_right_matches_fit_and_most_wrong_ones_do_not(calibrated: bool) -> None:
+    a, b = two_photos(120, 120)
+    fits = fits_two_views((CAMERA, CAMERA), a, b, 4.0, calibrated=calibrated)
+    assert fits[:120].mean() > 0.97
+    assert fits[120:].mean() < 0.15
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_wrong_matches_alone_never_fit(calibrated: bool) -> None:
+    a, b = two_photos(0, 1000)
+    assert not fits_two_views((CAMERA, CAMERA), a, b, 4.0, calibrated=calibrated).any()
+
+
+@pytest.mark.parametrize("count", [0, 1, 7])
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_too_few_matches_do_not_fit(count: int, calibrated: bool) -> None:
+    a, b = two_photos(count, 0)
+    fits = fits_two_views((CAMERA, CAMERA), a, b, 4.0, calibrated=calibrated)
+    assert fits.tolist() == [False] * count
+
+
+def test_pixels_without_a_ray_do_not_fit() -> None:
+    camera = Camera("OPENCV", 640, 480, (500.0, 500.0, 320.0, 240.0, -0.9, 0.0, 0.0, 0.0))
+    at = np.zeros((50, 2), np.float32)
+    assert not fits_two_views((camera, camera), at, at, 4.0, calibrated=True).any()
+
+
+def test_chance_by_hand() -> None:
+    # 10 matches, all inliers, 5 of which fix the pose: 5 * 1 * 252 * 0.01**5.
+    assert log10_chance(10, 10, 0.01, calibrated=True) == pytest.approx(math.log10(1260) - 10)
+    assert log10_chance(10, 5, 0.01, calibrated=True) == math.inf
+    assert log10_chance(10, 7, 0.01, calibrated=False) == math.inf
