@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from visloc.features.backends.torch import computed_with, torch_device
+from visloc.device import torch_device
+from visloc.features.backends.torch import computed_with
 from visloc.features.networks.r2d2.extractor import Seen
 from visloc.features.networks.r2d2.model import MEAN, STD, R2D2Network
 

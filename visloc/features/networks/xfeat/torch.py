@@ -9,7 +9,8 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
-from visloc.features.backends.torch import computed_with, torch_device
+from visloc.device import torch_device
+from visloc.features.backends.torch import computed_with
 from visloc.features.networks.xfeat.extractor import Seen
 from visloc.features.networks.xfeat.model import CELL_PX, XFeatNetwork
 
