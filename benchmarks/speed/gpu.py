@@ -24,7 +24,7 @@ import torch
 import typer
 
 from benchmarks.speed.building import MAP_ID, build
-from benchmarks.speed.dataset import Bench, make_bench, num_within
+from benchmarks.speed.dataset import Bench, Error, make_bench, num_within
 from benchmarks.speed.machine import load_average, num_threads, this_machine
 from benchmarks.speed.served import service
 from benchmarks.speed.steps import say
@@ -98,7 +98,7 @@ def ask_here(bench: Bench, maps_dir: Path) -> dict[str, Any]:
     localizer = Localizer(open_map(MapStore(maps_dir).folder(MAP_ID)), extractor)
     localizer.warm_up()
     stages: list[dict[str, float]] = []
-    errors = []
+    errors: list[Error | None] = []
     for seed in range(2):  # the first pass warms up
         stages, errors = [], []
         for record in dataset.images:
@@ -110,8 +110,10 @@ def ask_here(bench: Bench, maps_dir: Path) -> dict[str, Any]:
             ended = time.perf_counter()
             spent = {"decode": decoded - started, **answer.evidence.seconds}
             stages.append({**spent, "whole query": ended - started})
-            located = isinstance(answer, Localized) and truth is not None
-            errors.append(pose_error(answer.cam_from_world, truth) if located else None)
+            if isinstance(answer, Localized) and truth is not None:
+                errors.append(pose_error(answer.cam_from_world, truth))
+            else:
+                errors.append(None)
     known = [error for error in errors if error is not None]
     return {
         "computed_with": extractor.computed_with,
