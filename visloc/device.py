@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import torch
 
+# The driver's device files tell of a CUDA GPU without loading torch, which takes a second: of a
+# graphics card, in WSL, and on a Jetson.
+_CUDA_DEVICES = (Path("/dev/nvidiactl"), Path("/dev/dxg"), Path("/dev/nvhost-gpu"))
+
 
 @cache
+def has_cuda() -> bool:
+    """Return whether this process sees a CUDA GPU; ``CUDA_VISIBLE_DEVICES`` says which it sees."""
+    if not any(device.exists() for device in _CUDA_DEVICES):
+        return False
+    import torch
+
+    return torch.cuda.is_available()
+
+
 def torch_device() -> torch.device:
-    """Return the first CUDA GPU that this process sees, else the processor.
+    """Return the CUDA GPU where there is one, else the processor."""
+    import torch
 
-    ``CUDA_VISIBLE_DEVICES`` says which GPUs a process sees.
-    """
-    import torch  # takes a second to load, which not everything that imports this needs
-
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    return torch.device("cuda" if has_cuda() else "cpu")

@@ -45,16 +45,17 @@ def nearest_on(
     import torch
 
     count, most, dim = len(photos), max(map(len, photos)), a.shape[1]
+    lowest = -dim * LARGEST_PRODUCT  # of all products; where there is no second
     filled = np.zeros((count, most, dim), np.int8)
+    absent = np.full((count, most), lowest, np.int32)  # added to the product of each column
     for row, photo in enumerate(photos):
         filled[row, : len(photo)] = photo
-    sizes = torch.tensor([len(photo) for photo in photos], device=device)
+        absent[row, : len(photo)] = 0
     number = exact_float(dim)
     left = torch.tensor(a, device=device).to(number)
     right = torch.from_numpy(filled).to(device).to(number)
-    products = (left @ right.view(count * most, dim).T).view(len(a), count, most)
-    lowest = -dim * LARGEST_PRODUCT  # of all products; where there is no second
-    products.masked_fill_(torch.arange(most, device=device) >= sizes[:, None], lowest)
+    added = torch.from_numpy(absent).to(device).to(number).view(-1)
+    products = torch.addmm(added, left, right.view(-1, dim).T).view(len(a), count, most)
     best, rows = products.max(dim=2)
     of_columns = products.amax(dim=0)
     mutual = best == of_columns.gather(1, rows.T).T
