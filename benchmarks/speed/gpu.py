@@ -8,13 +8,13 @@ once more in a process that sees no GPU, with the same map. Prints tables in Mar
 
 from __future__ import annotations
 
-import asyncio
 import json
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,11 +25,11 @@ import typer
 
 from benchmarks.speed.building import MAP_ID, build
 from benchmarks.speed.dataset import Bench, Error, make_bench, num_within
+from benchmarks.speed.load import ask_at_once
 from benchmarks.speed.machine import load_average, num_threads, this_machine
 from benchmarks.speed.served import service
 from benchmarks.speed.steps import say
 from benchmarks.speed.tables import describe_machine, number, table
-from clients import AsyncClient
 from visloc.archive import MapStore, open_map
 from visloc.evaluation import pose_error
 from visloc.features import make_local_features
@@ -143,40 +143,21 @@ def _ask_service(bench: Bench, maps_dir: Path, workers: int) -> dict[str, Any]:
     settings = ["--workers", str(workers), "--threads-per-worker", str(threads)]
     free_before = torch.cuda.mem_get_info()[0]
     with service(bench, maps_dir, settings) as url:
-        asyncio.run(_load(bench, url, _CLIENTS, _LOAD_S / 2))  # a process's first answers are slow
-        alone, _ = asyncio.run(_load(bench, url, 1, _LOAD_S / 2))
-        latencies, seconds = asyncio.run(_load(bench, url, _CLIENTS, _LOAD_S))
+        ask = partial(ask_at_once, url, MAP_ID, bench.query)
+        ask(_CLIENTS, _LOAD_S / 2)  # the first answers of a process are slower
+        alone, many = ask(1, _LOAD_S / 2), ask(_CLIENTS, _LOAD_S)
         used = free_before - torch.cuda.mem_get_info()[0]
     return {
         "workers": workers,
         "threads": threads,
-        "alone": float(np.median(alone)),
-        "p50": float(np.median(latencies)),
-        "p95": float(np.percentile(latencies, 95)),
-        "queries_per_second": len(latencies) / seconds,
+        "alone": float(np.median(alone.latencies)),
+        "alone_stages": alone.stages,
+        "p50": float(np.median(many.latencies)),
+        "p95": float(np.percentile(many.latencies, 95)),
+        "stages": many.stages,
+        "queries_per_second": many.per_second,
         "megabytes": used / 1e6,
     }
-
-
-async def _load(bench: Bench, url: str, clients: int, seconds: float) -> tuple[list[float], float]:
-    """Ask for so long with so many clients at once; the latencies, and the seconds it took."""
-    dataset = read_dataset(bench.query)
-    cameras = [dataset.sensors[record.sensor_id].camera for record in dataset.images]
-    photos = [dataset.path_of(record).read_bytes() for record in dataset.images]
-    latencies: list[float] = []
-    began = time.perf_counter()
-
-    async def ask(client: AsyncClient, first: int) -> None:
-        number = first
-        while time.perf_counter() < began + seconds:
-            one, number = number % len(photos), number + 1
-            started = time.perf_counter()
-            await client.localize(photos[one], MAP_ID, cameras[one])
-            latencies.append(time.perf_counter() - started)
-
-    async with AsyncClient(url) as client:
-        await asyncio.gather(*(ask(client, first) for first in range(clients)))
-    return latencies, time.perf_counter() - began
 
 
 def _a_photo(bench: Bench) -> Path:
