@@ -16,7 +16,7 @@ from clients import AsyncClient
 from visloc.kapture import read_dataset
 
 _CLIENTS_OF_PROCESS = 8
-_START_S = 5.0  # that processes take to start
+_START_S = 4.0  # that processes take to start
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +76,7 @@ async def _ask_all(
                 found.append((latency, result.seconds))
 
     async with AsyncClient(url) as client:
-        await asyncio.sleep(max(0.0, begin - time.time()))
+        begin = max(begin, time.time())
+        await asyncio.sleep(begin - time.time())
         await asyncio.gather(*(ask(client, first) for first in range(clients)))
     return found
