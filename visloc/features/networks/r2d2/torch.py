@@ -36,7 +36,8 @@ class TorchNetwork:
             features = self.network(normalized)
         # The heads square x: that is beyond the range of half precision.
         features = features.float()
-        logits = self.network.logits(features)
+        # One map after the other, as looking for peaks reads them.
+        logits = self.network.logits(features).contiguous()
 
         @torch.inference_mode()
         def descriptors(x: NDArray[np.intp], y: NDArray[np.intp]) -> NDArray[np.float32]:
