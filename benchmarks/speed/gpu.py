@@ -47,8 +47,13 @@ _CLIENTS = 32
 _LOAD_S = 5.0
 
 
-def measure_gpu(bench: Bench, maps_dir: Path, workers: tuple[int, ...]) -> dict[str, Any]:
-    """Everything about one kind of local features; its map is built in ``maps_dir``."""
+def measure_gpu(
+    bench: Bench, maps_dir: Path, workers: tuple[int, ...], keep: Callable[[dict[str, Any]], None]
+) -> None:
+    """Everything about one kind of local features; its map is built in ``maps_dir``.
+
+    What is known so far is given to ``keep``, so that a run that is stopped leaves something.
+    """
     say(f"{bench.features}: building")
     torch.cuda.reset_peak_memory_stats()
     started = time.perf_counter()
@@ -57,13 +62,14 @@ def measure_gpu(bench: Bench, maps_dir: Path, workers: tuple[int, ...]) -> dict[
     say(f"{bench.features}: built in {figures['built_in']:.1f} s; asking")
     figures["gpu"] = ask_here(bench, maps_dir)
     figures["gpu"]["megabytes"] = torch.cuda.max_memory_allocated() / 1e6
+    keep(figures)
     say(f"{bench.features}: asking without the GPU")
     figures["processor"] = _ask_without_gpu(bench, maps_dir)
     figures["service"] = []
     for count in workers:
         say(f"{bench.features}: a service of {count} workers")
         figures["service"].append(_ask_service(bench, maps_dir, count))
-    return figures
+        keep(figures)
 
 
 def measure_extraction(bench: Bench) -> list[dict[str, Any]]:
@@ -198,18 +204,16 @@ def main(
         "by_features": {},
     }
 
-    def keep() -> None:
+    def keep(part: dict[str, Any], name: str, value: Any) -> None:
+        part[name] = value
         if report is not None:
             report.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 
     for name, bench in benches.items():
         bench.work.mkdir(parents=True, exist_ok=True)
-        measured = measure_gpu(bench, bench.work / "maps", counts)
-        figures["by_features"][name] = measured
-        keep()
+        measure_gpu(bench, bench.work / "maps", counts, partial(keep, figures["by_features"], name))
     say("extraction")
-    figures["extraction"] = measure_extraction(benches[names[0]])
-    keep()
+    keep(figures, "extraction", measure_extraction(benches[names[0]]))
     for line in _lines(figures):
         sys.stdout.write(f"{line}\n")
 
