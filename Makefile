@@ -10,7 +10,7 @@ PAGE_SOURCES := $(shell find web/src web/index.html web/*.json web/*.ts -type f)
 .DEFAULT_GOAL := help
 # Vite needs this much; without it the service has no page, and says so.
 NODE_IS_THERE = command -v npm >/dev/null && node -e 'const [a, b] = process.versions.node.split(".").map(Number); process.exit(a > 22 || (a === 22 && b >= 12) || (a === 20 && b >= 19) ? 0 : 1)'
-.PHONY: help install page check-page browser balancer demo test test-all docs-check docs-errors docs-options fuzz fuzz-api train-smoke bench bench-scale trust fmt lint types contracts proto proto-check check serve clean
+.PHONY: help install page check-page browser balancer demo test test-all docs-check docs-errors docs-options fuzz fuzz-api train-smoke bench bench-gpu bench-scale trust fmt lint types contracts proto proto-check check serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -89,6 +89,10 @@ train-smoke: install ## train 20 steps on the sample: the loss falls
 bench: install ## seconds and accuracy beside the peer and the machine's limit, of DATASET with FEATURES
 	$(BIN)/python -m benchmarks.speed $(or $(DATASET),../shared/data/redkitchen) \
 		--local-features $(or $(FEATURES),faster2d2) --weights-dir $(or $(WEIGHTS),../shared/weights) $(ARGS)
+
+bench-gpu: install ## networks, queries and a service on a CUDA GPU, of DATASET
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.speed.gpu $(or $(DATASET),../shared/data/redkitchen) \
+		--weights-dir $(or $(WEIGHTS),../shared/weights) $(ARGS)
 
 bench-scale: install ## maps of 100 to 100 000 images: opening, memory, retrieval
 	$(BIN)/python -m benchmarks.scale $(ARGS)

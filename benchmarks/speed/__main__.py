@@ -23,7 +23,6 @@ import typer
 from benchmarks.speed.building import MAP_ID, build
 from benchmarks.speed.dataset import make_bench
 from benchmarks.speed.figures import Measured
-from benchmarks.speed.gpu import measure_gpu
 from benchmarks.speed.limits import NETWORKS, measure_rates
 from benchmarks.speed.machine import num_threads, this_machine
 from benchmarks.speed.peer import export_for_peer, run_peer, why_no_peer
@@ -99,11 +98,10 @@ def main(
                 builds.append(steps.get(f"build-{number}", rebuild))
         for kind, measure in ask.items():
             rounds[kind].append(steps.get(f"{kind}-{number}", measure))
-    gpu = None if machine.cuda is None else steps.get("gpu", lambda: measure_gpu(bench, map_folder))
 
     measured = Measured(builds=builds, described=described, **rounds)
     loads = steps.load_averages()
-    for line in [*describe_machine(machine, loads), *tables(bench, measured, no_peer, gpu)]:
+    for line in [*describe_machine(machine, loads), *tables(bench, measured, no_peer)]:
         sys.stdout.write(f"{line}\n")
     if report is not None:
         figures = {
@@ -114,7 +112,6 @@ def main(
             "load_averages": loads,
             "without_peer": no_peer,
             **asdict(measured),
-            "gpu": gpu,
         }
         report.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 

@@ -6,6 +6,7 @@ import os
 import platform
 from dataclasses import dataclass
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -31,9 +32,9 @@ class Machine:
         cpu: the processor's name.
         threads: processor cores that this process may use.
         flags: what the processor has for networks.
-        cuda: the name of the CUDA device, if there is one.
+        cuda: the CUDA device and torch's version of CUDA, if there is one.
         python: its version.
-        packages: versions by name.
+        packages: versions by name, of those that are installed.
     """
 
     cpu: str
@@ -61,10 +62,16 @@ def this_machine() -> Machine:
         cpu=f"{model} ({family})" if family else model,
         threads=num_threads(),
         flags=tuple(label for flag, label in _FLAGS.items() if flag in known),
-        cuda=torch.cuda.get_device_name(0) if torch.cuda.is_available() else None,
+        cuda=_cuda_device(),
         python=platform.python_version(),
-        packages={name: version(name) for name in _PACKAGES},
+        packages={name: version(name) for name in _PACKAGES if find_spec(name) is not None},
     )
+
+
+def _cuda_device() -> str | None:
+    if not torch.cuda.is_available():
+        return None
+    return f"{torch.cuda.get_device_name(0)}, CUDA {torch.version.cuda}"
 
 
 def num_threads() -> int:

@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ _READY_WITHIN_S = 300.0
 def ask_service(bench: Bench, maps_dir: Path, seed: int) -> dict[str, Any]:
     """Start a service, ask it all queries at each concurrency; the reports of ``localize``."""
     reports = {}
-    with _service(bench, maps_dir) as url:
+    with service(bench, maps_dir) as url:
         _localize(bench, url, 1, seed)  # the first answers of a process are slower
         for concurrency in CONCURRENCIES:
             reports[str(concurrency)] = _localize(bench, url, concurrency, seed)
@@ -43,11 +43,11 @@ def _localize(bench: Bench, url: str, concurrency: int, seed: int) -> dict[str, 
 
 
 @contextmanager
-def _service(bench: Bench, maps_dir: Path) -> Iterator[str]:
-    """Run the service with its default settings; its URL."""
+def service(bench: Bench, maps_dir: Path, settings: Sequence[str] = ()) -> Iterator[str]:
+    """Run the service with its default settings but for these; its URL."""
     port, log = free_port(), bench.work / "service.log"
     command = [sys.executable, "-m", "service", "--maps-dir", str(maps_dir)]
-    command += ["--http-port", str(port), "--grpc-port", "0"]
+    command += ["--http-port", str(port), "--grpc-port", "0", *settings]
     if bench.weights_dir is not None:
         command += ["--weights-dir", str(bench.weights_dir)]
     with log.open("wb") as file:

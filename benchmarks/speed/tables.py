@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -32,9 +31,7 @@ def describe_machine(machine: Machine, loads: Sequence[float]) -> Iterator[str]:
     yield ""
 
 
-def tables(
-    bench: Bench, measured: Measured, no_peer: str | None, gpu: Mapping[str, Any] | None
-) -> Iterator[str]:
+def tables(bench: Bench, measured: Measured, no_peer: str | None) -> Iterator[str]:
     """All tables, ratios first. Figures are the median of the rounds, and their span."""
     counts = measured.builds[0]["counts"]
     yield (
@@ -45,15 +42,15 @@ def tables(
     )
     yield ""
     if no_peer is None:
-        yield from _table(["peer / ours", "ratio"], _ratio_rows(measured))
+        yield from table(["peer / ours", "ratio"], _ratio_rows(measured))
     else:
         yield f"Without the peer: {no_peer}."
         yield ""
     yield from _seconds(measured, with_peer=no_peer is None)
-    yield from _table(
+    yield from table(
         ["service, over HTTP", "p50 s", "p90 s", "queries per second"], _service_rows(measured)
     )
-    yield from _table(
+    yield from table(
         [
             "accuracy",
             "localized",
@@ -65,9 +62,8 @@ def tables(
         ],
         _accuracy_rows(bench, measured, with_peer=no_peer is None),
     )
-    yield from _table(["building", "seconds"], _building_rows(measured))
+    yield from table(["building", "seconds"], _building_rows(measured))
     yield from _limits(bench, measured)
-    yield from _gpu(gpu)
 
 
 def _ratio_rows(measured: Measured) -> Iterator[list[str]]:
@@ -81,17 +77,17 @@ def _seconds(measured: Measured, *, with_peer: bool) -> Iterator[str]:
     for stage in measured.stages():
         row = [stage.replace("_", " ")]
         if with_peer and stage == _EXTRACTION:
-            row.append(f"{_number(measured.stage(WAYS[0].label, stage).median, 3)} (ours, torch)")
+            row.append(f"{number(measured.stage(WAYS[0].label, stage).median, 3)} (ours, torch)")
         elif with_peer:
             known = stage in _PEER_STAGE
             row.append(_text(measured.peer_stage(_PEER_STAGE[stage]), 3) if known else "")
-        rows.append(row + [_number(measured.stage(way.label, stage).median, 3) for way in WAYS])
+        rows.append(row + [number(measured.stage(way.label, stage).median, 3) for way in WAYS])
     whole = [_text(measured.peer_total(), 2)] if with_peer else []
     rows.append(["**whole query**", *whole, *(_text(measured.total(w.label), 3) for w in WAYS)])
     slow = [""] if with_peer else []
     p90 = (_text(measured.total(way.label, 90), 3) for way in WAYS)
     rows.append(["its 90th percentile", *slow, *p90])
-    yield from _table(["s per query", *peer, *(way.label for way in WAYS)], rows)
+    yield from table(["s per query", *peer, *(way.label for way in WAYS)], rows)
 
 
 def _service_rows(measured: Measured) -> Iterator[list[str]]:
@@ -134,7 +130,7 @@ def _building_rows(measured: Measured) -> Iterator[list[str]]:
     yield ["ours: everything, with extraction and global descriptors", _text(whole, 1)]
     built = measured.builds[0]
     per_observation = built["bytes"] / built["counts"]["observations"]
-    yield ["bytes of map per observation, all files", _number(per_observation, 1)]
+    yield ["bytes of map per observation, all files", number(per_observation, 1)]
 
 
 def _limits(bench: Bench, measured: Measured) -> Iterator[str]:
@@ -143,12 +139,12 @@ def _limits(bench: Bench, measured: Measured) -> Iterator[str]:
     rows = [
         [
             what + (f" ({network.layer})" if name.startswith("convolution") and network else ""),
-            f"{_number(rates[name] / 1e9, 0)} {'GB/s' if name == 'copy' else 'GOP/s'}",
+            f"{number(rates[name] / 1e9, 0)} {'GB/s' if name == 'copy' else 'GOP/s'}",
         ]
         for name, what in RATES.items()
         if name in rates
     ]
-    yield from _table(["best rate of this machine", "measured"], rows)
+    yield from table(["best rate of this machine", "measured"], rows)
     least = measured.least_seconds(None if network is None else network.gflop_per_megapixel)
     rows = []
     for way in WAYS:
@@ -160,12 +156,12 @@ def _limits(bench: Bench, measured: Measured) -> Iterator[str]:
                     way.label,
                     stage.replace("_", " ")
                     + (f" ({about['computed_with']})" if stage == _EXTRACTION else ""),
-                    _number(seconds, 3),
-                    _number(spent, 3),
-                    f"{_number(100 * seconds / spent, 0)} %",
+                    number(seconds, 3),
+                    number(spent, 3),
+                    f"{number(100 * seconds / spent, 0)} %",
                 ]
             )
-    yield from _table(["limit", "stage", "least s", "measured s", "of the limit"], rows)
+    yield from table(["limit", "stage", "least s", "measured s", "of the limit"], rows)
     if network is not None:
         work = measured.described[DEFAULT]["megapixels"] * network.gflop_per_megapixel
         yield (
@@ -176,22 +172,8 @@ def _limits(bench: Bench, measured: Measured) -> Iterator[str]:
         yield ""
 
 
-def _gpu(gpu: Mapping[str, Any] | None) -> Iterator[str]:
-    if gpu is None:
-        yield "On a GPU: unmeasured, there is no CUDA device here."
-        yield ""
-        return
-    rows = [
-        [entry["network"], f"{entry['width']} x {entry['height']}", _number(entry["seconds"], 4)]
-        for entry in gpu["extraction"]
-    ]
-    rows.append(["whole query, p50", "of the dataset", _number(gpu["query_p50"], 4)])
-    yield from _table(["on the GPU", "photo", "seconds"], rows)
-    yield f"{_number(gpu['queries_per_second'], 1)} queries per second, 8 at once."
-    yield ""
-
-
-def _table(head: Sequence[str], rows: Iterator[list[str]] | Sequence[list[str]]) -> Iterator[str]:
+def table(head: Sequence[str], rows: Iterator[list[str]] | Sequence[list[str]]) -> Iterator[str]:
+    """A table in Markdown, and an empty line."""
     yield f"| {' | '.join(head)} |"
     yield f"|{'---|' * len(head)}"
     for row in rows:
@@ -200,9 +182,10 @@ def _table(head: Sequence[str], rows: Iterator[list[str]] | Sequence[list[str]])
 
 
 def _text(spread: Spread, digits: int) -> str:
-    median, low, high = (_number(v, digits) for v in (spread.median, spread.low, spread.high))
+    median, low, high = (number(v, digits) for v in (spread.median, spread.low, spread.high))
     return median if low == high else f"{median} ({low} to {high})"
 
 
-def _number(value: float, digits: int) -> str:
+def number(value: float, digits: int) -> str:
+    """A number with so many digits after the point, or a dash."""
     return f"{value:.{digits}f}" if np.isfinite(value) else "-"

@@ -13,8 +13,8 @@ from mapping.capture.job import Captured
 from mapping.progress import ItemProgress
 from mapping.report.held_out import left_out_sets, localize_held_out, spread_photos
 from mapping.report.model import tolerance_of
-from mapping.report.viewpoints import Viewpoints
 from visloc.archive import Map
+from visloc.localization.viewpoints import Viewpoints
 
 USED, NOT_CONNECTED, BLURRED = "used", "not connected", "too blurred"
 STILL, SKIPPED = "camera did not move", "skipped: its neighbours show it"

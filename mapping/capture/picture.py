@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from mapping.capture.account import Trials
 from mapping.report.grid import Plan
-from mapping.report.viewpoints import Viewpoints
 from visloc.archive import Map
+from visloc.localization.viewpoints import Viewpoints
 
 _SIDE, _MARGIN, _LEGEND = 1000, 60, 90
 _MOST_POINTS = 60_000

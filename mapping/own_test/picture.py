@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.report.viewpoints import Viewpoints
 from visloc.archive import Map
+from visloc.localization.viewpoints import Viewpoints
 
 _SIDE, _MARGIN = 1000, 40
 _GROUND, _LANDMARK, _PHOTO, _DOUBTED = (

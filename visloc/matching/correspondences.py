@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from visloc.device import torch_device
+from visloc.matching.on_device import nearest_on
 from visloc.matching.products import EightBitRows, in_threads, row_products
+
+if TYPE_CHECKING:
+    import torch
 
 # With 2000 to 5000 keypoints, 2 to 5 MB of products.
 _BLOCK_ROWS = 256
+_MOST_PRODUCTS_ON_DEVICE = 2**26  # 256 MB of them
 # Lowe's test of ambiguity: how much nearer than the second nearest the nearest must be. His 0.8 is
 # for SIFT; learned descriptors of unlike points lie closer together, so 0.9, which was chosen
 # before it was measured (docs/results.md).
@@ -116,8 +124,7 @@ def mutual_nearest_neighbours(
         Rows of a, rows of b and their dot products. Ties go to the lower row of b, and of a.
     """
     if len(a) == 0 or len(b) == 0:
-        none = np.empty(0, dtype=np.int64)
-        return none, none, np.empty(0, dtype=np.float32)
+        return _no_pairs()
     products = row_products(a.rows, b.rows, _BLOCK_ROWS)
     best_b = np.empty(len(a), dtype=np.int64)
     best = np.empty(len(a), dtype=np.float64)
@@ -136,15 +143,57 @@ def mutual_nearest_neighbours(
             np.max(similarity, axis=1, out=second[rows])
     # Equality with the column's maximum replaces a second, slower arg-max over the columns.
     mutual = np.flatnonzero(best == column_best[best_b])
+    return _pairs(mutual, best_b, best, second, a.scale * b.scale, max_ratio)
+
+
+def mutual_nearest_neighbours_on(
+    device: torch.device,
+    a: EightBitRows,
+    others: Sequence[EightBitRows],
+    max_ratio: float | None = None,
+) -> list[Pairs]:
+    """Return what ``mutual_nearest_neighbours`` gives of a and each of the others, from a device.
+
+    Products are exact here too, so that the pairs are the same. The device gets as many of the
+    others at a time as keep their products within 256 MB; those of a photo alone may be more.
+    """
+    found = [_no_pairs() for _ in others]
+    with_rows = [number for number, b in enumerate(others) if len(a) and len(b)]
+    most = max((len(others[number]) for number in with_rows), default=1)
+    step = max(1, _MOST_PRODUCTS_ON_DEVICE // (max(len(a), 1) * most))
+    for start in range(0, len(with_rows), step):
+        some = with_rows[start : start + step]
+        rows = [others[number].rows for number in some]
+        nearest = nearest_on(device, a.rows, rows, with_second=max_ratio is not None)
+        for number, (mutual, best_b, best, second) in zip(some, nearest, strict=True):
+            scale = a.scale * others[number].scale
+            found[number] = _pairs(mutual, best_b, best, second, scale, max_ratio)
+    return found
+
+
+def _no_pairs() -> Pairs:
+    none = np.empty(0, dtype=np.int64)
+    return none, none, np.empty(0, dtype=np.float32)
+
+
+def _pairs(
+    mutual: NDArray[np.intp],
+    best_b: NDArray[np.int64],
+    best: NDArray[np.float64],
+    second: NDArray[np.float64] | None,
+    scale: float,
+    max_ratio: float | None,
+) -> Pairs:
+    """Return the mutual rows that are clear and the first ones of their column, as pairs."""
     # Rows with equal similarity to one column (duplicate descriptors): the first one keeps it.
     _, first = np.unique(best_b[mutual], return_index=True)
     mutual = mutual[np.sort(first)]
     if second is not None and max_ratio is not None:
         # The squared distance of unit vectors is 2 - 2 cos.
-        half_squares = (1 - np.clip(s[mutual] * (a.scale * b.scale), -1, 1) for s in (best, second))
+        half_squares = (1 - np.clip(s[mutual] * scale, -1, 1) for s in (best, second))
         nearest, second_nearest = half_squares
         mutual = mutual[nearest < max_ratio**2 * second_nearest]
-    return mutual, best_b[mutual], (best[mutual] * (a.scale * b.scale)).astype(np.float32)
+    return mutual, best_b[mutual], (best[mutual] * scale).astype(np.float32)
 
 
 def propose_landmarks(
@@ -164,19 +213,25 @@ def propose_landmarks(
             ``photos``: keypoints, landmarks and similarities. What it says of the photos with the
             most pairs replaces those.
     """
-
-    def match(photo: tuple[NDArray[np.integer], EightBitRows]) -> Pairs:
-        landmarks, descriptors = photo
-        i, j, similarity = mutual_nearest_neighbours(query, descriptors, max_ratio)
-        return i, landmarks[j].astype(np.int64), similarity
-
-    found = in_threads(match, photos)
-    if not found:
+    photos = list(photos)
+    if not photos:
         return Proposals.none()
+    descriptors = [rows for _, rows in photos]
+    device = torch_device()
+    if device.type == "cpu":
+        pairs = in_threads(
+            partial(mutual_nearest_neighbours, query, max_ratio=max_ratio), descriptors
+        )
+    else:
+        pairs = mutual_nearest_neighbours_on(device, query, descriptors, max_ratio)
+    found = [
+        (i, landmarks[j].astype(np.int64), similarity)
+        for (landmarks, _), (i, j, similarity) in zip(photos, pairs, strict=True)
+    ]
     if rematch is not None:
         best = sorted(range(len(found)), key=lambda photo: -len(found[photo][0]))[:NUM_REMATCHED]
-        for photo, pairs in zip(best, in_threads(rematch, best), strict=True):
-            found[photo] = pairs
+        for photo, better in zip(best, in_threads(rematch, best), strict=True):
+            found[photo] = better
     keypoints, landmarks, similarities = map(np.concatenate, zip(*found, strict=True))
     ranks = np.repeat(np.arange(len(found)), [len(i) for i, _, _ in found])
     return Proposals(keypoints, landmarks, ranks, similarities)

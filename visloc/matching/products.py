@@ -8,16 +8,19 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+if TYPE_CHECKING:
+    import torch
+
 _LARGEST = 127
 # Whole numbers up to here are exact in single precision, as are sums of them that stay below.
 _EXACT_IN_FLOAT32 = 2**24
-_LARGEST_PRODUCT = 128**2
-_MOST_COLUMNS = (2**31 - 1) // _LARGEST_PRODUCT  # sums fit 32 bits
+LARGEST_PRODUCT = 128**2
+_MOST_COLUMNS = (2**31 - 1) // LARGEST_PRODUCT  # sums fit 32 bits
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -70,8 +73,7 @@ def row_products(a: NDArray[np.int8], b: NDArray[np.int8], most_rows: int) -> Ro
     if 1 < a.shape[1] <= _MOST_COLUMNS and _has_integer_products():
         multiply, operand, result = torch._int_mm, torch.int8, torch.int32
     else:
-        exact = a.shape[1] * _LARGEST_PRODUCT <= _EXACT_IN_FLOAT32
-        operand = result = torch.float32 if exact else torch.float64
+        operand = result = exact_float(a.shape[1])
         multiply = torch.mm
     left, right = torch.tensor(a, dtype=operand), torch.tensor(b, dtype=operand).T
     buffer = torch.empty((most_rows, len(b)), dtype=result)
@@ -83,6 +85,13 @@ def row_products(a: NDArray[np.int8], b: NDArray[np.int8], most_rows: int) -> Ro
         return np.asarray(out.numpy())
 
     return products
+
+
+def exact_float(dim: int) -> torch.dtype:
+    """Return the floats whose products of 8-bit rows with so many columns are exact."""
+    import torch
+
+    return torch.float32 if dim * LARGEST_PRODUCT <= _EXACT_IN_FLOAT32 else torch.float64
 
 
 @cache
@@ -99,7 +108,7 @@ def _has_integer_products() -> bool:
     if not hasattr(torch, "_int_mm") or has_vnni is None or not has_vnni():
         return False
     extreme = torch.full((32, 64), -128, dtype=torch.int8)
-    return bool((torch._int_mm(extreme, extreme.T) == 64 * _LARGEST_PRODUCT).all())
+    return bool((torch._int_mm(extreme, extreme.T) == 64 * LARGEST_PRODUCT).all())
 
 
 def in_threads(work: Callable[[S], T], items: Iterable[S]) -> list[T]:

@@ -6,15 +6,13 @@ import logging
 from functools import cache
 from pathlib import Path
 
+from visloc.device import has_cuda
 from visloc.errors import refuse
 from visloc.features.backends.openvino import import_openvino
 from visloc.options import Inference
 
 _LOGGER = logging.getLogger(__name__)
 _CPU_INFO = Path("/proc/cpuinfo")
-# The driver's device files tell of a CUDA GPU without loading torch, which takes a second: of a
-# graphics card, in WSL, and on a Jetson.
-_CUDA_DEVICES = (Path("/dev/nvidiactl"), Path("/dev/dxg"), Path("/dev/nvhost-gpu"))
 # Without these instructions products of 8-bit numbers are no faster than of floats, and OpenVINO
 # adds some of them up in 16 bits, where they may overflow.
 _EIGHT_BIT_FLAGS = frozenset({"avx512_vnni", "avx_vnni", "amx_int8"})
@@ -56,7 +54,7 @@ def choose_inference(wanted: Inference) -> Inference:
 
 
 def _automatic() -> tuple[Inference, str]:
-    if _has_cuda():
+    if has_cuda():
         return Inference.TORCH, "there is a CUDA GPU"
     missing = _missing_openvino()
     if missing is not None:
@@ -68,14 +66,6 @@ def _automatic() -> tuple[Inference, str]:
 @cache
 def _log_once(chosen: Inference, reason: str) -> None:
     _LOGGER.info("networks are computed with %s: %s", chosen.value, reason)
-
-
-def _has_cuda() -> bool:
-    if not any(device.exists() for device in _CUDA_DEVICES):
-        return False
-    import torch
-
-    return torch.cuda.is_available()
 
 
 def _missing_openvino() -> str | None:

@@ -80,11 +80,6 @@ def for_inference(network: N) -> N:
     return network
 
 
-def torch_device() -> torch.device:
-    """Return the CUDA GPU where there is one, else the processor."""
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-
-
 def computed_with(device: torch.device) -> str:
     """Return library and device, to show."""
     name = torch.cuda.get_device_name() if device.type == "cuda" else device.type

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from visloc.device import torch_device
 from visloc.errors import refuse
-from visloc.features.backends.torch import torch_device
 from visloc.features.base import GlobalDescriptor
 from visloc.features.descriptors.network_descriptor import (
     NetworkDescriptor,

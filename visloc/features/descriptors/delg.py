@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from visloc.features.backends.torch import torch_device
+from visloc.device import torch_device
 from visloc.features.base import GlobalDescriptor
 from visloc.features.descriptors.network_descriptor import (
     NetworkDescriptor,

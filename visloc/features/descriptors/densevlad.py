@@ -7,16 +7,22 @@ things everyone should know to improve object retrieval" (CVPR 2012).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from visloc.device import has_cuda, torch_device
 from visloc.features.base import Fingerprint, GlobalDescriptor
-from visloc.features.descriptors.vlad import VLAD_PARAMETERS, VladDescriptor
+from visloc.features.descriptors.vlad import VLAD_PARAMETERS, VladDescriptor, vlad_of_sums
 from visloc.options import Inference
 from visloc.types import LocalFeatures
+
+if TYPE_CHECKING:
+    import torch
 
 ORIENTATIONS = 8
 CELLS_PER_SIDE = 4
@@ -36,12 +42,16 @@ def load_densevlad(
     _inference: Inference = Inference.AUTO,
     _threads: int | None = None,
 ) -> GlobalDescriptor:
-    """Make the descriptor, which needs no weights."""
-    return DenseVlad()
+    """Make the descriptor, which needs no weights; a CUDA GPU computes it where there is one."""
+    return DenseVlad(torch_device() if has_cuda() else None)
 
 
 class DenseVlad(VladDescriptor):
-    """A photo's words are RootSIFT descriptors (128) of overlapping patches all over it."""
+    """A photo's words are RootSIFT descriptors (128) of overlapping patches all over it.
+
+    Args:
+        device: of torch, which sums words up; None for NumPy, which is the reference.
+    """
 
     fingerprint = Fingerprint(
         "densevlad",
@@ -57,6 +67,28 @@ class DenseVlad(VladDescriptor):
     )
     needs_image = True  # words lie on a grid, not at keypoints
     needs_local_features = False
+
+    def __init__(self, device: torch.device | None = None) -> None:
+        self._device = device
+        if device is not None:
+            from visloc.features.backends.torch import computed_with
+
+            self.computed_with = computed_with(device)
+
+    def pool(
+        self,
+        rgb: NDArray[np.uint8],
+        local: LocalFeatures,
+        vocabulary: Mapping[str, NDArray[np.float32]],
+    ) -> NDArray[np.float32]:
+        """Aggregate one photo; see ``VladDescriptor.pool``."""
+        centres = vocabulary["vocabulary"]
+        if self._device is None or len(centres) == 0:
+            return super().pool(rgb, local, vocabulary)
+        from visloc.features.descriptors.densevlad_torch import sums_of_words
+
+        shrunk = [gradient(grey) for grey in shrunk_greys(rgb)]
+        return vlad_of_sums(*sums_of_words(self._device, shrunk, centres), centres)
 
     def words(
         self,
@@ -77,20 +109,28 @@ def dense_root_sift(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     Columns: cell row, cell column, orientation of the gradient (0 to the right, then clockwise
     in steps of 45 degrees, as y points down).
     """
+    none = np.zeros((0, CELLS_PER_SIDE**2 * ORIENTATIONS), np.float32)
+    return np.concatenate([none, *map(_root_sift, shrunk_greys(rgb))])
+
+
+def shrunk_greys(rgb: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
+    """Return a photo (H, W, 3) in grey for each cell size; none of one too small for a patch."""
     height, width = rgb.shape[:2]
     if min(height, width) < min(CELL_SIZES_PX) * CELLS_PER_SIDE:
-        return np.zeros((0, CELLS_PER_SIDE**2 * ORIENTATIONS), np.float32)
+        return []
     grey = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY).astype(np.float32)
     working_scale = min(1.0, WORKING_SIZE_PX / max(height, width))
-    return np.concatenate(
-        [_root_sift_at(grey, working_scale * CELL_PX / size) for size in CELL_SIZES_PX]
-    )
+    return [_shrunk(grey, working_scale * CELL_PX / size) for size in CELL_SIZES_PX]
 
 
-def _root_sift_at(grey: NDArray[np.float32], scale: float) -> NDArray[np.float32]:
+def _shrunk(grey: NDArray[np.float32], scale: float) -> NDArray[np.float32]:
     height, width = (max(1, round(side * scale)) for side in grey.shape)
     shrunk = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
-    cells = _cells(orientation_channels(shrunk.astype(np.float32, copy=False)))
+    return shrunk.astype(np.float32, copy=False)
+
+
+def _root_sift(grey: NDArray[np.float32]) -> NDArray[np.float32]:
+    cells = _cells(orientation_channels(grey))
     rows, columns = (max(0, count - CELLS_PER_SIDE + 1) for count in cells.shape[:2])
     patches = np.empty((rows, columns, CELLS_PER_SIDE, CELLS_PER_SIDE, ORIENTATIONS), np.float32)
     for i in range(CELLS_PER_SIDE):
@@ -110,10 +150,7 @@ def orientation_channels(grey: NDArray[np.float32]) -> NDArray[np.float32]:
     The length of the gradient, as the difference of the neighbours on either side, is divided
     linearly between the two nearest of the orientations 0, 45, ..., 315 degrees.
     """
-    smooth = cv2.GaussianBlur(grey, (0, 0), SMOOTHING_SIGMA_PX)
-    length, angle = cv2.cartToPolar(
-        cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=1), cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=1)
-    )
+    length, angle = cv2.cartToPolar(*gradient(grey))
     position = angle.astype(np.float32, copy=False).ravel() * np.float32(ORIENTATIONS / (2 * np.pi))
     floor = np.floor(position)
     lower = floor.astype(np.intp)
@@ -126,14 +163,30 @@ def orientation_channels(grey: NDArray[np.float32]) -> NDArray[np.float32]:
     return channels.reshape(*grey.shape, ORIENTATIONS)
 
 
+def gradient(grey: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return how a grey image (H, W), smoothed, changes to the right and down, each (H, W)."""
+    smooth = cv2.GaussianBlur(grey, (0, 0), SMOOTHING_SIGMA_PX)
+    right = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=1)
+    down = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=1)
+    return np.asarray(right, np.float32), np.asarray(down, np.float32)
+
+
+def tent() -> NDArray[np.float32]:
+    """Return the weights of a cell's pixels along one axis: twice as wide as the cell."""
+    weights = np.convolve(np.ones(CELL_PX), np.ones(CELL_PX)) / CELL_PX**2
+    return weights.astype(np.float32)
+
+
 def _cells(channels: NDArray[np.float32]) -> NDArray[np.float32]:
     """Average channels (H, W, 8) in the cells of a grid: (H // 4, W // 4, 8).
 
     A tent twice as wide as a cell: a pixel counts for the cells on both sides, by its distance
     to their centres, so that a small shift changes little.
     """
-    tent = np.convolve(np.ones(CELL_PX), np.ones(CELL_PX)).astype(np.float32) / CELL_PX**2
-    averaged = cv2.sepFilter2D(channels, cv2.CV_32F, tent, tent, borderType=cv2.BORDER_CONSTANT)
+    weights = tent()
+    averaged = cv2.sepFilter2D(
+        channels, cv2.CV_32F, weights, weights, borderType=cv2.BORDER_CONSTANT
+    )
     height, width = (side // CELL_PX * CELL_PX for side in channels.shape[:2])
     centre = CELL_PX // 2
     return averaged[centre:height:CELL_PX, centre:width:CELL_PX].astype(np.float32, copy=False)

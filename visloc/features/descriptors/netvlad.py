@@ -25,7 +25,8 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from visloc.features.backends.torch import fixed_convolution, torch_device
+from visloc.device import torch_device
+from visloc.features.backends.torch import fixed_convolution
 from visloc.features.base import GlobalDescriptor
 from visloc.features.descriptors.network_descriptor import (
     NetworkDescriptor,

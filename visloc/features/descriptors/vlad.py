@@ -63,7 +63,13 @@ def aggregate(words: NDArray[np.float32], centres: NDArray[np.float32]) -> NDArr
     """
     if len(words) == 0 or len(centres) == 0:
         return np.zeros(centres.size, np.float32)
-    sums, counts = _sum_by_nearest(words, centres)
+    return vlad_of_sums(*_sum_by_nearest(words, centres), centres)
+
+
+def vlad_of_sums(
+    sums: NDArray[np.float32], counts: NDArray[np.float32], centres: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return the VLAD vector (K * d,) from the sums (K, d) and counts (K,) of centres' words."""
     residuals: NDArray[np.float32] = sums - counts[:, None] * centres
     # Words that lie exactly at their centre leave only rounding errors, which are no direction.
     floor = np.float32(1e-5) * np.linalg.norm(sums, axis=1, keepdims=True)

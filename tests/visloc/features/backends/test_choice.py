@@ -26,7 +26,7 @@ NOT_LOADABLE = [
 
 @pytest.fixture(autouse=True)
 def _no_gpu_and_nothing_logged(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inference, "_has_cuda", lambda: False)
+    monkeypatch.setattr(inference, "has_cuda", lambda: False)
     inference._log_once.cache_clear()
 
 
@@ -94,7 +94,7 @@ def test_8_bits_are_refused_where_their_sums_may_overflow(
 
 
 def test_gpu_computes_with_torch(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inference, "_has_cuda", lambda: True)
+    monkeypatch.setattr(inference, "has_cuda", lambda: True)
     assert choose_inference(Inference.AUTO) is Inference.TORCH
 
 

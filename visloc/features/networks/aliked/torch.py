@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from visloc.features.backends.torch import computed_with, torch_device
+from visloc.device import torch_device
+from visloc.features.backends.torch import computed_with
 from visloc.features.networks.aliked.extractor import Seen, padded, padding_of
 from visloc.features.networks.aliked.model import AlikedNetwork, Padding
 

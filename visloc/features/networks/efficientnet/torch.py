@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from visloc.features.backends.torch import computed_with, torch_device
+from visloc.device import torch_device
+from visloc.features.backends.torch import computed_with
 from visloc.features.networks.efficientnet.model import Block
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from visloc.features.backends.torch import computed_with, torch_device
+from visloc.device import torch_device
+from visloc.features.backends.torch import computed_with
 from visloc.features.networks.r2d2.extractor import Seen
 from visloc.features.networks.r2d2.model import MEAN, STD, R2D2Network
 
@@ -35,7 +36,8 @@ class TorchNetwork:
             features = self.network(normalized)
         # The heads square x: that is beyond the range of half precision.
         features = features.float()
-        logits = self.network.logits(features)
+        # One map after the other, as looking for peaks reads them.
+        logits = self.network.logits(features).contiguous()
 
         @torch.inference_mode()
         def descriptors(x: NDArray[np.intp], y: NDArray[np.intp]) -> NDArray[np.float32]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
-
 import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
-from visloc.features.backends.torch import computed_with, torch_device
+from visloc.device import torch_device
+from visloc.features.backends.torch import computed_with
 from visloc.features.networks.xfeat.extractor import Seen
 from visloc.features.networks.xfeat.model import CELL_PX, XFeatNetwork
 
@@ -26,9 +25,8 @@ class TorchNetwork:
     def look(self, grey: NDArray[np.float32]) -> Seen:
         """Look at a grey image (H, W) whose sides are multiples of 32."""
         pixels = torch.tensor(grey, device=self._device)[None, None]
-        half = torch.autocast("cuda") if self._device.type == "cuda" else contextlib.nullcontext()
-        with half:
-            features, logits, reliability = self.network(pixels)
-        heat = F.pixel_shuffle(logits.float().softmax(dim=1)[:, :-1], CELL_PX)[0, 0]
-        unit = F.normalize(features.float(), dim=1)[0].permute(1, 2, 0).contiguous()
-        return Seen(heat.cpu().numpy(), reliability.float()[0, 0].cpu().numpy(), unit.cpu().numpy())
+        # Not in half precision: the layers are so small that conversions cost more than they save.
+        features, logits, reliability = self.network(pixels)
+        heat = F.pixel_shuffle(logits.softmax(dim=1)[:, :-1], CELL_PX)[0, 0]
+        unit = F.normalize(features, dim=1)[0].permute(1, 2, 0).contiguous()
+        return Seen(heat.cpu().numpy(), reliability[0, 0].cpu().numpy(), unit.cpu().numpy())
