@@ -405,7 +405,7 @@ def _filtered(images: Tensor, kernels: Tensor) -> Tensor:
     photos, channels = images.shape[:2]
     padded = F.pad(images, (_REACH_PX,) * 4, mode="reflect")
     planes = padded.reshape(1, photos * channels, *padded.shape[2:])
-    every = kernels.repeat_interleave(channels, dim=0, output_size=photos * channels)
+    every = kernels.expand(-1, channels, -1, -1).reshape(-1, 1, *kernels.shape[2:])
     return F.conv2d(planes, every, groups=photos * channels).view(images.shape)
 
 
