@@ -15,7 +15,7 @@ import torch
 
 from training.checkpoint import FILE_NAME, State, load_state
 from training.export import export
-from training.pairs import Sources
+from training.pairs import make_sources
 from training.parallax import pack_rooms, read_rooms
 from training.photos import pack_photos, read_pack
 from training.plots import draw
@@ -71,12 +71,13 @@ def _parser() -> argparse.ArgumentParser:
         else:
             run.add_argument(name, type=type(each.default), help=meaning, metavar="N")
     _add_running(run)
+    run.add_argument("--fit-seconds", type=float, help="time steps, and do no more than fit")
     run.set_defaults(run=_run)
 
     again = commands.add_parser("resume", help="go on training where a run stopped")
     again.add_argument("folder", type=Path, help="of the run")
     _add_running(again)
-    again.set_defaults(run=_resume)
+    again.set_defaults(run=_resume, fit_seconds=None)
 
     check = commands.add_parser("validate", help="how well features match held-back photos")
     check.add_argument("features", nargs="*", help="names of local features")
@@ -161,16 +162,16 @@ def _trainer(settings: Settings, options: argparse.Namespace) -> Trainer:
     device = torch.device(options.device)
     if device.type == "cuda" and not torch.cuda.is_available():
         raise refuse("training.device", field="device", got="cuda")
-    pack = read_pack(options.photos, device)
+    pack = read_pack(options.photos)
     described = {
         "photos_sha256": pack.sha256,
         "photos": str(len(pack.photos)),
         "licences": "; ".join(f"{n} {each}" for each, n in sorted(pack.licences.items())),
     }
-    places = read_rooms(options.rooms, device) if settings.parallax_share else ()
+    places = read_rooms(options.rooms) if settings.parallax_share else ()
     if places:
         described["rooms_sha256"] = hashlib.sha256(options.rooms.read_bytes()).hexdigest()
-    return Trainer(settings, Sources(pack.photos, places, device), described)
+    return Trainer(settings, make_sources(pack.photos, places, device), described)
 
 
 def _train(trainer: Trainer, options: argparse.Namespace) -> int:
@@ -185,6 +186,7 @@ def _train(trainer: Trainer, options: argparse.Namespace) -> int:
         should_stop=lambda: bool(asked_to_stop),
         validate_every=options.validate_every,
         validated=_validation(options),
+        fit_seconds=options.fit_seconds,
     )
     how = "finished" if finished else "stopped; resume goes on"
     sys.stdout.write(f"step {trainer.step} of {trainer.settings.steps}: {how}\n")
@@ -194,12 +196,12 @@ def _train(trainer: Trainer, options: argparse.Namespace) -> int:
 def _validation(options: argparse.Namespace) -> Callable[[State], Score] | None:
     if options.validate_every is None:
         return None
-    pairs = validation_pairs(read_pack(options.validation, torch.device("cpu")).photos)
+    pairs = validation_pairs(read_pack(options.validation).photos)
     return lambda state: validate(features_of(state), pairs)
 
 
 def _validate(options: argparse.Namespace) -> int:
-    photos = read_pack(options.validation, torch.device("cpu")).photos
+    photos = read_pack(options.validation).photos
     pairs = validation_pairs(photos, options.per_photo)
     sys.stdout.write(
         f"{len(pairs)} pairs\n\n| features | right within 1 px | 3 px | 5 px | right matches"

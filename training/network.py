@@ -112,7 +112,8 @@ class TrainableR2D2(nn.Module):
 
     def forward(self, images: Tensor, bf16: bool = False) -> Maps:
         """Look at RGB (B, 3, H, W) in 0 to 1, even sizes; with bf16, in that precision up to x."""
-        with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
+        # Each weight is used once: there is nothing to keep, least of all in a recording.
+        with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16, cache_enabled=False):
             x = self.features(images)
         x = x.float().permute(0, 2, 3, 1)
         weight, bias = self.heads.weight[:, :, 0, 0], self.heads.bias

@@ -1,18 +1,24 @@
-"""The pairs of one step: always the same for the same settings, step and photos."""
+"""The pairs of one step: always the same for the same settings, step and photos.
+
+They are drawn as numbers on the processor, and made of these on the device by the same operations
+in each step.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from training.augmentation import augment
-from training.homographies import flow_between, look, random_looks, strength_at
-from training.parallax import Place, random_parallax
-from training.photos import Photo
+from training.atlas import Atlas, levels_to_look_at, look, make_atlas
+from training.augmentation import Conditions, augment, draw_conditions
+from training.homographies import applied, pixel_centres, random_looks, strength_at
+from training.parallax import Place, Rooms, make_rooms, other_view, random_views
+from training.photos import Photo, photo_levels
 from training.sampler import random_pixels
 from training.settings import Settings
 
@@ -38,40 +44,149 @@ class Sources:
     """Where pairs come from.
 
     Attributes:
-        photos: for homographies.
-        places: of synthetic rooms, for true parallax; may be empty.
+        atlas: the photos, for homographies, then the views of rooms.
+        sizes: (photos, 2) heights and widths, without the views.
+        rooms: for true parallax, None without.
         device: where the photos are and the pairs are made.
     """
 
-    photos: tuple[Photo, ...]
-    places: tuple[Place, ...]
+    atlas: Atlas
+    sizes: np.ndarray
+    rooms: Rooms | None
     device: torch.device
 
 
-def make_pairs(sources: Sources, settings: Settings, step: int) -> Pairs:
-    """Make the pairs of a step. Nothing is remembered between steps: resuming needs no state."""
+def make_sources(photos: Sequence[Photo], places: Sequence[Place], device: torch.device) -> Sources:
+    """Put photos and the views of places onto the device."""
+    views = [
+        Photo("view", photo_levels(view.image.permute(1, 2, 0).numpy()))
+        for place in places
+        for view in place
+    ]
+    atlas = make_atlas([*photos, *views], device)
+    rooms = make_rooms(places, device) if places else None
+    return Sources(atlas, atlas.sizes[: len(photos), 0], rooms, device)
+
+
+class Drawn(NamedTuple):
+    """Numbers that decide the pairs of a step: arrays, or tensors in float64.
+
+    Attributes:
+        begins: (2 B,) where the levels that are looked at begin, of first images, then second.
+        sizes: (2 B, 2) their heights and widths.
+        level_from_crop: (2 B, 3, 3).
+        photo_from_first: (B, 3, 3).
+        second_from_photo: (B, 3, 3).
+        in_room: (B,) 1 for pairs of two views, 0 for two looks at one photo.
+        views: (B, 2) of pairs in rooms.
+        intrinsics: (B, 2, 4) of them.
+        motion: (B, 3, 4) of them, second from first.
+        queries: (B, N, 2) pixels.
+        distractors: (B, N, 2) pixels.
+    """
+
+    begins: Any
+    sizes: Any
+    level_from_crop: Any
+    photo_from_first: Any
+    second_from_photo: Any
+    in_room: Any
+    views: Any
+    intrinsics: Any
+    motion: Any
+    queries: Any
+    distractors: Any
+
+
+def draw(sources: Sources, settings: Settings, step: int) -> tuple[Drawn, Conditions]:
+    """Draw the pairs of a step. Nothing is remembered between steps: resuming needs no state."""
     rng = np.random.default_rng([settings.seed, step])
     strength = strength_at(step, settings.mild_steps)
-    crop = settings.crop_px
-    firsts, seconds, flows = [], [], []
-    for _ in range(settings.batch):
-        if rng.random() < settings.parallax_share:
-            place = sources.places[rng.integers(len(sources.places))]
-            first, second, flow = random_parallax(rng, place, crop)
-        else:
-            photo = sources.photos[rng.integers(len(sources.photos))]
-            size = photo.levels[0].shape
-            looks = random_looks(rng, (size[1], size[2]), crop, strength)
-            first, second = (look(photo.levels, each, crop) for each in looks)
-            flow = flow_between(*looks, crop, sources.device)
-        firsts.append(first)
-        seconds.append(second)
-        flows.append(flow.to(sources.device))
-    images = augment(torch.stack([*firsts, *seconds]), rng, strength)
+    crop, batch = settings.crop_px, settings.batch
+    photo = rng.integers(len(sources.sizes), size=batch)
+    first, second = random_looks(rng, sources.sizes[photo], crop, strength)
+    looked_at = np.stack([photo, photo])
+    in_room = rng.random(batch) < settings.parallax_share
+    views, intrinsics = np.zeros((batch, 2), np.int64), np.ones((batch, 2, 4))
+    motion = np.zeros((batch, 3, 4))
+    if sources.rooms is not None and in_room.any():
+        pair, one, other = random_views(rng, sources.rooms, int(in_room.sum()), crop, strength)
+        first[in_room], second[in_room] = one, other
+        views[in_room] = sources.rooms.pairs[pair]
+        intrinsics[in_room] = sources.rooms.intrinsics[views[in_room]]
+        motion[in_room] = sources.rooms.second_from_first[pair]
+        looked_at[:, in_room] = len(sources.sizes) + views[in_room].T
+    levels = levels_to_look_at(
+        sources.atlas, looked_at.ravel(), np.concatenate([first, second]), crop
+    )
     queries, distractors = (
-        torch.from_numpy(
-            random_pixels(rng, settings.batch, settings.queries_per_image, crop, settings.border_px)
-        ).to(sources.device)
+        random_pixels(rng, batch, settings.queries_per_image, crop, settings.border_px)
         for _ in range(2)
     )
-    return Pairs(images, torch.stack(flows), queries, distractors)
+    drawn = Drawn(
+        *levels,
+        first,
+        np.linalg.inv(second),
+        in_room,
+        views,
+        intrinsics,
+        motion,
+        queries,
+        distractors,
+    )
+    conditions = draw_conditions(
+        rng, 2 * batch, strength, settings.night_share, settings.weather_share
+    )
+    return drawn, conditions
+
+
+def make(sources: Sources, settings: Settings, drawn: Drawn, conditions: Conditions) -> Pairs:
+    """Make pairs of what was drawn, tensors of float64 on the device."""
+    crop = settings.crop_px
+    seen = look(
+        sources.atlas.pixels,
+        drawn.begins.long(),
+        drawn.sizes.long(),
+        drawn.level_from_crop,
+        crop,
+    )
+    places = applied(drawn.photo_from_first, pixel_centres(crop, sources.device))
+    if sources.rooms is not None:
+        elsewhere = other_view(
+            sources.rooms.inverse_depth,
+            drawn.views.long(),
+            drawn.intrinsics,
+            drawn.motion,
+            places,
+        )
+        places = torch.where(drawn.in_room[:, None, None, None] > 0, elsewhere, places)
+    flow = applied(drawn.second_from_photo, places)
+    # A comparison with NaN is false.
+    inside = ((flow >= 0) & (flow < crop)).all(dim=-1, keepdim=True)
+    return Pairs(
+        augment(seen, conditions),
+        torch.where(inside, flow, torch.nan).float(),
+        drawn.queries.long(),
+        drawn.distractors.long(),
+    )
+
+
+def as_numbers(drawn: Drawn, conditions: Conditions) -> Tensor:
+    """Return everything that was drawn as one vector of float64, which travels in one piece."""
+    arrays = [np.asarray(each, np.float64).ravel() for each in (*drawn, *conditions)]
+    return torch.from_numpy(np.concatenate(arrays))
+
+
+def from_numbers(numbers: Tensor, like: tuple[Drawn, Conditions]) -> tuple[Drawn, Conditions]:
+    """Return what ``as_numbers`` joined, as tensors of the shapes of another step's."""
+    shapes = [np.shape(each) for each in (*like[0], *like[1])]
+    parts = torch.split(numbers, [int(np.prod(shape)) for shape in shapes])
+    tensors = [part.view(shape) for part, shape in zip(parts, shapes, strict=True)]
+    return Drawn(*tensors[: len(Drawn._fields)]), Conditions(*tensors[len(Drawn._fields) :])
+
+
+def make_pairs(sources: Sources, settings: Settings, step: int) -> Pairs:
+    """Draw and make the pairs of a step."""
+    like = draw(sources, settings, step)
+    numbers = as_numbers(*like).to(sources.device)
+    return make(sources, settings, *from_numbers(numbers, like))

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from itertools import permutations
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load
@@ -19,7 +23,7 @@ from samples.render import render_depth, render_photo
 from samples.scene import make_room
 from samples.trajectories import mapping_trajectory
 from training.files import write_tensors
-from training.homographies import rotation_about
+from training.homographies import Matrices, looks_at, moved, rotations_about
 from visloc.errors import NotFound, refuse
 from visloc.geometry import Camera, Pose
 
@@ -35,6 +39,12 @@ _JPEG_QUALITY = 95
 # A surface is seen by both cameras if its depths agree to this share; else something is before it.
 _SAME_DEPTH = 0.01
 _GOOD_SHARE, _MOST_TRIES = 0.6, 8
+_SPOTS_PX = 16  # between spots that tell how much two crops share
+# Looks at views: their pixels per crop pixel; and at full strength the second beside the first.
+_SCALES = (0.6, 1.5)
+_MAX_SCALE_CHANGE = 1.3
+_MAX_TILT_DEG = 20.0
+_MAX_TWIST_DEG = 20.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,87 +68,160 @@ class View:
 Place = tuple[View, ...]
 
 
-def flow_to_view(first: View, second: View, left: int, top: int, side_px: int) -> Tensor:
-    """Return where a square of the first view is seen in the second, NaN where it is not.
+@dataclass(frozen=True, slots=True, eq=False)
+class Rooms:
+    """Views of places, and which of them show the same place.
+
+    Attributes:
+        inverse_depth: (views, H, W) float32 on the device.
+        intrinsics: (views, 4), fx, fy, cx, cy.
+        pairs: (pairs, 2) views of one place.
+        second_from_first: (pairs, 3, 4) rotations and translations.
+        spots: (spots, 2) pixels, a grid over a view.
+        seen: (pairs, spots, 2) where they are in the second view, NaN where they are hidden.
+    """
+
+    inverse_depth: Tensor
+    intrinsics: NDArray[np.float64]
+    pairs: NDArray[np.int64]
+    second_from_first: NDArray[np.float64]
+    spots: NDArray[np.float64]
+    seen: NDArray[np.float64]
+
+
+def make_rooms(places: Sequence[Place], device: torch.device) -> Rooms:
+    """Put the views of all places, of one size, into one table."""
+    views = [view for place in places for view in place]
+    begins = np.cumsum([0, *(len(place) for place in places)]).tolist()
+    pairs = np.array(
+        [
+            (begin + one, begin + other)
+            for begin, place in zip(begins, places, strict=False)
+            for one, other in permutations(range(len(place)), 2)
+        ]
+    )
+    motions = [views[b].cam_from_world @ views[a].cam_from_world.inverse() for a, b in pairs]
+    depths = torch.from_numpy(np.stack([view.inverse_depth for view in views]).astype(np.float32))
+    second_from_first = np.stack([np.column_stack([m.rotation, m.translation]) for m in motions])
+    intrinsics = np.array([view.camera.params for view in views])
+    height, width = depths.shape[1:]
+    x, y = np.meshgrid(np.arange(8.0, width, _SPOTS_PX), np.arange(8.0, height, _SPOTS_PX))
+    spots = np.stack([x, y], axis=-1) + 0.5
+    seen = [
+        other_view(
+            depths,
+            torch.from_numpy(pairs[part]),
+            torch.from_numpy(intrinsics[pairs[part]]),
+            torch.from_numpy(second_from_first[part]),
+            torch.from_numpy(spots).expand(len(pairs[part]), -1, -1, -1),
+        ).numpy()
+        for part in (slice(n, n + 64) for n in range(0, len(pairs), 64))
+    ]
+    return Rooms(
+        depths.to(device),
+        intrinsics,
+        pairs,
+        second_from_first,
+        spots.reshape(-1, 2),
+        np.concatenate(seen).reshape(len(pairs), -1, 2),
+    )
+
+
+def other_view(
+    inverse_depth: Tensor,
+    pairs: Tensor,
+    intrinsics: Tensor,
+    second_from_first: Tensor,
+    points: Tensor,
+) -> Tensor:
+    """Return where pixels of first views are seen in second ones, NaN where they are not.
 
     Args:
-        first: the square is ``left`` to ``left + side_px``, ``top`` to ``top + side_px`` of it.
-        second: another view of the same room.
-        left: column.
-        top: row.
-        side_px: of the square.
+        inverse_depth: (views, H, W) float32.
+        pairs: (n, 2) int64, the first and the second view of each.
+        intrinsics: (n, 2, 4) float64, fx, fy, cx, cy of both.
+        second_from_first: (n, 3, 4) float64.
+        points: (n, h, w, 2) float64 pixels (x, y) of the first views.
 
     Returns:
-        (side_px, side_px, 2) float32 pixels (x, y) of the second view.
+        (n, h, w, 2) float64.
     """
-    y, x = np.mgrid[top : top + side_px, left : left + side_px] + 0.5
-    inverse = first.inverse_depth[top : top + side_px, left : left + side_px].astype(np.float64)
-    fx, fy, cx, cy = first.camera.params
-    rays = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)], axis=-1)
-    second_from_first = second.cam_from_world @ first.cam_from_world.inverse()
+    fx, fy, cx, cy = intrinsics[:, 0, :, None, None].unbind(dim=1)
+    x, y = (points[..., 0] - cx) / fx, (points[..., 1] - cy) / fy
+    inverse = _depth_at(inverse_depth[pairs[:, 0]], points)
+    turn = second_from_first[..., None, None]
     # Points times inverse depth: finite where nothing is seen.
-    points = rays @ second_from_first.rotation.T
-    points += inverse[..., None] * second_from_first.translation
-    fx, fy, cx, cy = second.camera.params
-    in_front = (points[..., 2] > 1e-6) & (inverse > 0)
-    depth_ratio = np.where(in_front, points[..., 2], 1.0)  # of second to first
-    flow = np.stack(
-        [fx * points[..., 0] / depth_ratio + cx, fy * points[..., 1] / depth_ratio + cy], axis=-1
+    u, v, depth_ratio = (
+        turn[:, row, 0] * x + turn[:, row, 1] * y + turn[:, row, 2] + turn[:, row, 3] * inverse
+        for row in range(3)
     )
+    in_front = (depth_ratio > 1e-6) & (inverse > 0)
+    depth_ratio = torch.where(in_front, depth_ratio, 1.0)  # of second to first
+    fx, fy, cx, cy = intrinsics[:, 1, :, None, None].unbind(dim=1)
+    found = torch.stack([fx * u / depth_ratio + cx, fy * v / depth_ratio + cy], dim=-1)
     # Inverse depth is linear in the pixel on a plane: interpolating it is exact there.
-    seen = cv2.remap(
-        second.inverse_depth.astype(np.float32),
-        np.where(in_front, flow[..., 0] - 0.5, -9.0).astype(np.float32),
-        np.where(in_front, flow[..., 1] - 0.5, -9.0).astype(np.float32),
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=0.0,
-    )
+    seen = _depth_at(inverse_depth[pairs[:, 1]], found)
     expected = inverse / depth_ratio
-    visible = in_front & (np.abs(seen - expected) < _SAME_DEPTH * expected)
-    return torch.from_numpy(np.where(visible[..., None], flow, np.nan).astype(np.float32))
+    visible = in_front & ((seen - expected).abs() < _SAME_DEPTH * expected)
+    return torch.where(visible[..., None], found, torch.nan)
 
 
-def random_parallax(
-    rng: np.random.Generator, place: Place, crop_px: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return crops (3, H, W) in 0 to 1 of two views of a place, and the flow (H, W, 2) on the CPU.
+def _depth_at(inverse_depth: Tensor, points: Tensor) -> Tensor:
+    """Return inverse depth (n, h, w) float64 of views (n, H, W) at pixels (n, h, w, 2)."""
+    height, width = inverse_depth.shape[1:]
+    x, y = points.unbind(dim=-1)
+    grid = torch.stack([x / width, y / height], dim=-1) * 2 - 1
+    # Far outside is as good as any other place outside.
+    seen = F.grid_sample(
+        inverse_depth[:, None],
+        grid.clamp(-9, 9).float(),
+        padding_mode="zeros",
+        align_corners=False,
+    )
+    return seen[:, 0].double()
 
-    Of some tries the first is taken in which most of the first crop is in the second; else the
-    best.
+
+def random_views(
+    rng: np.random.Generator, rooms: Rooms, count: int, crop_px: int, strength: float
+) -> tuple[NDArray[np.int64], Matrices, Matrices]:
+    """Return numbers of pairs (n,), and looks at both views, photo_from_crop (n, 3, 3) each.
+
+    Of some tries for each the first is taken in which most of the first crop is in the second;
+    else the best.
     """
-    best = (-1.0, 0, 0, 1, 0, 0, 0, torch.empty(0))
-    for _ in range(_MOST_TRIES):
-        one, other = rng.permutation(len(place))[:2].tolist()
-        height, width = place[one].image.shape[1:]
-        left, top = (int(rng.integers(size - crop_px + 1)) for size in (width, height))
-        flow = flow_to_view(place[one], place[other], left, top, crop_px)
-        known = flow[~flow[..., 0].isnan()]
-        if not len(known):
-            middle = torch.tensor([width / 2, height / 2])
-        else:
-            middle = known.median(dim=0).values
-        shift = rng.uniform(-0.15, 0.15, 2) * crop_px
-        # The centre of the crop on the middle of what is seen, moved a little, inside the view.
-        x, y = (
-            int(np.clip(round(float(m) + s - crop_px / 2), 0, size - crop_px))
-            for m, s, size in zip(middle, shift, (width, height), strict=True)
-        )
-        flow = flow - torch.tensor([x, y], dtype=torch.float32)
-        inside = ((flow >= 0) & (flow < crop_px)).all(dim=-1, keepdim=True)
-        share = float(inside.float().mean())
-        if share > best[0]:
-            best = (share, one, other, left, top, x, y, torch.where(inside, flow, torch.nan))
-        if share > _GOOD_SHARE:
-            break
-    _, one, other, left, top, x, y, flow = best
-    first = place[one].image[:, top : top + crop_px, left : left + crop_px]
-    second = place[other].image[:, y : y + crop_px, x : x + crop_px]
-    return first.float() / 255, second.float() / 255, flow
+    tries = count * _MOST_TRIES
+    pair = rng.integers(len(rooms.pairs), size=tries)
+    height, width = rooms.inverse_depth.shape[1:]
+    size = np.array([width, height])
+    lowest, highest = np.log(_SCALES)
+    most = min(highest, np.log(0.95 * height / crop_px))
+    scale = np.exp(rng.uniform(min(lowest, most), most, tries))
+    change = np.exp(strength * np.log(_MAX_SCALE_CHANGE) * rng.uniform(-1, 1, tries))
+    spot = rng.integers(len(rooms.spots), size=tries)
+    shift = rng.uniform(-0.15, 0.15, (tries, 2)) * crop_px
+    found = rooms.seen[pair, spot]
+    targets = rooms.spots[spot], np.where(np.isnan(found), size / 2, found) + shift
+    looks = []
+    for target, zoom, tilt, turn in (
+        (targets[0], scale, 0.0, 0.0),
+        (targets[1], scale * change, _MAX_TILT_DEG * strength, _MAX_TWIST_DEG * strength),
+    ):
+        margin = np.minimum(0.5 * zoom[:, None] * crop_px, size / 2)
+        inside = np.clip(target, margin, size - margin)
+        looks.append(looks_at(rng, inside, zoom, crop_px, tilt_deg=tilt, turn_deg=turn))
+    first, second = (
+        moved(np.asarray(np.linalg.inv(look)), points)
+        for look, points in zip(looks, (rooms.spots[None], rooms.seen[pair]), strict=True)
+    )
+    in_first, in_second = (((p >= 0) & (p < crop_px)).all(axis=2) for p in (first, second))
+    share = (in_first & in_second).sum(axis=1) / np.maximum(in_first.sum(axis=1), 1)
+    share = np.minimum(share, _GOOD_SHARE).reshape(count, _MOST_TRIES)
+    best = share.argmax(axis=1) + np.arange(count) * _MOST_TRIES
+    return pair[best], looks[0][best], looks[1][best]
 
 
 def pack_rooms(output: Path, *, rooms: int, places: int, seed: int) -> int:
-    """Photograph rooms, and return the number of photos. A room takes some seconds.
+    """Photograph rooms, and return the number of photos. A photo takes most of a second.
 
     Args:
         output: file to write.
@@ -147,34 +230,40 @@ def pack_rooms(output: Path, *, rooms: int, places: int, seed: int) -> int:
         seed: of the first room.
     """
     arrays: dict[str, NDArray[np.generic]] = {}
-    for room in range(rooms):
-        rng = np.random.default_rng([seed, room])
-        scene = make_room(seed + room)
-        for place, near in enumerate(mapping_trajectory(places)):
-            for view in range(_VIEWS_PER_PLACE):
-                pose = _moved(rng) @ near
-                name = f"{room:03}-{place:03}-{view}"
-                rgb = render_photo(scene, _CAMERA, pose, rng)
-                depth = render_depth(scene, _CAMERA, pose)
-                units = np.zeros(depth.shape)
-                np.divide(1 / _INVERSE_DEPTH_UNIT, depth, out=units, where=depth > 0)
-                coded = np.clip(np.rint(units), 0, 65535).astype(np.uint16)
-                arrays[f"{name}.image"] = _encoded(
-                    ".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-                )
-                arrays[f"{name}.inverse_depth"] = _encoded(".png", coded, [])
-                arrays[f"{name}.cam_from_world"] = np.column_stack(
-                    [pose.rotation, pose.translation]
-                )
+    with ProcessPoolExecutor(mp_context=get_context("spawn")) as workers:
+        for made in workers.map(_photographed, [seed] * rooms, range(rooms), [places] * rooms):
+            arrays |= made
     write_tensors(output, arrays, {"rooms": rooms, "places": places, "seed": seed})
     return len(arrays) // 3
 
 
+def _photographed(seed: int, room: int, places: int) -> dict[str, NDArray[np.generic]]:
+    """Return what a pack holds of one room."""
+    arrays: dict[str, NDArray[np.generic]] = {}
+    rng = np.random.default_rng([seed, room])
+    scene = make_room(seed + room)
+    for place, near in enumerate(mapping_trajectory(places)):
+        for view in range(_VIEWS_PER_PLACE):
+            pose = _moved(rng) @ near
+            name = f"{room:03}-{place:03}-{view}"
+            rgb = render_photo(scene, _CAMERA, pose, rng)
+            depth = render_depth(scene, _CAMERA, pose)
+            units = np.zeros(depth.shape)
+            np.divide(1 / _INVERSE_DEPTH_UNIT, depth, out=units, where=depth > 0)
+            coded = np.clip(np.rint(units), 0, 65535).astype(np.uint16)
+            arrays[f"{name}.image"] = _encoded(
+                ".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+            )
+            arrays[f"{name}.inverse_depth"] = _encoded(".png", coded, [])
+            arrays[f"{name}.cam_from_world"] = np.column_stack([pose.rotation, pose.translation])
+    return arrays
+
+
 def _moved(rng: np.random.Generator) -> Pose:
     """Return a small motion of a camera, as new_from_old."""
-    rotation = np.eye(3)
-    for axis, most in zip(np.eye(3), _MAX_TURN_DEG, strict=True):
-        rotation = rotation_about(axis, float(np.deg2rad(rng.uniform(-most, most)))) @ rotation
+    angles = np.deg2rad(rng.uniform(np.negative(_MAX_TURN_DEG), _MAX_TURN_DEG))
+    about_x, about_y, about_z = rotations_about(np.eye(3), angles)
+    rotation = about_z @ about_y @ about_x
     return Pose(rotation, -rotation @ rng.uniform(-_MAX_SHIFT_M, _MAX_SHIFT_M, 3))
 
 
@@ -183,8 +272,8 @@ def _encoded(suffix: str, image: NDArray[np.generic], options: list[int]) -> NDA
     return np.asarray(data, np.uint8).ravel()
 
 
-def read_rooms(path: Path, device: torch.device) -> tuple[Place, ...]:
-    """Read what ``pack_rooms`` wrote; the photos go onto the device.
+def read_rooms(path: Path) -> tuple[Place, ...]:
+    """Read what ``pack_rooms`` wrote.
 
     Raises:
         NotFound: ``training.rooms`` if there is no such file.
@@ -197,7 +286,7 @@ def read_rooms(path: Path, device: torch.device) -> tuple[Place, ...]:
         names = sorted(name.removesuffix(".image") for name in packed if name.endswith(".image"))
         places: dict[str, list[View]] = {}
         for name in names:
-            places.setdefault(name.rpartition("-")[0], []).append(_view(packed, name, device))
+            places.setdefault(name.rpartition("-")[0], []).append(_view(packed, name))
     except (SafetensorError, ValueError, KeyError, cv2.error) as error:
         raise refuse(
             "training.rooms", f"the rooms cannot be read: {error}", field=str(path)
@@ -205,7 +294,7 @@ def read_rooms(path: Path, device: torch.device) -> tuple[Place, ...]:
     return tuple(tuple(views) for views in places.values())
 
 
-def _view(packed: Mapping[str, NDArray[Any]], name: str, device: torch.device) -> View:
+def _view(packed: Mapping[str, NDArray[Any]], name: str) -> View:
     bgr = cv2.imdecode(packed[f"{name}.image"], cv2.IMREAD_COLOR)
     units = cv2.imdecode(packed[f"{name}.inverse_depth"], cv2.IMREAD_UNCHANGED)
     if bgr is None or units is None:
@@ -213,7 +302,7 @@ def _view(packed: Mapping[str, NDArray[Any]], name: str, device: torch.device) -
     matrix = packed[f"{name}.cam_from_world"].reshape(3, 4)
     rgb = np.ascontiguousarray(bgr[..., ::-1].transpose(2, 0, 1))
     return View(
-        torch.from_numpy(rgb).to(device),
+        torch.from_numpy(rgb),
         units.astype(np.float32) * np.float32(_INVERSE_DEPTH_UNIT),
         Pose(matrix[:, :3], matrix[:, 3]),
     )

@@ -1,7 +1,7 @@
-"""The photographs to learn from: packed into one file, unpacked onto the device.
+"""The photographs to learn from, packed into one file.
 
-The pack holds the photos as they are compressed, so that it travels well; on the device they lie
-as 8-bit pixels, each with halves of itself for looking at it from further away.
+The pack holds the photos as they are compressed, so that it travels well; unpacked they are 8-bit
+pixels, each with halves of itself for looking at it from further away.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ def _licences(table: Path) -> dict[str, str]:
         return {row["file"]: row["licence"] for row in csv.DictReader(file, delimiter="\t")}
 
 
-def read_pack(path: Path, device: torch.device) -> Pack:
-    """Read a pack and put its photos onto the device.
+def read_pack(path: Path) -> Pack:
+    """Read a pack and decode its photos.
 
     Raises:
         NotFound: ``training.pack`` if there is no such file.
@@ -112,15 +112,15 @@ def read_pack(path: Path, device: torch.device) -> Pack:
     photos: list[Photo] = []
     for name in sorted(packed):
         rgb = read_photo(packed[name].tobytes()).rgb
-        photos.append(Photo(name, photo_levels(rgb, device)))
+        photos.append(Photo(name, photo_levels(rgb)))
     return Pack(tuple(photos), hashlib.sha256(data).hexdigest(), licences)
 
 
-def photo_levels(rgb: np.ndarray, device: torch.device) -> tuple[Tensor, ...]:
+def photo_levels(rgb: np.ndarray) -> tuple[Tensor, ...]:
     """Halve a photo (H, W, 3) until its short side would be less than 64 px."""
     levels = []
     while True:
-        levels.append(torch.from_numpy(rgb).permute(2, 0, 1).contiguous().to(device))
+        levels.append(torch.from_numpy(rgb).permute(2, 0, 1).contiguous())
         height, width = rgb.shape[0] // 2, rgb.shape[1] // 2
         if min(height, width) < _SHORTEST_SIDE_PX:
             return tuple(levels)

@@ -7,7 +7,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,8 @@ from torch import Tensor
 from training.checkpoint import FILE_NAME, State, load_state, save_state
 from training.losses import peakiness_loss, reliability_loss, similarity_loss
 from training.network import ARCHITECTURES, Maps, TrainableR2D2
-from training.pairs import Pairs, Sources, make_pairs
+from training.pairs import Pairs, Sources, as_numbers, draw, from_numbers, make
+from training.recorded import RecordedStep
 from training.sampler import sample
 from training.settings import Settings
 from training.validation import Score
@@ -34,22 +35,11 @@ class LossIsNaN(VislocError):
     """Training has diverged; what the last checkpoint holds is from before."""
 
 
-@dataclass(frozen=True, slots=True)
-class Losses:
-    """The parts of what is minimized, their sum being it."""
-
-    reliability: Tensor
-    similarity: Tensor
-    peakiness: Tensor
-
-    @property
-    def total(self) -> Tensor:
-        """Their sum."""
-        return self.reliability + self.similarity + self.peakiness
+LOSSES = ("reliability", "similarity", "peakiness")
 
 
-def losses_of(maps: Maps, pairs: Pairs, settings: Settings) -> Losses:
-    """Compare what the network says about the images of pairs."""
+def losses_of(maps: Maps, pairs: Pairs, settings: Settings) -> Tensor:
+    """Compare what the network says about the images of pairs: (3,), ``LOSSES``."""
     first, second = maps.halves()
     sampled = sample(first, second, pairs.flow, pairs.queries, pairs.distractors)
     valid = ~pairs.flow[..., 0].isnan()
@@ -59,10 +49,12 @@ def losses_of(maps: Maps, pairs: Pairs, settings: Settings) -> Losses:
         second.repeatability[:, None], grid, padding_mode="border", align_corners=False
     )
     peakiness = [peakiness_loss(each.repeatability, settings.patch_px) for each in (first, second)]
-    return Losses(
-        reliability_loss(*sampled, settings.good_precision),
-        similarity_loss(first.repeatability, seen[:, 0], valid, settings.patch_px),
-        (peakiness[0] + peakiness[1]) / 2,
+    return torch.stack(
+        [
+            reliability_loss(*sampled, settings.good_precision),
+            similarity_loss(first.repeatability, seen[:, 0], valid, settings.patch_px),
+            (peakiness[0] + peakiness[1]) / 2,
+        ]
     )
 
 
@@ -89,14 +81,28 @@ class Trainer:
         self.step = 0
         self.seconds = 0.0
         self.network = TrainableR2D2(ARCHITECTURES[settings.architecture]).to(sources.device)
+        on_gpu = sources.device.type == "cuda"
+        if on_gpu:
+            for weight in self.network.parameters():
+                if weight.dim() == 4:
+                    weight.data = weight.data.contiguous(memory_format=torch.channels_last)
         self._compiled: Callable[..., Maps] = self.network
         if settings.compiled:
             self._compiled = torch.compile(self.network)
+        # A recorded step reads the learning rate from the device.
+        self._rate = torch.tensor(settings.learning_rate, device=sources.device)
         self.optimizer = torch.optim.Adam(
             self.network.parameters(),
-            lr=settings.learning_rate,
+            lr=self._rate if on_gpu else settings.learning_rate,
             weight_decay=settings.weight_decay,
+            fused=on_gpu,
+            capturable=on_gpu,
         )
+        self._like = draw(sources, settings, 0)
+        self._learn: Callable[[Tensor], Tensor] = self._learned
+        if on_gpu:
+            torch.backends.cudnn.benchmark = True
+            self._learn = RecordedStep(self._learned)
 
     def restore(self, state: State) -> None:
         """Go on where a checkpoint stands.
@@ -113,7 +119,11 @@ class Trainer:
                 got=getattr(self.settings, different),
             )
         self.network.load_state_dict(state.network)
-        self.optimizer.load_state_dict(state.optimizer)
+        # The options are those of this device.
+        options = self.optimizer.state_dict()["param_groups"]
+        self.optimizer.load_state_dict({**state.optimizer, "param_groups": options})
+        for group in self.optimizer.param_groups:
+            group["lr"] = self._rate if self._rate.is_cuda else group["lr"]
         self.step, self.seconds = state.step, state.seconds
 
     def start_from(self, state: State) -> None:
@@ -134,21 +144,35 @@ class Trainer:
             self.optimizer.state_dict(),
         )
 
-    def advance(self) -> Losses:
-        """Do one step."""
+    def advance(self) -> Tensor:
+        """Do one step, and return its losses (3,), ``LOSSES``, before it."""
         started = time.monotonic()
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate(self.settings, self.step)
-        pairs = make_pairs(self.sources, self.settings, self.step)
-        losses = losses_of(
-            self._compiled(pairs.images, bf16=self.settings.bf16), pairs, self.settings
-        )
-        self.optimizer.zero_grad(set_to_none=True)
-        torch.autograd.backward(losses.total)
-        self.optimizer.step()
+        rate = learning_rate(self.settings, self.step)
+        if self._rate.is_cuda:
+            self._rate.fill_(rate)
+        else:
+            for group in self.optimizer.param_groups:
+                group["lr"] = rate
+        losses = self._learn(as_numbers(*draw(self.sources, self.settings, self.step)))
         self.step += 1
         self.seconds += time.monotonic() - started
         return losses
+
+    def _learned(self, numbers: Tensor) -> Tensor:
+        """Learn from the pairs that numbers on the device decide: the same operations always."""
+        self.optimizer.zero_grad(set_to_none=True)
+        pairs = make(self.sources, self.settings, *from_numbers(numbers, self._like))
+        maps = self._compiled(pairs.images, bf16=self.settings.bf16)
+        losses = losses_of(maps, pairs, self.settings)
+        torch.autograd.backward(losses.sum())
+        self.optimizer.step()
+        return losses.detach()
+
+    def fit(self, seconds: float, since_step: int, steps_took_s: float) -> None:
+        """Take fewer steps if the rest would not end within seconds, as some steps took so long."""
+        each = steps_took_s / (self.step - since_step)
+        steps = self.step + max(1, int(seconds / each))
+        self.settings = replace(self.settings, steps=min(self.settings.steps, steps))
 
 
 def train(
@@ -160,6 +184,7 @@ def train(
     should_stop: Callable[[], bool] = lambda: False,
     validate_every: int | None = None,
     validated: Callable[[State], Score] | None = None,
+    fit_seconds: float | None = None,
 ) -> bool:
     """Do steps until the last one, or the time is over, or it should stop; True when finished.
 
@@ -175,19 +200,28 @@ def train(
         should_stop: asked after every step.
         validate_every: steps; needs ``validated``. The last step is validated as well.
         validated: the score of a state.
+        fit_seconds: in which the last step is to be done, from now; while the learning rate
+            rises, steps are timed, and the settings get as many as fit, if those are fewer.
 
     Raises:
         LossIsNaN: ``training.diverged``.
     """
-    settings = trainer.settings
     folder.mkdir(parents=True, exist_ok=True)
     log = _Log(folder / LOG_NAME, trainer.step)
     scores = _Scores(folder / VALIDATION_NAME, trainer.step)
     started = saved = time.monotonic()
-    decay_step = round(settings.decay_from * settings.steps)
     stopped = False
-    while trainer.step < settings.steps and not stopped:
-        if trainer.step == decay_step > 0:
+    timed_step, timed_at = trainer.step, started
+    while trainer.step < trainer.settings.steps and not stopped:
+        if fit_seconds is not None and trainer.step == trainer.settings.warm_up_steps // 2:
+            log.write()  # waits for the device
+            timed_step, timed_at = trainer.step, time.monotonic()
+        if fit_seconds is not None and trainer.step == trainer.settings.warm_up_steps:
+            log.write()
+            now = time.monotonic()
+            trainer.fit(fit_seconds - (now - started), timed_step, now - timed_at)
+        settings = trainer.settings
+        if trainer.step == round(settings.decay_from * settings.steps) > 0:
             save_state(folder / BEFORE_DECAY_NAME, trainer.state())
         rate = learning_rate(settings, trainer.step)
         log.note(trainer.step, rate, trainer.advance(), trainer.seconds)
@@ -202,7 +236,7 @@ def train(
             saved = time.monotonic()
     log.write()
     save_state(folder / FILE_NAME, trainer.state())
-    return trainer.step == settings.steps
+    return trainer.step == trainer.settings.steps
 
 
 def resume(trainer: Trainer, folder: Path) -> None:
@@ -215,11 +249,11 @@ class _Log:
 
     def __init__(self, path: Path, step: int) -> None:
         self._path = path
-        self._waiting: list[tuple[dict[str, Any], Losses]] = []
+        self._waiting: list[tuple[dict[str, Any], Tensor]] = []
         kept = path.read_text(encoding="utf-8").splitlines()[:step] if path.exists() else []
         path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
 
-    def note(self, step: int, rate: float, losses: Losses, seconds: float) -> None:
+    def note(self, step: int, rate: float, losses: Tensor, seconds: float) -> None:
         self._waiting.append(
             ({"step": step, "learning_rate": rate, "seconds": round(seconds, 2)}, losses)
         )
@@ -227,10 +261,13 @@ class _Log:
             self.write()
 
     def write(self) -> None:
+        if not self._waiting:
+            return
         lines = []
-        for line, losses in self._waiting:
-            for name in ("reliability", "similarity", "peakiness", "total"):
-                line[name] = round(float(getattr(losses, name).detach()), 5)
+        read = torch.stack([losses for _, losses in self._waiting]).tolist()
+        for (line, _), losses in zip(self._waiting, read, strict=True):
+            line.update({n: round(v, 5) for n, v in zip(LOSSES, losses, strict=True)})
+            line["total"] = round(sum(losses), 5)
             lines.append(json.dumps(line) + "\n")
             if not math.isfinite(line["total"]):
                 raise LossIsNaN(

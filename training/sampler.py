@@ -50,6 +50,11 @@ def offsets(lowest_px: int, highest_px: int) -> tuple[tuple[int, int], ...]:
     )
 
 
+@cache
+def _offsets_on(device: torch.device, lowest_px: int, highest_px: int) -> Tensor:
+    return torch.tensor(offsets(lowest_px, highest_px), device=device)
+
+
 def random_pixels(
     rng: np.random.Generator, images: int, per_image: int, size_px: int, border_px: int
 ) -> NDArray[np.int64]:
@@ -73,7 +78,7 @@ def sample(
     pair = torch.arange(images, device=flow.device)[:, None]
     match = flow[pair, queries[..., 1], queries[..., 0]]
     # A comparison with NaN is false.
-    asked = ((match >= 0) & (match < match.new_tensor([width, height]))).all(dim=-1)
+    asked = (match >= 0).all(dim=-1) & (match[..., 0] < width) & (match[..., 1] < height)
     match = match.masked_fill(~asked[..., None], 0).floor().long()
 
     wanted = _descriptors(first, queries)
@@ -82,7 +87,7 @@ def sample(
 
     def near(lowest_px: int, highest_px: int) -> tuple[Tensor, Tensor]:
         """Return pixels (B, N, M) at these distances from the match, and their cosines."""
-        steps = torch.tensor(offsets(lowest_px, highest_px), device=flow.device)
+        steps = _offsets_on(flow.device, lowest_px, highest_px)
         x = (match[..., None, 0] + steps[:, 0]).clamp(0, width - 1)
         y = (match[..., None, 1] + steps[:, 1]).clamp(0, height - 1)
         places, weights = neighbours(x, y, second.size, second.stride)
@@ -99,9 +104,8 @@ def sample(
     far = wanted.flatten(0, 1) @ others.flatten(0, 1).T
     far = far.view(images, queries.shape[1], images, -1)
     gap = (distractors[:, None] - match[:, :, None]).square().sum(dim=-1)  # (B, N, K)
-    is_right = torch.zeros_like(far, dtype=torch.bool)
-    is_right[pair[:, 0], :, pair[:, 0]] = gap < WRONG_FROM_PX**2
-    far = far.masked_fill(is_right, 0).flatten(2)
+    same_pair = torch.eye(images, dtype=torch.bool, device=flow.device)[:, None, :, None]
+    far = far.masked_fill(same_pair & (gap < WRONG_FROM_PX**2)[:, :, None], 0).flatten(2)
 
     negatives = torch.cat([near_misses, far], dim=2)
     precision = quantized_average_precision(positive[..., 0].flatten(), negatives.flatten(0, 1))
@@ -114,6 +118,9 @@ def sample(
 def _descriptors(maps: Maps, pixels: Tensor) -> Tensor:
     """Return unit vectors (B, N, C) at pixels (x, y) (B, N, 2)."""
     places, weights = neighbours(pixels[..., 0], pixels[..., 1], maps.size, maps.stride)
-    pair = torch.arange(len(pixels), device=pixels.device)[:, None, None]
-    taken = maps.features.flatten(1, 2)[pair, places]
+    features = maps.features.flatten(1, 2)
+    begins = torch.arange(len(pixels), device=pixels.device)[:, None, None] * features.shape[1]
+    # On a GPU the gradient of this is a sum, that of indexing twice would sort first.
+    taken = features.flatten(0, 1).index_select(0, (begins + places).flatten())
+    taken = taken.view(*places.shape, -1)
     return F.normalize((taken * weights[..., None]).sum(dim=2), dim=-1)

@@ -38,6 +38,8 @@ class Settings:
     good_precision: float = _setting(0.5, "average precision above which a place is reliable")
     mild_steps: int = _setting(0, "in which pairs grow from mild to as hard as they get")
     parallax_share: float = _setting(0.0, "of the pairs, from synthetic rooms instead of photos")
+    night_share: float = _setting(0.0, "of the photos, taken as at night")
+    weather_share: float = _setting(0.0, "of the photos that may have weather, season, shadows")
     bf16: bool = _setting(False, "convolutions in bfloat16, everything else in float32")
     compiled: bool = _setting(False, "compile the network: no gain on processors")
 
@@ -66,6 +68,8 @@ class Settings:
             ("border_px", self.border_px >= 0, "0 or more"),
             ("good_precision", 0 < self.good_precision < 1, "between 0 and 1"),
             ("mild_steps", self.mild_steps >= 0, "0 or more"),
+            ("night_share", 0 <= self.night_share <= 1, "0 to 1"),
+            ("weather_share", 0 <= self.weather_share <= 1, "0 to 1"),
             ("parallax_share", 0 <= self.parallax_share <= 1, "0 to 1"),
         ):
             if not is_right:
@@ -98,6 +102,19 @@ PRESETS = {
         query_step_px=6,
         mild_steps=1_000,
         parallax_share=0.2,
+        night_share=0.15,
+        bf16=True,
+    ),
+    # For one GPU, with light and weather beyond the published recipe.
+    "gpu": Settings(
+        learning_rate=1e-3,
+        final_learning_rate=1e-5,
+        warm_up_steps=600,
+        decay_from=0.0,
+        mild_steps=3_000,
+        parallax_share=0.2,
+        night_share=0.35,
+        weather_share=0.7,
         bf16=True,
     ),
     # For tests: seconds, and the loss falls.

@@ -11,10 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from training.augmentation import augment
+from training.atlas import levels_to_look_at, look, make_atlas
+from training.augmentation import augment, draw_conditions
 from training.checkpoint import State
 from training.export import export
-from training.homographies import Matrix, look, moved, random_looks
+from training.homographies import Matrices, moved, random_looks
 from training.photos import Photo
 from visloc.features import LocalFeatureExtractor, make_local_features
 from visloc.matching.correspondences import mutual_nearest_neighbours
@@ -25,6 +26,8 @@ THRESHOLDS_PX = (1.0, 3.0, 5.0)
 SIDE_PX = 320
 SEED = 17
 _STRENGTH = 1.0  # looks as different as the hardest in training
+_SHARES = (0.35, 0.7)  # of photos at night, and of those that may have weather
+_CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +61,7 @@ class Pair:
 
     first: NDArray[np.uint8]
     second: NDArray[np.uint8]
-    second_from_first: Matrix
+    second_from_first: Matrices
 
 
 def validation_pairs(photos: Sequence[Photo], per_photo: int = 1) -> list[Pair]:
@@ -67,10 +70,12 @@ def validation_pairs(photos: Sequence[Photo], per_photo: int = 1) -> list[Pair]:
     for number, photo in enumerate(photos):
         for repeat in range(per_photo):
             rng = np.random.default_rng([SEED, number, repeat])
-            height, width = photo.levels[0].shape[1:]
-            looks = random_looks(rng, (height, width), SIDE_PX, _STRENGTH)
-            seen = torch.stack([look(photo.levels, each, SIDE_PX) for each in looks])
-            first, second = augment(seen, rng, _STRENGTH)
+            atlas = make_atlas([photo], _CPU)
+            looks = np.concatenate(random_looks(rng, atlas.sizes[:, 0], SIDE_PX, _STRENGTH))
+            levels = levels_to_look_at(atlas, np.zeros(2, np.int64), looks, SIDE_PX)
+            begins, sizes, matrices = (torch.from_numpy(each) for each in levels)
+            seen = look(atlas.pixels, begins, sizes, matrices, SIDE_PX)
+            first, second = augment(seen, draw_conditions(rng, 2, _STRENGTH, *_SHARES))
             pairs.append(Pair(_pixels(first), _pixels(second), np.linalg.inv(looks[1]) @ looks[0]))
     return pairs
 

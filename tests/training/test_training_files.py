@@ -4,15 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from safetensors.numpy import load, save
 
 from training.files import read_about, write_tensors
 from training.parallax import read_rooms
 from training.photos import read_pack
 from visloc.errors import InvalidInput
-
-CPU = torch.device("cpu")
 
 
 def test_what_is_written_is_read_whatever_its_order_in_memory(tmp_path: Path) -> None:
@@ -55,8 +52,8 @@ def test_other_files_are_neither_packs_nor_rooms(data: bytes, tmp_path: Path) ->
     path = tmp_path / "other"
     path.write_bytes(data)
     with pytest.raises(InvalidInput, match="not a pack of photos") as caught:
-        read_pack(path, CPU)
+        read_pack(path)
     assert caught.value.code == "training.pack"
     with pytest.raises(InvalidInput, match="the rooms cannot be read") as caught:
-        read_rooms(path, CPU)
+        read_rooms(path)
     assert caught.value.code == "training.rooms"

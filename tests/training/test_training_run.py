@@ -16,7 +16,7 @@ from training.__main__ import main
 from training.checkpoint import FILE_NAME, load_state
 from training.export import export
 from training.network import ARCHITECTURES, TrainableR2D2
-from training.pairs import Sources
+from training.pairs import make_sources
 from training.photos import Photo, photo_levels
 from training.run import LOG_NAME, Trainer, learning_rate, resume, train
 from training.settings import PRESETS, Settings
@@ -40,11 +40,11 @@ def _one_thread() -> None:
 def photos(sample: Path) -> tuple[Photo, ...]:
     """The mapping photos of the sample."""
     paths = sorted((sample / "mapping").rglob("*.jpg"))
-    return tuple(Photo(path.name, photo_levels(read_photo_file(path).rgb, CPU)) for path in paths)
+    return tuple(Photo(path.name, photo_levels(read_photo_file(path).rgb)) for path in paths)
 
 
 def _trainer(photos: tuple[Photo, ...], settings: Settings = SMOKE) -> Trainer:
-    return Trainer(settings, Sources(photos, (), CPU), {"photos": "of the sample"})
+    return Trainer(settings, make_sources(photos, (), CPU), {"photos": "of the sample"})
 
 
 def _train(trainer: Trainer, folder: Path, stop_at: int | None = None) -> bool:
@@ -97,6 +97,14 @@ def test_lines_after_the_checkpoint_are_cut(photos: tuple[Photo, ...], tmp_path:
     _train(again, tmp_path)
     assert [line["step"] for line in _log(tmp_path)] == [0, 1, 2]
     assert _log(tmp_path)[2]["total"] > 0
+
+
+def test_a_run_does_no_more_steps_than_fit(photos: tuple[Photo, ...], tmp_path: Path) -> None:
+    trainer = _trainer(photos, replace(SMOKE, steps=1000, warm_up_steps=4))
+    # No time is left when the steps have been timed: one step more, the last.
+    assert train(trainer, tmp_path, seconds=None, checkpoint_every_s=1e9, fit_seconds=0.0)
+    assert trainer.step == trainer.settings.steps == 5
+    assert load_state(tmp_path / FILE_NAME, CPU).settings.steps == 5
 
 
 def test_a_run_with_other_settings_is_not_mixed_in(
