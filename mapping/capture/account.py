@@ -14,7 +14,7 @@ from mapping.progress import ItemProgress
 from mapping.report.held_out import left_out_sets, localize_held_out, spread_photos
 from mapping.report.model import tolerance_of
 from visloc.archive import Map
-from visloc.localization.viewpoints import Viewpoints
+from visloc.localization.constraints import MapGeometry
 
 USED, NOT_CONNECTED, BLURRED = "used", "not connected", "too blurred"
 STILL, SKIPPED = "camera did not move", "skipped: its neighbours show it"
@@ -49,7 +49,7 @@ class Stretch:
 
 def try_photos(opened: Map, progress: ItemProgress) -> Trials:
     """Ask the map for some of its photos, as if they and those beside them had not been taken."""
-    viewpoints = Viewpoints.of(opened)
+    viewpoints = MapGeometry(opened).viewpoints
     within = tolerance_of(opened, viewpoints)
     images = spread_photos(len(opened.images), _MOST_TRIED)
     right = []

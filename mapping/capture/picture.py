@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mapping.capture.account import Trials
 from mapping.report.grid import Plan
 from visloc.archive import Map
-from visloc.localization.viewpoints import Viewpoints
+from visloc.localization.constraints import MapGeometry
 
 _SIDE, _MARGIN, _LEGEND = 1000, 60, 90
 _MOST_POINTS = 60_000
@@ -27,7 +27,7 @@ _STRAYS = 0.01
 
 def draw_walk(opened: Map, trials: Trials, path: Path) -> None:
     """Write a PNG of the map from above; an existing file is replaced."""
-    viewpoints = Viewpoints.of(opened)
+    viewpoints = MapGeometry(opened).viewpoints
     plan = Plan.of(opened, viewpoints)
     walk, points = plan.level(viewpoints.centers), plan.level(opened.landmarks.astype(np.float64))
     points = points[:: max(1, len(points) // _MOST_POINTS)]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import Map
-from visloc.localization.viewpoints import Viewpoints
+from visloc.localization.constraints import MapGeometry
 
 _SIDE, _MARGIN = 1000, 40
 _GROUND, _LANDMARK, _PHOTO, _DOUBTED = (
@@ -29,7 +29,7 @@ def draw_doubts(opened: Map) -> bytes:
     Returns:
         A PNG of 1000 x 1000 pixels.
     """
-    viewpoints = Viewpoints.of(opened)
+    viewpoints = MapGeometry(opened).viewpoints
     centers = np.array([viewpoints.pose(row).center for row in range(len(opened.images))])
     doubted = {name for doubt in opened.manifest.parts.doubts for name in doubt.photos}
     plane = _plane(opened, centers)
