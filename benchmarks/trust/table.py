@@ -149,15 +149,19 @@ def _counts(name: str, outcomes: Sequence[Outcome]) -> list[object]:
 
 
 def _calibration(outcomes: Sequence[Outcome]) -> Iterator[str]:
-    known = [
-        (each.probability, each.right, each)
-        for each in outcomes
-        if each.probability is not None and each.right is not None
-    ]
+    # Night photos of gardenspoint that have a pose are asked by number too. One photo in one map
+    # has one answer, which counts once.
+    known = list(
+        {
+            (each.map_id, each.photo, each.probability): (each.probability, each.right)
+            for each in outcomes
+            if each.probability is not None and each.right is not None
+        }.values()
+    )
     error = sure = wrong = "-"
     if known:
-        error = f"{calibration_error([p for p, _, _ in known], [r for _, r, _ in known]):.3f}"
-        of_sure = [right for p, right, _ in known if p >= SURE]
+        error = f"{calibration_error(*zip(*known, strict=True)):.3f}"
+        of_sure = [right for probability, right in known if probability >= SURE]
         sure, wrong = str(len(of_sure)), str(sum(not right for right in of_sure))
     row = [len(known), error, sure, wrong]
     yield from _table(
