@@ -49,6 +49,9 @@ _OF_THE_PLACE, _LEAST_SHARE = 0.25, 0.5
 _PLACE_REACH_SHARE = 0.5
 # Poses of two places differ by more than this beyond three standard deviations.
 _APART_REACH_SHARE, _APART_ANGLE, _STDS = 0.2, math.radians(10.0), 3.0
+# A best pose that is more likely right than wrong gives way to no place that would be refused if it
+# were alone. A search always finds one that explains a little more than chance.
+_MORE_LIKELY_RIGHT = 0.5
 # The probability to miss a pose with half the share of inliers, and the fewest trials.
 _MISSED, _MIN_TRIALS = 0.01, 100
 # Matches by chance spread evenly over the disc of the inlier threshold, right ones lie in its
@@ -303,8 +306,9 @@ def _compared(
         photos: of the other place, among those that were searched.
 
     Returns:
-        ``preference`` for the best pose, infinite where the other pose would be no answer if it
-        were alone; of each pose its inliers and the photo that shows it best.
+        ``preference`` for the best pose, infinite where the other pose is no rival: it explains
+        no more than chance, or too little for an answer while the best pose is likely. Of each
+        pose its inliers and the photo that shows it best.
     """
     pairs = _Pairs(problem, proposed, best)
     seed = pairs.showing(pairs.errors(other.rig_from_world), photos)[0]
@@ -324,10 +328,9 @@ def _compared(
         scores.append(score(errors))
         compared.append((pose, int((errors <= 1.0).sum()), int(shown[0])))
     first, second = scores
-    if (
-        first_refusal((enough_inliers, enough_of_the_matches), problem.of(views), again)
-        or preference(second, np.zeros_like(second)) < SURE
-    ):
+    refusal = first_refusal((enough_inliers, enough_of_the_matches), problem.of(views), again)
+    is_no_answer = refusal is not None and (best.probability or 0.0) >= _MORE_LIKELY_RIGHT
+    if is_no_answer or preference(second, np.zeros_like(second)) < SURE:
         return math.inf, compared
     return preference(first, second), compared
 
