@@ -196,7 +196,12 @@ def _independent(opened: Map) -> bool:
     """Whether the photos' poses came from elsewhere than the landmarks.
 
     Where both were estimated together, a photo that is left out has its pose from landmarks that
-    are still there.
+    are still there. Poses in a unit that nobody knows were estimated from photos too, by another
+    tool: photos alone tell no scale. Editing a map, or tying it to the Earth, changes none of that.
     """
-    method = opened.manifest.method
-    return method.name != "model" and method.settings.get("poses") != "estimate"
+    manifest, before = opened.manifest, opened.manifest.parts.own_test
+    from_photos = (
+        manifest.method.name == "model" or manifest.method.settings.get("poses") == "estimate"
+    )
+    was_independent = before is None or before.independent
+    return manifest.world.metric and was_independent and not from_photos

@@ -73,6 +73,20 @@ def test_calibration_error_is_the_weighted_distance_of_ten_bins() -> None:
     assert calibration_error([0.55, 0.59], [True, False]) == pytest.approx(0.07)
 
 
+def test_an_answer_that_is_asked_for_twice_counts_once_in_the_calibration() -> None:
+    by_day = [replace(ASKED, photo=f"{i}.jpg", probability=0.9) for i in range(10)]
+    at_night = replace(ASKED, scenario="gardenspoint night", map_id="walk", probability=0.3)
+    by_number = replace(at_night, scenario="night by number")
+    other = replace(at_night, photo="b.jpg", right=False, probability=0.995)
+
+    told = "\n".join(write_tables([*by_day, at_night, by_number, other]))
+
+    assert "| all | 12 | 0.86 | 0.92 | 0.059 | 1 | 1 |" in told
+    assert "| by night | 2 | 0.65 | 0.50 | 0.847 | 1 | 1 |" in told
+    assert "| others | 10 | 0.90 | 1.00 | 0.100 | 0 | 0 |" in told
+    assert "look alike" not in told
+
+
 def test_an_answer_is_held_against_the_truth() -> None:
     truth = Pose.from_quaternion((0.9, 0.1, -0.3, 0.2), (1.0, 2.0, 3.0))
     query = Query("tried", "room", "b.jpg", (), truth, Threshold(0.15, 5.0))

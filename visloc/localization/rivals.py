@@ -19,7 +19,14 @@ from numpy.typing import NDArray
 from visloc.geometry import Pose, rotation_angle
 from visloc.localization.constraints import MapGeometry
 from visloc.localization.evidence import Shown
-from visloc.localization.gates import GATES, Problem, contradicts_priors, first_refusal
+from visloc.localization.gates import (
+    GATES,
+    Problem,
+    contradicts_priors,
+    enough_inliers,
+    enough_of_the_matches,
+    first_refusal,
+)
 from visloc.localization.preference import SURE, preference
 from visloc.matching.correspondences import Proposals, propose_landmarks
 from visloc.matching.products import round_descriptors
@@ -42,6 +49,9 @@ _OF_THE_PLACE, _LEAST_SHARE = 0.25, 0.5
 _PLACE_REACH_SHARE = 0.5
 # Poses of two places differ by more than this beyond three standard deviations.
 _APART_REACH_SHARE, _APART_ANGLE, _STDS = 0.2, math.radians(10.0), 3.0
+# A best pose that is more likely right than wrong gives way to no place that would be refused if it
+# were alone. A search always finds one that explains a little more than chance.
+_MORE_LIKELY_RIGHT = 0.5
 # The probability to miss a pose with half the share of inliers, and the fewest trials.
 _MISSED, _MIN_TRIALS = 0.01, 100
 # Matches by chance spread evenly over the disc of the inlier threshold, right ones lie in its
@@ -266,8 +276,8 @@ def stronger_place(
         other = pairs.solve(photos, best)
         if other is None or not _is_rival(problem, best, other, geometry.reach):
             continue
-        verdict, is_clear, compared = _compared(problem, geometry, proposed, best, other, photos)
-        if verdict >= SURE or not is_clear:
+        verdict, compared = _compared(problem, geometry, proposed, best, other, photos)
+        if verdict >= SURE:
             continue
         if verdict <= -SURE:
             found = pairs.refined(problem, other)
@@ -293,18 +303,19 @@ def _compared(
     best: GeneralizedPose,
     other: GeneralizedPose,
     photos: NDArray[np.int64],
-) -> tuple[float, bool, list[tuple[GeneralizedPose, int, int]]]:
-    """Compare two poses on equal terms: each with as many photos of its place.
+) -> tuple[float, list[tuple[GeneralizedPose, int, int]]]:
+    """Compare two poses on equal terms: each with as many photos, those that show it best.
 
-    Few photos of the other place may have been searched. Others taken next to the one that shows
-    it best are matched too.
+    Few photos of either place may have been searched. Others taken next to the one that shows it
+    best are matched too.
 
     Args:
         photos: of the other place, among those that were searched.
 
     Returns:
-        ``preference`` for the best pose; whether the other pose surely explains more than chance
-        does; of each pose its inliers and the photo that shows it best.
+        ``preference`` for the best pose, infinite where the other pose is no rival: it explains
+        no more than chance, or too little for an answer while the best pose is likely. Of each
+        pose its inliers and the photo that shows it best.
     """
     pairs = _Pairs(problem, proposed, best)
     seed = pairs.showing(pairs.errors(other.rig_from_world), photos)[0]
@@ -312,20 +323,23 @@ def _compared(
     theirs = geometry.nearest_photos(seed, NUM_COMPARED + 1)
     # In a small map even the photo that shows the best place best is among the nearest.
     theirs = theirs[theirs != own[0]][:NUM_COMPARED]
-    own = own[~np.isin(own, theirs)][:NUM_COMPARED]
-    pairs = _Pairs(problem, [each.matched_with(theirs, geometry) for each in proposed], best)
-    threshold = problem.registration.max_error_px
-    again = refine_generalized_pose(
-        pairs.views(theirs), other.rig_from_world, max_error_px=threshold
-    )
+    beside = geometry.nearest_photos(own[0], NUM_COMPARED)
+    further = np.concatenate([theirs, beside[~np.isin(beside, theirs)]])
+    pairs = _Pairs(problem, [each.matched_with(further, geometry) for each in proposed], best)
+    own = pairs.showing(pairs.errors(best.rig_from_world), np.setdiff1d(pairs.all_photos, theirs))
+    views, threshold = pairs.views(theirs), problem.registration.max_error_px
+    again = refine_generalized_pose(views, other.rig_from_world, max_error_px=threshold) or other
     scores, compared = [], []
-    for pose, shown in ((best, own), (again or other, theirs[: len(own)])):
+    for pose, shown in ((best, own[:NUM_COMPARED]), (again, theirs[: len(own)])):
         errors = pairs.by_keypoint(pairs.errors(pose.rig_from_world), shown)
         scores.append(score(errors))
         compared.append((pose, int((errors <= 1.0).sum()), int(shown[0])))
     first, second = scores
-    is_clear = preference(second, np.zeros_like(second)) >= SURE
-    return preference(first, second), is_clear, compared
+    refusal = first_refusal((enough_inliers, enough_of_the_matches), problem.of(views), again)
+    is_no_answer = refusal is not None and (best.probability or 0.0) >= _MORE_LIKELY_RIGHT
+    if is_no_answer or preference(second, np.zeros_like(second)) < SURE:
+        return math.inf, compared
+    return preference(first, second), compared
 
 
 def _is_rival(

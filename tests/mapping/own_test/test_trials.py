@@ -100,5 +100,19 @@ def test_poses_that_were_estimated_with_the_landmarks_are_not_independent(square
     assert estimated.orientation_factor == pytest.approx(1.5 * exact.orientation_factor, abs=0.01)
 
 
+def test_poses_in_a_unit_that_nobody_knows_are_not_independent_even_in_metres_later(
+    square: Map,
+) -> None:
+    world = square.manifest.world.model_copy(update={"metric": False})
+    manifest = square.manifest.model_copy(update={"world": world})
+    exact, unscaled = own_test(square), own_test(replace(square, manifest=manifest))
+    assert (exact.independent, unscaled.independent) == (True, False)
+    assert unscaled.position_factor == pytest.approx(1.5 * exact.position_factor, abs=0.01)
+
+    parts = square.manifest.parts.model_copy(update={"own_test": unscaled})
+    tied = square.manifest.model_copy(update={"parts": parts})
+    assert own_test(replace(square, manifest=tied)) == unscaled
+
+
 def score(inliers: int) -> Score:
     return Score(inliers=inliers, inlier_ratio=0.5)

@@ -15,7 +15,7 @@ from visloc.localization.rivals import score
 from visloc.localization.solving import SeenImage, Solved
 from visloc.options import LocalizeOptions, Matcher
 from visloc.priors import NO_PRIORS, Priors
-from visloc.types import CameraSource, NotLocalized, Reason
+from visloc.types import CameraSource, Localized, NotLocalized, Reason
 
 
 @pytest.fixture(scope="module")
@@ -239,3 +239,35 @@ def test_further_photos_are_matched_with_the_ratio_of_the_query(
             assert set(more.pairs.keypoints[ours]) == set(whole.pairs.keypoints[theirs])
         found[matcher] = len(more.pairs.keypoints)
     assert found[Matcher.RATIO] < found[Matcher.MUTUAL]
+
+
+@pytest.mark.parametrize(("num_alike", "is_rival"), [(75, False), (150, True)])
+def test_a_place_that_would_be_no_answer_alone_is_no_rival(
+    room: Localizer, place: Any, num_alike: int, is_rival: bool
+) -> None:
+    """On the other floor most landmarks stand elsewhere; those that do not are seen sharply.
+
+    All others are blurred, so that they speak for the right floor no more than chance. Of the sharp
+    ones the photo shows 16 or 31, and a pose needs 20 inliers.
+    """
+    building = Building(room, 0.0, 0.0)
+    features, rng = building.features(place, 0), np.random.default_rng(3)
+    landmarks = building.landmarks.copy()
+    landmarks[1, num_alike:] = rng.permutation(landmarks[1, num_alike:])
+    alike = (features.descriptors[:, None] == building.descriptors[0, :num_alike]).all(2).any(1)
+    radii, angles = 11 * np.sqrt(rng.uniform(size=len(alike))), rng.uniform(0, 6.28, len(alike))
+    blur = np.column_stack([radii * np.cos(angles), radii * np.sin(angles)]) * ~alike[:, None]
+    localizer = Localizer(
+        replace(building.localizer.map, landmarks=landmarks.reshape(-1, 3).astype(np.float32)), None
+    )
+    answer = localizer.localize_features(
+        replace(features, keypoints=np.clip(features.keypoints + blur, 0, [640, 480])),
+        place.camera,
+        LocalizeOptions(min_inliers=20),
+    )
+    assert (alike.sum() < 20) != is_rival
+    if is_rival:
+        assert isinstance(answer, NotLocalized)
+        assert answer.reason is Reason.AMBIGUOUS
+    else:
+        assert isinstance(answer, Localized)
