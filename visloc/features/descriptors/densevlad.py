@@ -17,6 +17,13 @@ from numpy.typing import NDArray
 
 from visloc.device import has_cuda, torch_device
 from visloc.features.base import Fingerprint, GlobalDescriptor
+from visloc.features.descriptors.dense_grid import (
+    CELL_PX,
+    CELLS_PER_SIDE,
+    MIN_CONTRAST,
+    ORIENTATIONS,
+    tent,
+)
 from visloc.features.descriptors.vlad import VLAD_PARAMETERS, VladDescriptor, vlad_of_sums
 from visloc.options import Inference
 from visloc.types import LocalFeatures
@@ -24,17 +31,11 @@ from visloc.types import LocalFeatures
 if TYPE_CHECKING:
     import torch
 
-ORIENTATIONS = 8
-CELLS_PER_SIDE = 4
 # Width of a cell in pixels of the photo at its working size. Coarser ones than the 4 to 10 px of
 # the paper found more of the nearest views in three places, with a quarter of the words.
 CELL_SIZES_PX = (8, 12, 16)
 WORKING_SIZE_PX = 640
-# A cell is this wide in the photo shrunk for its scale; patches overlap by all but one cell.
-CELL_PX = 4
 SMOOTHING_SIGMA_PX = 0.7
-# Grey levels between the neighbours of a pixel, averaged over a patch: below, it is mere noise.
-MIN_CONTRAST = 1.0
 
 
 def load_densevlad(
@@ -169,12 +170,6 @@ def gradient(grey: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np
     right = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=1)
     down = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=1)
     return np.asarray(right, np.float32), np.asarray(down, np.float32)
-
-
-def tent() -> NDArray[np.float32]:
-    """Return the weights of a cell's pixels along one axis: twice as wide as the cell."""
-    weights = np.convolve(np.ones(CELL_PX), np.ones(CELL_PX)) / CELL_PX**2
-    return weights.astype(np.float32)
 
 
 def _cells(channels: NDArray[np.float32]) -> NDArray[np.float32]:
