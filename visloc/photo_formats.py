@@ -255,7 +255,7 @@ def _decode_with_opencv(data: bytes, reduced: int) -> NDArray[np.uint8] | None:
 
 def _decode_with_pillow(opened: ImageFile, _reduced: int) -> NDArray[np.uint8] | None:
     try:
-        return np.array(opened.convert("RGB"), np.uint8)
+        return np.array(opened if opened.mode == "RGB" else opened.convert("RGB"), np.uint8)
     except MALFORMED:
         return None
 

@@ -15,6 +15,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, NoReturn
 
+import cv2
 import httpx
 import numpy as np
 import pytest
@@ -28,9 +29,11 @@ from service.http.app import create_app
 from service.http.envelope import RequestEnvelope
 from service.http.openapi import example
 from service.values import RigJob
+from tests.heic import heic
 from tests.turning import png, turned_camera, turned_pixels, turned_pose
 from visloc.geometry import Pose, rotation_angle
 from visloc.images import read_photo
+from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.words import answers, maps, scenes, status
 
 
@@ -146,6 +149,38 @@ def test_grey_transparent_palette_and_16_bit_photos_are_localized(
     answer = comparable(post(doors, encoded(photo), camera=camera_text(query.camera)))
 
     assert answer["status"] == "localized"
+
+
+@pytest.mark.parametrize("kind", ["HEIC", "AVIF"])
+def test_photos_of_phones_are_localized(kind: str, doors: Any, query: Any) -> None:
+    rgb = read_photo(query.image).rgb
+    data = heic(rgb)
+    if kind == "AVIF":
+        file = io.BytesIO()
+        Image.fromarray(rgb).save(file, "AVIF", quality=90)
+        data = file.getvalue()
+
+    over_http = comparable(post(doors, data, camera=camera_text(query.camera)))
+    camera = pb2.Camera(model="PINHOLE", width=256, height=192, params=query.camera.params)
+    over_grpc = doors.stub.Localize(pb2.LocalizeRequest(map="room", image=data, camera=camera))
+
+    assert over_http["status"] == "localized"
+    for position in (over_grpc.pose.position, over_http["pose"]["position"]):
+        assert np.linalg.norm(np.array(position) - query.cam_from_world.center) < 0.05
+
+
+def test_a_photo_of_more_pixels_than_the_limit_is_reduced(doors: Any, query: Any) -> None:
+    large = cv2.resize(read_photo(query.image).rgb, (1536, 1152), interpolation=cv2.INTER_CUBIC)
+    data = cv2.imencode(".jpg", large[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 75])[1].tobytes()
+    camera = query.camera.scaled(1536, 1152)
+
+    answer = comparable(post(doors, data, camera=camera_text(camera)))
+
+    assert answer["status"] == "localized"
+    assert (answer["camera"]["width"], answer["camera"]["height"]) == (768, 576)
+    assert answer["camera"]["source"] == "given_scaled"
+    found = np.array(answer["pose"]["position"])
+    assert np.linalg.norm(found - query.cam_from_world.center) < 0.05
 
 
 def test_a_photo_stored_turned_is_read_upright(doors: Any, query: Any) -> None:
