@@ -37,6 +37,27 @@ from visloc_api.v1 import localization_pb2_grpc as pb2_grpc
 
 VERSION = "1.2.3"
 CAMERA = "SIMPLE_PINHOLE, 64, 48, 60, 32, 24"
+# The places of a photo that begins with "refuse both".
+TWO_DOORS: list[dict[str, Any]] = [
+    {
+        "map": {"id": "floors", "version": "v2"},
+        "tile": "room@v1",
+        "position": [1.0, 0.25, -3.5],
+        "orientation": [1.0, 0.0, 0.0, 0.0],
+        "inliers": 60,
+        "image": "door [1].jpg",
+        "preference": 0.5,
+    },
+    {
+        "map": {"id": "shed", "version": "v1"},
+        "tile": None,
+        "position": [9.0, 0.25, -3.5],
+        "orientation": [0.0, 1.0, 0.0, 0.0],
+        "inliers": 40,
+        "image": None,
+        "preference": None,
+    },
+]
 POSE: dict[str, Any] = {
     "cam_from_world": {
         "rotation_wxyz": [0.9298410554097046, 0.01755162593, 0.31931803130557, 0.1819987554486438],
@@ -129,7 +150,7 @@ class CannedService:
         if image.startswith(b"refuse"):
             pose = None
             refusal = {"stage": "matching", "reason": "too_few_matches", "message": "3 [matches]"}
-            refusal |= {"candidates": []}
+            refusal |= {"candidates": TWO_DOORS if image.startswith(b"refuse both") else []}
         return {
             "request_id": asked["request_id"] or "made-up",
             "status": "localized" if refusal is None else "not_localized",

@@ -9,6 +9,7 @@ one as of the other.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -152,6 +153,7 @@ class _Pairs:
         self.photos = np.concatenate([each.photos[each.pairs.ranks] for each in proposed])
         self.similarities = np.concatenate([each.pairs.similarities for each in proposed])
         self.all_photos, self._photo = np.unique(self.photos, return_inverse=True)
+        self._image = np.repeat(np.arange(len(proposed)), [len(e.points) for e in proposed])
 
     def errors(self, pose: Pose) -> NDArray[np.float64]:
         """Return each pair's reprojection error in units of the inlier threshold."""
@@ -164,6 +166,23 @@ class _Pairs:
         scores = np.bincount(self._photo, score(errors), minlength=len(self.all_photos))
         of_photos = scores[np.searchsorted(self.all_photos, photos)]
         return photos[np.argsort(-of_photos, kind="stable")]
+
+    def showing_by_image(
+        self, errors: NDArray[np.float64], photos: NDArray[np.int64]
+    ) -> list[NDArray[np.int64]]:
+        """Sort photos as ``showing``, by the pairs of each image that speaks for the pose at all.
+
+        Cameras of a rig that look apart are shown by different photos.
+        """
+        num = len(self.all_photos)
+        rows = np.searchsorted(self.all_photos, photos)
+        sorted_photos = []
+        for image in range(len(self._proposed)):
+            scores = np.where(self._image == image, score(errors), 0.0)
+            of_photos = np.bincount(self._photo, scores, minlength=num)[rows]
+            if of_photos.max(initial=0.0) > 0.0:
+                sorted_photos.append(photos[np.argsort(-of_photos, kind="stable")])
+        return sorted_photos or [self.showing(errors, photos)]
 
     def places_elsewhere(
         self, errors: NDArray[np.float64], geometry: MapGeometry
@@ -307,7 +326,7 @@ def _compared(
     """Compare two poses on equal terms: each with as many photos, those that show it best.
 
     Few photos of either place may have been searched. Others taken next to the one that shows it
-    best are matched too.
+    best are matched too; of a rig, next to the one that shows it best to each camera.
 
     Args:
         photos: of the other place, among those that were searched.
@@ -318,19 +337,23 @@ def _compared(
         pose its inliers and the photo that shows it best.
     """
     pairs = _Pairs(problem, proposed, best)
-    seed = pairs.showing(pairs.errors(other.rig_from_world), photos)[0]
-    own = pairs.showing(pairs.errors(best.rig_from_world), pairs.all_photos)
-    theirs = geometry.nearest_photos(seed, NUM_COMPARED + 1)
-    # In a small map even the photo that shows the best place best is among the nearest.
-    theirs = theirs[theirs != own[0]][:NUM_COMPARED]
-    beside = geometry.nearest_photos(own[0], NUM_COMPARED)
-    further = np.concatenate([theirs, beside[~np.isin(beside, theirs)]])
+    seeds = pairs.showing_by_image(pairs.errors(other.rig_from_world), photos)
+    here = np.setdiff1d(pairs.all_photos, photos)
+    shown_best = pairs.showing_by_image(pairs.errors(best.rig_from_world), here)
+    most = NUM_COMPARED * max(len(seeds), len(shown_best))
+    theirs = _in_turn([geometry.nearest_photos(seed[0], NUM_COMPARED + 1) for seed in seeds])
+    # In a small map even the photos that show the best place best are among the nearest.
+    theirs = theirs[~np.isin(theirs, [each[0] for each in shown_best])][:most]
+    beside = [geometry.nearest_photos(each[0], NUM_COMPARED) for each in shown_best]
+    # One camera of a rig may not have searched a photo that another one found.
+    further = _in_turn([theirs, *beside, *(each[:NUM_COMPARED] for each in shown_best)])
     pairs = _Pairs(problem, [each.matched_with(further, geometry) for each in proposed], best)
-    own = pairs.showing(pairs.errors(best.rig_from_world), np.setdiff1d(pairs.all_photos, theirs))
+    here = np.setdiff1d(pairs.all_photos, np.concatenate([photos, theirs]))
+    own = _in_turn(pairs.showing_by_image(pairs.errors(best.rig_from_world), here))[:most]
     views, threshold = pairs.views(theirs), problem.registration.max_error_px
     again = refine_generalized_pose(views, other.rig_from_world, max_error_px=threshold) or other
     scores, compared = [], []
-    for pose, shown in ((best, own[:NUM_COMPARED]), (again, theirs[: len(own)])):
+    for pose, shown in ((best, own), (again, theirs[: len(own)])):
         errors = pairs.by_keypoint(pairs.errors(pose.rig_from_world), shown)
         scores.append(score(errors))
         compared.append((pose, int((errors <= 1.0).sum()), int(shown[0])))
@@ -340,6 +363,12 @@ def _compared(
     if is_no_answer or preference(second, np.zeros_like(second)) < SURE:
         return math.inf, compared
     return preference(first, second), compared
+
+
+def _in_turn(lists: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Take the first of each list, then the second of each, and so on, each photo once."""
+    in_turn = itertools.chain.from_iterable(itertools.zip_longest(*lists))
+    return np.array([photo for photo in dict.fromkeys(in_turn) if photo is not None], np.int64)
 
 
 def _is_rival(

@@ -55,6 +55,22 @@ def test_weights_are_names_and_numbers(http_url: str, photo: Path, service: Any)
     }
 
 
+def test_both_places_of_an_ambiguous_photo_are_printed(
+    url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photo = tmp_path / "door.jpg"
+    photo.write_bytes(b"refuse both")
+
+    localize("image", photo, "--map", "room", "--server", url)
+
+    lines = {line[:14].strip(): line[15:] for line in capsys.readouterr().out.splitlines()}
+    assert lines["either"] == (
+        "1 0.25 -3.5 in room@v1, turned 1 0 0 0: 60 inliers, most like door [1].jpg, "
+        "preferred by +0.5 deviations"
+    )
+    assert lines["or"] == "9 0.25 -3.5 in shed@v1, turned 0 1 0 0: 40 inliers"
+
+
 def test_a_photo_that_is_not_localized_has_its_own_exit_code_and_says_why(
     url: str, photo: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
