@@ -4,8 +4,9 @@
 
 Maps that the folder does not have are built first. Every answer becomes a line of JSON in
 ``--answers-dir``, one file for each of the scenarios: own, focal, prints, mirrored, halves, shapes,
-floors, floor-set, night, elsewhere. Prints tables in Markdown. With ``--beside CHECKOUT`` only
-the time of a query is measured, beside the code of another commit.
+floors, floor-set, night, elsewhere. Prints tables in Markdown. With ``--pictures DIR`` each photo
+that is wrongly believed is drawn, beside a mapping photo. With ``--beside CHECKOUT`` only the time
+of a query is measured, beside the code of another commit.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from benchmarks.trust.asking import Maps, ask_floors
 from benchmarks.trust.beside import time_beside
 from benchmarks.trust.maps import Places, make_missing
 from benchmarks.trust.outcomes import Outcome
+from benchmarks.trust.pictures import ask_and_draw
 from benchmarks.trust.scenarios import FLOOR_SET, NEEDED, SCENARIOS, floor_set
 from benchmarks.trust.table import write_tables
 
@@ -38,6 +40,9 @@ def main(
     only: Annotated[list[str] | None, typer.Option(help=f"Of {', '.join(NEEDED)}.")] = None,
     beside: Annotated[
         Path | None, typer.Option(help="Only time queries beside this checkout of a commit.")
+    ] = None,
+    pictures: Annotated[
+        Path | None, typer.Option(help="Gets a picture of each photo that is wrongly believed.")
     ] = None,
     weights_dir: Path | None = None,
 ) -> None:
@@ -58,11 +63,12 @@ def main(
     outcomes: list[Outcome] = []
     for name in chosen:
         started = perf_counter()
-        found = (
-            ask_floors(places.store, weights_dir, floor_set(places))
-            if name == FLOOR_SET
-            else maps.ask(SCENARIOS[name](places))
-        )
+        if name == FLOOR_SET:
+            found = ask_floors(places.store, weights_dir, floor_set(places))
+        elif pictures is None:
+            found = maps.ask(SCENARIOS[name](places))
+        else:
+            found = ask_and_draw(maps, SCENARIOS[name](places), places, pictures / name)
         outcomes += kept(found, answers_dir / f"{name}.jsonl")
         typer.echo(f"{name}: {perf_counter() - started:.0f} s", err=True)
     for line in write_tables(outcomes):

@@ -99,6 +99,7 @@ class _Compared:
 
     Attributes:
         apart: radians to the nearest mapping photo.
+        pixels: (e, 2) float64 where landmarks are expected.
         comparable: (e,) bool, whether a keypoint lies where the landmark is expected.
         explained: (e,) bool, whether it looks like the landmark.
         above_chance: (e,) float64, similarity above chance, in its standard deviations; 0 where
@@ -109,6 +110,7 @@ class _Compared:
     """
 
     apart: float
+    pixels: NDArray[np.float64]
     comparable: NDArray[np.bool_]
     explained: NDArray[np.bool_]
     above_chance: NDArray[np.float64]
@@ -172,6 +174,18 @@ def evidence_of(
         *_cover_features(compared),
     )
     return np.nan_to_num(np.array(values, dtype=np.float64), posinf=_MOST, neginf=-_MOST)
+
+
+def compared_landmarks(
+    geometry: MapGeometry, seen: SeenView, rig_from_world: Pose, max_error_px: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the pixels (n, 2) where keypoints were compared with landmarks, and which look alike.
+
+    For pictures of what speaks for and against a pose; arguments as of ``evidence_of``.
+    """
+    compared = _compare(geometry, seen, rig_from_world, max_error_px)
+    there = compared.comparable
+    return compared.pixels[there], compared.explained[there]
 
 
 def _shown_features(compared: Sequence[_Compared]) -> tuple[float, ...]:
@@ -264,6 +278,7 @@ def _compare(
             explained[comparable] = similarity > np.quantile(chance, _CHANCE)
     return _Compared(
         apart,
+        expected.pixels,
         comparable,
         explained,
         above_chance,

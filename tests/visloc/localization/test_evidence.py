@@ -15,7 +15,13 @@ from visloc.features import make_local_features
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo, read_photo
 from visloc.localization.constraints import Constraints
-from visloc.localization.evidence import FEATURES, SeenView, Shown, evidence_of
+from visloc.localization.evidence import (
+    FEATURES,
+    SeenView,
+    Shown,
+    compared_landmarks,
+    evidence_of,
+)
 from visloc.localization.gates import Problem, likely
 from visloc.localization.localizer import Localizer
 from visloc.localization.probability import read_model, shipped_model
@@ -92,6 +98,16 @@ def test_other_content_in_half_of_a_photo_lowers_the_probability(localizer: Loca
     half = features_of(localizer, *_listed(seen_from(localizer, 3, 0.5)))
     assert 0.35 < value(half, "keypoints_outside") < 0.65
     assert value(half, "contradicted") > 0.2
+
+
+def test_pictures_show_where_a_photo_looks_like_something_else(localizer: Localizer) -> None:
+    seen, pose = seen_from(localizer, 3, 0.5)
+    pixels, alike = compared_landmarks(localizer.geometry, seen, pose, 12.0)
+    # Keypoints are in the order of their columns: the left half looks like the map.
+    left = pixels[:, 0] < np.median(seen.view.pixels[:, 0])
+    assert alike[left].mean() > 0.6
+    assert alike[~left].mean() < 0.3
+    assert len(pixels) == len(alike) > 50
 
 
 def test_all_cameras_of_a_rig_count(localizer: Localizer) -> None:
