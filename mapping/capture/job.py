@@ -26,9 +26,9 @@ from visloc.archive import MapStore
 from visloc.errors import refuse
 from visloc.kapture import read_dataset
 
-# Measured on two cores with 640 x 480 and 1280 x 720 (docs/mapping.md): seconds of a photo on one
-# core from its features to its place in the map, and bytes in the work folder and in memory.
-_S_PER_PHOTO, _S_PER_PHOTO_SQUARED = 3.0, 0.004
+# Rough: 14 photos of 1600 x 900 took five seconds of one core each, smaller ones less; incremental
+# mapping grows faster than their number. Bytes are of the work folder, and of memory.
+_S_PER_PHOTO, _S_PER_PHOTO_SQUARED = 5.0, 0.004
 _DISK_PER_PHOTO, _MEMORY, _MEMORY_PER_PHOTO = 5 * 2**20, 2**30, 4 * 2**20
 # Frames are chosen so that each overlaps its nearest six on either side.
 _TOP_K = 12
