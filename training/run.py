@@ -146,7 +146,6 @@ class Trainer:
 
     def advance(self) -> Tensor:
         """Do one step, and return its losses (3,), ``LOSSES``, before it."""
-        started = time.monotonic()
         rate = learning_rate(self.settings, self.step)
         if self._rate.is_cuda:
             self._rate.fill_(rate)
@@ -155,7 +154,6 @@ class Trainer:
                 group["lr"] = rate
         losses = self._learn(as_numbers(*draw(self.sources, self.settings, self.step)))
         self.step += 1
-        self.seconds += time.monotonic() - started
         return losses
 
     def _learned(self, numbers: Tensor) -> Tensor:
@@ -224,7 +222,10 @@ def train(
         if trainer.step == round(settings.decay_from * settings.steps) > 0:
             save_state(folder / BEFORE_DECAY_NAME, trainer.state())
         rate = learning_rate(settings, trainer.step)
+        began = time.monotonic()
         log.note(trainer.step, rate, trainer.advance(), trainer.seconds)
+        # A GPU is waited for where the log reads losses.
+        trainer.seconds += time.monotonic() - began
         is_due = validate_every is not None and trainer.step % validate_every == 0
         if validated is not None and (is_due or trainer.step == settings.steps):
             scores.add(trainer.step, validated(trainer.state()))
