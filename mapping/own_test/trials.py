@@ -197,11 +197,13 @@ def _independent(opened: Map) -> bool:
 
     Where both were estimated together, a photo that is left out has its pose from landmarks that
     are still there. Poses in a unit that nobody knows were estimated from photos too, by another
-    tool: photos alone tell no scale. Editing a map, or tying it to the Earth, changes none of that.
+    tool: photos alone tell no scale. Editing a map, or tying it to the Earth, changes none of that:
+    then the test before it counts.
     """
     manifest, before = opened.manifest, opened.manifest.parts.own_test
+    if before is not None:
+        return before.independent
     from_photos = (
         manifest.method.name == "model" or manifest.method.settings.get("poses") == "estimate"
     )
-    was_independent = before is None or before.independent
-    return manifest.world.metric and was_independent and not from_photos
+    return manifest.world.metric and not from_photos

@@ -48,7 +48,9 @@ def _not_back(opened: Map, run: OwnTestRun) -> Doubt | None:
     if test.tested < LEAST_TESTED:
         return None
     right = test.localized - test.wrong
-    if test.wrong <= MOST_WRONG * test.tested and right >= LEAST_BACK * test.tested:
+    # Where poses were given, photos that find no place tell that the map is sparse, not wrong.
+    is_broken = _has_estimated_poses(opened) and right < LEAST_BACK * test.tested
+    if test.wrong <= MOST_WRONG * test.tested and not is_broken:
         return None
     names = [opened.images[row].name for row in (*run.wrong, *run.refused)]
     message = (
@@ -69,7 +71,7 @@ def _without_place(opened: Map, left_out: Sequence[str]) -> Doubt | None:
 
 def _apart(opened: Map) -> Doubt | None:
     """Doubt a map whose photos, placed by its landmarks alone, hang together by too few of them."""
-    if opened.manifest.method.settings.get("poses") != "estimate":
+    if not _has_estimated_poses(opened):
         return None  # pieces that do not see each other may have known poses
     pieces = _pieces(opened)
     sizes = np.bincount(pieces)
@@ -83,6 +85,10 @@ def _apart(opened: Map) -> Doubt | None:
         "largest"
     )
     return Doubt(kind="pieces", message=message, photos=tuple(names))
+
+
+def _has_estimated_poses(opened: Map) -> bool:
+    return opened.manifest.method.settings.get("poses") == "estimate"
 
 
 def _pieces(opened: Map) -> NDArray[np.int64]:

@@ -45,6 +45,12 @@ def square(
     return make_map(points, [looking([0.5 * np.sin(i), 0.0, 0.0], 15.0 * i) for i in range(24)])
 
 
+def estimated(opened: Map, poses: str = "estimate") -> Map:
+    """The same map, as if its poses had been found in such a way."""
+    method = opened.manifest.method.model_copy(update={"name": "sfm", "settings": {"poses": poses}})
+    return replace(opened, manifest=opened.manifest.model_copy(update={"method": method}))
+
+
 @pytest.mark.parametrize(
     ("tested", "refused", "wrong", "doubted"),
     [
@@ -61,9 +67,12 @@ def square(
 def test_photos_that_do_not_come_back_speak_against_a_map(
     square: Map, tested: int, refused: int, wrong: int, doubted: bool
 ) -> None:
-    found = doubts_about(square, ran(tested, refused, wrong))
+    found = doubts_about(estimated(square), ran(tested, refused, wrong))
 
     assert [doubt.kind for doubt in found] == (["own_test"] if doubted else [])
+    # Where poses were given, photos that find no place tell that a map is sparse, not wrong.
+    given = doubts_about(estimated(square, "given"), ran(tested, refused, wrong))
+    assert bool(given) == (doubted and wrong > 0)
     if doubted:
         (doubt,) = found
         assert f"of {tested} photos" in doubt.message
@@ -100,15 +109,13 @@ def test_pieces_speak_against_a_map_unless_its_poses_were_given(
     assert near.sum() > 100
     keep = np.flatnonzero(near)
     offsets = np.searchsorted(keep, opened.observation_offsets).astype(np.int64)
-    method = opened.manifest.method.model_copy(update={"name": "sfm", "settings": {"poses": poses}})
     split = replace(
         opened,
         observation_landmarks=opened.observation_landmarks[keep],
         observation_offsets=offsets,
-        manifest=opened.manifest.model_copy(update={"method": method}),
     )
 
-    found = doubts_about(split, ran(12, 0, 0))
+    found = doubts_about(estimated(split, poses), ran(12, 0, 0))
 
     assert [doubt.kind for doubt in found] == (["pieces"] if poses == "estimate" else [])
 

@@ -219,7 +219,7 @@ def test_what_is_not_an_image_is_refused(doors: Any) -> None:
     body = problem(post(doors, b"hello"), 422, "image.format")
 
     assert (body["field"], body["kind"]) == ("image", "InvalidInput")
-    assert body["expected"] == "JPEG, PNG, WebP, TIFF or BMP"
+    assert body["expected"] == "JPEG, HEIC, PNG, WebP, AVIF, TIFF or BMP"
 
 
 def test_a_truncated_jpeg_is_refused(doors: Any, query: Any) -> None:
@@ -345,7 +345,7 @@ def test_a_form_that_is_not_one_is_refused(doors: Any) -> None:
     refused("request.malformed", content=b"{", headers={"Content-Type": "application/json"})
     refused("request.map", files={"image": photo})
     refused("request.duplicate_field", files=[("image", photo), ("image", photo)])
-    refused("request.malformed", files=[("image", photo)] * 3)
+    refused("request.malformed", files=[("image", photo)] * 4)
     refused("request.malformed", data={"map": "x" * 100_000}, files={"image": photo})
     twice = refused("request.duplicate_field", data={"map": ["a", "b"]}, files={"image": photo})
     assert twice["field"] == "map"
