@@ -79,6 +79,14 @@ PlacedMapsDirOption = Annotated[
     typer.Option("--maps-dir", envvar=MAPS_DIR_VARIABLE, help="Folder of maps, or its URL."),
     OnCommandLine(partial(place_of, option="--maps-dir")),
 ]
+CacheDirOption = Annotated[
+    Path,
+    typer.Option(
+        envvar="VISLOC_CACHE_DIR",
+        help="Folder for local copies of maps, if --maps-dir is a URL.",
+        rich_help_panel=CLUSTER_PANEL,
+    ),
+]
 ForceOption = Annotated[
     bool, typer.Option("--force", help="Publish a new version of a map that exists.")
 ]

@@ -29,6 +29,8 @@ LOG_NAME = "log.jsonl"
 VALIDATION_NAME = "validation.jsonl"
 BEFORE_DECAY_NAME = "before-decay.pt"
 _LOG_EVERY_STEPS = 25  # reading a loss makes a GPU wait
+# A run without a warm-up is timed over so many steps.
+_LEAST_TIMED_STEPS = 2
 
 
 class LossIsNaN(VislocError):
@@ -199,7 +201,8 @@ def train(
         validate_every: steps; needs ``validated``. The last step is validated as well.
         validated: the score of a state.
         fit_seconds: in which the last step is to be done, from now; while the learning rate
-            rises, steps are timed, and the settings get as many as fit, if those are fewer.
+            rises, and for two steps at least, steps are timed. The settings then get as many as
+            fit, if those are fewer.
 
     Raises:
         LossIsNaN: ``training.diverged``.
@@ -210,11 +213,12 @@ def train(
     started = saved = time.monotonic()
     stopped = False
     timed_step, timed_at = trainer.step, started
+    timed_until = max(trainer.settings.warm_up_steps, _LEAST_TIMED_STEPS)
     while trainer.step < trainer.settings.steps and not stopped:
-        if fit_seconds is not None and trainer.step == trainer.settings.warm_up_steps // 2:
+        if fit_seconds is not None and trainer.step == timed_until // 2:
             log.write()  # waits for the device
             timed_step, timed_at = trainer.step, time.monotonic()
-        if fit_seconds is not None and trainer.step == trainer.settings.warm_up_steps:
+        if fit_seconds is not None and trainer.step == timed_until:
             log.write()
             now = time.monotonic()
             trainer.fit(fit_seconds - (now - started), timed_step, now - timed_at)

@@ -18,6 +18,7 @@ from mapping.options import (
     CLUSTER_PANEL,
     AcceptOption,
     AnyLocalFeaturesOption,
+    CacheDirOption,
     DepthSensorOption,
     FeaturesDirOption,
     ForceOption,
@@ -161,13 +162,7 @@ class BuildSettings:
         ),
         OnCommandLine(partial(place_of, option="--work-dir")),
     ] = None
-    cache_dir: Annotated[
-        Path,
-        _cluster_option(
-            envvar="VISLOC_CACHE_DIR",
-            help="Folder for local copies of maps, if --maps-dir is a URL.",
-        ),
-    ] = Path("maps-cache")
+    cache_dir: CacheDirOption = Path("maps-cache")
     force: ForceOption = False
     depth: DepthSettings = field(default_factory=DepthSettings)
     depth_sensor: DepthSensorOption = None

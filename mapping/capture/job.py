@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,6 +33,8 @@ _S_PER_PHOTO, _S_PER_PHOTO_SQUARED = 5.0, 0.004
 _DISK_PER_PHOTO, _MEMORY, _MEMORY_PER_PHOTO = 5 * 2**20, 2**30, 4 * 2**20
 # Frames are chosen so that each overlaps its nearest six on either side.
 _TOP_K = 12
+# A frame is shown for less than that.
+_PAST_END_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,9 +169,11 @@ def _moment(text: str, sources: Sources) -> tuple[str, float] | None:
     video, at, seconds = text.rpartition("@")
     names = [n for n, path in sources.videos.items() if video in (n, path.name, str(path))]
     try:
-        return (names[0], float(seconds)) if at and len(names) == 1 else None
+        second = float(seconds)
     except ValueError:
         return None
+    is_one = at and len(names) == 1 and 0.0 <= second < math.inf  # False for NaN
+    return (names[0], second) if is_one else None
 
 
 def _resolved(
@@ -188,13 +193,18 @@ def _resolved(
     for text in length.photos:
         if (moment := _moment(text, sources)) is not None:
             name, second = moment
-            times = videos[name].motion.seconds[videos[name].chosen.rows]
+            motion = videos[name].motion
+            if second > (end := float(motion.seconds[-1])) + _PAST_END_S:
+                raise refuse("capture.photo", field="--scale", got=f"{text}: it ends at {end:.1f}")
+            times = motion.seconds[videos[name].chosen.rows]
             found.append(f"{name}/{photo_name(float(times[abs(times - second).argmin()]))}")
             continue
         ends = [one for one in names if one == text or one.endswith(f"/{text}")]
         if len(ends) != 1:
             raise refuse("capture.photo", field="--scale", got=f"{text}: {len(ends)} photos")
         found.append(ends[0])
+    if found[0] == found[1]:
+        raise refuse("capture.photo", field="--scale", got=f"{found[0]} for both")
     return found[0], found[1], length.metres
 
 

@@ -60,7 +60,7 @@ def find_sources(paths: Sequence[Path]) -> Sources:
             for file in sorted(path.iterdir()):
                 if file.suffix.lower() in SUFFIXES and _is_plain(file) and is_video(file):
                     videos[_new_name(file.stem, taken)] = file
-        elif path.suffix.lower() == ".json":
+        elif path.suffix.lower() == ".json" and path.is_file():  # a pipe would never end
             exports[_new_name(path.resolve().parent.name, taken)] = path
         elif path.is_file() and is_video(path):
             videos[_new_name(path.stem, taken)] = path

@@ -30,6 +30,7 @@ SUFFIXES = (".mp4", ".m4v", ".mov", ".webm", ".mkv")
 # Demuxers by kind of file (visloc.file_kinds).
 _DEMUXERS = {"MP4": "mov", "MOV": "mov", "Matroska or WebM": "matroska"}
 _MAX_PIXELS = ImageLimits().max_pixels
+_PIXELS_OPTION = str(_MAX_PIXELS)
 _MIN_SIDE = 64
 # More than an hour at 60 frames a second: of one place, nobody films as long.
 _MAX_FRAMES, _MAX_SECONDS = 250_000, 4 * 3600.0
@@ -183,7 +184,8 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         if demuxer is None:
             raise refuse("capture.video", field=str(path), got=kind.name if kind else "other bytes")
         try:
-            container = av.open(file, "r", format=demuxer)
+            # Opening decodes the first frames to learn of the streams.
+            container = av.open(file, "r", format=demuxer, options={"max_pixels": _PIXELS_OPTION})
         except (FFmpegError, ValueError, UnicodeError) as error:
             raise _unreadable(path, error) from error
         with container:
@@ -205,7 +207,7 @@ def _check_size(path: Path, stream: VideoStream) -> None:
     if context.width * context.height > _MAX_PIXELS:
         raise refuse("capture.video_size", field=str(path), got=f"{context.width}x{context.height}")
     # A frame may claim another size than its track; the decoder then refuses it.
-    context.options = {"max_pixels": str(_MAX_PIXELS)}
+    context.options = {"max_pixels": _PIXELS_OPTION}
 
 
 def _unreadable(path: Path, error: Exception) -> VislocError:

@@ -8,9 +8,10 @@ from typing import Annotated
 import typer
 
 from mapping.cli.display import say
-from mapping.options import MapsDirOption
+from mapping.cluster.storage import open_store
+from mapping.options import CacheDirOption, PlacedMapsDirOption
 from mapping.own_test.picture import draw_doubts
-from visloc.archive import Map, MapStore
+from visloc.archive import Map
 from visloc.errors import refuse
 
 _SHOWN_NAMES = 10
@@ -18,13 +19,14 @@ _SHOWN_NAMES = 10
 
 def use(
     map_ref: Annotated[str, typer.Argument(metavar="MAP@VERSION", help="A published version.")],
-    maps_dir: MapsDirOption = Path("maps"),
+    maps_dir: PlacedMapsDirOption = Path("maps"),
+    cache_dir: CacheDirOption = Path("maps-cache"),
 ) -> None:
     """Put a published version of a map into use, also one that its own test speaks against."""
     map_id, _, version = map_ref.partition("@")
     if not version:
         raise refuse("map.use", field="MAP@VERSION", got=map_ref)
-    MapStore(maps_dir).set_current(map_id, version)
+    open_store(maps_dir, cache_dir).set_current(map_id, version)
     say(f"in use: {map_ref}")
 
 

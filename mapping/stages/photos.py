@@ -78,7 +78,9 @@ def read_in_frame(
     """
     photo = read_photo_file(path)
     if mask is not None:
-        photo = with_mask(photo, mask.read_bytes(), FILE_LIMITS, str(mask))
+        with mask.open("rb") as file:  # one byte more than is read tells that it is too large
+            data = file.read(FILE_LIMITS.max_bytes + 1)
+        photo = with_mask(photo, data, FILE_LIMITS, str(mask))
     stored = photo.width, photo.height
     if stored == size:
         return photo

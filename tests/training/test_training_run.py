@@ -99,12 +99,15 @@ def test_lines_after_the_checkpoint_are_cut(photos: tuple[Photo, ...], tmp_path:
     assert _log(tmp_path)[2]["total"] > 0
 
 
-def test_a_run_does_no_more_steps_than_fit(photos: tuple[Photo, ...], tmp_path: Path) -> None:
-    trainer = _trainer(photos, replace(SMOKE, steps=1000, warm_up_steps=4))
+@pytest.mark.parametrize(("warm_up", "steps"), [(4, 5), (0, 3)])
+def test_a_run_does_no_more_steps_than_fit(
+    photos: tuple[Photo, ...], tmp_path: Path, warm_up: int, steps: int
+) -> None:
+    trainer = _trainer(photos, replace(SMOKE, steps=1000, warm_up_steps=warm_up))
     # No time is left when the steps have been timed: one step more, the last.
     assert train(trainer, tmp_path, seconds=None, checkpoint_every_s=1e9, fit_seconds=0.0)
-    assert trainer.step == trainer.settings.steps == 5
-    assert load_state(tmp_path / FILE_NAME, CPU).settings.steps == 5
+    assert trainer.step == trainer.settings.steps == steps
+    assert load_state(tmp_path / FILE_NAME, CPU).settings.steps == steps
 
 
 def test_a_run_with_other_settings_is_not_mixed_in(

@@ -11,10 +11,11 @@ from PIL import Image
 
 from mapping.build.build import build_map
 from mapping.build.settings import BuildSettings
+from mapping.stages.photos import read_in_frame
 from tests.turning import store_photo_turned
 from visloc.archive import Map, open_map
-from visloc.errors import DatasetError, InvalidInput
-from visloc.images import read_photo_file, upright, with_mask
+from visloc.errors import DatasetError, InvalidInput, TooLarge
+from visloc.images import FILE_LIMITS, read_photo_file, upright, with_mask
 from visloc.kapture import read_dataset
 
 
@@ -94,6 +95,16 @@ def test_a_mask_of_another_size_is_refused_by_name(sample: Path, tmp_path: Path)
         "mask.size",
         str(tmp_path / "masks" / f"{names[0]}.png"),
     )
+
+
+def test_a_mask_file_of_any_length_is_not_read_whole(sample: Path, tmp_path: Path) -> None:
+    dataset = read_dataset(sample / "mapping")
+    mask = tmp_path / "mask.png"
+    with mask.open("wb") as file:
+        file.truncate(FILE_LIMITS.max_bytes + 2)
+    with pytest.raises(TooLarge) as caught:
+        read_in_frame(dataset.path_of(dataset.images[0]), (256, 192), "camera", mask)
+    assert (caught.value.code, caught.value.field) == ("image.too_large", str(mask))
 
 
 def test_ready_made_features_take_no_masks(sample: Path, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -98,3 +99,10 @@ def test_wanted_moments_become_photos(make_video: MakeVideo, tmp_path: Path) -> 
     videos = study_videos(sources, WorkFolder(tmp_path / "w"), 4, {"walk": [1.7]}, quiet)
     assert "00001.700s.jpg" in videos["walk"].names
     assert np.isclose(videos["walk"].motion.seconds[-1], 3.9)
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "transforms.json")
+    with pytest.raises(InvalidInput) as caught:
+        find_sources([tmp_path / "transforms.json"])
+    assert caught.value.code == "capture.video"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import fsspec
@@ -10,6 +11,7 @@ import pytest
 
 from mapping.build.build import build_map
 from mapping.build.settings import BuildSettings
+from mapping.cli.acceptance import use
 from mapping.cluster.storage import is_remote, open_store, opened_dataset, place_of
 from mapping.stages.work_folder import WorkFolder, key_of
 from visloc.archive import Map, open_map
@@ -57,6 +59,18 @@ def test_a_build_from_and_to_urls_makes_the_map_of_a_local_build(
     published = open_store(settings.maps_dir, tmp_path / "other cache")
     again = open_map(published.folder("walk"))
     assert again.manifest.content_hash == sfm_walk.manifest.content_hash
+
+
+def test_a_version_at_a_url_is_put_into_use(bucket: str, tmp_path: Path, sfm_walk: Map) -> None:
+    maps = place_of(f"{bucket}/{tmp_path.name}/maps", "--maps-dir")
+    store, version = open_store(maps, tmp_path / "cache"), sfm_walk.manifest.version
+    with store.incoming() as incoming:
+        shutil.copytree(sfm_walk.path, incoming / "map")
+        store.publish(incoming / "map", "walk", version, make_current=False)
+
+    use(f"walk@{version}", maps, tmp_path / "another cache")
+
+    assert open_store(maps, tmp_path / "other cache").current_version("walk") == version
 
 
 def test_a_build_that_was_interrupted_finds_its_work_at_the_url(
