@@ -94,7 +94,8 @@ def decode_heic(opened: pi_heif.HeifFile) -> NDArray[np.uint8]:
     if pixels.ndim == 2 or pixels.shape[2] < 3:
         grey = pixels if pixels.ndim == 2 else pixels[..., 0]
         pixels = np.repeat(grey[..., None], 3, axis=2)
-    return np.ascontiguousarray(pixels[..., :3])
+    # A copy: the array looks into memory that libheif frees together with ``opened``.
+    return np.array(pixels[..., :3], order="C")
 
 
 def _only(data: bytes, start: int, end: int, wanted: bytes) -> tuple[int, int]:

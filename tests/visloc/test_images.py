@@ -565,6 +565,13 @@ def test_a_heic_photo_that_declares_too_many_pixels_is_refused_from_its_header()
     assert (error.code, error.got) == ("image.too_many_pixels", "20000 x 20000")
 
 
+@pytest.mark.parametrize("side", [64, 1024])
+def test_the_pixels_of_a_heic_photo_stay_when_the_decoder_is_gone(side: int) -> None:
+    rgb = read_photo(heic(np.full((side, side, 3), 90, np.uint8))).rgb
+
+    assert np.abs(rgb.astype(int) - 90).max() <= 2
+
+
 # Photos of very many pixels
 
 
