@@ -40,6 +40,9 @@ _PLAUSIBLE_FOCAL = (0.25, 50.0)
 # libjpeg makes a JPEG smaller while it decodes, and then needs no memory for all of its pixels:
 # four times max_pixels are read so. The photos of phones have up to 200 megapixels.
 _MOST_REDUCED_AREA = 4
+# All pictures of which a photo is made have together at most so many times ``max_pixels``. The
+# largest photo of a phone is made of tiles as large as itself, and has a gain map.
+_MOST_DECODED_AREA = 5
 # A reduced photo has at most so many pixels. Features are found in fewer.
 _REDUCED_PIXELS = 16_000_000
 
@@ -315,12 +318,16 @@ def _reduction(header: PhotoHeader, limits: ImageLimits, field: str) -> int:
 def _check_passes(
     passes: Passes, header: PhotoHeader, reduced: int, limits: ImageLimits, field: str
 ) -> None:
-    """Refuse a JPEG that takes too long, or memory for all pixels although it is reduced.
+    """Refuse a photo that takes too long, or memory for all pixels although it is reduced.
 
     Raises:
         TooLarge: ``image.too_complex``.
     """
     width, height = header.size
+    if header.decoded_pixels > _MOST_DECODED_AREA * limits.max_pixels:
+        most = _MOST_DECODED_AREA * limits.max_pixels
+        got = f"{header.decoded_pixels} pixels"
+        raise _too_complex(field, f"at most {most} pixels in all of its pictures", got)
     if reduced > 1 and (passes.scans > 1 or passes.progressive):
         kind = "a progressive JPEG" if passes.progressive else f"{passes.scans} scans"
         raise _too_complex(field, f"one scan of {width} x {height} pixels, not progressive", kind)

@@ -92,6 +92,8 @@ class PhotoHeader:
         decode: returns (H, W, 3) uint8 RGB, or None when that fails. The argument is 1; for a JPEG
             also 2, 4 or 8, by which its sides are then divided, rounded up.
         turned: the orientation that ``decode`` has applied.
+        decoded_pixels: width times height of all that a decoder works through, where that may be
+            much more than the photo; 0 otherwise.
     """
 
     format: str
@@ -101,6 +103,7 @@ class PhotoHeader:
     exif: Image.Exif
     decode: Callable[[int], NDArray[np.uint8] | None]
     turned: int = 1
+    decoded_pixels: int = 0
 
 
 def open_header(data: bytes, field: str) -> PhotoHeader:
@@ -186,6 +189,7 @@ def _heic_header(data: bytes) -> PhotoHeader:
         exif,
         decode,
         turned=outline.orientation,
+        decoded_pixels=outline.decoded_pixels,
     )
 
 

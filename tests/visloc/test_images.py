@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps, TiffImagePlugin
 
-from tests.heic import heic
+from tests.heic import heic, tiled_heic
 from visloc.errors import InvalidInput, NotFound, TooLarge
 from visloc.images import (
     ImageLimits,
@@ -563,6 +563,18 @@ def test_a_heic_photo_that_declares_too_many_pixels_is_refused_from_its_header()
     error = refusal(heic(texture(), size=(20_000, 20_000)))
 
     assert (error.code, error.got) == ("image.too_many_pixels", "20000 x 20000")
+
+
+def test_a_heic_photo_of_tiles_is_read_and_one_of_very_many_is_refused() -> None:
+    tile = np.full((256, 256, 3), 90, np.uint8)
+    limits = ImageLimits(max_pixels=512 * 512)
+
+    photo = read_photo(tiled_heic(tile, 2, 2, (512, 512)), limits)
+    error = refusal(tiled_heic(tile, 5, 5, (256, 256)), limits)
+
+    assert photo.rgb.shape == (512, 512, 3)
+    assert np.abs(photo.rgb.astype(int) - 90).max() <= 2
+    assert (error.code, error.got) == ("image.too_complex", f"{26 * 256 * 256} pixels")
 
 
 @pytest.mark.parametrize("side", [64, 1024])
