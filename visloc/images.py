@@ -166,8 +166,9 @@ def with_mask(
     Raises:
         InvalidInput: ``mask.size``, and what ``read_photo`` raises.
     """
-    shown: NDArray[np.bool_] = np.asarray(_read(data, limits, field).rgb.any(axis=2))
-    height, width = shown.shape
+    read = _read(data, limits, field)
+    shown: NDArray[np.bool_] = np.asarray(read.rgb.any(axis=2))
+    width, height = read.file_size or (read.width, read.height)
     stored = photo.file_size or (photo.width, photo.height)
     if width * stored[1] == height * stored[0]:
         return replace(photo, mask=shown)

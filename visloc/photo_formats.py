@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import pi_heif
 from numpy.typing import NDArray
-from PIL import ExifTags, Image
+from PIL import AvifImagePlugin, ExifTags, Image
 from PIL.AvifImagePlugin import AvifImageFile
 from PIL.BmpImagePlugin import BmpImageFile
 from PIL.ImageFile import ImageFile
@@ -69,6 +69,8 @@ _REDUCED_FLAGS = {
     4: cv2.IMREAD_REDUCED_COLOR_4,
     8: cv2.IMREAD_REDUCED_COLOR_8,
 }
+# A process of the service or of a build has one core; Pillow would start a thread for each.
+AvifImagePlugin.DEFAULT_MAX_THREADS = 1
 _ONE_STRIP = 2**32 - 1  # of TIFF: all rows are in one
 _LEAST_PIECE = 2**20  # pixels of a strip or tile of TIFF that may always be
 # Segments of a JPEG or chunks of a PNG. 20 MiB of image data in the usual pieces are 2 600 chunks.

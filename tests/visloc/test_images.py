@@ -23,6 +23,7 @@ from visloc.images import (
     turn_of,
     upright,
     upright_from_stored,
+    with_mask,
 )
 
 ORIENTATIONS = range(1, 9)
@@ -598,6 +599,20 @@ def test_a_large_jpeg_is_reduced_while_it_is_decoded() -> None:
     # A pixel is the mean of those that it spans, so that (u, v) becomes (u / 2, v / 2).
     spanned = smooth[:300, :402].reshape(150, 2, 201, 2, 3).mean(axis=(1, 3))
     assert np.abs(photo.rgb - spanned).mean() < 1
+
+
+def test_a_mask_is_reduced_as_its_photo_is() -> None:
+    shown = np.zeros((301, 403), np.uint8)
+    shown[:, 200:] = 255
+    photo = encode(Image.fromarray(texture(403, 301)), "JPEG")
+    mask = encode(Image.fromarray(shown), "JPEG")
+    limits = ImageLimits(max_pixels=403 * 301 // 2)
+
+    masked = with_mask(read_photo(photo, limits), mask, limits)
+
+    assert masked.reduced == 2
+    points = np.array([[10.0, 10.0], [95.0, 149.0], [105.0, 10.0], [201.0, 150.0]])
+    assert masked.counts(points).tolist() == [False, False, True, True]
 
 
 def test_the_focal_length_of_a_reduced_photo_is_in_its_pixels() -> None:
