@@ -42,7 +42,7 @@ def heic(
     quarter_turns, mirror = _TURNS[orientation]
     properties = [
         _box(b"hvcC", _hvcc(units, 10 if ten_bits else 8)),
-        _box(b"colr", b"nclx" + struct.pack(">HHHB", 1, 13, 6, 0)),  # sRGB, BT.601, video levels
+        _COLOURS,
         _box(b"ispe", bytes(4) + struct.pack(">II", *(size or (width, height)))),
         *([_box(b"irot", bytes([quarter_turns]))] if quarter_turns else []),
         *([] if mirror is None else [_box(b"imir", bytes([mirror]))]),
@@ -56,6 +56,51 @@ def heic(
         meta = _meta(properties, items, start)
         start = len(ftyp) + len(meta) + 8
     return ftyp + meta + _box(b"mdat", b"".join(data for _, _, data in items))
+
+
+def tiled_heic(tile: NDArray[np.uint8], rows: int, columns: int, size: tuple[int, int]) -> bytes:
+    """Make a HEIC photo of ``size`` (width, height) whose tiles are all the same bytes."""
+    units, (height, width) = _hevc(tile, "yuv420p"), tile.shape[:2]
+    picture = b"".join(
+        struct.pack(">I", len(unit)) + unit for unit in units if _kind(unit) not in (32, 33, 34)
+    )
+    properties = [
+        _box(b"hvcC", _hvcc(units, 8)),
+        _box(b"ispe", bytes(4) + struct.pack(">II", width, height)),
+        _box(b"ispe", bytes(4) + struct.pack(">II", *size)),
+        _COLOURS,
+    ]
+    tiles = range(2, 2 + rows * columns)
+    grid = struct.pack(">BBBBII", 0, 1, rows - 1, columns - 1, *size)
+    kinds = [(1, b"grid"), *((number, b"hvc1") for number in tiles)]
+    entries = b"".join(
+        _box(b"infe", struct.pack(">IHH4s", 2 << 24, number, 0, kind) + b"\0")
+        for number, kind in kinds
+    )
+    links = struct.pack(">HBBB", 1, 2, 0x83, 0x84) + b"".join(
+        struct.pack(">HBBBB", number, 3, 0x81, 0x82, 0x84) for number in tiles
+    )
+    made_of = struct.pack(f">HH{len(tiles)}H", 1, len(tiles), *tiles)
+    ftyp, start = _box(b"ftyp", b"heic" + bytes(4) + b"mif1heic"), 0
+    for _ in range(2):  # the second time, the places of the items are known
+        places = struct.pack(">HHHII", 1, 0, 1, start, len(grid)) + b"".join(
+            struct.pack(">HHHII", number, 0, 1, start + len(grid), len(picture)) for number in tiles
+        )
+        parts = [
+            _box(b"hdlr", bytes(8) + b"pict" + bytes(13)),
+            _box(b"pitm", struct.pack(">IH", 0, 1)),
+            _box(b"iinf", struct.pack(">IH", 0, len(kinds)) + entries),
+            _box(b"iloc", struct.pack(">IBBH", 0, 0x44, 0, len(kinds)) + places),
+            _box(
+                b"iprp",
+                _box(b"ipco", b"".join(properties))
+                + _box(b"ipma", struct.pack(">II", 0, len(kinds)) + links),
+            ),
+            _box(b"iref", bytes(4) + _box(b"dimg", made_of)),
+        ]
+        meta = _box(b"meta", bytes(4) + b"".join(parts))
+        start = len(ftyp) + len(meta) + 8
+    return ftyp + meta + _box(b"mdat", grid + picture)
 
 
 def _hevc(rgb: NDArray[np.uint8], layout: str) -> list[bytes]:
@@ -119,3 +164,6 @@ def _meta(properties: list[bytes], items: list[tuple[int, bytes, bytes]], start:
 
 def _box(kind: bytes, content: bytes) -> bytes:
     return struct.pack(">I", len(content) + 8) + kind + content
+
+
+_COLOURS = _box(b"colr", b"nclx" + struct.pack(">HHHB", 1, 13, 6, 0))  # sRGB, BT.601, video levels

@@ -8,7 +8,7 @@ an orientation in EXIF's words.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +22,8 @@ pi_heif.options.AUX_IMAGES = False
 # A process of the service or of a build has one core.
 pi_heif.options.DECODE_THREADS = 1
 
-_MAX_BOXES = 10_000
+_MAX_BOXES = _MAX_PICTURES = 10_000
+_MAX_PICTURES = 10_000
 # EXIF's orientation by the quarter turns clockwise that it asks for, and by whether the picture is
 # mirrored left and right afterwards.
 _ORIENTATIONS = {
@@ -45,10 +46,14 @@ class HeicOutline:
         orientation: 1 to 8, what ``irot`` and ``imir`` of the main picture do.
         most_pixels: width times height of the largest picture in the file: also tiles, thumbnails
             and masks of transparency, all of which a decoder may allocate.
+        decoded_pixels: width times height of the main picture, of its tiles and of what belongs to
+            them, such as transparency, together. Tiles may be larger than the picture in which they
+            lie, and of the same few bytes.
     """
 
     orientation: int
     most_pixels: int
+    decoded_pixels: int
 
 
 def heic_outline(data: bytes) -> HeicOutline:
@@ -62,14 +67,21 @@ def heic_outline(data: bytes) -> HeicOutline:
     if not parts.keys() >= {b"pitm", b"iprp"}:
         raise ValueError("the file names no main picture or none of its properties")
     properties = list(_boxes(data, *_only(data, *parts[b"iprp"], b"ipco")))
-    sizes = [
-        _number(data, start + 4, 4) * _number(data, start + 8, 4)
-        for kind, start, _ in properties
+    sizes = {
+        index: _number(data, start + 4, 4) * _number(data, start + 8, 4)
+        for index, (kind, start, _) in enumerate(properties, start=1)
         if kind == b"ispe"
-    ]
+    }
+    most_pixels = max(sizes.values(), default=0)
     start = parts[b"pitm"][0]
     main = _number(data, start + 4, 4 if data[start] else 2)
-    linked = _links(data, _only(data, *parts[b"iprp"], b"ipma")).get(main, [])
+    links = _links(data, _only(data, *parts[b"iprp"], b"ipma"))
+    areas = {
+        item: max((sizes.get(index, 0) for index in linked), default=0)
+        for item, linked in links.items()
+    }
+    pieces = _pieces(data, *parts[b"iref"]) if b"iref" in parts else {}
+    linked = links.get(main, [])
     turns, mirrored = 0, False
     for index in linked:
         if not 1 <= index <= len(properties):
@@ -83,7 +95,11 @@ def heic_outline(data: bytes) -> HeicOutline:
             # Top and bottom is left and right, and half a turn.
             turns += 0 if _number(data, start, 1) & 1 else 2
             mirrored = not mirrored
-    return HeicOutline(_ORIENTATIONS[turns % 4, mirrored], max(sizes, default=0))
+    return HeicOutline(
+        _ORIENTATIONS[turns % 4, mirrored],
+        most_pixels,
+        sum(areas.get(item) or most_pixels for item in _all_pieces(main, pieces)),
+    )
 
 
 def decode_heic(opened: pi_heif.HeifFile) -> NDArray[np.uint8]:
@@ -94,7 +110,8 @@ def decode_heic(opened: pi_heif.HeifFile) -> NDArray[np.uint8]:
     if pixels.ndim == 2 or pixels.shape[2] < 3:
         grey = pixels if pixels.ndim == 2 else pixels[..., 0]
         pixels = np.repeat(grey[..., None], 3, axis=2)
-    return np.ascontiguousarray(pixels[..., :3])
+    # A copy: the array looks into memory that libheif frees together with ``opened``.
+    return np.array(pixels[..., :3], order="C")
 
 
 def _only(data: bytes, start: int, end: int, wanted: bytes) -> tuple[int, int]:
@@ -140,6 +157,32 @@ def _links(data: bytes, box: tuple[int, int]) -> dict[int, list[int]]:
         found.setdefault(item, []).extend(n & (0x7FFF if wide_links else 0x7F) for n in numbers)
         position += size * count
     return found
+
+
+def _pieces(data: bytes, start: int, end: int) -> dict[int, list[int]]:
+    """Return the pictures that each is made of or that belong to it (ISO/IEC 14496-12, 8.11.12)."""
+    size = 4 if data[start] else 2
+    found: dict[int, list[int]] = {}
+    for kind, first, _ in _boxes(data, start + 4, end):
+        item, count = _number(data, first, size), _number(data, first + size, 2)
+        places = range(first + size + 2, first + size + 2 + size * count, size)
+        others = [_number(data, place, size) for place in places]
+        if kind == b"dimg":
+            found.setdefault(item, []).extend(others)
+        elif kind == b"auxl":
+            for other in others:
+                found.setdefault(other, []).append(item)
+    return found
+
+
+def _all_pieces(main: int, pieces: Mapping[int, Sequence[int]]) -> list[int]:
+    """Return a picture and all pieces of its pieces, each as often as it is decoded."""
+    every = [main]
+    for item in every:
+        every += pieces.get(item, ())
+        if len(every) > _MAX_PICTURES:
+            raise ValueError(f"the picture is made of more than {_MAX_PICTURES} others")
+    return every
 
 
 def _number(data: bytes, start: int, size: int) -> int:

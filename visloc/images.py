@@ -40,6 +40,9 @@ _PLAUSIBLE_FOCAL = (0.25, 50.0)
 # libjpeg makes a JPEG smaller while it decodes, and then needs no memory for all of its pixels:
 # four times max_pixels are read so. The photos of phones have up to 200 megapixels.
 _MOST_REDUCED_AREA = 4
+# All pictures of which a photo is made have together at most so many times ``max_pixels``. The
+# largest photo of a phone is made of tiles as large as itself, and has a gain map.
+_MOST_DECODED_AREA = 5
 # A reduced photo has at most so many pixels. Features are found in fewer.
 _REDUCED_PIXELS = 16_000_000
 
@@ -163,8 +166,9 @@ def with_mask(
     Raises:
         InvalidInput: ``mask.size``, and what ``read_photo`` raises.
     """
-    shown: NDArray[np.bool_] = np.asarray(_read(data, limits, field).rgb.any(axis=2))
-    height, width = shown.shape
+    read = _read(data, limits, field)
+    shown: NDArray[np.bool_] = np.asarray(read.rgb.any(axis=2))
+    width, height = read.file_size or (read.width, read.height)
     stored = photo.file_size or (photo.width, photo.height)
     if width * stored[1] == height * stored[0]:
         return replace(photo, mask=shown)
@@ -315,12 +319,16 @@ def _reduction(header: PhotoHeader, limits: ImageLimits, field: str) -> int:
 def _check_passes(
     passes: Passes, header: PhotoHeader, reduced: int, limits: ImageLimits, field: str
 ) -> None:
-    """Refuse a JPEG that takes too long, or memory for all pixels although it is reduced.
+    """Refuse a photo that takes too long, or memory for all pixels although it is reduced.
 
     Raises:
         TooLarge: ``image.too_complex``.
     """
     width, height = header.size
+    if header.decoded_pixels > _MOST_DECODED_AREA * limits.max_pixels:
+        most = _MOST_DECODED_AREA * limits.max_pixels
+        got = f"{header.decoded_pixels} pixels"
+        raise _too_complex(field, f"at most {most} pixels in all of its pictures", got)
     if reduced > 1 and (passes.scans > 1 or passes.progressive):
         kind = "a progressive JPEG" if passes.progressive else f"{passes.scans} scans"
         raise _too_complex(field, f"one scan of {width} x {height} pixels, not progressive", kind)

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import pi_heif
 from numpy.typing import NDArray
-from PIL import ExifTags, Image
+from PIL import AvifImagePlugin, ExifTags, Image
 from PIL.AvifImagePlugin import AvifImageFile
 from PIL.BmpImagePlugin import BmpImageFile
 from PIL.ImageFile import ImageFile
@@ -69,6 +69,8 @@ _REDUCED_FLAGS = {
     4: cv2.IMREAD_REDUCED_COLOR_4,
     8: cv2.IMREAD_REDUCED_COLOR_8,
 }
+# A process of the service or of a build has one core; Pillow would start a thread for each.
+AvifImagePlugin.DEFAULT_MAX_THREADS = 1
 _ONE_STRIP = 2**32 - 1  # of TIFF: all rows are in one
 _LEAST_PIECE = 2**20  # pixels of a strip or tile of TIFF that may always be
 # Segments of a JPEG or chunks of a PNG. 20 MiB of image data in the usual pieces are 2 600 chunks.
@@ -92,6 +94,8 @@ class PhotoHeader:
         decode: returns (H, W, 3) uint8 RGB, or None when that fails. The argument is 1; for a JPEG
             also 2, 4 or 8, by which its sides are then divided, rounded up.
         turned: the orientation that ``decode`` has applied.
+        decoded_pixels: width times height of all that a decoder works through, where that may be
+            much more than the photo; 0 otherwise.
     """
 
     format: str
@@ -101,6 +105,7 @@ class PhotoHeader:
     exif: Image.Exif
     decode: Callable[[int], NDArray[np.uint8] | None]
     turned: int = 1
+    decoded_pixels: int = 0
 
 
 def open_header(data: bytes, field: str) -> PhotoHeader:
@@ -186,6 +191,7 @@ def _heic_header(data: bytes) -> PhotoHeader:
         exif,
         decode,
         turned=outline.orientation,
+        decoded_pixels=outline.decoded_pixels,
     )
 
 

@@ -27,25 +27,25 @@ NO_FILES: Mapping[str, bytes] = {}
 
 
 class Parts:
-    """The files of a form, each of which is one image."""
+    """The files of a form, each of which is one image or one mask."""
 
     def __init__(self, files: Mapping[str, bytes]) -> None:
         self._names = tuple(files)
         self._left = dict(files)
 
-    def take(self, name: str) -> bytes:
-        """Return the file of an image.
+    def take(self, name: str, field: str) -> bytes:
+        """Return the file that a field names.
 
         Raises:
-            InvalidInput: ``request.part`` when it was not sent, or is another image's already.
+            InvalidInput: ``request.part`` when it was not sent, or another field named it already.
         """
         if name not in self._left:
             raise refuse(
                 "request.part",
-                "another image already uses this part"
+                "another image or mask already uses this part"
                 if name in self._names
                 else "no file part of this name was sent",
-                field="part",
+                field=field,
                 expected=f"one of the file parts: {', '.join(self._left) or 'none is left'}"[:500],
                 got=name,
             )
@@ -63,7 +63,7 @@ class Parts:
                 "request.part",
                 "no image of the request names this part",
                 field=name[:100],
-                expected='an image with "part": NAME for every file',
+                expected='an image with "part": NAME, or "mask_part", for every file',
                 got=name,
             )
 
@@ -232,12 +232,18 @@ def _image(image: RigImage, parts: Parts, *, has_rig: bool) -> ImageJob:
                 expected="one of image, features, part",
                 got="part and another",
             )
-        content = parts.take(image.part)
+        content = parts.take(image.part, "part")
     mask = image.mask
     if image.mask_part is not None:
         if mask is not None:
-            raise refuse("request.query", field="mask", got="mask and mask_part")
-        mask = parts.take(image.mask_part)
+            raise refuse(
+                "request.query",
+                "a mask must be given in exactly one way",
+                field="mask",
+                expected="one of mask, mask_part",
+                got="both",
+            )
+        mask = parts.take(image.mask_part, "mask_part")
     return ImageJob(
         image.sensor or ONLY_SENSOR,
         query_to_core(content, image.features, mask),

@@ -6,7 +6,7 @@ import asyncio
 import logging
 from collections.abc import AsyncGenerator, AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import aclosing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from service.engine.catalog import Catalog
 from service.engine.instant_tasks import localize_in
@@ -213,11 +213,9 @@ class Engine:
     async def _search(self, job: RigJob) -> Localization:
         async with self._catalog.using(job.maps) as maps:
             sets, alone = parted(maps, job.priors)
-            one_place = not sets and len(alone) == 1
-            searched = job if one_place else replace(job, options=job.options.before_rivals())
-            searches = [self._sets.localize(searched, each) for each in sets]
+            searches = [self._sets.localize(job, each) for each in sets]
             if alone:
-                searches.append(localize_in(self.workers, searched, alone))
+                searches.append(localize_in(self.workers, job, alone))
             return gated(judged(await answers_of(searches), job.priors)[1], job.options)
 
     async def localize_sequence(

@@ -257,7 +257,7 @@ class SetSequence:
                 one.leg.start.rig,
                 one.instant.images,
                 instant.timestamp,
-                self._start.options.before_rivals(),
+                self._start.options,
                 one.priors,
                 ypr=self._start.ypr,
             )

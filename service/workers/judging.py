@@ -60,6 +60,18 @@ def gated(found: Localization, options: LocalizeOptions) -> Localization:
     return replace(found, answer=replace(found.answer, pose=None, refusal=refusal))
 
 
+def settled(
+    found: Sequence[Localization], options: LocalizeOptions, priors: Priors
+) -> tuple[int | None, Refusal | None]:
+    """Return the map on which a sequence settles with an instant, or why no map has its pose.
+
+    When the best place is refused, the second best is no answer.
+    """
+    best, verdict = judged(found, priors)
+    refusal = verdict.answer.refusal or not_probable_enough(verdict.answer, options)
+    return (best, None) if refusal is None else (None, refusal)
+
+
 def _tie(a: Localization, b: Localization, priors: Priors) -> Tie | None:
     """Return the transform between the frames of two answers; None where it is unknown.
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 from service.values import InstantJob, Localization, SequenceJob, check_order
 from service.workers.instants import Target, check_images, check_options, check_priors
-from service.workers.judging import judged
+from service.workers.judging import settled
 from visloc.errors import inside, refuse
-from visloc.localization.judge import candidate, most_inliers_first, not_probable_enough
+from visloc.localization.judge import candidate, most_inliers_first
 from visloc.localization.solving import SeenImage, Solved
 from visloc.priors import Priors
 from visloc.sequences.filling import TimeUnit, guess_time_unit
@@ -119,7 +119,7 @@ class SequenceRun:
     def _judged(self, solved: list[Solved], priors: Priors) -> tuple[int | None, list[Solved]]:
         """Return the map to settle on, if any, and the instant's solution in each map.
 
-        An instant that several maps explain has a pose in none of them.
+        An instant that ``settled`` refuses has a pose in none of them.
         """
         if len(self.targets) == 1:
             return None, solved
@@ -127,13 +127,9 @@ class SequenceRun:
             target.localization(one.answer, ypr=self._start.ypr)
             for target, one in zip(self.targets, solved, strict=True)
         ]
-        best, verdict = judged(found, priors)
-        if verdict.answer.pose is not None:
-            is_sure = not_probable_enough(verdict.answer, self._start.options) is None
-            return (best if is_sure else None), solved
-        refusal = verdict.answer.refusal
-        if refusal is None or refusal.reason is not Reason.AMBIGUOUS:
-            return None, solved
+        best, refusal = settled(found, self._start.options, priors)
+        if refusal is None:
+            return best, solved
         return None, [one if one.pose is None else one.refused(refusal) for one in solved]
 
     def _candidates(self, answers: Sequence[InstantAnswer]) -> tuple[Candidate, ...]:

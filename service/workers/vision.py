@@ -35,7 +35,7 @@ from service.values import (
     WorkerSettings,
 )
 from service.workers.instants import Target, check_images, check_options, check_priors, rig_in_map
-from service.workers.judging import judged
+from service.workers.judging import gated, judged
 from service.workers.open_maps import OpenMaps
 from service.workers.photos import DecodedQuery, decode, pack, summed
 from service.workers.sequences import SequenceRun
@@ -121,7 +121,8 @@ class Vision:
         if not job.debug or look is None or not isinstance(decoded.query, Photo):
             return best
         self._step()
-        return replace(best, debug=_picture(decoded.query, targets[row], look, best, solved))
+        told = gated(best, job.options)
+        return replace(best, debug=_picture(decoded.query, targets[row], look, told, solved))
 
     def check_rig(self, job: RigJob, maps: Sequence[MapFolder]) -> None:
         """Refuse a rig's images, which come without their photos, or options that do not fit."""
@@ -163,11 +164,15 @@ class Vision:
     def _solve(
         self, job: RigJob, targets: Sequence[Target], seen: Sequence[tuple[SeenImage, ...]]
     ) -> tuple[int, Localization, Solved]:
-        """Solve for a pose in every map; return the chosen answer and the row of its map."""
-        solved = []
+        """Solve for a pose in every map; return the chosen answer and the row of its map.
+
+        A raised ``min_probability`` does not count yet: the engine may compare the answer with
+        those of other places.
+        """
+        solved, options = [], job.options.before_rivals()
         for target, images in zip(targets, seen, strict=True):
             self._step()
-            solved.append(target.localizer.solve(images, job.options, job.priors, job.timestamp))
+            solved.append(target.localizer.solve(images, options, job.priors, job.timestamp))
         found = [
             target.localization(one.answer, ypr=job.ypr)
             for target, one in zip(targets, solved, strict=True)

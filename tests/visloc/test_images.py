@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps, TiffImagePlugin
 
-from tests.heic import heic
+from tests.heic import heic, tiled_heic
 from visloc.errors import InvalidInput, NotFound, TooLarge
 from visloc.images import (
     ImageLimits,
@@ -23,6 +23,7 @@ from visloc.images import (
     turn_of,
     upright,
     upright_from_stored,
+    with_mask,
 )
 
 ORIENTATIONS = range(1, 9)
@@ -565,6 +566,25 @@ def test_a_heic_photo_that_declares_too_many_pixels_is_refused_from_its_header()
     assert (error.code, error.got) == ("image.too_many_pixels", "20000 x 20000")
 
 
+def test_a_heic_photo_of_tiles_is_read_and_one_of_very_many_is_refused() -> None:
+    tile = np.full((256, 256, 3), 90, np.uint8)
+    limits = ImageLimits(max_pixels=512 * 512)
+
+    photo = read_photo(tiled_heic(tile, 2, 2, (512, 512)), limits)
+    error = refusal(tiled_heic(tile, 5, 5, (256, 256)), limits)
+
+    assert photo.rgb.shape == (512, 512, 3)
+    assert np.abs(photo.rgb.astype(int) - 90).max() <= 2
+    assert (error.code, error.got) == ("image.too_complex", f"{26 * 256 * 256} pixels")
+
+
+@pytest.mark.parametrize("side", [64, 1024])
+def test_the_pixels_of_a_heic_photo_stay_when_the_decoder_is_gone(side: int) -> None:
+    rgb = read_photo(heic(np.full((side, side, 3), 90, np.uint8))).rgb
+
+    assert np.abs(rgb.astype(int) - 90).max() <= 2
+
+
 # Photos of very many pixels
 
 
@@ -579,6 +599,20 @@ def test_a_large_jpeg_is_reduced_while_it_is_decoded() -> None:
     # A pixel is the mean of those that it spans, so that (u, v) becomes (u / 2, v / 2).
     spanned = smooth[:300, :402].reshape(150, 2, 201, 2, 3).mean(axis=(1, 3))
     assert np.abs(photo.rgb - spanned).mean() < 1
+
+
+def test_a_mask_is_reduced_as_its_photo_is() -> None:
+    shown = np.zeros((301, 403), np.uint8)
+    shown[:, 200:] = 255
+    photo = encode(Image.fromarray(texture(403, 301)), "JPEG")
+    mask = encode(Image.fromarray(shown), "JPEG")
+    limits = ImageLimits(max_pixels=403 * 301 // 2)
+
+    masked = with_mask(read_photo(photo, limits), mask, limits)
+
+    assert masked.reduced == 2
+    points = np.array([[10.0, 10.0], [95.0, 149.0], [105.0, 10.0], [201.0, 150.0]])
+    assert masked.counts(points).tolist() == [False, False, True, True]
 
 
 def test_the_focal_length_of_a_reduced_photo_is_in_its_pixels() -> None:

@@ -307,6 +307,8 @@ AT_RIGHT = "rig.sensors.right.cam_from_rig"
         ({"images": [{"sensor": "left"}]}, "request.query", "images[0].image"),
         ({"images": [image(part="x")]}, "request.query", "images[0].image"),
         ({"images": [{"sensor": "left", "part": "x"}]}, "request.part", "images[0].part"),
+        ({"images": [image(mask_part="x")]}, "request.part", "images[0].mask_part"),
+        ({"images": [image(mask="AAAA", mask_part="x")]}, "request.query", "images[0].mask"),
         ({"images": [image(camera={})]}, "request.missing_field", "images[0].camera.model"),
         (
             {"images": [image(camera=CAMERA | {"params": [NAN, 1, 1, 1]})]},

@@ -117,6 +117,25 @@ def test_debug_shows_points_in_the_frame_of_the_set(served: Any, query: Any) -> 
     assert found.debug.overlay == own.debug.overlay
 
 
+def test_the_picture_of_a_raised_gate_says_that_the_pose_was_refused(
+    client: Client, query: Any
+) -> None:
+    more = {"min_probability": 1.0}
+    believed = client.localize(query.image, "site", query.camera, debug=True)
+    alone, refused = (
+        client.localize(query.image, each, query.camera, options=more, debug=True)
+        for each in ("room", "site")
+    )
+
+    assert believed.localized
+    assert not alone.localized
+    assert not refused.localized
+    for found in (believed, alone, refused):
+        assert found.debug is not None
+    assert refused.debug.overlay == alone.debug.overlay
+    assert refused.debug.overlay != believed.debug.overlay
+
+
 def test_features_are_searched_in_a_set_as_photos_are(
     client: Client, site: Path, query: Any
 ) -> None:

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from service.values import Localization
-from service.workers.judging import gated, judged
+from service.workers.judging import gated, judged, settled
 from tests.visloc.answers import localized, refused
 from visloc.archive import Geodetic
 from visloc.options import LocalizeOptions
+from visloc.priors import NO_PRIORS
 from visloc.types import InstantAnswer, Reason
 
 
@@ -88,6 +89,27 @@ def test_a_raised_gate_refuses_the_best_place_and_never_makes_the_second_best_wi
             assert answer.refusal is not None
             assert answer.refusal.reason is Reason.UNLIKELY_POSE
             assert "0.50" in answer.refusal.message
+
+
+def test_a_sequence_settles_on_no_second_best_map() -> None:
+    best = of_map("a@v1", likely(localized(400), 0.5))
+    second = of_map("b@v1", likely(localized(60, (50, 0, 0)), 0.95))
+
+    assert settled([second, best], LocalizeOptions(), NO_PRIORS) == (1, None)
+    row, refusal = settled([second, best], LocalizeOptions(min_probability=0.8), NO_PRIORS)
+    assert row is None
+    assert refusal is not None
+    assert refusal.reason is Reason.UNLIKELY_POSE
+    rival = of_map("c@v1", likely(localized(390, (50, 0, 0)), 0.95))
+    row, refusal = settled([rival, best], LocalizeOptions(), NO_PRIORS)
+    assert row is None
+    assert refusal is not None
+    assert refusal.reason is Reason.AMBIGUOUS
+    wrong_camera = of_map("d@v1", refused(500, Reason.CAMERA_CONTRADICTED))
+    row, refusal = settled([second, wrong_camera], LocalizeOptions(), NO_PRIORS)
+    assert row is None
+    assert refusal is not None
+    assert refusal.reason is Reason.CAMERA_CONTRADICTED
 
 
 def test_a_pose_that_was_not_judged_passes_every_gate() -> None:
