@@ -9,9 +9,9 @@ place from nearby: in another hallway the pictures, the numbers and the furnitur
 Between photos of one place that share is low too, if they are taken far apart. In order of time,
 photos next to each other are likely to show one place, and need less. Any other pair with a low
 share is believed where third photos agree with it: their own pairs lead from its keypoints to
-those that it matches them with. So a third photo never links places that no believed pair links; and what
-repeats itself within one place does not pass, as over a third photo the first door in a row does
-not lead to the second.
+those that it matches them with. So a third photo never links places that no believed pair links;
+and what repeats itself within one place does not pass, as over a third photo the first door in a
+row does not lead to the second.
 """
 
 from __future__ import annotations
