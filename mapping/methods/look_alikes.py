@@ -6,15 +6,19 @@ Bischof, "What can missing correspondences tell us about 3D structure and motion
 keypoint that other photos of its place confirm should be found again in every photo that shows the
 place from nearby: in another hallway the pictures, the numbers and the furniture are not.
 
-Between photos of one place that share is low too, if they are taken far apart. Such a pair is no
-loss where photos between them link both. In order of time, photos next to each other are likely to
-show one place, and need less.
+Between photos of one place that share is low too, if they are taken far apart. In order of time,
+photos next to each other are likely to show one place, and need less. Any other pair with a low
+share is believed where third photos agree with it: their own pairs lead from its keypoints to
+those that it matches them with. So a third photo never links places that no believed pair links;
+and what repeats itself within one place does not pass, as over a third photo the first door in a
+row does not lead to the second.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +32,8 @@ _CONFIRMING = 4
 # at most so many steps, and of all others. Measured: benchmarks/joining.py.
 _NEAR_STEPS = 3
 _LEAST_NEAR, _LEAST_FAR = 0.1, 0.3
+# Fewest matches of a pair that third photos must agree with.
+_MIN_AGREEING = 15
 # Fewer confirmed keypoints than that tell nothing.
 _MIN_EXPECTED = 20
 _FIT_ROUNDS = 5
@@ -47,12 +53,53 @@ def without_look_alikes(photos: Sequence[SfmPhoto], matches: Sequence[Matches]) 
     """
     confirmed = _Confirmed(photos, matches)
     order = _ranks(photos)
+    believed = [
+        _share_found(photos, confirmed, pair)
+        >= (_LEAST_NEAR if _are_near(photos, order, pair) else _LEAST_FAR)
+        for pair in matches
+    ]
+    links = _Links(photos)
+    for pair in compress(matches, believed):
+        links.add(pair)
     return [
         pair
-        for pair in matches
-        if _share_found(photos, confirmed, pair)
-        >= (_LEAST_NEAR if _are_near(photos, order, pair) else _LEAST_FAR)
+        for pair, known in zip(matches, believed, strict=True)
+        if known or links.agree_with(pair)
     ]
+
+
+class _Links:
+    """Believed pairs, to follow keypoints from photo to photo."""
+
+    def __init__(self, photos: Sequence[SfmPhoto]) -> None:
+        self._counts = [len(photo.keypoints) for photo in photos]
+        self._rows: dict[int, dict[int, NDArray[np.uint32]]] = defaultdict(dict)
+
+    def add(self, pair: Matches) -> None:
+        self._rows[pair.first][pair.second] = pair.rows
+        self._rows[pair.second][pair.first] = pair.rows[:, ::-1]
+
+    def agree_with(self, pair: Matches) -> bool:
+        """Tell whether third photos link the keypoints that a pair matches, and to no others.
+
+        More keypoints must be linked as the pair matches them than otherwise.
+        """
+        first, second = self._rows[pair.first], self._rows[pair.second]
+        agrees = np.zeros(len(pair.rows), dtype=bool)
+        differs = np.zeros(len(pair.rows), dtype=bool)
+        for third in first.keys() & second.keys():
+            there = self._lookup(pair.first, first[third])[pair.rows[:, 0]]
+            back = self._lookup(pair.second, second[third])[pair.rows[:, 1]]
+            linked = (there >= 0) & (back >= 0)
+            agrees |= linked & (there == back)
+            differs |= linked & (there != back)
+        return bool(agrees.sum() >= max(_MIN_AGREEING, differs.sum()))
+
+    def _lookup(self, photo: int, rows: NDArray[np.uint32]) -> NDArray[np.int64]:
+        """Return (n,) the keypoint that each keypoint of a photo matches; -1 for none."""
+        found = np.full(self._counts[photo], -1)
+        found[rows[:, 0]] = rows[:, 1]
+        return found
 
 
 class _Confirmed:

@@ -17,6 +17,8 @@ from visloc.geometry import Camera
 
 # Keypoints of a photo that take part.
 MOST = 1000
+# Pairs with so few matches keep all: they may be all that links two parts.
+FEW = 200
 # The longer side of a photo is divided into so many cells, which have equal parts of them.
 _CELLS = 8
 
@@ -24,7 +26,8 @@ _CELLS = 8
 def thin(photos: Sequence[SfmPhoto], matches: Sequence[Matches]) -> list[Matches]:
     """Return the pairs with the matches between the ``MOST`` best keypoints of both photos.
 
-    The best of a cell are those matched in most pairs, which make the longest tracks.
+    Pairs with ``FEW`` matches or fewer stay as they are. The best of a cell are those matched in
+    most pairs, which make the longest tracks.
     """
     counts = [np.zeros(len(photo.keypoints), dtype=np.int64) for photo in photos]
     for pair in matches:
@@ -36,6 +39,9 @@ def thin(photos: Sequence[SfmPhoto], matches: Sequence[Matches]) -> list[Matches
     ]
     thinned = []
     for pair in matches:
+        if len(pair.rows) <= FEW:
+            thinned.append(pair)
+            continue
         both = kept[pair.first][pair.rows[:, 0]] & kept[pair.second][pair.rows[:, 1]]
         thinned.append(Matches(pair.first, pair.second, pair.rows[both]))
     return thinned

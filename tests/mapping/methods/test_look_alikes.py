@@ -69,27 +69,40 @@ def place_of(row: int) -> int:
 
 @pytest.mark.parametrize("rows", [True, False])
 def test_pairs_of_two_places_are_dropped_and_pairs_of_one_stay(rows: bool) -> None:
-    share = 0.2 if rows else 0.08
+    share = 0.08
     photos = make_hallways(share, rows=rows)
     matches = matches_of(photos, share)
     across = [pair for pair in matches if place_of(pair.first) != place_of(pair.second)]
     # Without the test they would be joined: many more than a mapper asks for.
     assert min(len(pair.rows) for pair in across) >= MAPPER_CONFIGS["config1"].min_num_matches
-    kept = without_look_alikes(photos, matches)
     within = [pair for pair in matches if place_of(pair.first) == place_of(pair.second)]
-    # The last photo of one hallway and the first of the other follow each other.
-    near = [p for p in across if rows and abs(p.first - p.second) <= 3]
-    assert {(p.first, p.second) for p in kept} <= {(p.first, p.second) for p in within + near}
-    assert {(p.first, p.second) for p in within} <= {(p.first, p.second) for p in kept}
+    assert without_look_alikes(photos, matches) == within
 
 
 def test_the_next_photo_in_time_needs_less_than_a_later_one() -> None:
-    share = 0.2
-    photos = make_hallways(share, rows=False)
-    kept = without_look_alikes(photos, matches_of(photos, share))
-    across = [p for p in kept if place_of(p.first) != place_of(p.second)]
-    assert across
-    assert all(abs(photos[p.first].timestamp - photos[p.second].timestamp) <= 3 for p in across)
+    photos = make_hallways(0)[:PHOTOS_EACH]
+    pairs = {(p.first, p.second): p for p in matches_of(photos, 0) if p.second < PHOTOS_EACH}
+    # Two halves of the walk, and one pair between them.
+    halves = [p for rows, p in pairs.items() if (rows[0] < 4) == (rows[1] < 4)]
+    near, far = few_of(pairs[3, 4]), few_of(pairs[0, 7])
+    assert near in without_look_alikes(photos, [*halves, near])
+    assert far not in without_look_alikes(photos, [*halves, far])
+
+
+def few_of(pair: Matches, shift: int = 0) -> Matches:
+    """A fifth of a pair's matches, each keypoint with the one that comes ``shift`` later."""
+    some = pair.rows[::5]
+    rows = np.column_stack([some[:, 0], np.roll(some[:, 1], shift)])
+    return Matches(pair.first, pair.second, rows)
+
+
+def test_a_pair_is_believed_when_third_photos_link_the_same_keypoints() -> None:
+    photos = make_hallways(0)[:PHOTOS_EACH]
+    pairs = {(p.first, p.second): p for p in matches_of(photos, 0) if p.second < PHOTOS_EACH}
+    farthest = pairs.pop((0, 7))
+    same, another = few_of(farthest), few_of(farthest, shift=1)
+    assert same in without_look_alikes(photos, [*pairs.values(), same])
+    assert another not in without_look_alikes(photos, [*pairs.values(), another])
 
 
 def test_two_photos_alone_are_believed() -> None:
