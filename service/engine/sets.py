@@ -22,7 +22,7 @@ from service.engine.instant_tasks import localize_in
 from service.engine.set_photos import SetPhotos, Slots
 from service.telemetry.metrics import Metrics
 from service.values import ImageJob, Localization, MapFolder, Query, Rig, RigJob, Where
-from service.workers.judging import judged
+from service.workers.judging import agree, judged
 from service.workers.pool import Workers
 from visloc.archive import SetOutline, TileRecord
 from visloc.archive.places import anchor_rms
@@ -35,7 +35,6 @@ from visloc.errors import (
     VislocError,
     refuse,
 )
-from visloc.localization.judge import measured_pose
 from visloc.options import LocalizeOptions
 from visloc.priors import Priors
 from visloc.sets.choosing import (
@@ -188,8 +187,9 @@ class SetSearch:
             raise unfit[0]
         chosen, answer = judged([each for _, each in found])
         row = found[chosen][0]
-        posed = {row for row, each in found if measured_pose(each.answer) is not None}
-        refusal = left_open(outline, row, answer.place, choice.without(posed), choice.first)
+        elsewhere = choice.without([other for other, each in found if agree(each, answer)])
+        places = {other: each.place for other, each in found}
+        refusal = left_open(outline, row, places, elsewhere, choice.first)
         if refusal is not None:
             answer = replace(answer, answer=replace(answer.answer, pose=None, refusal=refusal))
         return row, answer

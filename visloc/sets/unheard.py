@@ -6,13 +6,13 @@ and its photos would go to another tile that looks like it.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import SetOutline
-from visloc.localization.judge import PlaceAnswer, candidate, measured_pose
+from visloc.localization.judge import PlaceAnswer, candidate, measured_pose, most_inliers_first
 from visloc.sets.choosing import MAX_SEARCHED, is_doubtful
 from visloc.types import Reason, Refusal
 
@@ -46,31 +46,33 @@ def hard_to_find(
 def left_open(
     outline: SetOutline,
     row: int,
-    place: PlaceAnswer,
-    silent: NDArray[np.bool_],
+    places: Mapping[int, PlaceAnswer],
+    elsewhere: NDArray[np.bool_],
     close: Collection[int],
 ) -> Refusal | None:
     """Refuse a doubtful answer that leaves another tile open.
 
-    A tile without a pose stays open when its own photos are mistaken for those of the tile that
-    answers. So does one that looks about as much like the photo, if the answer is more likely wrong
-    than right. Tiles of the same place, whose photos lie among each other, are no contradiction.
+    A tile that does not agree stays open when its own photos are mistaken for those of the tile
+    that answers, even if it has a pose that explains much less: it is poor. So does one that looks
+    about as much like the photo, if the answer is more likely wrong than right. Tiles of the same
+    place, whose photos lie among each other, are no contradiction.
 
     Args:
         outline: the set.
         row: of the tile whose answer was chosen.
-        place: that answer.
-        silent: (T,) tiles that the priors allow and that gave no pose.
+        places: the answers of the tiles that were searched, by row.
+        elsewhere: (T,) tiles that the priors allow and that gave no pose at the same place.
         close: rows of the tiles with at least half of the best coarse score.
 
     Returns:
-        A refusal, ``ambiguous``, with the only pose as its candidate; None for an answer that
-        stands.
+        A refusal, ``ambiguous``, with the poses that there are as its candidates; None for an
+        answer that stands.
     """
-    pose, tiles = measured_pose(place.answer), outline.tiles
+    place, tiles = places[row], outline.tiles
+    pose = measured_pose(place.answer)
     if pose is None or pose.probability is None or not is_doubtful(place.answer):
         return None
-    for other in np.flatnonzero(silent & apart(outline.photo_boxes, row)).tolist():
+    for other in np.flatnonzero(elsewhere & apart(outline.photo_boxes, row)).tolist():
         if tiles[row].ref in tiles[other].mistaken_for:
             why = f"whose own photos look like those of {place.ref}"
         elif other in close and pose.probability < _MORE_LIKELY_RIGHT:
@@ -82,9 +84,14 @@ def left_open(
             Reason.AMBIGUOUS,
             f"{place.ref} explains the query with {place.answer.num_inliers} inliers, but with a "
             f"probability of only {pose.probability:.2f}; it may also show {tiles[other].ref}, "
-            f"{why}, although that gave no pose. Send priors that exclude one of them, or map the "
-            "latter with more photos",
-            (candidate(place),),
+            f"{why}. Send priors that exclude one of them, or map the latter with more photos",
+            most_inliers_first(
+                [
+                    candidate(each)
+                    for each in (place, places.get(other))
+                    if each and measured_pose(each.answer)
+                ]
+            ),
         )
     return None
 

@@ -35,16 +35,16 @@ def probable(probability: float | None) -> InstantAnswer:
     return replace(answer, pose=replace(answer.pose, probability=probability))
 
 
-def place(outline: SetOutline, row: int, probability: float | None) -> PlaceAnswer:
-    return PlaceAnswer(outline.ref, probable(probability), outline.tiles[row].ref)
+def place(outline: SetOutline, row: int, probability: float | None) -> dict[int, PlaceAnswer]:
+    return {row: PlaceAnswer(outline.ref, probable(probability), outline.tiles[row].ref)}
 
 
-def silent(*rows: int) -> np.ndarray:
+def elsewhere(*rows: int) -> np.ndarray:
     return np.isin(np.arange(3), rows)
 
 
 def test_a_doubtful_answer_is_refused_where_a_poor_tile_may_be_right(floors: SetOutline) -> None:
-    refusal = left_open(floors, GOOD, place(floors, GOOD, 0.89), silent(POOR, OTHER), (GOOD,))
+    refusal = left_open(floors, GOOD, place(floors, GOOD, 0.89), elsewhere(POOR, OTHER), (GOOD,))
 
     assert refusal is not None
     assert refusal.reason is Reason.AMBIGUOUS
@@ -54,21 +54,31 @@ def test_a_doubtful_answer_is_refused_where_a_poor_tile_may_be_right(floors: Set
     assert (only.tile, only.num_inliers) == ("good@v1", 150)
 
 
+def test_a_worse_pose_of_a_poor_tile_elsewhere_is_a_candidate_too(floors: SetOutline) -> None:
+    worse = PlaceAnswer(floors.ref, localized(20, (5, 5, 3.5)), floors.tiles[POOR].ref)
+    answers = {POOR: worse, **place(floors, GOOD, 0.8)}
+
+    refusal = left_open(floors, GOOD, answers, elsewhere(POOR), (GOOD,))
+
+    assert refusal is not None
+    assert [each.tile for each in refusal.candidates] == ["good@v1", "poor@v1"]
+
+
 @pytest.mark.parametrize("probability", [0.9, 1.0, None])
 def test_a_sure_answer_stands(floors: SetOutline, probability: float | None) -> None:
     answer = place(floors, GOOD, probability)
-    assert left_open(floors, GOOD, answer, silent(POOR, OTHER), (GOOD, OTHER)) is None
+    assert left_open(floors, GOOD, answer, elsewhere(POOR, OTHER), (GOOD, OTHER)) is None
 
 
-def test_a_tile_that_gave_a_pose_or_is_excluded_is_not_left_open(floors: SetOutline) -> None:
-    assert left_open(floors, GOOD, place(floors, GOOD, 0.3), silent(OTHER), (GOOD,)) is None
+def test_a_tile_that_agrees_or_is_excluded_is_not_left_open(floors: SetOutline) -> None:
+    assert left_open(floors, GOOD, place(floors, GOOD, 0.3), elsewhere(OTHER), (GOOD,)) is None
 
 
 def test_photos_of_a_poor_tile_are_no_doubt_about_tiles_that_they_do_not_resemble(
     floors: SetOutline,
 ) -> None:
     answer = place(floors, OTHER, 0.6)
-    assert left_open(floors, OTHER, answer, silent(GOOD, POOR), (GOOD, OTHER)) is None
+    assert left_open(floors, OTHER, answer, elsewhere(GOOD, POOR), (GOOD, OTHER)) is None
 
 
 def test_an_answer_more_likely_wrong_than_right_gives_way_to_a_tile_as_similar(
@@ -80,7 +90,7 @@ def test_an_answer_more_likely_wrong_than_right_gives_way_to_a_tile_as_similar(
         (0.5, (OTHER, GOOD), False),
     ):
         refusal = left_open(
-            floors, OTHER, place(floors, OTHER, probability), silent(GOOD, POOR), close
+            floors, OTHER, place(floors, OTHER, probability), elsewhere(GOOD, POOR), close
         )
         assert (refusal is not None) == is_refused
         if refusal is not None:
@@ -93,14 +103,14 @@ def test_tiles_whose_photos_lie_among_each_other_do_not_contradict(outline: Make
     answer = place(overlapping, 0, 0.2)
 
     assert apart(overlapping.photo_boxes, 0).tolist() == [False, False, True]
-    assert left_open(overlapping, 0, answer, silent(1), (0, 1)) is None
-    assert left_open(overlapping, 0, answer, silent(1, 2), (0, 2)) is not None
+    assert left_open(overlapping, 0, answer, elsewhere(1), (0, 1)) is None
+    assert left_open(overlapping, 0, answer, elsewhere(1, 2), (0, 2)) is not None
 
 
 def test_tiles_that_the_set_does_not_find_are_searched_where_an_answer_is_doubtful(
     floors: SetOutline,
 ) -> None:
-    assert hard_to_find(floors, {"good@v1"}, silent(POOR, OTHER)) == (POOR,)
-    assert hard_to_find(floors, {"other@v1"}, silent(POOR, GOOD)) == ()
-    assert hard_to_find(floors, {"good@v1"}, silent(OTHER)) == ()
+    assert hard_to_find(floors, {"good@v1"}, elsewhere(POOR, OTHER)) == (POOR,)
+    assert hard_to_find(floors, {"other@v1"}, elsewhere(POOR, GOOD)) == ()
+    assert hard_to_find(floors, {"good@v1"}, elsewhere(OTHER)) == ()
     assert hard_to_find(floors, set(), ALL) == ()
