@@ -269,7 +269,7 @@ class Localized:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """One of the two places between which an ambiguous query leaves the choice.
+    """One of the places between which an ambiguous query leaves the choice.
 
     Attributes:
         rig_from_world: the pose there, in the frame of ``map``; of the camera, for a photo on its
@@ -299,7 +299,7 @@ class NotLocalized:
         stage: the stage that gave up.
         reason: why, as a stable word.
         message: why, for a person.
-        candidates: the two places of an ambiguous photo; () otherwise.
+        candidates: the places of an ambiguous photo that have a pose; () otherwise.
     """
 
     evidence: Evidence

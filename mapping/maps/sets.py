@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.maps.editing import moved_anchor
+from mapping.maps.mistaken import mistaken_for
 from mapping.progress import one_step
 from mapping.stages.publishing import new_version
 from visloc.archive import (
     Anchor,
+    CoarseIndex,
     FingerprintRecord,
     Map,
     MapStore,
@@ -63,6 +65,7 @@ class _Placed:
         metric: whether its own unit is a metre.
         down: (3,) in the set's frame; None where the map does not know it.
         anchor: what its world rests on, in the set's frame.
+        doubts: what its own test says against it.
     """
 
     record: TileRecord
@@ -70,6 +73,7 @@ class _Placed:
     metric: bool
     down: NDArray[np.float64] | None
     anchor: Anchor | None
+    doubts: tuple[str, ...]
 
 
 def publish_set(
@@ -120,12 +124,15 @@ def publish_set(
     if model is None:
         with one_step(progress, "coarse model"):
             model = learn(lambda tile: open_published(folders[tile]), len(folders))
+    coarse = coarse_index(_described(folders, model, progress), model)
+    with one_step(progress, "look-alikes"):
+        records = _with_look_alikes(folders, [one.record for one in placed], coarse)
     content = SetContent(
         world=world,
         local_features=placed[0].features,
-        tiles=tuple(one.record for one in placed),
-        coarse=coarse_index(_described(folders, model, progress), model),
-        notes=tuple(notes),
+        tiles=records,
+        coarse=coarse,
+        notes=(*notes, *_warnings(records), *(note for one in placed for note in one.doubts)),
     )
     return _publish_changed(store, set_id, content)
 
@@ -217,7 +224,29 @@ def _placed(opened: Map, set_from_tile: Similarity) -> _Placed:
         metric=manifest.world.metric,
         down=None if opened.gravity is None else set_from_tile.rotation @ opened.gravity,
         anchor=None if anchor is None else moved_anchor(anchor, set_from_tile),
+        doubts=tuple(f"{opened.ref} is in doubt: {each.message}" for each in manifest.parts.doubts),
     )
+
+
+def _with_look_alikes(
+    folders: Sequence[Path], records: Sequence[TileRecord], coarse: CoarseIndex
+) -> tuple[TileRecord, ...]:
+    boxes = np.array([(each.photo_extent.min, each.photo_extent.max) for each in records])
+    found = mistaken_for(lambda tile: open_published(folders[tile]), boxes, coarse)
+    return tuple(
+        each.model_copy(update={"mistaken_for": tuple(records[row].ref for row in rows)})
+        for each, rows in zip(records, found, strict=True)
+    )
+
+
+def _warnings(records: Sequence[TileRecord]) -> list[str]:
+    """Say which tiles are too poor to tell their photos from those of others."""
+    return [
+        f"photos of {each.ref} look more like those of {', '.join(each.mistaken_for)}: queries "
+        "there are often refused as ambiguous; map it with more photos, or send priors"
+        for each in records
+        if each.mistaken_for
+    ]
 
 
 def _box(points: NDArray[np.float64]) -> Extent:

@@ -85,7 +85,7 @@ def run_own_test(opened: Map) -> OwnTestRun:
     tested, trials, localized, refused = 0, [], [], []
     with one_thread_here():
         for image in images:
-            left_out = _left_out(opened, viewpoints, image)
+            left_out = left_out_with(opened, viewpoints, image)
             if left_out is None:
                 continue
             tested += 1
@@ -147,8 +147,8 @@ def _factor(
     return round(factor, 2)
 
 
-def _left_out(opened: Map, viewpoints: Viewpoints, image: int) -> NDArray[np.int64] | None:
-    """Photos (k,) to leave out with one; None when nothing would remain."""
+def left_out_with(opened: Map, viewpoints: Viewpoints, image: int) -> NDArray[np.int64] | None:
+    """Return the photos (k,) to leave out with one, and itself; None when nothing would remain."""
     apart = viewpoints.apart_from(viewpoints.pose(image))
     left_out = np.flatnonzero(taken_with(opened, image) | (apart < _LEFT_OUT_WITHIN))
     if len(left_out) == len(opened.images):

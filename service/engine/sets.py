@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import defaultdict
-from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,7 +22,7 @@ from service.engine.instant_tasks import localize_in
 from service.engine.set_photos import SetPhotos, Slots
 from service.telemetry.metrics import Metrics
 from service.values import ImageJob, Localization, MapFolder, Query, Rig, RigJob, Where
-from service.workers.judging import judged
+from service.workers.judging import agree, judged
 from service.workers.pool import Workers
 from visloc.archive import SetOutline, TileRecord
 from visloc.archive.places import anchor_rms
@@ -37,8 +37,16 @@ from visloc.errors import (
 )
 from visloc.options import LocalizeOptions
 from visloc.priors import Priors
-from visloc.sets.choosing import TileScore, allowed_tiles, is_clear, plan, tiles_near
+from visloc.sets.choosing import (
+    TileScore,
+    allowed_tiles,
+    is_clear,
+    is_doubtful,
+    plan,
+    tiles_near,
+)
 from visloc.sets.frame import answer_in_set, priors_in_tile, scaled_device
+from visloc.sets.unheard import hard_to_find, left_open
 from visloc.types import Near
 
 # Errors of reaching a map, not of the map itself, have codes that begin so.
@@ -53,13 +61,22 @@ class Choice:
     """The tiles to search, by row.
 
     Attributes:
+        first: the best, and those about as good.
         rest: to search when none of the first has a clear answer.
+        allowed: (T,) those that the priors allow.
         blind: whether the photos ranked no tile.
     """
 
     first: tuple[int, ...]
     rest: tuple[int, ...]
+    allowed: NDArray[np.bool_]
     blind: bool = False
+
+    def without(self, rows: Collection[int]) -> NDArray[np.bool_]:
+        """Return which tiles (T,) the priors allow, except some."""
+        left = self.allowed.copy()
+        left[list(rows)] = False
+        return left
 
 
 class SetSearch:
@@ -124,9 +141,10 @@ class SetSearch:
                 scores[each.tile] += each.score
         best_first = sorted(scores, key=lambda tile: -scores[tile])
         if best_first:
-            return Choice(*plan([TileScore(tile, scores[tile]) for tile in best_first]))
+            first, rest = plan([TileScore(tile, scores[tile]) for tile in best_first])
+            return Choice(first, rest, allowed)
         # Any tile can report that a photo shows nothing.
-        return Choice((int(rows[0]),), (), blind=len(rows) > 1 or not photos.any_decoded)
+        return Choice((int(rows[0]),), (), allowed, blind=len(rows) > 1 or not photos.any_decoded)
 
     async def search(
         self,
@@ -138,7 +156,8 @@ class SetSearch:
         """Search tiles, and judge their answers.
 
         A tile that refuses the query, say because it does not know the rig, is ignored as long as
-        others answer.
+        others answer. A doubtful answer is refused as ambiguous when it leaves another tile open
+        (``visloc.sets.unheard``).
 
         Returns:
             The row of a tile, and its answer in the set's frame.
@@ -151,7 +170,7 @@ class SetSearch:
         found: list[tuple[int, Localization]] = []
         missing: list[tuple[TileRecord, VislocError]] = []
         unfit: list[VislocError] = []
-        for rows in (choice.first, choice.rest):
+        for rows in _in_turn(outline, choice, found):
             if any(is_clear(each.answer) for _, each in found):
                 break
             for row, each in await self._asked(outline, rows, photos, ask):
@@ -167,7 +186,13 @@ class SetSearch:
         if not found:
             raise unfit[0]
         chosen, answer = judged([each for _, each in found])
-        return found[chosen][0], answer
+        row = found[chosen][0]
+        elsewhere = choice.without([other for other, each in found if agree(each, answer)])
+        places = {other: each.place for other, each in found}
+        refusal = left_open(outline, row, places, elsewhere, choice.first)
+        if refusal is not None:
+            answer = replace(answer, answer=replace(answer.answer, pose=None, refusal=refusal))
+        return row, answer
 
     async def _asked(
         self,
@@ -196,6 +221,16 @@ class SetSearch:
                 return row, error
 
         return await together(search(row) for row in rows)
+
+
+def _in_turn(
+    outline: SetOutline, choice: Choice, found: Sequence[tuple[int, Localization]]
+) -> Iterator[tuple[int, ...]]:
+    """Yield the tiles that are searched together; ``found`` grows meanwhile."""
+    yield choice.first
+    yield choice.rest
+    doubtful = {outline.tiles[row].ref for row, each in found if is_doubtful(each.answer)}
+    yield hard_to_find(outline, doubtful, choice.without([row for row, _ in found]))
 
 
 def tile_unavailable(tile: TileRecord, error: VislocError) -> VislocError:

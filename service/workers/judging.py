@@ -16,6 +16,7 @@ from visloc.localization.judge import (
     judge,
     measured_pose,
     not_probable_enough,
+    poses_agree,
 )
 from visloc.options import LocalizeOptions
 from visloc.priors import NO_PRIORS, Priors
@@ -50,6 +51,14 @@ def judged(found: Sequence[Localization], priors: Priors = NO_PRIORS) -> tuple[i
     row = max(rows, key=lambda row: found[row].answer.num_inliers)
     refused = replace(found[row].answer, pose=None, refusal=verdict)
     return row, replace(found[row], answer=refused)
+
+
+def agree(a: Localization, b: Localization) -> bool:
+    """Tell whether both answers have poses, at the same place."""
+    if measured_pose(a.answer) is None or measured_pose(b.answer) is None:
+        return False
+    tie = _tie(a, b, NO_PRIORS)
+    return tie is not None and poses_agree(a.answer, b.answer, tie)
 
 
 def gated(found: Localization, options: LocalizeOptions) -> Localization:

@@ -23,7 +23,7 @@ from visloc.geometry import Pose, Similarity
 from visloc.priors import MAX_TILES
 
 SET_FORMAT = "visloc-set"
-SET_MAJOR, SET_MINOR = 1, 0
+SET_MAJOR, SET_MINOR = 1, 1
 # Scale of a tile. Beyond these, squares and inverses overflow.
 MIN_SCALE, MAX_SCALE = 1e-9, 1e9
 # The time of a query is proportional to it.
@@ -61,6 +61,8 @@ class TileRecord(Record):
         extent: bounding box of landmarks and photos, along the set's axes.
         photo_extent: bounding box of the photos' centres, along the set's axes.
         reach: median distance from its photos to the landmarks that they see.
+        mistaken_for: refs of the tiles that the set would search, without this one, for more than
+            a few of this tile's own photos. Sets of format 1.0 do not say.
     """
 
     map: Annotated[str, Field(pattern=rf"^{ID_PATTERN.pattern}$")]
@@ -73,6 +75,7 @@ class TileRecord(Record):
     images: Annotated[int, Field(ge=1)]
     landmarks: Annotated[int, Field(ge=1)]
     size_bytes: Annotated[int, Field(ge=0)]
+    mistaken_for: Annotated[tuple[str, ...], Field(max_length=MAX_TILES)] = ()
 
     @property
     def ref(self) -> str:

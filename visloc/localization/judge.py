@@ -104,7 +104,7 @@ def judge(places: Sequence[PlaceAnswer], ties: Ties) -> int | Refusal:
             return i
     for i, j in itertools.combinations(rivals, 2):
         tie = ties(i, j)
-        if tie is None or not _agree(answers[i], answers[j], tie):
+        if tie is None or not poses_agree(answers[i], answers[j], tie):
             return _ambiguous(places[i], places[j], tied=tie is not None)
     similar = [i for i in rivals if answers[i].num_inliers >= _SIMILAR_SHARE * most]
     first = similar[0]
@@ -174,7 +174,7 @@ def _spread(answer: InstantAnswer) -> float:
     return float(position_covariance(pose.rig_from_world, pose.covariance).trace())
 
 
-def _agree(a: InstantAnswer, b: InstantAnswer, tie: Tie) -> bool:
+def poses_agree(a: InstantAnswer, b: InstantAnswer, tie: Tie) -> bool:
     """Whether two poses from two maps agree."""
     known_a, known_b = measured_pose(a), measured_pose(b)
     assert known_a is not None  # the caller has looked

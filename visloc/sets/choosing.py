@@ -23,8 +23,8 @@ MAX_SEARCHED = 5
 # Tiles with at least this share of the best score are searched together with the best: look-alike
 # floors score 0.55 to 1 of each other, places that are not alike below 0.3.
 _CLOSE_SCORE = 0.5
-# With so many inliers no other tile is searched.
-CLEAR_INLIERS = 100
+# With so many inliers, and so probable a pose, no other tile is searched.
+CLEAR_INLIERS, CLEAR_PROBABILITY = 100, 0.9
 _NAMED = 5
 
 
@@ -148,8 +148,21 @@ def plan(scores: Sequence[TileScore]) -> tuple[tuple[int, ...], tuple[int, ...]]
 
 
 def is_clear(answer: InstantAnswer) -> bool:
-    """Tell whether a pose has so many inliers that no other tile needs to be searched."""
-    return measured_pose(answer) is not None and answer.num_inliers >= CLEAR_INLIERS
+    """Tell whether a pose is so sure that no other tile needs to be searched."""
+    if measured_pose(answer) is None or answer.num_inliers < CLEAR_INLIERS:
+        return False
+    return not is_doubtful(answer)
+
+
+def is_doubtful(answer: InstantAnswer) -> bool:
+    """Tell whether a pose is stated to be less than probable.
+
+    A pose without a probability, such as one from motion, is not judged.
+    """
+    pose = measured_pose(answer)
+    if pose is None or pose.probability is None:
+        return False
+    return pose.probability < CLEAR_PROBABILITY
 
 
 def _named(outline: SetOutline, names: Sequence[str]) -> NDArray[np.bool_]:

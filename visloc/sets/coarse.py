@@ -130,10 +130,15 @@ def describe(opened: Map, model: CoarseModel, *, seed: int = 0) -> DescribedTile
     return described(descriptors_of(opened, model), model, seed=seed)
 
 
+def photo_descriptor(opened: Map, photo: int, model: CoarseModel) -> NDArray[np.float32]:
+    """Return the descriptor (D,) of a photo of a map, from its stored local descriptors."""
+    return descriptor_of(_words(opened, photo), model)
+
+
 def descriptors_of(opened: Map, model: CoarseModel) -> NDArray[np.float32]:
     """Return the descriptors (n, D) of a map's photos, from their stored local descriptors."""
     photos = range(len(opened.images))
-    return np.array([descriptor_of(_words(opened, photo), model) for photo in photos])
+    return np.array([photo_descriptor(opened, photo, model) for photo in photos])
 
 
 def descriptor_of(words: NDArray[np.float32], model: CoarseModel) -> NDArray[np.float32]:
@@ -208,8 +213,7 @@ def ranked(
 ) -> tuple[TileScore, ...]:
     """Rank tiles as ``rank_tiles`` does, for a query's descriptor (D,)."""
     tiles = _similar(coarse, query, _proposed(coarse, query, allowed))
-    sides = query @ coarse.model["planes"]
-    sides /= max(float(np.sqrt(np.mean(sides**2))), _LEAST_SIDE)
+    sides = _sides(coarse, query)
     scores = np.array([_score(coarse, tile, sides) for tile in tiles.tolist()])
     order = np.argsort(-scores, kind="stable")
     return tuple(TileScore(int(tiles[i]), float(scores[i])) for i in order)
@@ -244,14 +248,39 @@ def _similar(
     return np.sort(tiles[np.argpartition(-scores, MAX_RANKED)[:MAX_RANKED]])
 
 
-def _score(coarse: CoarseIndex, tile: int, sides: NDArray[np.float32]) -> float:
+def score_without(
+    coarse: CoarseIndex, query: NDArray[np.float32], tile: int, left_out: NDArray[np.int64]
+) -> float:
+    """Score a tile as ``ranked`` does, as if it did not have some of its photos.
+
+    Args:
+        coarse: the index.
+        query: descriptor (D,).
+        tile: row of the tile.
+        left_out: (k,) rows of the tile's photos, not all of them.
+    """
+    return _score(coarse, tile, _sides(coarse, query), left_out)
+
+
+def _sides(coarse: CoarseIndex, query: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the signed distances (bits,) from the planes, in units of their root mean square."""
+    sides = query @ coarse.model["planes"]
+    return np.asarray(sides / max(float(np.sqrt(np.mean(sides**2))), _LEAST_SIDE))
+
+
+def _score(
+    coarse: CoarseIndex,
+    tile: int,
+    sides: NDArray[np.float32],
+    left_out: NDArray[np.int64] | None = None,
+) -> float:
     """The mean cosine of a query with the best photos of a tile.
 
     Args:
         coarse: the index.
         tile: row of the tile.
-        sides: (bits,) signed distances of the query's descriptor from the planes, in units of
-            their root mean square.
+        sides: of the query's descriptor.
+        left_out: (k,) rows of the tile's photos that do not count; None for none.
     """
     start, stop = int(coarse.offsets[tile]), int(coarse.offsets[tile + 1])
     best = np.empty(0, np.float32)
@@ -262,6 +291,8 @@ def _score(coarse: CoarseIndex, tile: int, sides: NDArray[np.float32]) -> float:
         # times distance is proportional to their cosine.
         signed = 2.0 * (bits.astype(np.float32) @ sides) - sides.sum()
         cosines = math.sqrt(math.pi / 2) / coarse.bits * signed
+        if left_out is not None:
+            cosines = cosines[~np.isin(np.arange(block, block + len(codes)), start + left_out)]
         best = np.sort(np.concatenate([best, cosines]))[-_NUM_BEST:]
     return float(best.mean())
 

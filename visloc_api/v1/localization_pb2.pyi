@@ -1130,7 +1130,7 @@ class Refusal(_message.Message):
     """for a person"""
     @_builtins.property
     def candidates(self) -> _containers.RepeatedCompositeFieldContainer[Global___Candidate]:
-        """of reason ambiguous: the two places, most inliers first"""
+        """of reason ambiguous: the places with a pose, most inliers first"""
 
     def __init__(
         self,

@@ -224,7 +224,8 @@ class Refusal(Answer):
     candidates: Annotated[
         tuple[Candidate, ...],
         Field(
-            description="of reason ambiguous: the two places, most inliers first; empty otherwise"
+            description="of reason ambiguous: the places with a pose, most inliers first; "
+            "empty otherwise"
         ),
     ] = ()
 

@@ -15,6 +15,7 @@ from visloc.priors import NO_PRIORS, GravityPrior, HeightBand, PosePrior, Positi
 from visloc.sets.choosing import (
     allowed_tiles,
     is_clear,
+    is_doubtful,
     nearest_tile,
     plan,
     tiles_near,
@@ -181,3 +182,13 @@ def test_an_answer_is_clear_with_many_inliers() -> None:
     assert is_clear(localized(100))
     assert not is_clear(localized(99))
     assert not is_clear(refused(500))
+
+
+def test_a_doubtful_answer_is_not_clear() -> None:
+    answer = localized(500)
+    assert answer.pose is not None
+    for probability, clear in ((0.89, False), (0.9, True), (None, True)):
+        asked = replace(answer, pose=replace(answer.pose, probability=probability))
+        assert is_clear(asked) == clear
+        assert is_doubtful(asked) == (not clear)
+    assert not is_doubtful(refused(500))

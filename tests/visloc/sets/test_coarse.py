@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from visloc.sets.coarse import (
     learn,
     rank_tiles,
     ranked,
+    score_without,
 )
 from visloc.types import LocalFeatures
 
@@ -88,6 +90,21 @@ def test_scores_are_the_mean_cosines_of_the_three_best_photos() -> None:
         # Three standard deviations of what 256 signs tell of a cosine.
         assert found[tile] == pytest.approx(best.mean(), abs=0.2)
     assert found[1] > 0.75
+
+
+def test_photos_that_are_left_out_do_not_count() -> None:
+    index, rows = index_of(3, 6)
+    kept, query = np.array([1, 4, 5]), rows[1, 0]
+    fewer = replace(
+        index,
+        codes=np.concatenate([index.codes[:6], index.codes[6 + kept], index.codes[12:]]),
+        offsets=np.array([0, 6, 9, 15]),
+    )
+
+    without = score_without(index, query, 1, np.array([0, 2, 3]))
+
+    assert without == {s.tile: s.score for s in ranked(fewer, query)}[1]
+    assert without < {s.tile: s.score for s in ranked(index, query)}[1]
 
 
 def test_codes_tell_enough_to_leave_out_the_other_tiles() -> None:
