@@ -14,6 +14,7 @@ from visloc.archive.schema import (
     ImageRecord,
     Manifest,
     OwnTest,
+    PlaceError,
     World,
 )
 from visloc.archive.set_schema import SetManifest, SetWorld, SimilarityRecord, TileRecord
@@ -48,6 +49,7 @@ __all__ = [
     "MapSet",
     "MapStore",
     "OwnTest",
+    "PlaceError",
     "SetContent",
     "SetManifest",
     "SetOutline",
