@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.capture.frames import FilmedVideo
-from mapping.own_test.verdict import MAX_NAMES, MOST_APART
+from mapping.own_test.verdict import LINKING_LANDMARKS, MAX_NAMES, MOST_APART
 from mapping.progress import ItemProgress
 from mapping.report.held_out import left_out_sets, localize_held_out, spread_photos
 from mapping.report.model import tolerance_of
@@ -81,21 +81,28 @@ def doubts_of_capture(
             "frames lie away from the rest"
         )
         found.append(Doubt(kind="order", message=message, photos=tuple(astray[:MAX_NAMES])))
-    rows = {image.name: row for row, image in enumerate(opened.images)}
-    named = [name for name in measured if name in rows]
-    back = _come_back(opened, [rows[name] for name in named], lambda *_: None)
-    lost = [name for name, right in zip(named, back, strict=True) if not right or name in astray]
-    if lost:
+    if lost := _lost(opened, measured, astray):
         message = "the size rests on photos that do not come back where they were taken (--scale)"
         found.append(Doubt(kind="scale", message=message, photos=tuple(lost)))
     return tuple(found)
+
+
+def _lost(opened: Map, measured: Sequence[str], astray: Sequence[str]) -> list[str]:
+    rows = {image.name: row for row, image in enumerate(opened.images)}
+    # Those that are not in the map gave it no size.
+    named = [name for name in measured if name in rows]
+    if not named:
+        return []
+    back = _come_back(opened, [rows[name] for name in named], lambda *_: None)
+    return [name for name, right in zip(named, back, strict=True) if not right or name in astray]
 
 
 def out_of_order(opened: Map, films: Mapping[str, FilmedVideo]) -> list[str]:
     """Return the names of frames that lie away from most frames of their film.
 
     The poses of two frames say how far the landmarks of the first move in the picture from one to
-    the other. Where that is much more than the picture moved, the path jumps.
+    the other. Where that is much more than the picture moved, and the frames share few landmarks,
+    the path jumps.
     """
     rows = {image.name: row for row, image in enumerate(opened.images)}
     astray = []
@@ -128,10 +135,18 @@ def _pieces(opened: Map, frames: Sequence[tuple[int, float]]) -> list[list[int]]
 
 
 def _jumps(opened: Map, first: int, second: int, seen: float) -> bool:
-    """Whether two poses move the picture by much more than was seen, in its longer sides."""
-    offsets = opened.observation_offsets
-    landmarks = np.asarray(opened.observation_landmarks[offsets[first] : offsets[first + 1]])
-    landmarks = landmarks[:: max(1, len(landmarks) // _MOST_POINTS)].astype(np.int64)
+    """Whether two poses move the picture by much more than was seen, in its longer sides.
+
+    Frames that share landmarks confirm each other: a fast turn can escape the corners' tracking.
+    """
+    offsets, observed = opened.observation_offsets, opened.observation_landmarks
+    landmarks, others = (
+        np.asarray(observed[offsets[row] : offsets[row + 1]]).astype(np.int64)
+        for row in (first, second)
+    )
+    if len(np.intersect1d(landmarks, others)) >= LINKING_LANDMARKS:
+        return False
+    landmarks = landmarks[:: max(1, len(landmarks) // _MOST_POINTS)]
     points = opened.landmarks[landmarks].astype(np.float64) + opened.manifest.world.origin
     pixels = []
     for row in (first, second):
