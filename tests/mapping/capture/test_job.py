@@ -44,7 +44,7 @@ def test_a_capture_that_was_killed_after_publishing_is_told_and_not_made_again(
     monkeypatch.setattr(job, "build_map", lambda *_: pytest.fail("it is made already"))
     told = capture_map(settings, quiet, lambda _: pytest.fail("nothing is to be matched"))
     assert told.folder == store.folder(map_id)
-    assert list(told.photos)[0] == "walk/00000.000s.jpg"
+    assert next(iter(told.photos)) == "walk/00000.000s.jpg"
     # Another capture is not taken for it, nor the same one after all was told.
     other = CaptureSettings(settings.sources, map_id, maps, photos=5)
     with pytest.raises(Conflict, match="exists"):
