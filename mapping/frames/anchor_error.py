@@ -16,8 +16,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.archive import Geodetic, PlaceError
+from visloc.archive import Geodetic
 from visloc.archive.places import enu_of
+from visloc.archive.schema import PlaceError
 from visloc.geopose import place_jacobian
 
 # A direction that the fit leaves fewer degrees of freedom takes the variance of both.

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from visloc.archive import Geodetic, PlaceError
+from visloc.archive import Geodetic
 from visloc.archive.places import GeoCircle, circle_of
-from visloc.archive.schema import Anchor, Extent, World
+from visloc.archive.schema import Anchor, Extent, PlaceError, World
 from visloc.geodesy import ecef_from_geodetic, enu_from_ecef, geodetic_from_enu
 from visloc.geometry import Pose, rotation_angle
 from visloc.geopose import accuracy_of, earth_covariance, geopose_of

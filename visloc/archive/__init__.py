@@ -14,7 +14,6 @@ from visloc.archive.schema import (
     ImageRecord,
     Manifest,
     OwnTest,
-    PlaceError,
     World,
 )
 from visloc.archive.set_schema import SetManifest, SetWorld, SimilarityRecord, TileRecord
@@ -49,7 +48,6 @@ __all__ = [
     "MapSet",
     "MapStore",
     "OwnTest",
-    "PlaceError",
     "SetContent",
     "SetManifest",
     "SetOutline",
