@@ -56,7 +56,7 @@ def capture(work: Path, map_id: str, *arguments: str) -> Map:
             [
                 *(sys.executable, "-m", "mapping.cli.main", "capture", *arguments),
                 *("--map", map_id, "--maps-dir", str(maps)),
-                *("--output", str(work / f"{map_id}.png")),
+                *("--output", str(work / f"{map_id}.png"), "--accept"),
             ],
             check=True,
         )
