@@ -63,7 +63,7 @@ def _beside(maps: Maps, query: Query, places: Places) -> NDArray[np.uint8]:
     for (x, y), is_alike in zip(pixels, alike, strict=True):
         color = _ALIKE if is_alike else _DIFFERENT
         cv2.circle(asked, (int(x), int(y)), radius, color, -1)
-    photo = geometry.photo_name(int(np.argmin(geometry.apart_from(pose))))
+    photo = geometry.photo_name(int(np.argmin(geometry.viewpoints.apart_from(pose))))
     folder = places.dataset(query.map_id, "mapping") / "sensors" / "records_data"
     return np.hstack([_scaled(asked), _scaled(read_photo_file(folder / photo).rgb)])
 
