@@ -36,11 +36,11 @@ from visloc.evaluation import pose_error
 from visloc.features import make_global_descriptor, make_local_features
 from visloc.geodesy import enu_from_geodetic
 from visloc.geometry import Camera, Pose, Similarity
+from visloc.geopose import earth_covariance
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.localization.localizer import Localizer
 from visloc.options import LocalizeOptions
-from visloc.pose.centre import position_covariance
 from visloc.types import Localized
 
 WALK_RATE, HALLWAY_RATE = 10, 5
@@ -56,7 +56,7 @@ def capture(work: Path, map_id: str, *arguments: str) -> Map:
             [
                 *(sys.executable, "-m", "mapping.cli.main", "capture", *arguments),
                 *("--map", map_id, "--maps-dir", str(maps)),
-                *("--output", str(work / f"{map_id}.png")),
+                *("--output", str(work / f"{map_id}.png"), "--accept"),
             ],
             check=True,
         )
@@ -179,21 +179,13 @@ def drone(work: Path, data: Path) -> str:
 
 
 def _offset(error: NDArray[np.float64], answer: Localized, anchor: Anchor) -> str:
-    """How far off a position is, and whether what is stated covers it.
-
-    The stated covariance is of the position in the map. The fixes scatter too: each by ``rms``
-    about the map, whose place on Earth is the mean of so many.
-    """
-    stated = position_covariance(answer.cam_from_world, answer.covariance)
-    assert anchor.rms is not None
-    fixes = anchor.rms**2 / 3 * (1 + 1 / anchor.images) * np.eye(3)
-    alone, with_fixes = (
-        "inside" if error @ np.linalg.solve(c, error) <= chdtri(3, 0.05) else "outside"
-        for c in (stated, stated + fixes)
-    )
+    """How far off a position is, and whether what is stated of it on Earth covers it."""
+    stated = earth_covariance(answer.cam_from_world, answer.covariance, anchor)
+    covered = "inside" if error @ np.linalg.solve(stated, error) <= chdtri(3, 0.05) else "outside"
+    east, north, up = np.sqrt(np.diag(stated))
     return (
-        f"{error[2]:+.2f} m in height, {math.hypot(*error[:2]):.2f} m level, {alone} the stated "
-        f"95 %, {with_fixes} with the scatter of the fixes"
+        f"{error[2]:+.2f} m in height, {math.hypot(*error[:2]):.2f} m level, {covered} the stated "
+        f"95 % (standard deviations {east:.2f}, {north:.2f}, {up:.2f} m)"
     )
 
 

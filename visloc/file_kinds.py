@@ -44,6 +44,12 @@ def _photos(name: str, advice: str = "") -> FileKind:
 
 def _video(name: str) -> FileKind:
     return FileKind(
+        name, f"{name} videos", "make a map of them with: mapping capture VIDEO --map ID"
+    )
+
+
+def _other_video(name: str) -> FileKind:
+    return FileKind(
         name,
         f"{name} videos",
         "take frames out of them, into a folder that exists, such as with: "
@@ -74,12 +80,12 @@ _SIGNATURES: tuple[tuple[bytes, FileKind], ...] = (
     (b"MMOR", _RAW),  # Olympus
     (b"FOVb", _RAW),  # Sigma
     (b"\x1aE\xdf\xa3", _video("Matroska or WebM")),
-    (b"\0\0\x01\xba", _video("MPEG")),
+    (b"\0\0\x01\xba", _other_video("MPEG")),
     (b"%PDF-", FileKind("PDF", "PDF documents", "save the photos in them as JPEG or PNG")),
     (b"8BPS", _photos("Photoshop", "save them as PNG")),
     (b"<svg", _SVG),
 )
-_RIFF = {b"WEBP": _photos("WebP"), b"AVI ": _video("AVI")}
+_RIFF = {b"WEBP": _photos("WebP"), b"AVI ": _other_video("AVI")}
 # Brands of ISO base media files (ISO/IEC 14496-12, 23008-12), the telling ones first.
 _BRANDS: tuple[tuple[tuple[bytes, ...], FileKind], ...] = (
     ((b"avif", b"avis"), _AVIF),

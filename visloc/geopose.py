@@ -13,10 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.archive import Geodetic
+from visloc.archive import Anchor, Geodetic
 from visloc.archive.places import enu_of, origin_of
 from visloc.geodesy import enu_from_ecef, geodetic_from_enu
-from visloc.geometry import Pose, cross_matrix
+from visloc.geometry import Pose
+from visloc.pose.centre import position_covariance
 
 # forward = z of the camera, left = -x, up = -y
 _BODY_FROM_DEVICE = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -94,27 +95,72 @@ class GeoPoseAccuracy:
 def accuracy_of(
     device_from_world: Pose,
     covariance: NDArray[np.float64],
-    geodetic: Geodetic,
-    alignment_rms: float | None,
+    anchor: Anchor,
 ) -> GeoPoseAccuracy:
-    """Return the accuracy of a GeoPose.
+    """Return the accuracy of a GeoPose; arguments as for ``earth_covariance``.
+
+    The error of the place turns the device too.
+    """
+    position = np.sqrt(np.diag(earth_covariance(device_from_world, covariance, anchor)))
+    geodetic = _placed(anchor)
+    turns = covariance[:3, :3]
+    if geodetic.error is not None:
+        enu_from_world = Pose.from_quaternion(geodetic.rotation_wxyz, geodetic.translation)
+        device_from_enu = device_from_world.rotation @ enu_from_world.rotation.T
+        turn_of_place = np.array(geodetic.error.covariance)[:3, :3]
+        turns = turns + device_from_enu @ turn_of_place @ device_from_enu.T
+    orientation = np.degrees(np.sqrt(np.maximum(np.diag(turns), 0.0)))
+    return GeoPoseAccuracy(float(position.mean()), float(orientation.mean()))
+
+
+def earth_covariance(
+    device_from_world: Pose, covariance: NDArray[np.float64], anchor: Anchor
+) -> NDArray[np.float64]:
+    """Return the covariance (3, 3) of a position on Earth, metres east, north and up.
+
+    The sum of three, which are independent: that of the position in the map; that of the place of
+    the map at this position, G C G^T with C of ``PlaceError`` and G of ``place_jacobian``; and that
+    of one fix. The last because neighbouring fixes share errors, so that many of them do not
+    average those out, and their scatter about the map does not show them. Where only the scatter
+    (``rms``) is known, a third of its square goes to each axis.
 
     Args:
         device_from_world: the pose in the map.
         covariance: (6, 6) of rotation (rad) then translation, for R <- Exp(w) R and t <- t + dt.
-        geodetic: where the map's world lies.
-        alignment_rms: how far the map's photos, in units of its world, are from where they were
-            said to be on Earth, if that is known. A third of its square goes to each axis: errors
-            of fixes are shared by neighbours, so that many photos do not average them out.
+        anchor: what the map's place on Earth rests on.
     """
-    # The centre -R^T t moves by -R^T (dt + [t] w); the rotation to ENU follows.
+    geodetic = _placed(anchor)
     turn = Pose.from_quaternion(geodetic.rotation_wxyz, geodetic.translation).rotation
-    jacobian = turn @ device_from_world.rotation.T
-    jacobian = jacobian @ np.hstack([cross_matrix(device_from_world.translation), np.eye(3)])
-    variances = np.diag(jacobian @ covariance @ jacobian.T) + (alignment_rms or 0.0) ** 2 / 3
-    position = geodetic.scale * np.sqrt(np.maximum(variances, 0.0))
-    orientation = np.degrees(np.sqrt(np.diag(covariance)[:3]))
-    return GeoPoseAccuracy(float(position.mean()), float(orientation.mean()))
+    in_map = turn @ position_covariance(device_from_world, covariance) @ turn.T
+    if geodetic.error is None:
+        fix = (anchor.rms or 0.0) ** 2 / 3 * np.eye(3)
+        return np.asarray(geodetic.scale**2 * (in_map + fix))
+    error = geodetic.error
+    placed = enu_of(device_from_world.center[None], geodetic)
+    gradient = place_jacobian(placed - np.array(error.middle))[0]
+    of_place = gradient @ np.array(error.covariance) @ gradient.T
+    fix = np.diag([error.level**2, error.level**2, error.up**2])
+    return np.asarray(geodetic.scale**2 * in_map + of_place + fix)
+
+
+def place_jacobian(offsets: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the derivatives (n, 3, 7) of positions on Earth by the parameters of ``PlaceError``.
+
+    Args:
+        offsets: (n, 3) of the positions from the middle of the fixes, metres east, north and up.
+    """
+    east, north, up = offsets.T
+    zero = np.zeros(len(offsets))
+    # w x offset, as a matrix times w.
+    turns = np.array([[zero, up, -north], [-up, zero, east], [north, -east, zero]])
+    moves = np.broadcast_to(np.eye(3), (len(offsets), 3, 3))
+    return np.concatenate([turns.transpose(2, 0, 1), moves, offsets[:, :, None]], axis=2)
+
+
+def _placed(anchor: Anchor) -> Geodetic:
+    if anchor.geodetic is None:
+        raise ValueError("the map has no place on Earth")
+    return anchor.geodetic
 
 
 def _half_open(angle: float) -> float:

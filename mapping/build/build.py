@@ -24,7 +24,7 @@ from mapping.cluster.workers import one_thread_here
 from mapping.methods.known_model import landmarks_from_reconstruction
 from mapping.methods.rgbd import landmarks_from_depth
 from mapping.methods.sfm import landmarks_from_matches
-from mapping.own_test.publishing import publish_content
+from mapping.own_test.publishing import Examine, publish_content
 from mapping.pairing import write_pairs
 from mapping.progress import Progress, one_step
 from mapping.stages.colours import landmark_colours
@@ -57,6 +57,7 @@ def build_map(
     progress: Progress,
     costs: Costs | None = None,
     finish: Finish | None = None,
+    examine: Examine | None = None,
 ) -> Path:
     """Build a map and publish it, as the current version unless its own test speaks against it.
 
@@ -68,6 +69,7 @@ def build_map(
         progress: told the stages.
         costs: gathers what they cost.
         finish: changes the landmarks at the end.
+        examine: finds more that speaks against the version.
 
     Returns:
         The folder of the new version; for maps at a URL, of the local copy.
@@ -102,7 +104,7 @@ def build_map(
                 with one_thread_here():  # so that processors do not change the result
                     context = _context(settings, work, workers, progress)
                     dataset = dataset.with_pixels_from(settings.pixel_origin)
-                    folder = _Job(settings, dataset, store, scratch, context, finish).run()
+                    folder = _Job(settings, dataset, store, scratch, context, finish, examine).run()
             work.remove()
             shutil.rmtree(scratch, ignore_errors=True)
     except storage_errors() as error:
@@ -157,6 +159,7 @@ class _Job:
     scratch: Path
     context: BuildContext
     finish: Finish | None
+    examine: Examine | None
 
     def run(self) -> Path:
         settings, context = self.settings, self.context
@@ -248,6 +251,7 @@ class _Job:
                     content,
                     self.settings.map_id,
                     left_out=left_out,
+                    examine=self.examine,
                     accept=self.settings.accept,
                 )
                 wrote(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))

@@ -2,40 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapping.capture.frames import FilmedVideo
 from mapping.capture.job import Captured
-from mapping.progress import ItemProgress
-from mapping.report.held_out import left_out_sets, localize_held_out, spread_photos
-from mapping.report.model import tolerance_of
+from mapping.capture.trying import Trials
 from visloc.archive import Map
-from visloc.localization.constraints import MapGeometry
 
 USED, NOT_CONNECTED, BLURRED = "used", "not connected", "too blurred"
 STILL, SKIPPED = "camera did not move", "skipped: its neighbours show it"
 _STILL = 0.02  # longer sides of the picture in a second
-_MOST_TRIED = 60
 _GOOD, _USABLE = 0.9, 0.7
 # Names that a line lists.
 _NAMED = 3
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Trials:
-    """Photos of the map, each localized without itself and its nearest neighbours.
-
-    Attributes:
-        images: (t,) rows of the map's photos, in their order.
-        right: (t,) whether it came back where it was.
-    """
-
-    images: NDArray[np.int64]
-    right: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,25 +29,15 @@ class Stretch:
     fate: str
 
 
-def try_photos(opened: Map, progress: ItemProgress) -> Trials:
-    """Ask the map for some of its photos, as if they and those beside them had not been taken."""
-    viewpoints = MapGeometry(opened).viewpoints
-    within = tolerance_of(opened, viewpoints)
-    images = spread_photos(len(opened.images), _MOST_TRIED)
-    right = []
-    for done, image in enumerate(images):
-        progress(done, len(images))
-        sets = left_out_sets(opened, viewpoints, image)[:2]
-        right.append(
-            bool(sets) and within.holds(localize_held_out(opened, viewpoints, image, sets[-1]))
-        )
-    progress(len(images), len(images))
-    return Trials(np.array(images, np.int64), np.array(right, np.bool_))
+def fates(captured: Captured, opened: Map, astray: Collection[str] = ()) -> list[Stretch]:
+    """What became of each second of each video, and of each photo of each folder.
 
-
-def fates(captured: Captured, opened: Map) -> list[Stretch]:
-    """What became of each second of each video, and of each photo of each folder."""
-    placed = {image.name for image in opened.images}
+    Args:
+        captured: the capture.
+        opened: its map.
+        astray: names of frames that lie away from their film's others.
+    """
+    placed = {image.name for image in opened.images} - set(astray)
     stretches = []
     for source, video in captured.videos.items():
         stretches += _joined(source, _fates_of_seconds(source, video, placed))
@@ -117,7 +89,8 @@ def verdict(trials: Trials, captured: Captured, opened: Map) -> str:
     """How good the map is, in a sentence or two for everybody."""
     share = float(trials.right.mean()) if len(trials.right) else 0.0
     grade = "good" if share >= _GOOD else ("usable" if share >= _USABLE else "poor")
-    if len(opened.images) < len(captured.photos) / 2:
+    doubts = opened.manifest.parts.doubts
+    if doubts or len(opened.images) < len(captured.photos) / 2:
         grade = "poor"
     size = (
         "its unit is a metre"
@@ -128,6 +101,7 @@ def verdict(trials: Trials, captured: Captured, opened: Map) -> str:
         f"the map is {grade}: {len(opened.images)} of {len(captured.photos)} photos are in it, and "
         f"{int(trials.right.sum())} of {len(trials.right)} photos that were tried came back where "
         f"they were taken, without themselves and those beside them; {size}"
+        + "".join(f"; {doubt.message}" for doubt in doubts)
     )
 
 

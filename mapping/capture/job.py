@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from mapping.capture.markers import find_markers, grey_photos
 from mapping.capture.placing import Yardstick, place
 from mapping.capture.settings import CaptureSettings, KnownLength
 from mapping.capture.sources import Sources, find_sources, read_capture, study_videos
+from mapping.capture.trying import doubts_of_capture
 from mapping.cluster.stage_timings import Costs
 from mapping.importers import ImportedModel, write_imported
 from mapping.methods.sfm_settings import SfmSettings
@@ -35,6 +37,8 @@ _DISK_PER_PHOTO, _MEMORY, _MEMORY_PER_PHOTO = 5 * 2**20, 2**30, 4 * 2**20
 _TOP_K = 12
 # A frame is shown for less than that.
 _PAST_END_S = 1.0
+# Says which versions there were when a capture began.
+_BEGUN = "begun.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +69,18 @@ class Captured:
         videos: by the name that their photos have in the map.
         photos: names of all photos that were tried.
         notes: on what was left out of the sources or assumed.
+        work: folder of what a killed run finds again; ``forget`` removes it.
     """
 
     folder: Path
     videos: Mapping[str, FilmedVideo]
     photos: Sequence[str]
     notes: Sequence[str]
+    work: Path
+
+    def forget(self) -> None:
+        """Remove what a killed run would find again, once all is told."""
+        shutil.rmtree(self.work, ignore_errors=True)
 
 
 def capture_map(
@@ -81,29 +91,36 @@ def capture_map(
 ) -> Captured:
     """Make a map of videos, photos and exports, and publish it.
 
-    If it is killed, the same call finds its finished work again.
+    If it is killed, the same call finds its finished work again. A call whose map is published, and
+    which ``Captured.forget`` did not end, returns that map.
 
     Args:
         announce: told before the long work.
 
     Raises:
         Conflict: ``map.exists`` without ``force``; ``build.running``.
-        InvalidInput: ``capture.*`` for sources and lengths that cannot be used; what importers and
-            builds raise.
+        NotFound, InvalidInput: ``capture.*`` for sources and lengths that cannot be used; what
+            importers and builds raise.
     """
     length, marker_m = settings.known_length, settings.marker_m
     if length is not None and marker_m is not None:
         raise refuse("capture.two_scales", field="--marker-size")
-    refuse_existing_map(settings.map_id, MapStore(settings.maps_dir), force=settings.force)
+    store = MapStore(settings.maps_dir)
     sources = find_sources(settings.sources)
     # Ids begin with a letter or digit: no work folder of a build has this name.
     root = settings.maps_dir / ".work" / f".capture-{settings.map_id}"
     with exclusive(root.with_name(f"{root.name}.lock")):
+        finished = _published_before(settings, root, store)
+        if finished is None:
+            refuse_existing_map(settings.map_id, store, force=settings.force)
+            _begin(settings, root, store)
         wanted = _wanted_seconds(length, sources)
         studied = study_videos(sources, WorkFolder(root), settings.photos, wanted, progress)
         model = read_capture(sources, studied, root, progress)
         names = tuple(image.name for image in model.images)
         yardstick = Yardstick(_resolved(length, sources, studied, names), marker_m=marker_m)
+        if finished is not None:
+            return Captured(finished, studied, names, model.notes, root)
         announce(_outlook(len(names), settings.workers, root))
         dataset = root / "dataset"
         shutil.rmtree(dataset, ignore_errors=True)  # of a capture that was killed
@@ -111,10 +128,42 @@ def capture_map(
         if marker_m is not None:
             yardstick = _with_markers(dataset, marker_m, progress)
         folder = build_map(
-            _build_settings(settings, model, dataset), progress, costs, partial(place, yardstick)
+            _build_settings(settings, model, dataset),
+            progress,
+            costs,
+            partial(place, yardstick),
+            partial(doubts_of_capture, films=studied, measured=_measured(yardstick)),
         )
-        shutil.rmtree(root, ignore_errors=True)
-    return Captured(folder, studied, names, notes)
+    return Captured(folder, studied, names, notes, root)
+
+
+def _published_before(settings: CaptureSettings, root: Path, store: MapStore) -> Path | None:
+    """The version that this capture published before it was killed."""
+    try:
+        begun = json.loads((root / _BEGUN).read_text())
+        if begun["settings"] != _told(settings):
+            return None
+        new = [one for one in store.versions(settings.map_id) if one not in begun["versions"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return store.folder(f"{settings.map_id}@{new[-1]}") if new else None
+
+
+def _begin(settings: CaptureSettings, root: Path, store: MapStore) -> None:
+    """Note which versions there are before this capture."""
+    root.mkdir(parents=True, exist_ok=True)
+    begun = {"settings": _told(settings), "versions": store.versions(settings.map_id)}
+    (root / _BEGUN).write_text(json.dumps(begun))
+
+
+def _told(settings: CaptureSettings) -> str:
+    """What was asked for: the same again goes on, another begins anew."""
+    sources = [path.resolve() for path in settings.sources]
+    return repr(replace(settings, sources=sources, workers=1))
+
+
+def _measured(yardstick: Yardstick) -> tuple[str, ...]:
+    return () if yardstick.length is None else yardstick.length[:2]
 
 
 def _build_settings(
@@ -145,6 +194,7 @@ def _build_settings(
         metric=metric,
         sfm=sfm,
         workers=settings.workers,
+        accept=settings.accept,
         force=settings.force,
     )
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapping.capture.account import Trials
+from mapping.capture.trying import Trials
 from mapping.report.grid import Plan
 from visloc.archive import Map
 from visloc.localization.constraints import MapGeometry

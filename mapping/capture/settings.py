@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from mapping.options import (
+    AcceptOption,
     ForceOption,
     GlobalFeaturesOption,
     LocalFeaturesOption,
@@ -94,6 +95,7 @@ class CaptureSettings:
     weights_dir: WeightsDirOption = None
     max_keypoints: MaxKeypointsOption = 5000
     workers: WorkersOption = 1
+    accept: AcceptOption = False
     force: ForceOption = False
 
     @property

@@ -10,10 +10,12 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from mapping.capture.account import Trials, fates, film_again, try_photos, verdict
+from mapping.capture.account import fates, film_again, verdict
 from mapping.capture.job import Captured, Outlook, capture_map
 from mapping.capture.picture import draw_walk
 from mapping.capture.settings import CaptureSettings
+from mapping.capture.trying import Trials, out_of_order, try_photos
+from mapping.cli.acceptance import require_acceptance
 from mapping.cli.display import ERR, OUT, print_costs, print_map, say, say_notes, say_peak_memory
 from mapping.cli.progress import StageProgress
 from mapping.cluster.stage_timings import Costs
@@ -34,7 +36,8 @@ def capture(
     """Make a map of videos, photos or scans of one place.
 
     Tells beforehand how long it takes. Tells afterwards what became of each second and photo, how
-    good the map is, and what to film again. Killed, the same command resumes.
+    good the map is, and what to film again. A map that its own test speaks against is not put into
+    use. Killed, the same command resumes.
     """
     costs = Costs()
     with StageProgress(ERR) as progress:
@@ -50,6 +53,10 @@ def capture(
     say_notes(captured.notes)
     _print_account(captured, opened, trials)
     say(f"picture: {picture}")
+    captured.forget()
+    require_acceptance(
+        opened, accept=settings.accept, pictures=settings.maps_dir / ".work" / ".doubts"
+    )
 
 
 def _announce(outlook: Outlook) -> None:
@@ -61,7 +68,7 @@ def _announce(outlook: Outlook) -> None:
 
 
 def _print_account(captured: Captured, opened: Map, trials: Trials) -> None:
-    stretches = fates(captured, opened)
+    stretches = fates(captured, opened, out_of_order(opened, captured.videos))
     table = Table(box=None)
     for name in ("source", "part", "what became of it"):
         table.add_column(name)

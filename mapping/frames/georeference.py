@@ -23,6 +23,7 @@ from mapping.frames.anchor import (
     align_positions,
     coordinate_system,
 )
+from mapping.frames.anchor_error import place_error
 from mapping.stages.publishing import new_version
 from mapping.stages.work_folder import exclusive
 from visloc.archive import Anchor, Geodetic, Map, MapStore, down_of, write_anchored
@@ -174,6 +175,10 @@ def georeference(opened: Map, known: Correspondences) -> Georeference:
         similarity = _keep_scale(similarity, known.points[found.agrees], local[found.agrees])
     geodetic = _geodetic(origin, similarity)
     _check_down(opened, geodetic)
+    agrees = found.agrees
+    error = place_error(
+        geodetic, known.points[agrees], local[agrees], fits_scale=not opened.manifest.world.metric
+    )
     residuals = similarity.apply(known.points) - local
     rms = math.sqrt(float(np.mean(np.sum(residuals[found.agrees] ** 2, axis=1))))
     anchor = Anchor.model_validate(
@@ -181,7 +186,7 @@ def georeference(opened: Map, known: Correspondences) -> Georeference:
             "kind": known.kind,
             "images": int(found.agrees.sum()),
             "rms": rms / similarity.scale,  # in units of the world
-            "geodetic": geodetic,
+            "geodetic": geodetic.model_copy(update={"error": error}),
         }
     )
     return Georeference(anchor, known.names, residuals, found.agrees)

@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import JsonValue
 
 from mapping.frames.anchor import align_positions, known_positions
+from mapping.frames.anchor_error import place_error
 from mapping.methods.intrinsics import (
     CAMERAS,
     CameraOrigin,
@@ -184,4 +185,9 @@ def _anchored(
     errors = np.linalg.norm(similarity.apply(centers) - positions, axis=1)[agrees]
     rms = float(np.sqrt(np.mean(errors**2)))
     anchor = known.anchor.model_copy(update={"images": int(agrees.sum()), "rms": rms})
+    if anchor.geodetic is not None:  # then the world's axes are east, north and up of it
+        placed = similarity.apply(centers[agrees])
+        error = place_error(anchor.geodetic, placed, positions[agrees])
+        geodetic = anchor.geodetic.model_copy(update={"error": error})
+        anchor = anchor.model_copy(update={"geodetic": geodetic})
     return similarity, anchor, ()

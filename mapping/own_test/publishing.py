@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mapping.own_test.trials import run_own_test
 from mapping.own_test.verdict import doubts_about
 from mapping.stages.publishing import link_photos, new_version
-from visloc.archive import MapContent, MapStore, add_own_test, open_map, write_map
+from visloc.archive import Map, MapContent, MapStore, add_own_test, open_map, write_map
 from visloc.archive.checks import read_manifest
+from visloc.archive.schema import Doubt
+
+Examine = Callable[[Map], Sequence[Doubt]]
+"""What else speaks against a map, beside its own test."""
 
 
 def publish_edited(
@@ -48,6 +52,7 @@ def publish_content(
     *,
     based_on: str | None = None,
     left_out: Sequence[str] = (),
+    examine: Examine | None = None,
     accept: bool = False,
 ) -> Path:
     """Write content beside the files that a folder has already, test it, and publish it.
@@ -56,12 +61,13 @@ def publish_content(
 
     Args:
         left_out: photos that found no place, as for ``doubts_about``.
+        examine: finds more doubts.
         accept: make it current all the same.
 
     Raises:
         Conflict: ``map.outdated``.
     """
-    version = write_content(incoming, content, map_id, left_out)
+    version = write_content(incoming, content, map_id, left_out, examine)
     return publish_tested(store, incoming, map_id, version, based_on=based_on, accept=accept)
 
 
@@ -82,7 +88,11 @@ def publish_tested(
 
 
 def write_content(
-    folder: Path, content: MapContent, map_id: str, left_out: Sequence[str] = ()
+    folder: Path,
+    content: MapContent,
+    map_id: str,
+    left_out: Sequence[str] = (),
+    examine: Examine | None = None,
 ) -> str:
     """Write content beside the files that a folder has already, test it, and return its version.
 
@@ -92,5 +102,5 @@ def write_content(
     write_map(folder, content, map_id=map_id, version=version, created=created)
     opened = open_map(folder)
     run = run_own_test(opened)
-    doubts = doubts_about(opened, run, left_out)
+    doubts = (*doubts_about(opened, run, left_out), *(examine(opened) if examine else ()))
     return add_own_test(folder, run.test, version=version, doubts=doubts)

@@ -24,7 +24,7 @@ LEAST_TESTED = 8
 MOST_LEFT_OUT = 0.4
 MOST_APART = 0.1
 # A pose needs at least as many landmarks by default (``RegistrationPreset.min_inliers``).
-_LINKING_LANDMARKS = 30
+LINKING_LANDMARKS = 30
 MAX_NAMES = 100
 
 
@@ -81,7 +81,7 @@ def _apart(opened: Map) -> Doubt | None:
     names = [opened.images[row].name for row in outside[:MAX_NAMES]]
     message = (
         f"the photos fell apart into {len(sizes)} pieces that share fewer than "
-        f"{_LINKING_LANDMARKS} landmarks; {len(outside)} of {len(pieces)} photos lie outside the "
+        f"{LINKING_LANDMARKS} landmarks; {len(outside)} of {len(pieces)} photos lie outside the "
         "largest"
     )
     return Doubt(kind="pieces", message=message, photos=tuple(names))
@@ -100,6 +100,6 @@ def _pieces(opened: Map) -> NDArray[np.int64]:
     seen = coo_array((ones, (photos, landmarks)), (num, len(opened.landmarks))).tocsr()
     seen.data[:] = 1  # a photo may see a landmark twice
     shared = seen @ seen.T
-    shared.data = (shared.data >= _LINKING_LANDMARKS).astype(np.int32)
+    shared.data = (shared.data >= LINKING_LANDMARKS).astype(np.int32)
     shared.eliminate_zeros()
     return np.asarray(connected_components(shared, directed=False)[1])

@@ -13,6 +13,9 @@ from visloc_api.words.answers import MapRef
 from visloc_api.words.maps import MapInfo
 from visloc_api.words.scenes import MapCamera, MapImage, MapImages
 
+# Answers state it where they state an accuracy (``visloc.geopose``).
+_NOT_SAID = {"geodetic": {"error"}}
+
 
 def map_info(served: ServedMap, *, in_list: bool = False) -> MapInfo:
     """Describe a map or a set of maps; in lists without its tiles."""
@@ -35,7 +38,7 @@ def map_info(served: ServedMap, *, in_list: bool = False) -> MapInfo:
             "extent": world.extent.model_dump(),
             "size_bytes": outline.size_bytes,
             "down": None if outline.gravity is None else outline.gravity.tolist(),
-            "anchor": None if world.anchor is None else world.anchor.model_dump(),
+            "anchor": None if world.anchor is None else world.anchor.model_dump(exclude=_NOT_SAID),
             "place": None if place is None else asdict(place),
             "current": served.current,
             "versions": [{"version": name, "current": used} for name, used in served.versions],

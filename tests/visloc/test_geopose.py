@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from visloc.archive import Geodetic
 from visloc.archive.places import GeoCircle, circle_of
-from visloc.archive.schema import Anchor, Extent, World
+from visloc.archive.schema import Anchor, Extent, PlaceError, World
 from visloc.geodesy import ecef_from_geodetic, enu_from_ecef, geodetic_from_enu
 from visloc.geometry import Pose, rotation_angle
-from visloc.geopose import accuracy_of, geopose_of
+from visloc.geopose import accuracy_of, earth_covariance, geopose_of
 
 # Camera axes right, down, forward as columns of world_from_cam, level, looking along a bearing.
 ANCHOR = Geodetic(latitude_deg=48.2741, longitude_deg=2.6973, altitude_m=90.0)
@@ -40,6 +40,10 @@ def body_to_camera(enu_from_body: NDArray[np.float64]) -> Pose:
     """cam_from_enu of a camera at the origin whose body is turned so."""
     body_from_cam = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     return Pose((enu_from_body @ body_from_cam).T, np.zeros(3))
+
+
+def anchored(geodetic: Geodetic, rms: float | None = None) -> Anchor:
+    return Anchor(kind="correspondences", images=0, rms=rms, geodetic=geodetic)
 
 
 def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
@@ -169,13 +173,13 @@ def test_far_from_the_anchor_east_is_east_there() -> None:
 def test_accuracy_is_the_mean_of_the_deviations_in_metres_and_degrees() -> None:
     sigma = np.array([0.002, 0.004, 0.006, 0.1, 0.1, 0.1])
     identity = Pose.identity()
-    found = accuracy_of(identity, np.diag(sigma**2), ANCHOR, None)
+    found = accuracy_of(identity, np.diag(sigma**2), anchored(ANCHOR))
     assert found.position == pytest.approx(0.1)
     assert found.orientation == pytest.approx(math.degrees(0.004))
     scaled = ANCHOR.model_copy(update={"scale": 3.0})
-    assert accuracy_of(identity, np.diag(sigma**2), scaled, None).position == pytest.approx(0.3)
+    assert accuracy_of(identity, np.diag(sigma**2), anchored(scaled)).position == pytest.approx(0.3)
     # 3 m off in all, so 1.73 m along each axis.
-    with_alignment = accuracy_of(identity, np.diag(sigma**2), ANCHOR, 3.0)
+    with_alignment = accuracy_of(identity, np.diag(sigma**2), anchored(ANCHOR, 3.0))
     assert with_alignment.position == pytest.approx(math.hypot(0.1, math.sqrt(3)))
 
 
@@ -190,9 +194,27 @@ def test_accuracy_does_not_depend_on_where_the_worlds_origin_is() -> None:
     jacobian[3:, :3] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     about_center = np.diag([1e-4] * 3 + [0.0025] * 3)
     covariance = jacobian @ about_center @ jacobian.T
-    found = accuracy_of(Pose(rotation, translation), covariance, ANCHOR, None)
+    found = accuracy_of(Pose(rotation, translation), covariance, anchored(ANCHOR))
     assert found.position == pytest.approx(0.05, rel=1e-6)
     assert found.orientation == pytest.approx(math.degrees(0.01))
+
+
+def test_the_error_of_the_place_grows_away_from_the_fixes_and_turns_the_device() -> None:
+    sigma = np.array([0.01, 0.01, 0.01, 0.2, 0.2, 0.3, 0.02])  # w, t and the scale
+    error = PlaceError.model_validate(
+        {"middle": (5, 0, 0), "covariance": np.diag(sigma**2).tolist(), "level": 0.4, "up": 0.7}
+    )
+    anchor = anchored(ANCHOR.model_copy(update={"error": error}), 99.0)
+    near, far = (
+        earth_covariance(level_camera(0, (5.0, north, 0.0)), np.zeros((6, 6)), anchor)
+        for north in (0.0, 100.0)
+    )
+    np.testing.assert_allclose(near, np.diag([0.2, 0.2, 0.58]), atol=1e-12)
+    # 100 m north: 0.01 rad are 1 m east and up, 2 % are 2 m north.
+    np.testing.assert_allclose(far - near, np.diag([1.0, 4.0, 1.0]), atol=1e-9)
+    turned = accuracy_of(level_camera(0, (5.0, 0, 0)), np.zeros((6, 6)), anchor)
+    assert turned.orientation == pytest.approx(math.degrees(0.01))
+    assert turned.position == pytest.approx(np.sqrt([0.2, 0.2, 0.58]).mean())
 
 
 def test_the_circle_of_a_map_holds_it() -> None:

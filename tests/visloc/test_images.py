@@ -304,8 +304,8 @@ def test_what_is_not_an_image_is_refused_with_the_formats_that_are_read(data: by
     [
         (b"\0\0\0\x0cJXL \r\n\x87\n", "JPEG XL", "convert them to JPEG"),
         (b"II*\0\x10\0\0\0CR\2\0", "raw", "develop them to JPEG"),
-        (b"\0\0\0\x14ftypqt  \0\0\0\0qt  ", "MOV", "take frames out of them"),
-        (b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom", "MP4", "take frames out of them"),
+        (b"\0\0\0\x14ftypqt  \0\0\0\0qt  ", "MOV", "mapping capture VIDEO"),
+        (b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom", "MP4", "mapping capture VIDEO"),
         (b"GIF89a" + bytes(100), "GIF", "save them as PNG"),
     ],
 )

@@ -144,11 +144,33 @@ class Extent(Record):
     max: Vector
 
 
+_Bounded = Annotated[float, Field(ge=-1e12, le=1e12)]
+_Row = tuple[_Bounded, _Bounded, _Bounded, _Bounded, _Bounded, _Bounded, _Bounded]
+
+
+class PlaceError(Record):
+    """How far off a place on Earth may be that was fitted to fixes or given points.
+
+    Attributes:
+        middle: of these, metres east, north and up of the place.
+        covariance: 7 x 7 of w, t and s, for ``enu' = middle + exp(s) Exp(w) (enu - middle) + t``:
+            rad, metres, and the logarithm of the scale.
+        level: standard deviation of one of these, metres east and north.
+        up: the same upwards.
+    """
+
+    middle: tuple[_Bounded, _Bounded, _Bounded]
+    covariance: tuple[_Row, _Row, _Row, _Row, _Row, _Row, _Row]
+    level: Annotated[float, Field(ge=0, le=1e6)]
+    up: Annotated[float, Field(ge=0, le=1e6)]
+
+
 class Geodetic(Record):
     """Where the world lies on Earth, WGS84.
 
     ``enu = scale R x + translation`` gives metres east, north and up of the position. Maps of
-    formats before 1.3 have the identity: their axes point east, north and up, in metres.
+    formats before 1.3 have the identity: their axes point east, north and up, in metres. ``error``
+    does not depend on the world's frame; None when it is unknown.
     """
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)]
@@ -157,6 +179,7 @@ class Geodetic(Record):
     scale: Annotated[float, Field(gt=0)] = 1.0
     rotation_wxyz: UnitQuaternion = (1.0, 0.0, 0.0, 0.0)
     translation: Vector = (0.0, 0.0, 0.0)
+    error: PlaceError | None = None
 
 
 class Anchor(Record):
@@ -252,7 +275,7 @@ class Doubt(Record):
     """A reason why a version was not put into use by itself.
 
     Attributes:
-        kind: ``own_test``, ``left_out`` or ``pieces``.
+        kind: ``own_test``, ``left_out`` or ``pieces``; of a capture also ``order`` or ``scale``.
         message: a sentence for people.
         photos: names of those that it is about, or of the first of them.
     """

@@ -136,18 +136,17 @@ async def _answer(
     cam_from_world, covariance = _first_camera(found)
     map_ref = f"{found.map_id}@{found.map_version}"
     geopose, _ = geoposes_to_words(cam_from_world, found.geodetic, ypr=False)
-    if geopose is None or found.geodetic is None:
-        # The map was chosen by its anchor, and then replaced by a version without one.
-        raise refuse("geopose.not_anchored", ref=map_ref)
     # An anchor that was given, not estimated, has no known accuracy.
     anchor = (await engine.map(map_ref)).outline.manifest.world.anchor
-    rms = None if anchor is None else anchor.rms
-    accuracy = accuracy_of(cam_from_world, covariance, found.geodetic, rms)
+    if geopose is None or anchor is None or anchor.geodetic is None:
+        # The map was chosen by its anchor, and then replaced by a version without one.
+        raise refuse("geopose.not_anchored", ref=map_ref)
+    accuracy = accuracy_of(cam_from_world, covariance, anchor)
     return GeoPoseResponse(
         id=(asked.id or request_id)[:_MAX_ID],
         timestamp=round(time() * 1000) if asked.timestamp is None else asked.timestamp,
         accuracy=GeoPoseAccuracy(
-            position=UNKNOWN if rms is None else accuracy.position,
+            position=UNKNOWN if anchor.rms is None else accuracy.position,
             orientation=accuracy.orientation,
         ),
         geopose=geopose,

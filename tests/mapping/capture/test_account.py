@@ -7,12 +7,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mapping.capture.account import Trials, fates, film_again, try_photos, verdict
+from mapping.capture.account import fates, film_again, verdict
 from mapping.capture.choosing import ChosenFrames
 from mapping.capture.frames import FilmedVideo
 from mapping.capture.job import Captured
 from mapping.capture.motion import Motion
 from mapping.capture.picture import draw_walk
+from mapping.capture.trying import Trials, try_photos
 from mapping.capture.video import VideoFacts
 
 
@@ -39,7 +40,11 @@ def captured() -> Captured:
         Path("walk.mp4"), "", facts, Motion(seconds, np.ones(20), path), ChosenFrames(rows, blurred)
     )
     return Captured(
-        Path("map"), {"walk": video}, [*(f"walk/{n}" for n in video.names), "photos/a.jpg"], ()
+        Path("map"),
+        {"walk": video},
+        [*(f"walk/{n}" for n in video.names), "photos/a.jpg"],
+        (),
+        Path(),
     )
 
 
@@ -72,7 +77,7 @@ def test_a_map_of_the_sample_is_judged_and_drawn(build_sample: Any, tmp_path: Pa
     assert len(trials.images) == len(opened.images)
     assert 0 < trials.right.sum() < len(trials.right)
     names = [image.name for image in opened.images]
-    text = verdict(trials, Captured(opened.path, {}, names, ()), opened)
+    text = verdict(trials, Captured(opened.path, {}, names, (), Path()), opened)
     assert f"{len(names)} of {len(names)} photos are in it" in text
     assert f"{trials.right.sum()} of {len(names)} photos that were tried came back" in text
     assert "its unit is a metre" in text
@@ -86,8 +91,12 @@ def test_a_map_of_the_sample_is_judged_and_drawn(build_sample: Any, tmp_path: Pa
 
 def test_a_map_that_lost_most_photos_is_poor() -> None:
     opened: Any = _Opened(["a.jpg"])
-    opened.manifest = SimpleNamespace(world=SimpleNamespace(metric=False))
+    opened.manifest = SimpleNamespace(
+        world=SimpleNamespace(metric=False), parts=SimpleNamespace(doubts=())
+    )
     trials = Trials(np.array([0]), np.array([True]))
-    text = verdict(trials, Captured(Path("map"), {}, ["a.jpg", "b.jpg", "c.jpg"], ()), opened)
+    text = verdict(
+        trials, Captured(Path("map"), {}, ["a.jpg", "b.jpg", "c.jpg"], (), Path()), opened
+    )
     assert "the map is poor: 1 of 3 photos" in text
     assert "its size is not known" in text

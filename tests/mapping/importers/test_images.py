@@ -172,7 +172,7 @@ def test_every_file_is_used_or_left_out_with_its_reason(tmp_path: Path) -> None:
         "sub/phone.jpg": reasons["sub/a.jxl"],
         "b.cr2": "raw photos are not read here; develop them",
         "cut.heic": "damaged or cut off",
-        "walk.mp4": "MP4 videos are not read here; take frames out of them, into a folder that",
+        "walk.mp4": "MP4 videos are not read here; make a map of them with: mapping capture VIDEO",
         "walk.MOV": "MOV videos",
         "anim.gif": "GIF pictures",
         "no_suffix": "rename them",
@@ -210,7 +210,7 @@ def test_without_anything_left_out_there_is_no_list(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "data", "part"),
     [
-        ("walk.mp4", b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom", "take frames out of them"),
+        ("walk.mp4", b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom", "mapping capture VIDEO --map ID"),
         ("a.jpg", b"\xff\xd8\xff\xe0", "a map takes several photos"),
         ("list.txt", b"a.jpg", "name the folder"),
     ],

@@ -1,0 +1,158 @@
+"""What speaks against a capture's map: photos that do not come back, films whose path jumps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.capture.frames import FilmedVideo
+from mapping.own_test.verdict import LINKING_LANDMARKS, MAX_NAMES, MOST_APART
+from mapping.progress import ItemProgress
+from mapping.report.held_out import left_out_sets, localize_held_out, spread_photos
+from mapping.report.model import tolerance_of
+from visloc.archive import Map
+from visloc.archive.schema import Doubt
+from visloc.geometry import Pose
+from visloc.localization.constraints import MapGeometry
+from visloc.pose.colmap import project
+
+_MOST_TRIED = 60
+# The path of a film jumps where its poses say that the picture moved by more than so many times
+# what was seen, and by so much of its longer side more. Seen is a median over tracked corners.
+_TIMES_SEEN, _MORE_THAN_SEEN = 3.0, 0.1
+# Frames whose pictures moved further from one another tell nothing: they may not overlap.
+_FAR = 0.4
+_MOST_POINTS = 300
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trials:
+    """Photos of the map, each localized without itself and its nearest neighbours.
+
+    Attributes:
+        images: (t,) rows of the map's photos, in their order.
+        right: (t,) whether it came back where it was.
+    """
+
+    images: NDArray[np.int64]
+    right: NDArray[np.bool_]
+
+
+def try_photos(opened: Map, progress: ItemProgress) -> Trials:
+    """Ask the map for some of its photos, as if they and those beside them had not been taken."""
+    images = spread_photos(len(opened.images), _MOST_TRIED)
+    right = _come_back(opened, images, progress)
+    return Trials(np.array(images, np.int64), np.array(right, np.bool_))
+
+
+def _come_back(opened: Map, images: Sequence[int], progress: ItemProgress) -> list[bool]:
+    viewpoints = MapGeometry(opened).viewpoints
+    within = tolerance_of(opened, viewpoints)
+    right = []
+    for done, image in enumerate(images):
+        progress(done, len(images))
+        sets = left_out_sets(opened, viewpoints, image)[:2]
+        right.append(
+            bool(sets) and within.holds(localize_held_out(opened, viewpoints, image, sets[-1]))
+        )
+    progress(len(images), len(images))
+    return right
+
+
+def doubts_of_capture(
+    opened: Map, films: Mapping[str, FilmedVideo], measured: Sequence[str]
+) -> tuple[Doubt, ...]:
+    """Return what speaks against the map of a capture, beside what its own test finds.
+
+    Args:
+        opened: the map.
+        films: the videos that it was made of, by name.
+        measured: names of the photos of the known length that gives the map its size, if any.
+    """
+    found = []
+    astray = out_of_order(opened, films)
+    filmed = [image.name for image in opened.images if image.name.partition("/")[0] in films]
+    if len(astray) > MOST_APART * len(filmed):
+        message = (
+            f"the path of a film jumps where its pictures do not: {len(astray)} of {len(filmed)} "
+            "frames lie away from the rest"
+        )
+        found.append(Doubt(kind="order", message=message, photos=tuple(astray[:MAX_NAMES])))
+    if lost := _lost(opened, measured, astray):
+        message = "the size rests on photos that do not come back where they were taken (--scale)"
+        found.append(Doubt(kind="scale", message=message, photos=tuple(lost)))
+    return tuple(found)
+
+
+def _lost(opened: Map, measured: Sequence[str], astray: Sequence[str]) -> list[str]:
+    rows = {image.name: row for row, image in enumerate(opened.images)}
+    # Those that are not in the map gave it no size.
+    named = [name for name in measured if name in rows]
+    if not named:
+        return []
+    back = _come_back(opened, [rows[name] for name in named], lambda *_: None)
+    return [name for name, right in zip(named, back, strict=True) if not right or name in astray]
+
+
+def out_of_order(opened: Map, films: Mapping[str, FilmedVideo]) -> list[str]:
+    """Return the names of frames that lie away from most frames of their film.
+
+    The poses of two frames say how far the landmarks of the first move in the picture from one to
+    the other. Where that is much more than the picture moved, and the frames share few landmarks,
+    the path jumps.
+    """
+    rows = {image.name: row for row, image in enumerate(opened.images)}
+    astray = []
+    for source, film in films.items():
+        seen = zip(film.names, film.motion.path[film.chosen.rows].tolist(), strict=True)
+        placed = [(rows[f"{source}/{n}"], at) for n, at in seen if f"{source}/{n}" in rows]
+        pieces = _pieces(opened, placed)
+        most = max(pieces, key=len, default=[])
+        astray += [opened.images[row].name for row, _ in placed if row not in most]
+    return astray
+
+
+def _pieces(opened: Map, frames: Sequence[tuple[int, float]]) -> list[list[int]]:
+    """Cut frames (row, path) where the path jumps; a piece goes on where it fits again."""
+    pieces: list[list[tuple[int, float]]] = []
+    for frame in frames:
+        # That of the frame before is tried first.
+        pieces.sort(key=lambda piece: -piece[-1][1])
+        for piece in pieces:
+            (before, start), (row, end) = piece[-1], frame
+            if end - start <= _FAR and not _jumps(opened, before, row, end - start):
+                piece.append(frame)
+                break
+        else:
+            if pieces and frame[1] - pieces[0][-1][1] > _FAR:
+                pieces[0].append(frame)  # nothing was seen between them that contradicts
+            else:
+                pieces.append([frame])
+    return [[row for row, _ in piece] for piece in pieces]
+
+
+def _jumps(opened: Map, first: int, second: int, seen: float) -> bool:
+    """Whether two poses move the picture by much more than was seen, in its longer sides.
+
+    Frames that share landmarks confirm each other: a fast turn can escape the corners' tracking.
+    """
+    offsets, observed = opened.observation_offsets, opened.observation_landmarks
+    landmarks, others = (
+        np.asarray(observed[offsets[row] : offsets[row + 1]]).astype(np.int64)
+        for row in (first, second)
+    )
+    if len(np.intersect1d(landmarks, others)) >= LINKING_LANDMARKS:
+        return False
+    landmarks = landmarks[:: max(1, len(landmarks) // _MOST_POINTS)]
+    points = opened.landmarks[landmarks].astype(np.float64) + opened.manifest.world.origin
+    pixels = []
+    for row in (first, second):
+        pose = Pose.from_quaternion(opened.image_poses[row][:4], opened.image_poses[row][4:])
+        camera = opened.cameras[opened.images[row].camera]
+        pixels.append(project(camera, pose.apply(points)) / max(camera.width, camera.height))
+    moved = np.linalg.norm(pixels[1] - pixels[0], axis=1)
+    moved[~np.isfinite(moved)] = np.inf  # behind the camera
+    return bool(np.median(moved) > _TIMES_SEEN * seen + _MORE_THAN_SEEN)

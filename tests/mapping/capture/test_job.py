@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mapping.capture import job
+from mapping.capture.job import capture_map
+from mapping.capture.settings import CaptureSettings
+from tests.mapping.capture.conftest import panned
+from visloc.archive import MapStore
+from visloc.errors import Conflict
+
+
+class Killed(Exception):
+    """Stands for a signal that ends the process."""
+
+
+def quiet(*_: object) -> None:
+    pass
+
+
+def test_a_capture_that_was_killed_after_publishing_is_told_and_not_made_again(
+    make_video: Callable[..., Path], built_maps: Path, tmp_path: Path, monkeypatch: Any
+) -> None:
+    maps = tmp_path / "maps"
+    store = MapStore(maps)
+    ready = MapStore(built_maps)
+    (map_id, *_) = ready.ids()
+
+    def published_and_killed(*_: object) -> Path:
+        with store.incoming() as incoming:
+            shutil.copytree(ready.folder(map_id), incoming, dirs_exist_ok=True)
+            store.publish(incoming, map_id, ready.current_version(map_id))
+        raise Killed
+
+    monkeypatch.setattr(job, "build_map", published_and_killed)
+    settings = CaptureSettings([make_video(panned(20, 12))], map_id, maps)
+    with pytest.raises(Killed):
+        capture_map(settings, quiet, quiet)
+    monkeypatch.setattr(job, "build_map", lambda *_: pytest.fail("it is made already"))
+    told = capture_map(settings, quiet, lambda _: pytest.fail("nothing is to be matched"))
+    assert told.folder == store.folder(map_id)
+    assert next(iter(told.photos)) == "walk/00000.000s.jpg"
+    # Another capture is not taken for it, nor the same one after all was told.
+    other = CaptureSettings(settings.sources, map_id, maps, photos=5)
+    with pytest.raises(Conflict, match="exists"):
+        capture_map(other, quiet, quiet)
+    told.forget()
+    with pytest.raises(Conflict, match="exists"):
+        capture_map(settings, quiet, quiet)
