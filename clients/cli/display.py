@@ -160,8 +160,9 @@ def _print_pose(console: Console, pose: PoseEstimate, unit: str) -> None:
 
 
 def _print_candidates(console: Console, candidates: Sequence[Candidate]) -> None:
-    """Print the two places of an ambiguous photo."""
-    for label, each in zip(("either", "or"), candidates, strict=False):
+    """Print the places of an ambiguous photo: two, or the one that is known."""
+    labels = ("perhaps",) if len(candidates) == 1 else ("either", "or")
+    for label, each in zip(labels, candidates, strict=False):
         preference = each.preference
         facts = [
             f"{each.inliers} inliers",

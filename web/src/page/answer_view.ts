@@ -170,7 +170,8 @@ function candidateList(answer: LocalizeResponse, actions: AnswerActions): HTMLEl
     }
     return element("li", { class: "stack near" }, facts, buttons);
   });
-  return [section("Either of two places", element("ol", { class: "candidates" }, ...rows))];
+  const title = candidates.length === 1 ? "Perhaps here" : "Either of two places";
+  return [section(title, element("ol", { class: "candidates" }, ...rows))];
 }
 
 function signed(value: number): string {
