@@ -157,9 +157,17 @@ def _begin(settings: CaptureSettings, root: Path, store: MapStore) -> None:
 
 
 def _told(settings: CaptureSettings) -> str:
-    """What was asked for: the same again goes on, another begins anew."""
-    sources = [path.resolve() for path in settings.sources]
-    return repr(replace(settings, sources=sources, workers=1))
+    """What was asked for: the same again goes on, another begins anew.
+
+    A video that was filmed again under the same name is another.
+    """
+    files = []
+    for source in settings.sources:
+        path = source.resolve()
+        for each in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            state = each.lstat()
+            files.append((str(each), state.st_size, state.st_mtime_ns))
+    return repr((files, replace(settings, sources=[], workers=1)))
 
 
 def _measured(yardstick: Yardstick) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic import JsonValue
 
 from mapping.capture.markers import Sighting, marker_sides
+from mapping.methods.sfm import UNPLACED
 from mapping.report.grid import up_of_cameras
 from mapping.stages.landmarks import MadeLandmarks, View
 from mapping.stages.photos import MappingPhoto
@@ -72,7 +73,9 @@ def place(
     if made.anchor.kind == "none":
         up = up_of_cameras(np.array([view.cam_from_world.rotation for view in made.views]))
     turn = np.eye(3) if up is None else _turned_up(up)
-    notes = [*made.notes]
+    # Once the size is known, the unit is not arbitrary; that z was guessed has a note of its own.
+    has_size = scale is not None and scale.metres is not None
+    notes = [note for note in made.notes if not (has_size and note == UNPLACED)]
     if scale is not None:
         notes.append(scale.note)
     if up is not None:
@@ -80,7 +83,7 @@ def place(
     rms = made.anchor.rms
     return replace(
         _moved(made, Similarity(metres, turn, np.zeros(3))),
-        metric=scale is not None and scale.metres is not None,
+        metric=has_size,
         anchor=made.anchor.model_copy(update={"rms": None if rms is None else rms * metres}),
         settings={**made.settings, **({} if scale is None else {"scale": dict(scale.record)})},
         notes=tuple(notes),

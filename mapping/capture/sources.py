@@ -22,6 +22,8 @@ from visloc.kapture.dataset import UNKNOWN_CAMERA
 
 _EXPORT = "transforms.json"
 _GNSS = "gnss"
+# A video whose frames end so long before the end that it states may have been cut.
+_CUT_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,17 +154,24 @@ def _video_model(video: FilmedVideo, folder: Path) -> ImportedModel:
         name = f"{video.facts.device} {FROM_EXIF}".lstrip()
         sensor = Sensor.with_camera("camera", camera, name=name)
     images = tuple(ImportedImage(name, "camera", i, None) for i, name in enumerate(video.names))
-    return ImportedModel({"camera": sensor}, images, folder, notes=_notes_on_place(video))
+    return ImportedModel({"camera": sensor}, images, folder, notes=_notes_on(video))
 
 
-def _notes_on_place(video: FilmedVideo) -> tuple[str, ...]:
-    if video.facts.position is None:
-        return ()
-    latitude, longitude, _ = video.facts.position
-    return (
-        f"{video.path.name} says where it began ({latitude:.5f}, {longitude:.5f}); one position "
-        "does not tell how the map lies on Earth",
-    )
+def _notes_on(video: FilmedVideo) -> tuple[str, ...]:
+    facts, name, end = video.facts, video.path.name, float(video.motion.seconds[-1])
+    notes = []
+    if facts.seconds > end + _CUT_S:
+        notes.append(
+            f"{name} ends after {end:.1f} s and says that it lasts {facts.seconds:.1f} s: it may "
+            "have been cut while it was copied"
+        )
+    if facts.position is not None:
+        latitude, longitude, _ = facts.position
+        notes.append(
+            f"{name} says where it began ({latitude:.5f}, {longitude:.5f}); one position "
+            "does not tell how the map lies on Earth"
+        )
+    return tuple(notes)
 
 
 def _joined(parts: Mapping[str, ImportedModel], photos: Path) -> ImportedModel:

@@ -34,6 +34,9 @@ from visloc.archive import Anchor, GlobalFeatures
 from visloc.geometry import Pose, Similarity
 from visloc.kapture import Dataset
 
+UNPLACED = "nothing says where the photos were taken: the frame and unit are arbitrary"
+"""The note on a map that has no place in the world."""
+
 
 def landmarks_from_matches(
     context: BuildContext,
@@ -168,8 +171,7 @@ def _anchored(
     free = Similarity(1.0, np.eye(3), np.zeros(3)), Anchor(kind="none", images=0)
     known = known_positions(dataset, photos)
     if known is None:
-        note = "nothing says where the photos were taken: the frame and unit are arbitrary"
-        return *free, (note,)
+        return *free, (UNPLACED,)
     placed = np.array([model.views[row] is not None for row in known.photos])
     views = [view for row in known.photos if (view := model.views[row]) is not None]
     centers = np.array([view.cam_from_world.center for view in views]).reshape(-1, 3)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -49,6 +50,12 @@ def test_a_capture_that_was_killed_after_publishing_is_told_and_not_made_again(
     other = CaptureSettings(settings.sources, map_id, maps, photos=5)
     with pytest.raises(Conflict, match="exists"):
         capture_map(other, quiet, quiet)
+    (video,) = settings.sources
+    written = video.stat().st_mtime_ns
+    os.utime(video, ns=(written, written + 1))  # as if it had been filmed again
+    with pytest.raises(Conflict, match="exists"):
+        capture_map(settings, quiet, quiet)
+    os.utime(video, ns=(written, written))
     told.forget()
     with pytest.raises(Conflict, match="exists"):
         capture_map(settings, quiet, quiet)

@@ -106,3 +106,21 @@ def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput) as caught:
         find_sources([tmp_path / "transforms.json"])
     assert caught.value.code == "capture.video"
+
+
+def test_a_video_that_was_cut_while_it_was_copied_is_told(
+    make_video: MakeVideo, tmp_path: Path
+) -> None:
+    film = make_video(panned(60, step=8), "walk.webm", codec="libvpx")
+    notes = {}
+    for name, share in (("whole", 1.0), ("cut", 0.5)):
+        copied = tmp_path / name / "walk.webm"
+        copied.parent.mkdir()
+        copied.write_bytes(film.read_bytes()[: int(share * film.stat().st_size)])
+        sources = find_sources([copied])
+        videos = study_videos(sources, WorkFolder(tmp_path / name / "work"), 10, {}, quiet)
+        notes[name] = read_capture(sources, videos, tmp_path / name / "work", quiet).notes
+
+    assert notes["whole"] == ()
+    (note,) = notes["cut"]
+    assert "says that it lasts 6.0 s" in note
