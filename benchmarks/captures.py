@@ -19,7 +19,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
-import cv2
 import numpy as np
 import typer
 from numpy.typing import NDArray
@@ -127,8 +126,7 @@ def hallway(work: Path, data: Path) -> str:
     photos = sorted((data / "ie_tower" / HALLWAY).glob("f11_hallway_right*.jpg"))
     film = work / "hallway.mp4"
     if not film.exists():
-        pictures = (cv2.cvtColor(cv2.imread(str(p)), cv2.COLOR_BGR2RGB) for p in photos)  # type: ignore[arg-type]
-        encode_video(film, (np.asarray(p, np.uint8) for p in pictures), rate=HALLWAY_RATE)
+        encode_video(film, (read_photo_file(path).rgb for path in photos), rate=HALLWAY_RATE)
     opened = capture(work, "hallway", str(film))
     found = frame_poses(opened, HALLWAY_RATE)
     given = read_dataset(data / "ie_tower" / "floor11_hallway_right" / "mapping")

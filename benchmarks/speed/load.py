@@ -21,7 +21,7 @@ _START_S = 4.0  # that processes take to start
 
 @dataclass(frozen=True, slots=True)
 class Answered:
-    """What clients saw.
+    """How long clients waited for their answers, and how many came.
 
     Attributes:
         latencies: (n,) seconds of each request.

@@ -44,7 +44,7 @@ def _localize(bench: Bench, url: str, concurrency: int, seed: int) -> dict[str, 
 
 @contextmanager
 def service(bench: Bench, maps_dir: Path, settings: Sequence[str] = ()) -> Iterator[str]:
-    """Run the service with its default settings but for these; its URL."""
+    """Run the service and yield its URL. Settings that are not given have their defaults."""
     port, log = free_port(), bench.work / "service.log"
     command = [sys.executable, "-m", "service", "--maps-dir", str(maps_dir)]
     command += ["--http-port", str(port), "--grpc-port", "0", *settings]

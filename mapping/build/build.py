@@ -65,11 +65,11 @@ def build_map(
     before stays current until the new one is complete and verified.
 
     Args:
-        settings: of the build.
-        progress: told the stages.
-        costs: gathers what they cost.
-        finish: changes the landmarks at the end.
-        examine: finds more that speaks against the version.
+        settings: what is built, from what, and how.
+        progress: is called with each stage and how much of it is done.
+        costs: gathers the seconds and the memory of each stage.
+        finish: changes the landmarks before they become a map.
+        examine: returns doubts about the map beyond those of its own test.
 
     Returns:
         The folder of the new version; for maps at a URL, of the local copy.

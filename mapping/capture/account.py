@@ -1,4 +1,4 @@
-"""What became of each photo and each second of video, how good the map is, what to film again."""
+"""Tell what became of a capture, how good its map is, and what should be filmed again."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Stretch:
 
 
 def fates(captured: Captured, opened: Map, astray: Collection[str] = ()) -> list[Stretch]:
-    """What became of each second of each video, and of each photo of each folder.
+    """Return what became of each second of each video, and of each photo of each folder.
 
     Args:
         captured: the capture.

@@ -161,10 +161,13 @@ def test_damage_within_is_passed_over_or_refused(make_video: MakeVideo) -> None:
     for at in noise.integers(200, len(data) - 200, 40).tolist():
         data[at] = int(noise.integers(256))
     path.write_bytes(bytes(data))
+    frames, code = 0, None
     try:
-        assert len(list(frames_of(path))) <= 30
+        frames = len(list(frames_of(path)))
     except InvalidInput as refused:
-        assert refused.code == "capture.video"  # noqa: PT017  both are right
+        code = refused.code
+    assert frames <= 30
+    assert code in (None, "capture.video")
 
 
 def test_sound_alone_is_refused(tmp_path: Path) -> None:
@@ -175,8 +178,9 @@ def test_sound_alone_is_refused(tmp_path: Path) -> None:
         stream = container.add_stream("aac", rate=44100, layout="mono")
         frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
         frame.sample_rate = 44100
-        for packet in (*stream.encode(frame), *stream.encode()):  # type: ignore[call-overload]
-            container.mux(packet)
+        assert isinstance(stream, av.AudioStream)
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
     with pytest.raises(InvalidInput, match="no video track"):
         video_facts(path)
 

@@ -78,7 +78,8 @@ def test_candidates_are_the_poses_on_both_floors(room: Localizer, place: Any, fl
     first, second = answer.candidates
     assert first.num_inliers >= second.num_inliers > 30
     assert first.preference is not None
-    assert first.preference == -second.preference  # type: ignore[operator]
+    assert second.preference is not None
+    assert first.preference == -second.preference
     assert abs(first.preference) < SURE
     names = {image.name for image in building.localizer.map.images}
     assert {first.image, second.image} <= names
