@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from training.atlas import Atlas, levels_to_look_at, look, make_atlas
-from training.augmentation import Conditions, augment, draw_conditions
+from training.augmentation import augment
+from training.conditions import Conditions, draw_conditions
 from training.homographies import applied, pixel_centres, random_looks, strength_at
 from training.parallax import Place, Rooms, make_rooms, other_view, random_views
 from training.photos import Photo, photo_levels

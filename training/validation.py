@@ -12,8 +12,9 @@ import torch
 from numpy.typing import NDArray
 
 from training.atlas import levels_to_look_at, look, make_atlas
-from training.augmentation import augment, draw_conditions
+from training.augmentation import augment
 from training.checkpoint import State
+from training.conditions import draw_conditions
 from training.export import export
 from training.homographies import Matrices, moved, random_looks
 from training.photos import Photo

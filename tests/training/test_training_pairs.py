@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from training.atlas import levels_to_look_at, look, make_atlas
-from training.augmentation import Conditions, augment, draw_conditions
+from training.augmentation import augment
+from training.conditions import Conditions, draw_conditions
 from training.homographies import applied, pixel_centres, random_looks, strength_at
 from training.pairs import Sources, draw, make, make_pairs, make_sources
 from training.parallax import Rooms, View, make_rooms, other_view, random_views
