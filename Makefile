@@ -10,7 +10,7 @@ PAGE_SOURCES := $(shell find web/src web/index.html web/*.json web/*.ts -type f)
 .DEFAULT_GOAL := help
 # Vite needs this much; without it the service has no page, and says so.
 NODE_IS_THERE = command -v npm >/dev/null && node -e 'const [a, b] = process.versions.node.split(".").map(Number); process.exit(a > 22 || (a === 22 && b >= 12) || (a === 20 && b >= 19) ? 0 : 1)'
-.PHONY: help install page check-page browser balancer demo test test-all docs-check docs-errors docs-options fuzz fuzz-api train-smoke bench bench-gpu bench-scale trust fmt lint types contracts proto proto-check check serve clean
+.PHONY: help install page check-page browser balancer promtool demo test test-all docs-check docs-errors docs-options fuzz fuzz-api train-smoke bench bench-gpu bench-scale trust fmt lint types contracts proto proto-check check serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -59,13 +59,23 @@ balancer:
 		done; \
 	else echo 'There is no HAProxy, or no kubectl: the tests of several replicas are skipped.' >&2; fi
 
+# As above: tests that find no promtool are skipped.
+promtool:
+	@if command -v promtool >/dev/null; then :; \
+	elif command -v apt-get >/dev/null && test "$$(id -u)" = 0; then \
+		echo 'Installing Prometheus, whose promtool tests the alerts.' >&2; \
+		apt-get update -qq >/dev/null 2>&1; \
+		DEBIAN_FRONTEND=noninteractive apt-get install -qq --yes --no-install-recommends prometheus \
+			>/dev/null 2>&1 || echo 'It cannot be installed: those tests are skipped.' >&2; \
+	else echo 'There is no promtool: the tests of the alerts are skipped.' >&2; fi
+
 demo: install ## the main job on a synthetic sample: build, serve, localize, picture
 	$(BIN)/python examples/demo.py
 
-test: install browser balancer ## the tests, in under ten minutes on two cores
+test: install browser balancer promtool ## the tests, in under ten minutes on two cores
 	$(BIN)/pytest -m 'not slow' --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
-test-all: install browser balancer ## the slow tests too
+test-all: install browser balancer promtool ## the slow tests too
 	$(BIN)/pytest
 
 docs-check: install ## run the commands that the docs print, or parse those that take hours: PAGES

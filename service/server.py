@@ -23,7 +23,7 @@ from service.http.backend import Backend
 from service.http.health import metrics_app
 from service.http.slow_clients import Arrivals, http_protocol
 from service.security.access import open_access
-from service.security.tls import TlsConfig, check_tls, tls_config
+from service.security.tls import Certificate, open_certificate
 from service.settings import ServiceSettings, SettingsError
 from service.telemetry.logs import configure_logging
 from service.telemetry.metrics import Metrics, ServiceState
@@ -48,7 +48,7 @@ class Server:
 
     def __init__(self, settings: ServiceSettings) -> None:
         self._settings = settings
-        check_tls(settings)
+        self._certificate = open_certificate(settings)
         if settings.weights_dir is not None and not settings.weights_dir.is_dir():
             raise SettingsError(f"weights_dir: {settings.weights_dir} is no folder")
         access = open_access(settings)
@@ -75,7 +75,9 @@ class Server:
                 self._http.append(self._metrics_server(listener))
                 self.metrics_port = listener.getsockname()[1]
             try:
-                self._grpc = GrpcServer(self.engine, settings, self.observer, access)
+                self._grpc = GrpcServer(
+                    self.engine, settings, self.observer, access, self._certificate
+                )
             except RuntimeError as error:
                 address = f"{settings.host}:{settings.grpc_port}"
                 raise OSError(f"cannot listen on {address}: {error}") from None
@@ -85,11 +87,11 @@ class Server:
     def _http_server(self, listener: socket.socket) -> _HttpServer:
         app, connections = create_app(self.backend), self.backend.connections
         grace_s = self._settings.arrival_timeout_s
-        return _HttpServer(app, listener, connections, grace_s, tls_config(self._settings))
+        return _HttpServer(app, listener, connections, grace_s, self._certificate)
 
     def _metrics_server(self, listener: socket.socket) -> _HttpServer:
         app, connections = metrics_app(self.backend), OpenConnections(METRICS_CONNECTIONS)
-        return _HttpServer(app, listener, connections, self._settings.arrival_timeout_s, {})
+        return _HttpServer(app, listener, connections, self._settings.arrival_timeout_s, None)
 
     async def open(self) -> None:
         """Answer requests. Until ``load`` is done, /readyz and gRPC's health say not ready."""
@@ -145,6 +147,7 @@ class Server:
             store_reachable=self._store.reachable,
             buffered_bytes=self.backend.arrivals.bytes_held,
             max_buffered_bytes=settings.max_buffered_bytes,
+            certificate_ends=None if self._certificate is None else self._certificate.ends,
             folders={"cache": settings.cache_dir} if remote else {"maps": Path(settings.maps_dir)},
         )
 
@@ -181,7 +184,7 @@ class _HttpServer(uvicorn.Server):
         listener: the listening socket.
         connections: at most so many, and not too slow.
         grace_s: the longest TLS handshake, head, or body of a refused request.
-        tls: settings of uvicorn.
+        certificate: for TLS; None for plain HTTP.
     """
 
     def __init__(
@@ -190,7 +193,7 @@ class _HttpServer(uvicorn.Server):
         listener: socket.socket,
         connections: OpenConnections,
         grace_s: float,
-        tls: TlsConfig,
+        certificate: Certificate | None,
     ) -> None:
         super().__init__(
             uvicorn.Config(
@@ -201,18 +204,20 @@ class _HttpServer(uvicorn.Server):
                 ws="none",
                 proxy_headers=False,  # any local process could forge them
                 http=http_protocol(grace_s, connections),
-                **tls,
             )
         )
         self._listener = listener
         self._open = connections
         self._grace_s = grace_s
+        self._certificate = certificate
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         del sockets
         await super().startup(sockets=[])  # uvicorn itself listens nowhere
+        certificate = self._certificate
+        context = None if certificate is None else lambda: certificate.context
         self._acceptor = Acceptor(
-            self._listener, self._open, self._make_protocol, self.config.ssl, self._grace_s
+            self._listener, self._open, self._make_protocol, context, self._grace_s
         )
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:

@@ -6,6 +6,7 @@ import asyncio
 import math
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from typing import TypeVar
 
 from visloc.errors import refuse
@@ -16,8 +17,20 @@ T = TypeVar("T")
 _MAX_TIMEOUT_CHARS = 32
 
 
-def timeout_of(header: str | None, limit_s: float) -> float:
-    """Return the seconds that a request may take.
+@dataclass(frozen=True, slots=True)
+class TimeLimit:
+    """The time that a request may take.
+
+    Attributes:
+        is_callers: whether the caller chose it. Missing such a limit says nothing about the server.
+    """
+
+    seconds: float
+    is_callers: bool = False
+
+
+def time_limit_of(header: str | None, limit_s: float) -> TimeLimit:
+    """Return the time that a request may take.
 
     Args:
         header: what the caller asks for; None when it does not say.
@@ -27,42 +40,42 @@ def timeout_of(header: str | None, limit_s: float) -> float:
         InvalidInput: ``request.timeout`` when it is not a positive number.
     """
     if header is None:
-        return limit_s
+        return TimeLimit(limit_s)
     try:
         seconds = float(header) if len(header) <= _MAX_TIMEOUT_CHARS else math.nan
     except ValueError:
         seconds = math.nan
     if not seconds > 0:  # NaN fails too
         raise refuse("request.timeout", field=TIMEOUT_HEADER, got=header)
-    return min(seconds, limit_s)
+    return TimeLimit(seconds, is_callers=True) if seconds < limit_s else TimeLimit(limit_s)
 
 
 @asynccontextmanager
-async def within(seconds: float) -> AsyncIterator[None]:
+async def within(limit: TimeLimit) -> AsyncIterator[None]:
     """Give up what the block waits for when the time is over.
 
     Raises:
-        TimedOut: ``server.deadline``.
+        TimedOut: ``request.deadline`` when the caller chose the limit, else ``server.deadline``.
     """
     try:
-        async with asyncio.timeout(seconds):
+        async with asyncio.timeout(limit.seconds):
             yield
     except TimeoutError:
         raise refuse(
-            "server.deadline",
+            "request.deadline" if limit.is_callers else "server.deadline",
             "the time for the request is over; the server is busy, or the request is large",
-            expected=f"an answer within {seconds:g} s",
+            expected=f"an answer within {limit.seconds:g} s",
         ) from None
 
 
-async def each_within(seconds: float, items: AsyncIterator[T]) -> AsyncGenerator[T]:
+async def each_within(limit: TimeLimit, items: AsyncIterator[T]) -> AsyncGenerator[T]:
     """Give items as they come, each within a time after the one before was taken.
 
     Raises:
-        TimedOut: ``server.deadline``.
+        TimedOut: as ``within`` raises.
     """
     while True:
-        async with within(seconds):
+        async with within(limit):
             try:
                 item = await anext(items)
             except StopAsyncIteration:

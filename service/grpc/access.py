@@ -81,7 +81,7 @@ class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
                 async with asyncio.timeout(_KEYLESS_S):
                     return await behaviour(messages, context)
             except TimeoutError:
-                over = refuse("server.deadline", "watching ends after a while; call again")
+                over = refuse("request.deadline", "watching ends after a while; call again")
                 await self._envelope.refuse(_name(method), over, context)
             finally:
                 self._keyless -= 1

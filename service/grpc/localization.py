@@ -7,7 +7,7 @@ from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing
 
 from service.api.answers import instant_answer, localize_response
-from service.api.deadlines import within
+from service.api.deadlines import TimeLimit, within
 from service.api.maps import map_info
 from service.api.request_ids import request_id
 from service.engine.engine import Engine
@@ -35,7 +35,9 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
         self._engine = engine
         self._observer = observer
         self._envelope = Envelope(observer)
-        self._timeout_s, self._patience_s = settings.request_timeout_s, settings.arrival_timeout_s
+        self._limit = TimeLimit(settings.request_timeout_s)
+        # A client that takes no answers is slow, not the server.
+        self._taking = TimeLimit(settings.arrival_timeout_s, is_callers=True)
         self._max_request_bytes = settings.max_request_bytes
         self._limits = BatchLimits(settings.max_rig_images, settings.max_instants)
 
@@ -46,7 +48,7 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
         id_ = request_id(request.request_id)
         async with self._envelope("Localize", id_, context):
             # Features take a moment to check: not on the event loop.
-            async with within(self._timeout_s):
+            async with within(self._limit):
                 job = await asyncio.to_thread(localize_job_of, request, self._max_request_bytes)
                 found = await self._engine.localize(job)
             self._observer.localization(found)
@@ -60,7 +62,7 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
         id_ = request_id(request.request_id)
         async with self._envelope("LocalizeRig", id_, context):
             with self._engine.admit_batch():
-                async with within(self._timeout_s):
+                async with within(self._limit):
                     job = await asyncio.to_thread(rig_job_of, request, self._limits)
                     found = await self._engine.localize_rig(job)
             self._observer.instant(found)
@@ -87,7 +89,7 @@ class LocalizationServicer(pb2_grpc.LocalizationServicer):
                     async for found in answers:
                         self._observer.instant(found)
                         answer = instant_answer(found, id_)
-                        async with within(self._patience_s):
+                        async with within(self._taking):
                             await context.write(message_of(answer, pb2.InstantAnswer()))
 
     async def _instants(

@@ -16,7 +16,7 @@ from service.grpc.localization import LocalizationServicer
 from service.grpc.maps import MapsServicer
 from service.grpc.slow_clients import TimelyCalls
 from service.security.access import Access
-from service.security.tls import grpc_credentials
+from service.security.tls import Certificate
 from service.settings import ServiceSettings
 from service.telemetry.observer import Observer
 from visloc_api.v1 import localization_pb2 as pb2
@@ -35,7 +35,12 @@ class GrpcServer:
     """
 
     def __init__(
-        self, engine: Engine, settings: ServiceSettings, observer: Observer, access: Access
+        self,
+        engine: Engine,
+        settings: ServiceSettings,
+        observer: Observer,
+        access: Access,
+        certificate: Certificate | None,
     ) -> None:
         envelope = Envelope(observer)
         self._connections = GrpcConnections(settings.max_connections)
@@ -68,11 +73,11 @@ class GrpcServer:
             (*SERVICE_NAMES, health.SERVICE_NAME, reflection.SERVICE_NAME), self._server
         )
         host = f"[{settings.host}]" if ":" in settings.host else settings.host
-        address, credentials = f"{host}:{settings.grpc_port}", grpc_credentials(settings)
-        if credentials is None:
+        address = f"{host}:{settings.grpc_port}"
+        if certificate is None:
             self.port = self._server.add_insecure_port(address)
         else:
-            self.port = self._server.add_secure_port(address, credentials)
+            self.port = self._server.add_secure_port(address, certificate.credentials())
 
     async def start(self) -> None:
         """Accept calls."""

@@ -134,7 +134,7 @@ class Acceptor:
     Args:
         listener: the listening socket.
         make: makes the protocol of a new connection.
-        context: of TLS; None for plain HTTP.
+        context: returns the TLS context for a new connection; None for plain HTTP.
         handshake_s: the longest TLS handshake.
     """
 
@@ -143,15 +143,14 @@ class Acceptor:
         listener: socket.socket,
         connections: OpenConnections,
         make: Callable[[], Connection],
-        context: ssl.SSLContext | None,
+        context: Callable[[], ssl.SSLContext] | None,
         handshake_s: float,
     ) -> None:
         self._listener = listener
         self._connections = connections
         self._make = make
-        self._tls: dict[str, Any] = {}
-        if context is not None:
-            self._tls = {"ssl": context, "ssl_handshake_timeout": handshake_s}
+        self._context = context
+        self._handshake_s = handshake_s
         self._loop = asyncio.get_running_loop()
         self._accepted: socket.socket | None = None  # waits for room
         self._pausing: asyncio.TimerHandle | None = None
@@ -214,8 +213,11 @@ class Acceptor:
         connection.opening = self._loop.create_task(self._connect(connection, accepted))
 
     async def _connect(self, connection: Connection, accepted: socket.socket) -> None:
+        tls: dict[str, Any] = {}
+        if self._context is not None:
+            tls = {"ssl": self._context(), "ssl_handshake_timeout": self._handshake_s}
         try:
-            await self._loop.connect_accepted_socket(lambda: connection, accepted, **self._tls)
+            await self._loop.connect_accepted_socket(lambda: connection, accepted, **tls)
         except OSError:  # the client's TLS handshake failed
             self._connections.remove(connection)
 

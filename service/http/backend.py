@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from starlette.requests import Request
 
-from service.api.deadlines import timeout_of
+from service.api.deadlines import TimeLimit, time_limit_of
 from service.engine.engine import Engine
 from service.http.acceptor import OpenConnections
 from service.http.slow_clients import Arrivals
@@ -43,11 +43,11 @@ def backend_of(request: Request) -> Backend:
     return backend
 
 
-def timeout_s_of(request: Request) -> float:
-    """Return how many seconds the request may take.
+def limit_of(request: Request) -> TimeLimit:
+    """Return the time that the request may take.
 
     Raises:
         InvalidInput: ``request.timeout``.
     """
     limit_s = backend_of(request).settings.request_timeout_s
-    return timeout_of(request.headers.get(TIMEOUT_HEADER), limit_s)
+    return time_limit_of(request.headers.get(TIMEOUT_HEADER), limit_s)

@@ -10,9 +10,9 @@ from functools import partial
 from fastapi import FastAPI, Request, Response
 
 from service.api.answers import instant_answer, localize_response
-from service.api.deadlines import each_within, within
+from service.api.deadlines import TimeLimit, each_within, within
 from service.engine.engine import Engine
-from service.http.backend import backend_of, timeout_s_of
+from service.http.backend import backend_of, limit_of
 from service.http.bodies import read_localize_job, read_rig_job, read_sequence_jobs
 from service.http.openapi.app import problems
 from service.http.openapi.request_bodies import LOCALIZE_BODY, RIG_BODY, SEQUENCE_BODY
@@ -51,10 +51,10 @@ async def localize(request: Request) -> Response:
 
     A photo that cannot be localized is an answer (`status: not_localized`), not an error.
     """
-    backend, timeout_s = backend_of(request), timeout_s_of(request)
+    backend, limit = backend_of(request), limit_of(request)
     backend.engine.check_room()
     job = await read_localize_job(request)
-    async with within(timeout_s):
+    async with within(limit):
         found = await while_connected(request.receive, backend.engine.localize(job))
     backend.observer.localization(found)
     return json_response(localize_response(found, request.state.request_id))
@@ -65,10 +65,10 @@ async def localize_rig(request: Request) -> Response:
 
     A photo that cannot be used fails alone: the others are still localized.
     """
-    backend, timeout_s = backend_of(request), timeout_s_of(request)
+    backend, limit = backend_of(request), limit_of(request)
     job = await read_rig_job(request)
     with backend.engine.admit_batch():
-        async with within(timeout_s):
+        async with within(limit):
             found = await while_connected(request.receive, backend.engine.localize_rig(job))
     backend.observer.instant(found)
     return json_response(instant_answer(found, request.state.request_id))
@@ -79,9 +79,9 @@ async def localize_sequence(request: Request) -> Response:
 
     With `Accept: application/x-ndjson` each answer is one line, sent as soon as it is final.
     """
-    backend, timeout_s = backend_of(request), timeout_s_of(request)
+    backend, limit = backend_of(request), limit_of(request)
     start, instants = await read_sequence_jobs(request)
-    answers = _observed(_admitted(backend.engine, start, instants), timeout_s, backend.observer)
+    answers = _observed(_admitted(backend.engine, start, instants), limit, backend.observer)
     id_ = request.state.request_id
     message = partial(instant_answer, request_id=id_)
     if _wants_lines(request):
@@ -124,10 +124,10 @@ async def _admitted(
 
 
 async def _observed(
-    answers: AsyncGenerator[Localization], timeout_s: float, observer: Observer
+    answers: AsyncGenerator[Localization], limit: TimeLimit, observer: Observer
 ) -> AsyncGenerator[Localization]:
     """Pass answers on, each within the timeout, and report them."""
-    async with aclosing(answers), aclosing(each_within(timeout_s, answers)) as timed:
+    async with aclosing(answers), aclosing(each_within(limit, answers)) as timed:
         async for answer in timed:
             observer.instant(answer)
             yield answer

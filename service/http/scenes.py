@@ -11,7 +11,7 @@ from fastapi import FastAPI, Query, Request, Response
 from service.api.deadlines import within
 from service.api.maps import map_images
 from service.engine.engine import Engine
-from service.http.backend import backend_of, timeout_s_of
+from service.http.backend import backend_of, limit_of
 from service.http.cache_headers import (
     ASK_ALWAYS_PRIVATE,
     FOR_EVER_PRIVATE,
@@ -75,7 +75,7 @@ async def get_points(
         body = await engine.scenes.points(outline, first, count)
         return Response(body, headers=headers, media_type=_BINARY)
 
-    async with within(timeout_s_of(request)):
+    async with within(limit_of(request)):
         return await _of_version(engine, ref, answer)
 
 
@@ -98,7 +98,7 @@ async def get_images(
         )
         return Response(text, headers=headers, media_type="application/json")
 
-    async with within(timeout_s_of(request)):
+    async with within(limit_of(request)):
         return await _of_version(engine, ref, answer)
 
 

@@ -1,59 +1,176 @@
-"""The TLS certificate of both transports."""
+"""The TLS certificate of both transports, read again when its files change."""
 
 from __future__ import annotations
 
+import logging
+import re
 import ssl
-from typing import TypedDict
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from time import time
 
 import grpc
 
 from service.settings import ServiceSettings, SettingsError
 
+logger = logging.getLogger(__name__)
 
-class TlsConfig(TypedDict, total=False):
-    """Settings of uvicorn."""
-
-    ssl_certfile: str
-    ssl_keyfile: str
+_PEM = re.compile(rb"-----BEGIN CERTIFICATE-----.*?-----END CERTIFICATE-----", re.DOTALL)
+# Tags of ASN.1.
+_VERSION, _UTC_TIME = 0xA0, 0x17
 
 
-def check_tls(settings: ServiceSettings) -> None:
-    """Refuse a certificate that cannot be used, before any port is open.
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    """A chain of certificates and its private key, as one state of the files.
+
+    Attributes:
+        ends: when the first certificate of the chain expires, seconds since 1970.
+        chain: PEM.
+        key: PEM.
+    """
+
+    ends: float
+    chain: bytes
+    key: bytes
+    context: ssl.SSLContext
+
+
+class Certificate:
+    """The service's certificate. New connections get that which is in the files by then.
+
+    If changed files cannot be used, such as while only one of both is new, that is logged and the
+    old certificate stays in use.
+
+    Raises:
+        SettingsError: naming the setting, when the files cannot be used at the start.
+    """
+
+    def __init__(self, chain: Path, key: Path) -> None:
+        self._files = (chain, key)
+        self._seen = _version_of(self._files)
+        self._pair = _read(self._files)
+        if self._pair.ends < time():
+            logger.error("the certificate in %s has expired: clients refuse it", chain)
+
+    @property
+    def ends(self) -> float:
+        """When the first certificate of the chain expires, seconds since 1970."""
+        return self._now().ends
+
+    @property
+    def context(self) -> ssl.SSLContext:
+        """The context for a new HTTPS connection."""
+        return self._now().context
+
+    def credentials(self) -> grpc.ServerCredentials:
+        """Return credentials for gRPC that ask for the certificate with every connection."""
+        sent = self._pair
+
+        def changed() -> grpc.ServerCertificateConfiguration | None:
+            nonlocal sent
+            pair = self._now()
+            if pair is sent:
+                return None
+            sent = pair
+            return _for_grpc(pair)
+
+        return grpc.dynamic_ssl_server_credentials(_for_grpc(sent), changed)
+
+    def _now(self) -> _Pair:
+        version = _version_of(self._files)
+        if version != self._seen:
+            self._seen = version
+            try:
+                self._pair = _read(self._files)
+            except SettingsError as error:
+                logger.error("the certificate was not reloaded: %s", error)  # noqa: TRY400
+            else:
+                ends = datetime.fromtimestamp(self._pair.ends, UTC)
+                logger.info("reloaded the certificate: it is valid until %s", ends.isoformat())
+        return self._pair
+
+
+def open_certificate(settings: ServiceSettings) -> Certificate | None:
+    """Read the certificate before any port is open; None without TLS.
 
     Raises:
         SettingsError: naming the setting.
     """
-    certificate, key = settings.tls_cert, settings.tls_key
-    if (certificate is None) != (key is None):
-        given, missing = ("tls_key", "tls_cert") if certificate is None else ("tls_cert", "tls_key")
+    chain, key = settings.tls_cert, settings.tls_key
+    if chain is not None and key is not None:
+        return Certificate(chain, key)
+    if chain is not None or key is not None:
+        given, missing = ("tls_key", "tls_cert") if chain is None else ("tls_cert", "tls_key")
         raise SettingsError(f"{missing}: {given} was given without it; TLS needs both")
-    if certificate is None or key is None:
-        return
-    for name, path in (("tls_cert", certificate), ("tls_key", key)):
+    return None
+
+
+def _read(files: tuple[Path, Path]) -> _Pair:
+    contents = []
+    for name, path in zip(("tls_cert", "tls_key"), files, strict=True):
         try:
-            path.read_bytes()
+            contents.append(path.read_bytes())
         except OSError as error:
             raise SettingsError(f"{name}: {path} cannot be read: {error.strerror}") from None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         # An encrypted key would otherwise ask for its password on the terminal.
-        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, lambda: b"")
-    except (ssl.SSLError, ValueError) as error:
+        context.load_cert_chain(*files, lambda: b"")
+        certificates = [ssl.PEM_cert_to_DER_cert(pem.decode()) for pem in _PEM.findall(contents[0])]
+        ends = min(_end_of(certificate) for certificate in certificates)
+    except (ssl.SSLError, ValueError, IndexError) as error:
         raise SettingsError(
-            f"tls_cert, tls_key: {certificate} and {key} are not a certificate chain and its "
+            f"tls_cert, tls_key: {files[0]} and {files[1]} are not a certificate chain and its "
             f"private key, both PEM and not encrypted: {error}"
         ) from None
+    chain_pem, key_pem = contents
+    return _Pair(ends, chain_pem, key_pem, context)
 
 
-def tls_config(settings: ServiceSettings) -> TlsConfig:
-    """Return the settings for HTTPS; none without a certificate."""
-    if settings.tls_cert is None or settings.tls_key is None:
-        return {}
-    return {"ssl_certfile": str(settings.tls_cert), "ssl_keyfile": str(settings.tls_key)}
+def _for_grpc(pair: _Pair) -> grpc.ServerCertificateConfiguration:
+    return grpc.ssl_server_certificate_configuration([(pair.key, pair.chain)])
 
 
-def grpc_credentials(settings: ServiceSettings) -> grpc.ServerCredentials | None:
-    """Return the credentials for gRPC over TLS; None without a certificate."""
-    if settings.tls_cert is None or settings.tls_key is None:
+def _version_of(files: tuple[Path, Path]) -> object:
+    return tuple(_stamp_of(path) for path in files)
+
+
+def _stamp_of(path: Path) -> tuple[int, ...] | None:
+    try:
+        stat = path.stat()
+    except OSError:
         return None
-    pair = (settings.tls_key.read_bytes(), settings.tls_cert.read_bytes())
-    return grpc.ssl_server_credentials([pair])
+    return stat.st_mtime_ns, stat.st_size, stat.st_ino
+
+
+def _end_of(certificate: bytes) -> float:
+    """Return when a certificate expires, seconds since 1970.
+
+    Python's own ``ssl`` tells this only of certificates that it trusts (RFC 5280, section 4.1).
+
+    Args:
+        certificate: DER.
+    """
+    _, body, _ = _element(certificate)
+    _, fields, _ = _element(body)
+    if fields[0] == _VERSION:
+        _, _, fields = _element(fields)
+    for _ in ("serial number", "signature algorithm", "issuer"):
+        _, _, fields = _element(fields)
+    _, validity, _ = _element(fields)
+    _, _, not_after = _element(validity)
+    tag, text, _ = _element(not_after)
+    year = "%y" if tag == _UTC_TIME else "%Y"
+    moment = datetime.strptime(text.decode("ascii"), f"{year}%m%d%H%M%SZ")
+    return moment.replace(tzinfo=UTC).timestamp()
+
+
+def _element(data: bytes) -> tuple[int, bytes, bytes]:
+    """Return the tag and the content of the first element of DER, and what follows it."""
+    length, start = data[1], 2
+    if length & 0x80:
+        start += length & 0x7F
+        length = int.from_bytes(data[2:start], "big")
+    return data[0], data[start : start + length], data[start + length :]

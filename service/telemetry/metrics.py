@@ -48,6 +48,7 @@ class ServiceState:
         worker_pids: of the worker processes alive.
         loaded_maps: bytes of each map that is open in a worker, by (id, version).
         unusable_maps: the error code of each map that exists and cannot be served, by id.
+        certificate_ends: when the TLS certificate expires, seconds since 1970; None without TLS.
         folders: on disks that may fill up, by purpose: ``maps``, ``cache``.
     """
 
@@ -68,6 +69,7 @@ class ServiceState:
     worker_pids: tuple[int, ...] = ()
     loaded_maps: Mapping[tuple[str, str], int] = field(default_factory=dict)
     unusable_maps: Mapping[str, str] = field(default_factory=dict)
+    certificate_ends: float | None = None
     folders: Mapping[str, Path] = field(default_factory=dict)
 
 
@@ -245,6 +247,12 @@ def _gauges_of(state: ServiceState) -> Iterator[Metric]:
         resident_memory(state.worker_pids),
         *("process", "kind"),
     )
+    if state.certificate_ends is not None:
+        yield _gauge(
+            "certificate_ends_timestamp_seconds",
+            "When the TLS certificate in use expires, seconds since 1970.",
+            {(): state.certificate_ends},
+        )
     limit = memory_limit()
     if limit is not None:
         yield _gauge("memory_limit_bytes", "Memory of the container or machine.", {(): limit})

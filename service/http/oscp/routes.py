@@ -14,7 +14,7 @@ from starlette.responses import Response
 from service.api.answers import geoposes_to_words
 from service.api.deadlines import within
 from service.api.oscp import GeoPoseAccuracy, GeoPoseRequest, GeoPoseResponse, GeoPoseStatus
-from service.http.backend import Backend, backend_of, timeout_s_of
+from service.http.backend import Backend, backend_of, limit_of
 from service.http.bodies import checked_media_type
 from service.http.openapi.app import problems
 from service.http.oscp.examples import GEOPOSE_BODY, GEOPOSE_RESPONSES
@@ -68,11 +68,11 @@ async def geopose(request: Request) -> Response:
         backend.observer.error(error)
         return problem_response(error, request.state.request_id, HTTPStatus.NOT_ACCEPTABLE)
     checked_media_type(request, _READ)
-    timeout_s = timeout_s_of(request)
+    limit = limit_of(request)
     backend.engine.check_room()
     async with backend.arrivals.body(request, backend.settings.max_batch_bytes) as body:
         asked, job = await asyncio.to_thread(_read, body, backend.settings)
-    async with within(timeout_s):
+    async with within(limit):
         work = _answer(backend, asked, job, request.state.request_id)
         answer = await while_connected(request.receive, work)
     if kind.partition(";")[0] == OGC:

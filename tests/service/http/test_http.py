@@ -423,7 +423,7 @@ def test_the_work_for_a_client_that_hung_up_is_given_up(
 def test_a_caller_says_how_long_it_waits(doors: Any, query: Any, given_up: threading.Event) -> None:
     response = post(doors, query.image, headers={"X-Request-Timeout": "0.2"})
 
-    body = problem(response, 504, "server.deadline")
+    body = problem(response, 504, "request.deadline")
     assert (body["kind"], body["expected"]) == ("TimedOut", "an answer within 0.2 s")
     assert given_up.wait(10)
 

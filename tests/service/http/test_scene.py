@@ -286,7 +286,7 @@ def test_an_order_that_takes_too_long_is_there_the_next_time(
     monkeypatch.setattr(service.engine.scenes, "detail_order", slow)
     with serve(maps_dir, load=False) as doors:
         late = doors.http.get("/maps/room/points", headers={"X-Request-Timeout": "0.2"})
-        problem(late, 504, "server.deadline")
+        problem(late, 504, "request.deadline")
         enough.set()
         assert doors.http.get("/maps/room/points").status_code == 200
 

@@ -27,7 +27,7 @@ from cryptography.hazmat.primitives.serialization import (
 from clients import AsyncClient, Client
 from service.security.access import ANY_KEY, needed_over_http
 from service.security.key_file import Scope, edited_keys, new_key
-from service.security.tls import check_tls, grpc_credentials, tls_config
+from service.security.tls import Certificate, open_certificate
 from service.server import Server
 from service.settings import ServiceSettings, SettingsError
 from service.telemetry.logs import TextFormatter
@@ -35,12 +35,23 @@ from visloc.errors import Forbidden, NotFound, Unauthenticated, Unavailable
 
 
 def make_certificate(
-    folder: Path, name: str = "server", encryption: KeySerializationEncryption | None = None
+    folder: Path,
+    name: str = "server",
+    encryption: KeySerializationEncryption | None = None,
+    *,
+    host: str = "localhost",
+    days: tuple[float, float] = (-1, 1),
 ) -> tuple[Path, Path]:
-    """Write a certificate of 127.0.0.1 and localhost, and its key."""
+    """Write a certificate of a host, for localhost of 127.0.0.1 too, and its key.
+
+    Args:
+        days: from now, between which it is valid.
+    """
     key = ec.generate_private_key(ec.SECP256R1())
-    subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "localhost")])
-    names = [x509.DNSName("localhost"), x509.IPAddress(ip_address("127.0.0.1"))]
+    subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, host)])
+    names: list[x509.GeneralName] = [x509.DNSName(host)]
+    if host == "localhost":
+        names.append(x509.IPAddress(ip_address("127.0.0.1")))
     now = datetime.now(UTC)
     certificate = (
         x509.CertificateBuilder()
@@ -48,8 +59,8 @@ def make_certificate(
         .issuer_name(subject)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - timedelta(days=1))
-        .not_valid_after(now + timedelta(days=1))
+        .not_valid_before(now + timedelta(days=days[0]))
+        .not_valid_after(now + timedelta(days=days[1]))
         .add_extension(x509.SubjectAlternativeName(names), critical=False)
         .add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=True)
         .sign(key, hashes.SHA256())
@@ -67,33 +78,33 @@ def settings(certificate: Path | None, key: Path | None) -> ServiceSettings:
 
 
 def test_without_a_certificate_nothing_is_encrypted() -> None:
-    check_tls(settings(None, None))
-    assert tls_config(settings(None, None)) == {}
-    assert grpc_credentials(settings(None, None)) is None
+    assert open_certificate(settings(None, None)) is None
 
 
 def test_a_certificate_with_its_key_is_used(tmp_path: Path) -> None:
     certificate, key = make_certificate(tmp_path)
-    given = settings(certificate, key)
 
-    check_tls(given)
-    assert tls_config(given) == {"ssl_certfile": str(certificate), "ssl_keyfile": str(key)}
-    assert grpc_credentials(given) is not None
+    opened = open_certificate(settings(certificate, key))
+
+    assert opened is not None
+    parsed = x509.load_pem_x509_certificate(certificate.read_bytes())
+    assert opened.ends == parsed.not_valid_after_utc.timestamp()
+    assert opened.context.minimum_version >= ssl.TLSVersion.TLSv1_2
 
 
 def test_one_without_the_other_is_refused_by_name(tmp_path: Path) -> None:
     certificate, key = make_certificate(tmp_path)
     with pytest.raises(SettingsError, match=r"^tls_key: tls_cert was given without it"):
-        check_tls(settings(certificate, None))
+        open_certificate(settings(certificate, None))
     with pytest.raises(SettingsError, match=r"^tls_cert: tls_key was given without it"):
-        check_tls(settings(None, key))
+        open_certificate(settings(None, key))
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
     certificate, key = make_certificate(tmp_path)
     key.unlink()
     with pytest.raises(SettingsError, match=r"^tls_key: .*server\.key cannot be read: No such"):
-        check_tls(settings(certificate, key))
+        open_certificate(settings(certificate, key))
 
 
 def test_files_that_are_no_pair_are_refused(tmp_path: Path) -> None:
@@ -103,17 +114,56 @@ def test_files_that_are_no_pair_are_refused(tmp_path: Path) -> None:
     garbage.write_bytes(b"\x00garbage")
     for pair in ((certificate, other_key), (certificate, garbage), (key, certificate)):
         with pytest.raises(SettingsError, match=r"^tls_cert, tls_key: .* are not a certificate"):
-            check_tls(settings(*pair))
+            open_certificate(settings(*pair))
 
 
 def test_a_key_with_a_password_is_refused_and_asks_nobody(tmp_path: Path) -> None:
     encryption = BestAvailableEncryption(b"secret")
     with pytest.raises(SettingsError, match="not encrypted"):
-        check_tls(settings(*make_certificate(tmp_path, encryption=encryption)))
+        open_certificate(settings(*make_certificate(tmp_path, encryption=encryption)))
 
 
-def test_old_versions_of_tls_are_not_spoken() -> None:
-    assert ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).minimum_version >= ssl.TLSVersion.TLSv1_2
+@pytest.mark.parametrize("years", [10, 40])
+def test_the_end_of_a_chain_is_that_of_its_first_certificate_to_end(
+    tmp_path: Path, years: int
+) -> None:
+    """After 2049, certificates write times in another way."""
+    certificate, key = make_certificate(tmp_path, days=(-1, 365 * years))
+    assert Certificate(certificate, key).ends > time.time() + 86_400 * 364 * years
+
+    above, _ = make_certificate(tmp_path, "above", days=(-1, 5))
+    certificate.write_bytes(certificate.read_bytes() + above.read_bytes())
+    assert Certificate(certificate, key).ends < time.time() + 86_400 * 6
+
+
+def replace(certificate: tuple[Path, Path], by: tuple[Path, Path]) -> None:
+    for old, new in zip(certificate, by, strict=True):
+        new.replace(old)
+
+
+def test_half_a_renewal_keeps_the_old_pair_and_is_logged_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    files = make_certificate(tmp_path)
+    opened = Certificate(*files)
+    old = opened.context
+    certificate, key = make_certificate(tmp_path, "new", days=(-1, 90))
+
+    certificate.replace(files[0])
+    assert opened.context is opened.context is old
+    assert caplog.text.count("the certificate was not reloaded") == 1
+    files[1].unlink()
+    assert opened.context is old
+    key.replace(files[1])
+    assert opened.context is not old
+    assert opened.ends > time.time() + 86_400 * 80
+
+
+def test_an_expired_certificate_is_logged_at_the_start(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    Certificate(*make_certificate(tmp_path, days=(-3, -1)))
+    assert "has expired" in caplog.text
 
 
 # The service itself, with a certificate and keys, asked by its own clients
@@ -222,6 +272,58 @@ def test_a_server_that_the_client_does_not_trust_gets_no_key(
     ):
         client.maps()
     assert caught.value.code == "server.unreachable"
+
+
+@pytest.mark.parametrize("door", ["http", "grpc"])
+@pytest.mark.parametrize(
+    "made", [{"days": (-3, -1)}, {"days": (1, 3)}, {"host": "maps.example.org"}], ids=str
+)
+def test_clients_send_no_key_to_a_certificate_that_is_not_valid_for_it(
+    made: dict[str, Any], door: str, tmp_path: Path, serve: Callable[..., Any]
+) -> None:
+    """Expired, not yet valid, or of another host; signed by an authority that the client trusts."""
+    certificate, private_key = make_certificate(tmp_path, **made)
+    (tmp_path / "maps").mkdir()
+    files = {"tls_cert": certificate, "tls_key": private_key}
+    with serve(tmp_path / "maps", load=False, **files) as doors:
+        urls = {
+            "http": f"https://127.0.0.1:{doors.server.http_port}",
+            "grpc": f"grpcs://localhost:{doors.server.grpc_port}",
+        }
+        with (
+            Client(urls[door], api_key="k", ca=certificate, timeout_s=5) as client,
+            pytest.raises(Unavailable) as caught,
+        ):
+            client.maps()
+    assert caught.value.code == "server.unreachable"
+
+
+@pytest.mark.parametrize("door", ["http", "grpc"])
+def test_a_renewed_certificate_is_taken_over_and_open_connections_go_on(
+    door: str, tmp_path: Path, serve: Callable[..., Any]
+) -> None:
+    files = make_certificate(tmp_path)
+    old_ca, new_ca = tmp_path / "old-ca.pem", tmp_path / "new-ca.pem"
+    old_ca.write_bytes(files[0].read_bytes())
+    (tmp_path / "maps").mkdir()
+    with serve(tmp_path / "maps", load=False, tls_cert=files[0], tls_key=files[1]) as doors:
+        url = {
+            "http": f"https://127.0.0.1:{doors.server.http_port}",
+            "grpc": f"grpcs://localhost:{doors.server.grpc_port}",
+        }[door]
+        with Client(url, ca=old_ca, timeout_s=20) as connected:
+            assert connected.maps() == []
+            renewed = make_certificate(tmp_path, "new", days=(-1, 90))
+            new_ca.write_bytes(renewed[0].read_bytes())
+            replace(files, renewed)
+            with Client(url, ca=new_ca, timeout_s=20) as client:
+                assert client.maps() == []
+            with Client(url, ca=old_ca, timeout_s=5) as late, pytest.raises(Unavailable):
+                late.maps()
+            assert connected.maps() == []
+        ends = doors.server.state().certificate_ends
+    assert ends is not None
+    assert ends > time.time() + 86_400 * 80
 
 
 def test_without_tls_nothing_is_answered(guarded: Guarded) -> None:

@@ -32,6 +32,8 @@ FOREIGN = {
 # What Prometheus adds to everything that it scrapes.
 SCRAPED = {"job", "instance"}
 KEYWORDS = {"group_left", "and", "or", "unless"}
+# Requests in which the service has no part, as alerts and dashboard leave them out.
+PROBES = "GET /(healthz|readyz|metrics)"
 
 
 def known_series() -> dict[str, set[str]]:
@@ -47,6 +49,7 @@ def known_series() -> dict[str, set[str]]:
         worker_pids=(os.getpid(),),
         loaded_maps={("hall", "1"): 1},
         unusable_maps={"yard": "map.array"},
+        certificate_ends=2e9,
         folders={"maps": ROOT},
     )
     series: dict[str, set[str]] = {}
@@ -120,6 +123,20 @@ def test_expressions_name_kinds_codes_and_outcomes_that_exist() -> None:
         assert matchers.get("localized", "true") in ("true", "false")
 
 
+def test_every_share_of_requests_leaves_out_probes() -> None:
+    shares = [
+        (name, matchers)
+        for _, text in expressions()
+        if "/" in re.sub(r'"[^"]*"', "", text)
+        for name, matchers in selectors(text)
+        if name == "visloc_requests_total"
+    ]
+
+    assert len(shares) >= 4
+    for _, matchers in shares:
+        assert matchers["route"] == PROBES
+
+
 def test_the_check_notices_what_does_not_exist() -> None:
     (found,) = selectors('histogram_quantile(0.9, sum by (le) (rate(visloc_no{a="b"}[5m]))) > 5e9')
 
@@ -168,7 +185,8 @@ def test_panels_have_a_unit_a_description_and_do_not_overlap() -> None:
             assert panel["description"].endswith(".")
         if panel["type"] in ("stat", "timeseries"):
             assert panel["fieldConfig"]["defaults"]["unit"]
-    assert len({panel["id"] for panel in panels()}) == len(panels())
+    for name in ("id", "title"):
+        assert len({panel[name] for panel in panels()}) == len(panels())
 
 
 def test_the_dashboard_asks_the_data_source_that_is_provisioned() -> None:
@@ -178,7 +196,12 @@ def test_the_dashboard_asks_the_data_source_that_is_provisioned() -> None:
     assert set(re.findall(r'"uid": "(\w+)"', DASHBOARD.read_text())) == {source["uid"], "visloc"}
 
 
-@pytest.mark.skipif(shutil.which("promtool") is None, reason="needs promtool of Prometheus")
+needs_promtool = pytest.mark.skipif(
+    shutil.which("promtool") is None, reason="needs promtool of Prometheus"
+)
+
+
+@needs_promtool
 @pytest.mark.parametrize("command", [["config", "prometheus.yml"], ["rules", "alerts.yml"]])
 def test_prometheus_takes_its_files(command: list[str]) -> None:
     done = subprocess.run(
@@ -187,7 +210,7 @@ def test_prometheus_takes_its_files(command: list[str]) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.skipif(shutil.which("promtool") is None, reason="needs promtool of Prometheus")
+@needs_promtool
 def test_prometheus_parses_every_expression(tmp_path: Path) -> None:
     rules = [
         {"record": f"a{n}", "expr": re.sub(r"\$__rate_interval", "1m", text)}
@@ -204,7 +227,7 @@ def test_prometheus_parses_every_expression(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.skipif(shutil.which("promtool") is None, reason="needs promtool of Prometheus")
+@needs_promtool
 def test_alerts_fire_when_they_should_and_not_before() -> None:
     cases = Path(__file__).with_name("alerts_test.yml")
     done = subprocess.run(
