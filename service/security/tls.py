@@ -76,7 +76,11 @@ class Certificate:
             sent = pair
             return _for_grpc(pair)
 
-        return grpc.dynamic_ssl_server_credentials(_for_grpc(sent), changed)
+        # Its stubs forget that None means: as before.
+        return grpc.dynamic_ssl_server_credentials(
+            _for_grpc(sent),
+            changed,  # type: ignore[arg-type]
+        )
 
     def _now(self) -> _Pair:
         version = _version_of(self._files)
