@@ -88,6 +88,9 @@ class ServiceSettings(BaseModel):
     """PEM file of the certificate's private key"""
     cors_origins: Names = ()
     """comma-separated origins of other web pages that may call the HTTP API; none by default"""
+    trusted_proxies: Names = ()
+    """comma-separated addresses or networks of proxies; the log takes the address of their callers
+    from X-Forwarded-For"""
     page: bool = True
     """whether to serve the web page at /, which shows maps and localizes photos; its files need no
     key"""

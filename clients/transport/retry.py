@@ -16,9 +16,8 @@ from clients.wire.requests import (
     StartSequence,
     UseVersion,
 )
+from visloc_api.words.wire import MAP_HEADER
 
-# Header of HTTP and metadata of gRPC. A balancer that routes by it finds the map already open.
-MAP_HEADER = "x-visloc-map"
 # Before a request is sent a second time. Never a third: it may have ended both servers.
 RESEND_PAUSE_S = 0.1
 # gRPC retries by itself. Its servers answer INTERNAL when a request must not be sent again.

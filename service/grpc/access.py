@@ -19,6 +19,7 @@ from service.security.access import (
     tokens_of,
 )
 from service.security.key_file import Key
+from service.security.proxies import FORWARDED_HEADER, address_of_grpc
 from service.telemetry.logs import UNMATCHED
 from visloc.errors import Overloaded, VislocError, refuse
 
@@ -75,14 +76,14 @@ class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
                 busy = refuse(
                     "server.busy", "there are too many calls without an API key; try again shortly"
                 )
-                await self._envelope.refuse(_name(method), busy, context)
+                await self._refuse(method, busy, context)
             self._keyless += 1
             try:
                 async with asyncio.timeout(_KEYLESS_S):
                     return await behaviour(messages, context)
             except TimeoutError:
                 over = refuse("request.deadline", "watching ends after a while; call again")
-                await self._envelope.refuse(_name(method), over, context)
+                await self._refuse(method, over, context)
             finally:
                 self._keyless -= 1
 
@@ -96,7 +97,7 @@ class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
                 try:
                     stack.enter_context(self._access.place(key))
                 except Overloaded as error:
-                    await self._envelope.refuse(_name(method), error, context)
+                    await self._refuse(method, error, context)
                 return await behaviour(messages, context)
 
         return handler_like(handler, serve)
@@ -104,10 +105,19 @@ class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
     def _refusal(self, error: VislocError, method: str) -> Handler:
         async def refuse(messages: AsyncIterator[Any], context: Context) -> None:
             del messages  # not read
-            await self._envelope.refuse(_name(method), error, context)
+            await self._refuse(method, error, context)
 
         made: Handler = grpc.stream_stream_rpc_method_handler(refuse)
         return made
+
+    async def _refuse(self, method: str, error: VislocError, context: Context) -> None:
+        forwarded = [
+            value
+            for name, value in context.invocation_metadata() or ()
+            if name == FORWARDED_HEADER and isinstance(value, str)
+        ]
+        caller = self._access.caller(address_of_grpc(context.peer()), forwarded)
+        await self._envelope.refuse(_name(method), error, context, caller=caller)
 
 
 def _name(method: str) -> str:

@@ -75,11 +75,17 @@ class Envelope:
                 logger.exception("request %s failed unexpectedly", id_)
                 await self._refuse(internal_error(), id_, context, record)
 
-    async def refuse(self, method: str, error: VislocError, context: Context) -> None:
-        """Answer a call with an error before its method runs."""
+    async def refuse(
+        self, method: str, error: VislocError, context: Context, *, caller: str | None = None
+    ) -> None:
+        """Answer a call with an error before its method runs.
+
+        Args:
+            caller: its address, for the log.
+        """
         id_ = request_id(None)
         with self._observer.request("grpc", id_, route=method) as record:
-            record.peer = context.peer()
+            record.peer = caller
             await self._refuse(error, id_, context, record)
 
     async def _refuse(

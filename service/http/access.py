@@ -9,6 +9,7 @@ from starlette.applications import Starlette
 from starlette.datastructures import Headers
 from starlette.middleware.cors import CORSMiddleware
 from starlette.responses import Response
+from starlette.routing import Match
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.http.responses import problem_response
@@ -16,6 +17,7 @@ from service.security.access import Access, needed_over_http, tokens_of
 from service.security.key_file import Key
 from service.telemetry.observer import Observer
 from visloc.errors import VislocError
+from visloc_api.words.wire import MAP_HEADER, TIMEOUT_HEADER
 
 
 def add_access(app: Starlette, access: Access, observer: Observer, *, page: bool = False) -> None:
@@ -35,7 +37,7 @@ def add_access(app: Starlette, access: Access, observer: Observer, *, page: bool
             allow_origins=sorted(access.origins),
             allow_methods=["GET", "POST", "PUT", "DELETE"],
             allow_headers=[
-                *("Authorization", "X-API-Key", "X-Request-ID", "X-Request-Timeout"),
+                *("Authorization", "X-API-Key", "X-Request-ID", TIMEOUT_HEADER, MAP_HEADER),
                 "traceparent",
             ],
             expose_headers=["Location", "Retry-After", "X-Request-ID"],
@@ -67,6 +69,7 @@ class AccessControl:
                 stack.enter_context(self._access.place(key))
             except VislocError as error:
                 self._observer.error(error)
+                _note_route(scope)
                 response = self._refusal(error, scope["state"]["request_id"], key)
                 await response(scope, receive, send)
                 return
@@ -79,3 +82,11 @@ class AccessControl:
         if response.status_code == HTTPStatus.TOO_MANY_REQUESTS:
             response.headers["Retry-After"] = str(self._access.wait_s(key))
         return response
+
+
+def _note_route(scope: Scope) -> None:
+    """Note for the log which route a refused request was for: the app does not get to see it."""
+    for route in scope["app"].routes:
+        if route.matches(scope)[0] is Match.FULL:
+            scope["route"] = route
+            return

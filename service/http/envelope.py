@@ -14,6 +14,7 @@ from service.api.request_ids import request_id
 from service.errors import internal_error, stopping_error
 from service.http.backend import Backend
 from service.http.responses import problem_response
+from service.security.proxies import FORWARDED_HEADER
 from service.telemetry.logs import UNMATCHED, RequestRecord
 from service.telemetry.tracing import traceparent_of
 from visloc.errors import VislocError, refuse
@@ -33,6 +34,7 @@ class RequestEnvelope:
         self._engine = backend.engine
         self._observer = backend.observer
         self._connections = backend.connections
+        self._access = backend.access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -42,7 +44,8 @@ class RequestEnvelope:
         id_ = request_id(headers.get("x-request-id"))
         scope.setdefault("state", {})["request_id"] = id_
         with self._observer.request("http", id_, traceparent=headers.get("traceparent")) as record:
-            record.peer = scope["client"][0] if scope.get("client") else None
+            peer = scope["client"][0] if scope.get("client") else None
+            record.peer = self._access.caller(peer, headers.getlist(FORWARDED_HEADER))
 
             async def send_with_id(message: Message) -> None:
                 if message["type"] == "http.response.start":

@@ -12,6 +12,7 @@ from time import monotonic
 
 from service.security.key_file import Key, Scope
 from service.security.key_ring import KeyRing
+from service.security.proxies import Networks, caller_of, networks_of
 from service.settings import ServiceSettings, SettingsError
 from service.telemetry.logs import note_key
 from visloc.errors import InvalidInput, refuse
@@ -117,6 +118,7 @@ class Access:
     Args:
         ring: the keys; without keys, everyone on this machine may do everything.
         origins: of the web pages that may call; ``*`` for all, only with keys.
+        proxies: tell in ``X-Forwarded-For`` whom they forward.
         now: a clock, seconds.
     """
 
@@ -125,12 +127,18 @@ class Access:
         ring: KeyRing | None,
         origins: Collection[str] = (),
         *,
+        proxies: Networks = (),
         now: Callable[[], float] = monotonic,
     ) -> None:
         self._ring = ring
         self.origins = frozenset(origins)
+        self._proxies = proxies
         self._now = now
         self._uses: dict[str, _Use] = {}
+
+    def caller(self, peer: str | None, forwarded: Iterable[str]) -> str | None:
+        """Return the address of a caller for the log; see ``caller_of``."""
+        return caller_of(peer, forwarded, self._proxies)
 
     def check_page(self, scheme: str, host: str, origins: Collection[str]) -> None:
         """Refuse requests that a foreign web page makes a browser on this machine send.
@@ -240,9 +248,11 @@ def open_access(settings: ServiceSettings) -> Access:
             raise SettingsError(
                 f"cors_origins: {origin!r} is no origin such as https://maps.example.org"
             )
+    proxies = networks_of(settings.trusted_proxies)
     if settings.keys_file is not None:
         try:
-            return Access(KeyRing(settings.keys_file), settings.cors_origins)
+            ring = KeyRing(settings.keys_file)
+            return Access(ring, settings.cors_origins, proxies=proxies)
         except InvalidInput as error:
             raise SettingsError(f"keys_file: {error}") from None
     if not is_loopback(settings.host):
@@ -250,7 +260,7 @@ def open_access(settings: ServiceSettings) -> Access:
             f"keys_file: needed, because others can reach host {settings.host!r}; make one with "
             "`python -m service.keys init`, or listen on 127.0.0.1 only"
         )
-    return Access(None, settings.cors_origins)
+    return Access(None, settings.cors_origins, proxies=proxies)
 
 
 def is_loopback(host: str) -> bool:

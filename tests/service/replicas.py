@@ -69,9 +69,18 @@ def wait_until(is_so: Callable[[], bool]) -> None:
 
 @contextmanager
 def balanced(
-    maps_dirs: Sequence[Path | str], work: Path, environment: Mapping[str, str] | None = None
+    maps_dirs: Sequence[Path | str],
+    work: Path,
+    environment: Mapping[str, str] | None = None,
+    **settings: object,
 ) -> Iterator[Balanced]:
-    """Run a replica for each folder or URL of maps, and a balancer before them."""
+    """Run a replica for each folder or URL of maps, and a balancer before them.
+
+    Callers find it at 127.0.0.1, and at ``[::1]`` too.
+
+    Args:
+        settings: further settings of the replicas, by name.
+    """
     ports = free_port(), free_port()
     addresses = [f"127.0.0.{number}" for number in range(1, len(maps_dirs) + 1)]
     with ExitStack() as stack:
@@ -85,6 +94,7 @@ def balanced(
                 environment=environment,
                 cache_dir=work / f"cache-{address}",
                 drain_delay_s=3,
+                **settings,
             )
             replica.start()
             stack.callback(replica.stop)
@@ -96,8 +106,8 @@ def balanced(
             ["haproxy", "-db", "-f", str(CONFIG)],
             env={
                 "PATH": os.environ["PATH"],
-                "HTTP_BIND": f"127.0.0.1:{http}",
-                "GRPC_BIND": f"127.0.0.1:{grpc}",
+                "HTTP_BIND": f"127.0.0.1:{http},[::1]:{http}",
+                "GRPC_BIND": f"127.0.0.1:{grpc},[::1]:{grpc}",
                 "STATUS_BIND": f"127.0.0.1:{status}",
                 "REPLICAS": NAME,
                 "MAX_REPLICAS": str(len(addresses)),

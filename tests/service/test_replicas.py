@@ -19,6 +19,7 @@ from moto.server import ThreadedMotoServer
 
 from benchmarks.reliability.service_process import READY_WITHIN_S, ServiceProcess
 from clients import Client
+from service.security.key_file import Scope, edited_keys, new_key
 from tests.conftest import Query
 from tests.service.replicas import Balanced, balanced, wait_until
 from visloc.archive import MapStore
@@ -283,3 +284,32 @@ def test_without_a_replica_callers_are_told(both: Balanced, query: Query) -> Non
     for url in (both.http, both.grpc):
         with Client(url) as client, pytest.raises(Unavailable):
             client.localize(query.image, "room", query.camera)
+
+
+def test_the_log_of_a_replica_names_the_caller_of_the_balancer(tmp_path: Path) -> None:
+    """The balancer, at 127.0.0.1, is trusted; what callers say of themselves is not."""
+    (tmp_path / "maps").mkdir()
+    with edited_keys(tmp_path / "keys.json") as keys:
+        key, token = new_key("phones", frozenset({Scope.LOCALIZE}))
+        keys.append(key)
+    settings = {"keys_file": tmp_path / "keys.json", "trusted_proxies": "127.0.0.1"}
+    sent = {"authorization": f"Bearer {token}", "x-forwarded-for": "198.51.100.1"}
+    with balanced([tmp_path / "maps"], tmp_path, **settings) as one:
+        http, target = (url.replace("127.0.0.1", "[::1]") for url in (one.http, one.grpc))
+        assert httpx.get(f"{http}/maps", headers=sent).status_code == 403
+        with grpc.insecure_channel(target.removeprefix("grpc://")) as channel:
+            with pytest.raises(grpc.RpcError) as refused:
+                LocalizationStub(channel).ListMaps(
+                    pb2.ListMapsRequest(), metadata=tuple(sent.items())
+                )
+            assert refused.value.code() is grpc.StatusCode.PERMISSION_DENIED
+        # Past the balancer, from an address that is no proxy's.
+        with httpx.Client(transport=httpx.HTTPTransport(local_address="127.0.0.9")) as direct:
+            assert direct.get(f"{one.replicas[0].url}/maps", headers=sent).status_code == 403
+        log = one.replicas[0].log
+        wait_until(lambda: log.read_text().count("access.scope") == 3)
+        lines = [json.loads(line) for line in log.read_text().splitlines()]
+    refusals = [line for line in lines if line.get("code") == "access.scope"]
+    assert [line["peer"] for line in refusals] == ["::1", "::1", "127.0.0.9"]
+    assert [line["route"] for line in refusals] == ["GET /maps", "ListMaps", "GET /maps"]
+    assert {line["key"] for line in refusals} == {"phones"}

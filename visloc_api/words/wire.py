@@ -13,6 +13,8 @@ REQUEST_ID_HEADER = "X-Request-ID"
 REQUEST_ID = re.compile(r"[\x21-\x7e]{1,128}")
 # How many seconds an HTTP caller waits; gRPC has deadlines.
 TIMEOUT_HEADER = "X-Request-Timeout"
+# Metadata of gRPC too. A balancer that routes by it finds the map already open.
+MAP_HEADER = "x-visloc-map"
 NDJSON = "application/x-ndjson"
 # The server's version goes with every answer over gRPC, as a header.
 VERSION_KEY = "visloc-version"

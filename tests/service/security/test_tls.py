@@ -6,6 +6,7 @@ import logging
 import ssl
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
@@ -238,26 +239,63 @@ def test_the_server_says_over_both_doors_why_it_refuses(guarded: Guarded, door: 
             client.map_version("room", "1")
 
 
-@pytest.mark.parametrize("door", ["http", "grpc"])
-def test_the_log_names_the_key_that_was_refused(guarded: Guarded, door: str) -> None:
+@contextmanager
+def access_log() -> Iterator[Callable[..., str]]:
+    """The access log; the function waits for a line with these facts, and returns it."""
     log, written = logging.getLogger("service.access"), io.StringIO()
     handler = logging.StreamHandler(written)
     handler.setFormatter(TextFormatter())
     log.addHandler(handler)
     level = log.level
     log.setLevel(logging.INFO)
-    try:
-        with guarded.client(door, Scope.LOCALIZE) as client, pytest.raises(Forbidden):
-            client.maps()
+
+    def line_with(*facts: str) -> str:
         deadline = time.monotonic() + 20
-        while "code=access.scope" not in written.getvalue() and time.monotonic() < deadline:
+        while True:
+            for line in written.getvalue().splitlines():
+                if all(fact in line for fact in facts):
+                    return line
+            assert time.monotonic() < deadline, written.getvalue()
             time.sleep(0.01)  # the caller is answered first
+
+    try:
+        yield line_with
     finally:
         log.removeHandler(handler)
         log.setLevel(level)
-    (line,) = written.getvalue().splitlines()
+
+
+# Routes over HTTP, calls over gRPC, of what the client asks for.
+ROUTES = {"http": '"GET /maps/{ref}"', "grpc": "GetMap"}
+
+
+@pytest.mark.parametrize("door", ["http", "grpc"])
+def test_the_log_names_key_route_and_caller_of_a_refusal(guarded: Guarded, door: str) -> None:
+    with access_log() as line_with:
+        with guarded.client(door, Scope.LOCALIZE) as client, pytest.raises(Forbidden):
+            client.map("hall")
+        line = line_with(f"route={ROUTES[door]}", "key=localize")
     assert "code=access.scope" in line
-    assert "key=localize" in line
+    assert "peer=127.0.0.1" in line
+
+
+@pytest.mark.parametrize("door", ["http", "grpc"])
+def test_the_log_names_the_route_of_a_caller_without_a_key(guarded: Guarded, door: str) -> None:
+    url = getattr(guarded, door)
+    with access_log() as line_with:
+        with Client(url, ca=guarded.ca) as client, pytest.raises(Unauthenticated):
+            client.map("hall")
+        line = line_with(f"route={ROUTES[door]}", "code=access.key_missing")
+    assert "key=" not in line
+
+
+def test_what_is_no_route_has_no_name_in_the_log(guarded: Guarded) -> None:
+    context = ssl.create_default_context(cafile=guarded.ca)
+    for path, method in (("/admin/x", "GET"), ("/localize", "DELETE")):
+        with access_log() as line_with:
+            refused = httpx.request(method, guarded.http + path, verify=context)
+            assert line_with("route=unmatched", "status=401")
+        assert refused.status_code == 401
 
 
 @pytest.mark.parametrize("door", ["http", "grpc"])
