@@ -33,8 +33,8 @@ from service.values import WorkerSettings
 from visloc.archive import MapStore
 from visloc.options import Inference
 
-# When the server stops: the time in which requests that are already on their way over open
-# connections still get an answer, 503. After it, idle connections are closed.
+# When the server stops: the time in which requests that are already on their way, over open or new
+# connections, still get an answer, 503. After it, idle connections are closed.
 _LAST_WORDS_S = 0.3
 
 
@@ -223,8 +223,9 @@ class _HttpServer(uvicorn.Server):
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Accept no more connections, and return when all requests have ended."""
         del sockets
-        self._acceptor.close()
         await asyncio.sleep(_LAST_WORDS_S)
+        self._acceptor.close()
+        await asyncio.sleep(_LAST_WORDS_S)  # for the last ones that it accepted
         self._open.close_unopened()  # uvicorn does not know them yet
         await super().shutdown()
 

@@ -102,7 +102,8 @@ def test_what_is_rendered_is_what_kubernetes_takes(objects: Objects) -> None:
         kubernetes_validate.validate(each, kubernetes_validate.latest_version(), strict=True)
 
     assert {kind for kind, _ in objects} == {
-        *("ConfigMap", "Deployment", "HorizontalPodAutoscaler", "PodDisruptionBudget", "Service")
+        *("ConfigMap", "Deployment", "HorizontalPodAutoscaler", "NetworkPolicy"),
+        *("PodDisruptionBudget", "Service"),
     }
 
 
@@ -252,6 +253,31 @@ def test_the_autoscaler_asks_for_what_the_adapter_makes_of_real_metrics(objects:
     assert workers < int(metric["pods"]["target"]["averageValue"]) <= 4 * workers
     assert spec["minReplicas"] >= 2
     assert "replicas" not in objects["Deployment", "visloc"]["spec"]
+
+
+def may_come_from(objects: Objects, name: str) -> dict[str, list[dict[str, Any]] | None]:
+    """By port, who may reach a pod; None for everybody."""
+    policy = objects["NetworkPolicy", name]["spec"]
+    assert policy["podSelector"] == objects["Deployment", name]["spec"]["selector"]
+    assert policy["policyTypes"] == ["Ingress"]
+    return {port["port"]: rule.get("from") for rule in policy["ingress"] for port in rule["ports"]}
+
+
+def test_only_the_balancer_reaches_replicas_and_only_prometheus_the_metrics(
+    objects: Objects,
+) -> None:
+    monitoring = {
+        "namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": "monitoring"}}
+    }
+    balancer = {"podSelector": objects["Deployment", "visloc-balancer"]["spec"]["selector"]}
+
+    replicas, balancers = (may_come_from(objects, n) for n in ("visloc", "visloc-balancer"))
+    assert replicas == {"http": [balancer], "grpc": [balancer], "metrics": [monitoring]}
+    assert balancers == {"http": None, "grpc": None, "status": [monitoring]}
+    for name, ports in (("visloc", replicas), ("visloc-balancer", balancers)):
+        assert {port["name"] for port in container_of(objects, name)["ports"]} == ports.keys()
+    values = (KUBERNETES / "monitoring" / "adapter.yaml").read_text()
+    assert "prometheus-operated.monitoring.svc" in values  # the namespace of Prometheus
 
 
 def test_prometheus_is_shown_ports_that_are_there(objects: Objects) -> None:

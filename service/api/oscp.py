@@ -21,7 +21,12 @@ from visloc.geometry import Camera, Pose
 from visloc.options import LocalizeOptions
 from visloc.types import MAX_RADIUS_M, Near, RigSensor
 from visloc_api.words.geopose import GeoPose
-from visloc_api.words.message import MAX_INSTANT_VALUES, check_json_values, refusal_of
+from visloc_api.words.message import (
+    MAX_INSTANT_VALUES,
+    check_json_values,
+    check_names_once,
+    refusal_of,
+)
 
 # A device is searched for so far around a position at least: cities make fixes worse than they say.
 _MIN_RADIUS_M = 100.0
@@ -139,12 +144,15 @@ class GeoPoseRequest(_Read):
         """Check a request written as JSON.
 
         Raises:
-            InvalidInput: ``request.malformed``, ``request.missing_field``, ``request.invalid``.
+            InvalidInput: ``request.malformed``, ``request.missing_field``, ``request.invalid``,
+                ``request.duplicate_field``.
             TooLarge: ``request.too_large``.
         """
         check_json_values(text, MAX_INSTANT_VALUES)
         try:
-            body = json.loads(text, parse_constant=_refuse_constant)
+            body = json.loads(
+                text, parse_constant=_refuse_constant, object_pairs_hook=_object_of_fields
+            )
         except (ValueError, RecursionError):
             raise refuse("request.malformed", expected="JSON") from None
         body = _object(body, "")
@@ -419,6 +427,11 @@ def _finite(value: object) -> int | float | None:
         return None
     # Infinite, or a whole number that no clock shows.
     return value if abs(value) < 2**63 and np.isfinite(float(value)) else None
+
+
+def _object_of_fields(fields: list[tuple[str, Any]]) -> dict[str, Any]:
+    check_names_once(fields)
+    return dict(fields)
 
 
 def _refuse_constant(name: str) -> None:

@@ -17,9 +17,18 @@ from service.engine.sets import SetSearch, answers_of, parted
 from service.engine.uploads import Uploads
 from service.errors import stopping_error
 from service.telemetry.metrics import Metrics
-from service.values import InstantJob, Localization, RigJob, SequenceJob, ServedMap, WorkerSettings
+from service.values import (
+    InstantJob,
+    Localization,
+    MapFolder,
+    RigJob,
+    SequenceJob,
+    ServedMap,
+    WorkerSettings,
+)
 from service.workers.judging import gated, judged
 from service.workers.pool import Workers
+from service.workers.tasks import Vision
 from visloc.archive import MapStore
 from visloc.errors import VislocError, refuse
 from visloc.types import Near
@@ -88,7 +97,7 @@ class Engine:
         self._photos = 0
         self._max_batches = max_batches
         self._batches = 0
-        self._uploads = Uploads(store, max_upload_bytes)
+        self._uploads = Uploads(store, max_upload_bytes, self._try_out)
         self._following: asyncio.Task[None] | None = None
         self._started = False
         self._withdrawn = self._draining = False
@@ -271,11 +280,12 @@ class Engine:
         return await asyncio.to_thread(self._catalog.listing.describe, ref)
 
     async def upload(self, map_id: str, version: str, chunks: AsyncIterator[bytes]) -> ServedMap:
-        """Publish a packed map, verified byte by byte, without making it current.
+        """Publish a packed map, verified and tried, without making it current.
 
         Raises:
             VislocError: errors of ``Uploads.publish``.
         """
+        self._check_ready()
 
         async def counted() -> AsyncIterator[bytes]:
             async for chunk in chunks:
@@ -286,6 +296,9 @@ class Engine:
             await self._uploads.publish(map_id, version, counted())
         logger.info("map %s@%s was uploaded", map_id, version)
         return await self.map(f"{map_id}@{version}")
+
+    async def _try_out(self, version: MapFolder) -> None:
+        await self.workers.run(Vision.try_out, version)
 
     async def set_current(self, map_id: str, version: str) -> ServedMap:
         """Make a version current once a worker process has it open and warm.

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 from visloc.archive import MapStore
-
-logger = logging.getLogger(__name__)
 
 
 def open_store(maps_dir: str, cache_dir: Path, max_cache_bytes: int) -> MapStore:
@@ -24,8 +21,7 @@ def open_store(maps_dir: str, cache_dir: Path, max_cache_bytes: int) -> MapStore
         except (ImportError, ValueError) as error:  # a protocol that is not known or not installed
             raise ValueError(f"the URL cannot be used: {error}") from None
     folder = Path(maps_dir)
-    if not maps_dir or (folder.exists() and not folder.is_dir()):
-        raise ValueError(f"{maps_dir!r} is no folder")
-    if not folder.exists():
-        logger.warning("maps_dir: %s does not exist yet; the first map creates it", folder)
+    # One that is not there is misspelt, or not mounted: its service would be ready without maps.
+    if not maps_dir or not folder.is_dir():
+        raise ValueError(f"{maps_dir!r} is no folder; make it if it is to hold maps")
     return MapStore(folder)

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+import logging
+from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, asynccontextmanager
 from functools import partial
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
+from service.values import MapFolder
 from visloc.archive import MapStore
 from visloc.archive.packed import unpack_map
+from visloc.archive.set_rules import AnyManifest
+from visloc.archive.set_schema import SetManifest
 from visloc.archive.version_rules import checked_name
-from visloc.errors import InvalidInput, MapCorrupt, refuse
+from visloc.errors import Conflict, InvalidInput, MapCorrupt, WeightsError, refuse
+
+logger = logging.getLogger(__name__)
 
 # Uploads that are written or verified at once.
 MAX_UPLOADS = 4
@@ -25,10 +31,18 @@ T = TypeVar("T")
 
 
 class Uploads:
-    """Publishes uploaded maps of at most ``max_bytes``. Used from one event loop."""
+    """Publishes uploaded maps. Used from one event loop.
 
-    def __init__(self, store: MapStore, max_bytes: int) -> None:
-        self._store, self._max_bytes = store, max_bytes
+    Args:
+        store: the maps.
+        max_bytes: of a packed map, and of its files.
+        try_out: uses a verified version as a query does; raises if it cannot be used.
+    """
+
+    def __init__(
+        self, store: MapStore, max_bytes: int, try_out: Callable[[MapFolder], Awaitable[None]]
+    ) -> None:
+        self._store, self._max_bytes, self._try_out = store, max_bytes, try_out
         # Verifying gigabytes takes minutes; other work has threads of its own meanwhile.
         self._threads = ThreadPoolExecutor(MAX_UPLOADS, thread_name_prefix="upload")
         self._running: set[str] = set()
@@ -45,6 +59,7 @@ class Uploads:
             InvalidInput: ``map.id``, ``packed.*``, and errors of ``verify_map``.
             StorageFull: ``maps.storage_full``.
             Forbidden: ``maps.read_only``.
+            Unavailable: ``server.worker_died`` when trying the map ended the process.
         """
         ref = f"{checked_name(map_id, 'map')}@{checked_name(version, 'map version')}"
         if version in await asyncio.to_thread(self._store.versions, map_id):
@@ -60,7 +75,8 @@ class Uploads:
         try:
             async with self._incoming() as folder:
                 await self._write(folder / "packed", chunks)
-                await self._to_end(self._publish, folder, map_id, version)
+                loop = asyncio.get_running_loop()
+                await self._to_end(self._publish, folder, map_id, version, loop)
         finally:
             self._running.discard(ref)
 
@@ -98,10 +114,18 @@ class Uploads:
                     await flush()
             await flush()
 
-    def _publish(self, folder: Path, map_id: str, version: str) -> None:
-        """Unpack, verify and publish; in a thread."""
-        packed, target = folder / "packed", folder / "map"
+    def _publish(
+        self, folder: Path, map_id: str, version: str, loop: asyncio.AbstractEventLoop
+    ) -> None:
+        """Unpack, verify, try and publish; in a thread."""
+        packed, target = folder / "packed", folder / map_id / version
+
+        def accept(manifest: AnyManifest) -> None:
+            tried = MapFolder(f"{map_id}@{version}", target, isinstance(manifest, SetManifest))
+            asyncio.run_coroutine_threadsafe(self._tried(tried), loop).result()
+
         try:
+            target.parent.mkdir()
             manifest = unpack_map(packed, target, self._max_bytes)
             packed.unlink()
             if (manifest.id, manifest.version) != (map_id, version):
@@ -111,11 +135,18 @@ class Uploads:
                     expected=f"{manifest.id}@{manifest.version}",
                     got=f"{map_id}@{version}",
                 )
-            self._store.publish(target, map_id, version, make_current=False)
+            self._store.publish(target, map_id, version, make_current=False, accept=accept)
         except MapCorrupt as error:
             # Damaged before it arrived; and the caller must not learn the server's folders.
             field = None if error.field is None else error.field.removeprefix(f"{target}/")
             raise error.about(field, InvalidInput) from error
+
+    async def _tried(self, version: MapFolder) -> None:
+        """Raise when a version could never be used here."""
+        try:
+            await self._try_out(version)
+        except (Conflict, WeightsError) as error:  # other features than here: it is not damaged
+            logger.info("map %s cannot be used here yet: %s", version.ref, error)
 
     async def _to_end(self, work: Callable[P, T], *given: P.args, **named: P.kwargs) -> T:
         """Run in a thread, and wait for its end even if cancelled.

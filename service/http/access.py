@@ -44,6 +44,11 @@ def add_access(app: Starlette, access: Access, observer: Observer, *, page: bool
         )
 
 
+def tokens_in(headers: Headers) -> set[str]:
+    """Return the API keys that a request carries."""
+    return tokens_of(headers.getlist("authorization"), headers.getlist("x-api-key"))
+
+
 class AccessControl:
     """Admits or refuses a request before any of its body is read."""
 
@@ -63,7 +68,7 @@ class AccessControl:
             try:
                 host, origins = headers.get("host", ""), headers.getlist("origin")
                 self._access.check_page(scope["scheme"], host, origins)
-                tokens = tokens_of(headers.getlist("authorization"), headers.getlist("x-api-key"))
+                tokens = tokens_in(headers)
                 needed = needed_over_http(scope["method"], scope["path"], page=self._page)
                 key = self._access.key_of(tokens, needed)
                 stack.enter_context(self._access.place(key))

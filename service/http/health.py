@@ -10,8 +10,10 @@ from starlette.applications import Starlette
 from starlette.routing import Route
 
 import visloc
+from service.http.access import tokens_in
 from service.http.backend import Backend, backend_of
 from service.http.responses import json_response
+from service.security.access import READ
 from visloc_api.words.status import Health, MapNotLoaded, Readiness
 
 
@@ -39,14 +41,24 @@ async def healthz() -> Response:
 
 
 async def readyz(request: Request) -> Response:
-    """Tell whether maps and networks are warm: 200, or 503 while they are not."""
-    status = backend_of(request).engine.status
+    """Tell whether maps and networks are warm: 200, or 503 while they are not.
+
+    It needs no key, but names maps only to a key with the scope `read`.
+    """
+    backend = backend_of(request)
+    status = backend.engine.status
+    if not backend.access.may(tokens_in(request.headers), READ):
+        return _answer(Readiness(ready=status.ready, maps=[], not_loaded=[]))
     not_loaded = [
         MapNotLoaded(id=map_id, code=error.code, message=str(error))
         for map_id, error in status.not_loaded.items()
     ]
     readiness = Readiness(ready=status.ready, maps=list(status.maps), not_loaded=not_loaded)
-    return json_response(readiness, 200 if status.ready else 503)
+    return _answer(readiness)
+
+
+def _answer(readiness: Readiness) -> Response:
+    return json_response(readiness, 200 if readiness.ready else 503)
 
 
 async def metrics(request: Request) -> Response:

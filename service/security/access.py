@@ -15,7 +15,7 @@ from service.security.key_ring import KeyRing
 from service.security.proxies import Networks, caller_of, networks_of
 from service.settings import ServiceSettings, SettingsError
 from service.telemetry.logs import note_key
-from visloc.errors import InvalidInput, refuse
+from visloc.errors import Forbidden, InvalidInput, Unauthenticated, refuse
 from visloc_api.v1 import localization_pb2 as pb2
 
 # The scopes that the key of a request must have; None when it needs no key. Unknown paths and
@@ -23,6 +23,8 @@ from visloc_api.v1 import localization_pb2 as pb2
 Needed = frozenset[Scope] | None
 NOTHING: Needed = None
 ANY_KEY: Needed = frozenset()
+
+READ: Needed = frozenset({Scope.READ})
 
 _PUBLIC_PATHS = frozenset({"/healthz", "/readyz", "/openapi.json"})
 _READING_METHODS = frozenset({"GET", "HEAD"})
@@ -189,6 +191,14 @@ class Access:
                 got=f"one with {', '.join(sorted(key.scopes))}",
             )
         return key
+
+    def may(self, tokens: Collection[str], needed: Needed) -> bool:
+        """Tell whether a caller with these keys may have what needs a scope."""
+        try:
+            self.key_of(tokens, needed)
+        except (Unauthenticated, Forbidden):
+            return False
+        return True
 
     @contextmanager
     def place(self, key: Key | None) -> Iterator[None]:

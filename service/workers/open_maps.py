@@ -69,6 +69,10 @@ class OpenMaps:
             logger.info("map %s closed, to stay within max_loaded_bytes", ref)
         return found
 
+    def try_out(self, version: MapFolder) -> None:
+        """Open a map or a set, warm it up, and close it again; errors as in ``open``."""
+        self._open(version)
+
     def close(self, ref: str) -> None:
         self._opened.pop(ref, None)
 

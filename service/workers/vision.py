@@ -85,6 +85,10 @@ class Vision:
         """Open a map, or a set without its tiles; errors as in ``OpenMaps.open``."""
         self._maps.open(version)
 
+    def try_out(self, version: MapFolder) -> None:
+        """Use a version once and close it again; errors as in ``OpenMaps.open``."""
+        self._maps.try_out(version)
+
     def warm(self, maps: Sequence[MapFolder]) -> None:
         """Open maps; log those that cannot be used."""
         for version in maps:

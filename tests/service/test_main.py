@@ -49,6 +49,31 @@ def started(*arguments: str) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
+def test_who_comes_just_after_sigterm_is_told_that_the_server_stops(built_maps: Path) -> None:
+    """Until nobody listens any more, there is an answer to every request."""
+    arguments = ["--maps-dir", str(built_maps), "--http-port=0", "--grpc-port=0"]
+    with started(*arguments) as process:
+        assert process.stderr is not None
+        ready = next(found for line in process.stderr if (found := READY.search(line)))
+        url = f"http://127.0.0.1:{ready[1]}/localize"
+        told: list[str] = []
+
+        def ask_for_ever(client: httpx.Client) -> None:
+            while True:
+                answer = client.post(url, files={"image": b"x"}, data={"map": "room"})
+                told.append(answer.json()["code"])
+
+        with httpx.Client(limits=httpx.Limits(max_keepalive_connections=0)) as client:
+            process.send_signal(signal.SIGTERM)
+            with pytest.raises(httpx.ConnectError):  # refused, not reset
+                ask_for_ever(client)
+        assert process.wait(30) == 0
+    # The others came before the signal arrived.
+    assert (
+        {"server.stopping"} <= set(told) <= {"server.stopping", "image.undecodable", "image.format"}
+    )
+
+
 def test_the_command_says_when_it_is_ready_answers_on_both_doors_and_ends_on_sigterm(
     built_maps: Path,
 ) -> None:

@@ -9,18 +9,27 @@ import shutil
 import socket
 import threading
 import time
+import zipfile
 from collections.abc import Callable, Iterator
 from concurrent import futures
 from pathlib import Path
 from typing import Any
 
 import grpc
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from clients import AsyncClient, Client, Near
 from clients.cli.main import main
+from tests.conftest import Query
 from visloc.archive import MapStore
-from visloc.archive.checks import content_hash, json_text, manifest_hash
+from visloc.archive.checks import (
+    content_hash,
+    json_text,
+    manifest_hash,
+    sha256_of,
+)
 from visloc.archive.packed import pack_map
 from visloc.errors import Conflict, InvalidInput, NotFound, TooLarge, VislocError
 from visloc_api.v1 import localization_pb2 as pb2
@@ -502,6 +511,82 @@ def test_a_place_that_is_none_is_refused(near: tuple[float, float, float], clien
     with pytest.raises(InvalidInput) as caught:
         client.maps(Near(*near))
     assert caught.value.code.startswith("near.")
+
+
+Arrays = dict[str, NDArray[np.float32]]
+
+
+def without_axes(model: Arrays) -> None:
+    for name in [name for name in model if name.startswith("axes")]:
+        del model[name]
+
+
+def with_mean_of_one_number(model: Arrays) -> None:
+    model["mean"] = model["mean"][:1]
+
+
+def with_fewer_words(model: Arrays) -> None:
+    model["vocabulary"] = model["vocabulary"][:-1]
+
+
+def with_words_beyond_all_others(model: Arrays) -> None:
+    model["vocabulary"] = np.full_like(model["vocabulary"], 3e38)
+
+
+@pytest.fixture
+def repacked(root: Path, tmp_path: Path) -> Callable[[Callable[[Path, Any], None]], Path]:
+    """Packs ``room`` as its version ``v-other`` after a change of its folder and its manifest."""
+
+    def repack(change: Callable[[Path, Any], None]) -> Path:
+        copied = Path(shutil.copytree(MapStore(root).folder("room"), tmp_path / "map"))
+        manifest = json.loads((copied / "manifest.json").read_text())
+        manifest["version"] = "v-other"
+        change(copied, manifest)
+        manifest["content_hash"] = content_hash(manifest)
+        manifest["manifest_hash"] = manifest_hash(manifest)
+        (copied / "manifest.json").write_text(json_text(manifest))
+        with zipfile.ZipFile(tmp_path / "map.zip", "w") as archive:  # pack_map checks more
+            for name in ("manifest.json", *sorted(manifest["files"])):
+                archive.write(copied / name, name)
+        return tmp_path / "map.zip"
+
+    return repack
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        (without_axes, "map.unusable"),
+        (with_mean_of_one_number, "map.range"),
+        (with_fewer_words, "map.range"),
+        (with_words_beyond_all_others, "map.range"),
+    ],
+)
+def test_a_map_whose_models_cannot_work_is_refused_when_it_comes(
+    change: Callable[[Arrays], None], code: str, repacked: Any, doors: Any, query: Query
+) -> None:
+    def with_other_model(folder: Path, manifest: Any) -> None:
+        file = next((folder / "global").glob("*.model.npz"))
+        name = file.relative_to(folder).as_posix()
+        arrays = dict(np.load(file))
+        change(arrays)
+        np.savez(file, **arrays)  # type: ignore[arg-type]  # its stub thinks of allow_pickle
+        manifest["files"][name] = {"size": file.stat().st_size, "sha256": sha256_of(file)}
+
+    sent = repacked(with_other_model)
+    with Client(doors.url) as client:
+        refused(InvalidInput, code, lambda: client.upload_map(sent, "room", "v-other"))
+        assert "v-other" not in [each.version for each in client.map("room").versions]
+        assert client.localize(query.image, "room", query.camera).localized
+
+
+def test_a_map_whose_origin_is_nowhere_is_refused(repacked: Any, doors: Any) -> None:
+    def far_away(_: Path, manifest: Any) -> None:
+        manifest["world"]["origin"] = [1e300, 0.0, 0.0]
+
+    sent = repacked(far_away)
+    with Client(doors.url) as client:
+        refused(InvalidInput, "map.manifest", lambda: client.upload_map(sent, "room", "v-other"))
 
 
 @pytest.mark.parametrize("near", ["", "1", "1,2", "1,2,3,4", "a,b,c", "nan,0,1", "1;2;3"])

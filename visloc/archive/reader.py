@@ -10,6 +10,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from visloc.archive import models
 from visloc.archive.checks import (
     check_checksums,
     check_files,
@@ -264,6 +265,8 @@ def verify_map(folder: Path) -> Map:
             opened.global_descriptors[record.fingerprint.name],
         )
         fine[f"global/{stem}.npy"] = is_finite(rows.values)
+        model = opened.global_models[record.fingerprint.name]
+        fine[_model_file(record)] = models.fits(model, record.dim)
         if rows.scales is not None:
             fine[f"global/{stem}.scales.npy"] = is_finite(rows.scales) and rows.scales.min() >= 0
         if rows.clusters is not None:

@@ -35,6 +35,9 @@ MAX_PHOTO_SIDE = 640
 MAX_PHOTO_BYTES = 2**20
 
 Vector = tuple[float, float, float]
+# Farther than Earth-centred coordinates reach, and near enough for millimetres in float64.
+_Metres = Annotated[float, Field(ge=-1e9, le=1e9)]
+Origin = tuple[_Metres, _Metres, _Metres]
 VectorT = TypeVar("VectorT", bound=tuple[float, ...])
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
@@ -208,7 +211,7 @@ class World(Record):
     """
 
     metric: bool
-    origin: Vector
+    origin: Origin
     extent: Extent
     anchor: Anchor | None = None
     gravity: Direction | None = None

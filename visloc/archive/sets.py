@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from visloc.archive import models
 from visloc.archive.checks import (
     check_checksums,
     check_files,
@@ -225,6 +226,8 @@ def verify_set(folder: Path) -> MapSet:
     scales = opened.coarse.centroids.scales
     if scales is None or not is_finite(scales) or scales.min() < 0:
         raise refuse("map.range", field=str(folder / _SCALES))
+    if not models.fits(opened.coarse.model, opened.manifest.coarse.dim):
+        raise refuse("map.range", field=str(folder / _MODEL))
     return opened
 
 

@@ -5,7 +5,7 @@ A set of maps lies beside its tiles, as a version of the same kind.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 
@@ -111,6 +111,7 @@ class MapStore:
         *,
         make_current: bool = True,
         based_on: str | None = None,
+        accept: Callable[[AnyManifest], None] | None = None,
     ) -> Path:
         """Verify a finished map folder, give it its place, and make it current.
 
@@ -126,6 +127,7 @@ class MapStore:
                 version is not among ``ids``.
             based_on: the version that it was made from, if any. It must still be the current one;
                 otherwise the changes that became current meanwhile would be lost.
+            accept: called once the map is verified; what it raises refuses the map.
 
         Returns:
             The local folder of the published version.
@@ -142,6 +144,8 @@ class MapStore:
         checked_name(version, "map version")
         manifest = verify_any(incoming).manifest
         refuse_renamed(manifest, str(incoming), map_id, version)
+        if accept is not None:
+            accept(manifest)
         with self.backend.changing():
             refuse_other_kind(manifest, self._any_version(map_id))
             refuse_missing_tiles(manifest, self._manifests)

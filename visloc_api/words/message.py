@@ -5,6 +5,7 @@ Names and types are checked; errors have the codes of this API.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
@@ -97,11 +98,16 @@ class IncomingMessage(_Made):
                 in texts too.
 
         Raises:
-            InvalidInput: as ``read``, and ``request.malformed``.
+            InvalidInput: as ``read``, ``request.malformed``, ``request.duplicate_field``.
             TooLarge: ``request.too_large``.
         """
         check_json_values(text, max_values, cls.path.rstrip("."))
-        return cls._checked(lambda: cls.model_validate_json(text, context=limits))
+        checked = cls._checked(lambda: cls.model_validate_json(text, context=limits))
+        try:
+            json.loads(text, object_pairs_hook=check_names_once)  # pydantic takes the last one
+        except (ValueError, RecursionError):
+            raise refuse("request.malformed", expected="JSON") from None
+        return checked
 
     def given(self) -> dict[str, Any]:
         """Return the fields that were given, as JSON has them, but bytes as they are."""
@@ -123,6 +129,21 @@ class IncomingMessage(_Made):
             raise refusal
         finally:
             del refusal
+
+
+def check_names_once(fields: list[tuple[str, object]]) -> None:
+    """Refuse an object of JSON that has a field twice, of which readers take one or the other.
+
+    Args:
+        fields: names and values, as ``json`` gives them to its ``object_pairs_hook``.
+
+    Raises:
+        InvalidInput: ``request.duplicate_field``.
+    """
+    names = [name for name, _ in fields]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise refuse("request.duplicate_field", field=twice[:100])
 
 
 def check_json_values(text: str | bytes, max_values: int, field: str = "") -> None:

@@ -28,10 +28,15 @@ class Readiness(Answer):
     """Whether photos are accepted."""
 
     ready: Annotated[bool, Field(description="whether the maps to open at start are open and warm")]
-    maps: Annotated[list[str], Field(description="id@version of what is loaded")]
+    maps: Annotated[
+        list[str], Field(description="id@version of what is loaded; empty without the scope read")
+    ]
     not_loaded: Annotated[
         list[MapNotLoaded],
-        Field(description="maps that cannot be served; the server can be ready without them"),
+        Field(
+            description="maps that cannot be served; the server can be ready without them. Empty "
+            "without the scope read"
+        ),
     ]
 
 

@@ -14,10 +14,19 @@ from typing import Any
 import pytest
 
 from service.engine.uploads import Uploads
+from service.values import MapFolder
 from visloc.archive import MapStore
 from visloc.archive.checks import json_text, manifest_hash
 from visloc.archive.packed import pack_map, unpack_map
-from visloc.errors import Conflict, InvalidInput, StorageFull, TooLarge, VislocError
+from visloc.errors import (
+    Conflict,
+    InvalidInput,
+    StorageFull,
+    TooLarge,
+    Unavailable,
+    VislocError,
+    refuse,
+)
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +48,18 @@ def store(tmp_path: Path) -> MapStore:
     return MapStore(tmp_path / "maps")
 
 
+async def usable(version: MapFolder) -> None:
+    """Stands for a worker that could use the map."""
+    assert (version.folder / "manifest.json").is_file()
+
+
 async def chunks_of(content: bytes, size: int = 100_000) -> AsyncIterator[bytes]:
     for start in range(0, len(content), size):
         yield content[start : start + size]
 
 
 def publish(store: MapStore, content: bytes, max_bytes: int = 10**9) -> None:
-    asyncio.run(Uploads(store, max_bytes).publish("room", "v1", chunks_of(content)))
+    asyncio.run(Uploads(store, max_bytes, usable).publish("room", "v1", chunks_of(content)))
 
 
 def files_in(store: MapStore) -> list[str]:
@@ -70,7 +84,7 @@ def test_nothing_is_taken_of_a_version_that_exists(store: MapStore, packed: byte
         yield b""
 
     with pytest.raises(Conflict) as caught:
-        asyncio.run(Uploads(store, 10**9).publish("room", "v1", chunks()))
+        asyncio.run(Uploads(store, 10**9, usable).publish("room", "v1", chunks()))
     assert caught.value.code == "map.version_exists"
 
 
@@ -79,7 +93,7 @@ def test_nothing_is_taken_under_names_that_are_paths(
     names: tuple[str, str], store: MapStore, packed: bytes
 ) -> None:
     with pytest.raises(InvalidInput) as caught:
-        asyncio.run(Uploads(store, 10**9).publish(*names, chunks_of(packed)))
+        asyncio.run(Uploads(store, 10**9, usable).publish(*names, chunks_of(packed)))
     assert caught.value.code == "map.id"
     assert files_in(store) == []
 
@@ -94,7 +108,7 @@ def test_no_more_than_the_limit_is_written(store: MapStore) -> None:
             yield bytes(1_000_000)
 
     with pytest.raises(TooLarge) as caught:
-        asyncio.run(Uploads(store, 10_000_000).publish("room", "v1", chunks()))
+        asyncio.run(Uploads(store, 10_000_000, usable).publish("room", "v1", chunks()))
     assert caught.value.code == "request.too_large"
     assert written == 11_000_000
     assert files_in(store) == []
@@ -116,6 +130,36 @@ def test_a_damaged_map_is_the_senders_mistake(store: MapStore, packed: bytes) ->
             publish(store, bytes(damaged))
         assert str(store.root) not in str(caught.value)
     assert files_in(store) == []
+
+
+@pytest.mark.parametrize(
+    ("reason", "kind"),
+    [
+        (refuse("map.unusable", field="room@v1"), InvalidInput),
+        (refuse("server.worker_died"), Unavailable),
+    ],
+)
+def test_a_map_that_cannot_be_used_is_refused_and_leaves_nothing(
+    reason: VislocError, kind: type[VislocError], store: MapStore, packed: bytes
+) -> None:
+    async def unusable(version: MapFolder) -> None:
+        assert (version.ref, version.is_set) == ("room@v1", False)
+        raise reason
+
+    with pytest.raises(kind) as caught:
+        asyncio.run(Uploads(store, 10**9, unusable).publish("room", "v1", chunks_of(packed)))
+    assert caught.value.code == reason.code
+    assert files_in(store) == []
+
+
+def test_a_map_of_features_that_are_not_here_is_published(store: MapStore, packed: bytes) -> None:
+    """They may be installed before it is put into use."""
+
+    async def of_others(version: MapFolder) -> None:
+        raise refuse("map.features", field=version.ref, name="sift")
+
+    asyncio.run(Uploads(store, 10**9, of_others).publish("room", "v1", chunks_of(packed)))
+    assert store.versions("room") == ["v1"]
 
 
 def test_a_full_disk_leaves_nothing_and_says_so(
@@ -164,7 +208,7 @@ def test_a_cancelled_upload_leaves_all_or_nothing_and_can_be_repeated(
             await asyncio.sleep(10)
 
     async def run() -> None:
-        uploads = Uploads(store, 10**9)
+        uploads = Uploads(store, 10**9, usable)
         task = asyncio.create_task(uploads.publish("room", "v1", chunks()))
         assert await asyncio.to_thread(reached.wait, 10)
         task.cancel()
@@ -188,7 +232,7 @@ def test_a_cancelled_upload_leaves_all_or_nothing_and_can_be_repeated(
 
 def test_one_version_is_taken_once_at_a_time(store: MapStore, packed: bytes) -> None:
     async def run() -> list[VislocError | None]:
-        uploads = Uploads(store, 10**9)
+        uploads = Uploads(store, 10**9, usable)
         calls = [uploads.publish("room", "v1", chunks_of(packed)) for _ in range(3)]
         found = await asyncio.gather(*calls, return_exceptions=True)
         assert all(each is None or isinstance(each, VislocError) for each in found)

@@ -420,6 +420,34 @@ def test_the_work_for_a_client_that_hung_up_is_given_up(
         time.sleep(0.01)
 
 
+@pytest.mark.parametrize(
+    ("path", "text"),
+    [
+        ("/localize", '{"map": "room", "map": "hall", "image": "AAAA"}'),
+        ("/localize", '{"map": "room", "image": "AAAA", "options": {"top_k": 1, "top_k": 2}}'),
+        ("/maps/room/current", '{"version": "1", "version": "1"}'),
+        ("/geopose", '{"id": "1", "id": "2"}'),
+        ("/geopose", '{"sensors": [{"id": "a", "id": "b"}]}'),
+    ],
+)
+def test_a_field_twice_in_json_is_refused(path: str, text: str, doors: Any) -> None:
+    headers = {"Content-Type": "application/json"}
+    if path == "/geopose":
+        headers["Accept"] = "application/vnd.oscp+json;version=2.0"
+    response = doors.http.post(path, content=text, headers=headers)
+
+    assert problem(response, 422, "request.duplicate_field")["field"] in text
+
+
+@pytest.mark.parametrize("size", [2**63, 2**64 - 1, 2**64, 10**19])
+def test_a_length_beyond_all_numbers_is_refused_at_once(size: int, doors: Any) -> None:
+    head = f"Host: localhost\r\nContent-Type: application/json\r\nContent-Length: {size}\r\n\r\n"
+    for path in ("/localize", "/localize/rig", "/maps/room/current"):
+        with socket.create_connection(("127.0.0.1", doors.server.http_port), timeout=5) as sent:
+            sent.sendall(f"POST {path} HTTP/1.1\r\n{head}".encode())
+            assert sent.recv(12) == b"HTTP/1.1 413"
+
+
 def test_a_caller_says_how_long_it_waits(doors: Any, query: Any, given_up: threading.Event) -> None:
     response = post(doors, query.image, headers={"X-Request-Timeout": "0.2"})
 

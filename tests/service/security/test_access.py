@@ -435,7 +435,7 @@ def test_no_page_may_call_unless_its_origin_is_named(keys: Keys) -> None:
     preflight = {
         "Origin": "https://maps.example.org",
         "Access-Control-Request-Method": "POST",
-        "Access-Control-Request-Headers": "authorization,x-request-id",
+        "Access-Control-Request-Headers": "authorization,x-request-id,x-visloc-map",
     }
     closed = http_door(Access(KeyRing(keys.path))).ask("OPTIONS", "/localize", preflight)
     door = http_door(Access(KeyRing(keys.path), ["https://maps.example.org"]))

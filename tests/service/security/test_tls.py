@@ -3,6 +3,7 @@ from __future__ import annotations
 import asyncio
 import io
 import logging
+import shutil
 import ssl
 import time
 from collections.abc import Callable, Iterator
@@ -383,6 +384,27 @@ def test_every_route_of_the_service_has_a_scope_of_its_own_or_is_open(guarded: G
     routes = [(method.upper(), path) for path, methods in paths.items() for method in methods]
     assert len(routes) > 10
     assert [route for route in routes if needed_over_http(*route) == ANY_KEY] == []
+
+
+def test_readiness_names_maps_only_to_a_key_that_may_read(
+    built_maps: Path, tmp_path: Path, serve: Callable[..., Any]
+) -> None:
+    tokens = {}
+    with edited_keys(tmp_path / "keys.json") as keys:
+        for scope in (Scope.READ, Scope.LOCALIZE):
+            key, tokens[scope] = new_key(scope.value, frozenset({scope}))
+            keys.append(key)
+    maps = Path(shutil.copytree(built_maps, tmp_path / "maps"))
+    shutil.copytree(maps / "room", maps / "hall")  # a manifest of another name
+    with serve(maps, keys_file=tmp_path / "keys.json") as doors:
+        for sent in (None, "visloc_wrong", tokens[Scope.LOCALIZE]):
+            headers = {} if sent is None else {"X-API-Key": sent}
+            answer = doors.http.get("/readyz", headers=headers)
+            assert answer.status_code == 200
+            assert answer.json() == {"ready": True, "maps": [], "not_loaded": []}
+        told = doors.http.get("/readyz", headers={"X-API-Key": tokens[Scope.READ]}).json()
+    assert told["maps"][0].startswith("room@")
+    assert told["not_loaded"][0]["id"] == "hall"
 
 
 def test_a_service_that_would_be_open_to_others_does_not_start(tmp_path: Path) -> None:
