@@ -10,7 +10,7 @@ PAGE_SOURCES := $(shell find web/src web/index.html web/*.json web/*.ts -type f)
 .DEFAULT_GOAL := help
 # Vite needs this much; without it the service has no page, and says so.
 NODE_IS_THERE = command -v npm >/dev/null && node -e 'const [a, b] = process.versions.node.split(".").map(Number); process.exit(a > 22 || (a === 22 && b >= 12) || (a === 20 && b >= 19) ? 0 : 1)'
-.PHONY: help install page check-page browser balancer promtool demo test test-all docs-check docs-errors docs-options fuzz fuzz-api train-smoke bench bench-gpu bench-scale trust fmt lint types contracts proto proto-check check serve clean
+.PHONY: help install licences-check page check-page browser balancer promtool demo test test-all docs-check docs-errors docs-options licences lock sbom audit fuzz fuzz-api train-smoke bench bench-gpu bench-scale trust fmt lint types contracts proto proto-check check serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -87,6 +87,28 @@ docs-errors: install ## write the tables of error codes from visloc/error_codes.
 docs-options: install ## write the table of options from visloc/options.py
 	$(BIN)/python -m tests.option_docs
 
+licences: install ## write docs/licences.md, and check it against supply_chain/policy.toml
+	$(BIN)/python -m supply_chain.licences --write
+
+lock: install ## write docker/locks from constraints.txt, with the hashes of the package index
+	$(BIN)/python -m supply_chain.lock
+
+# What an image holds: its lock, and torch, which no lock has.
+define held_by
+{ cat docker/locks/$$image.txt; test $$image = clients || grep '^torch==' constraints.txt; }
+endef
+
+sbom: install ## write .sbom/IMAGE.cdx.json (CycloneDX): what each image holds
+	mkdir -p .sbom
+	for image in service mapping clients; do $(held_by) | PYTHONWARNINGS=ignore $(BIN)/cyclonedx-py \
+		requirements --pyproject pyproject.toml --output-reproducible --output-file .sbom/$$image.cdx.json - \
+		|| exit 1; done
+
+audit: install ## known vulnerabilities of what the images hold; fails too where PyPI does not tell
+	mkdir -p .sbom
+	for image in service mapping clients; do $(held_by) | sed 's/ --hash.*//' > .sbom/$$image.txt; \
+		$(BIN)/pip-audit --strict --no-deps --disable-pip --requirement .sbom/$$image.txt || exit 1; done
+
 fuzz: install ## fuzz what reads strangers' bytes: RUNS inputs for each target
 	$(BIN)/python -m tests.fuzz --runs $(or $(RUNS),100000)
 
@@ -136,10 +158,13 @@ check-page: page ## types, format and unit tests of web/
 	@if $(NODE_IS_THERE); then npm run --prefix web --silent check; \
 	else echo 'The page is not checked: there is no Node.js.' >&2; fi
 
-check: lint types contracts proto-check check-page ## what must be green before review
+licences-check: install ## dependencies have licences that the policy allows
+	$(BIN)/python -m supply_chain.licences
+
+check: lint types contracts licences-check proto-check check-page ## what must be green before review
 
 serve: install ## serve the maps in maps/ on 127.0.0.1:8000 (HTTP) and :50051 (gRPC)
 	$(BIN)/python -m service --maps-dir maps
 
 clean: ## remove what make made
-	rm -rf $(VENV) .demo .bench .trust web/node_modules visloc_web/built
+	rm -rf $(VENV) .sbom .demo .bench .trust web/node_modules visloc_web/built

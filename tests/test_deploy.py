@@ -253,32 +253,45 @@ def test_an_image_holds_what_was_made_elsewhere_and_makes_nothing_itself(image: 
     assert not any("pip" in step for step in stages[image].of("RUN"))
 
 
-def test_the_dependencies_are_those_that_the_tests_run_with() -> None:
-    installs = [
-        step
+def test_what_is_installed_is_locked_with_hashes() -> None:
+    steps = {
+        name: step
         for name, stage in dockerfile().items()
         for instruction, step in stage.own
-        if name.endswith("-packages") and instruction == "RUN"
-    ]
-    extras = {name for step in installs for name in re.findall(r"\[([\w,]+)\]", step)}
-
-    assert len(installs) == 5
-    assert all("--constraint constraints.txt" in step for step in installs)
-    assert extras == {
-        "vision,gem",
-        "service,s3,tracing",
-        "service,gem,s3,tracing",
-        "mapping",
-        "clients",
+        if instruction == "RUN" and "docker/locks" in step
     }
-    declared = PROJECT["project"]["optional-dependencies"]
-    assert {name for names in extras for name in names.split(",")} <= declared.keys()
+    locks = {name: re.findall(r"docker/locks/(\S+)\.txt", step) for name, step in steps.items()}
+
+    assert locks == {
+        "builder": ["build"],
+        "vision-packages": ["vision"],
+        "service-packages": ["service"],
+        "mapping-packages": ["mapping"],
+        "clients-packages": ["clients"],
+        "service-cuda-packages": ["service"],
+    }
+    assert all("install --require-hashes --no-deps --requirement" in s for s in steps.values())
+    assert all((ROOT / f"docker/locks/{lock}.txt").exists() for (lock,) in locks.values())
+
+
+def test_the_wheel_is_made_by_a_locked_tool() -> None:
+    wheels = [
+        step
+        for stage in dockerfile().values()
+        for instruction, step in stage.own
+        if instruction == "RUN" and "pip wheel" in step
+    ]
+
+    assert len(wheels) == 2
+    assert all("pip wheel --no-deps --no-build-isolation" in step for step in wheels)
+    assert "hatchling==" in (ROOT / "docker" / "locks" / "build.txt").read_text()
 
 
 def test_the_dependencies_are_made_before_the_code_is_copied() -> None:
     copied = [line.split()[:-1] for line in dockerfile()["service-packages"].of("COPY")]
 
     assert copied == [
+        ["docker/locks"],
         ["pyproject.toml", "constraints.txt", "README.md", "LICENSE"],
         ["visloc/__init__.py"],  # the version
     ]

@@ -1,0 +1,1 @@
+"""What the images are made of: locked versions with hashes, licences, parts lists."""
