@@ -71,11 +71,12 @@ class _ModelTask:
             return _to_item(triangulate(*inputs, partial(progress, TRIANGULATION)))
 
         stages = (MAPPING, TRIANGULATION) if self.settings.estimate_poses else (TRIANGULATION,)
-        total = len(self.photos)
-        progress(stages[0], 0, total)
+        if self.work.has(key):
+            for stage in stages:
+                progress(stage, len(self.photos), len(self.photos))
+            return
+        progress(stages[0], 0, len(self.photos))
         self.work.get(key, compute)
-        for stage in stages:
-            progress(stage, total, total)
 
     def _given(self, photo: MappingPhoto) -> SfmPhoto:
         return SfmPhoto(

@@ -70,7 +70,7 @@ def landmarks_from_matches(
     matches, matches_key = match_pairs(context, photos, pairs.rows, verification)
     rigs = known_rigs(dataset, {photo.record.sensor_id for photo in photos})
     model = make_model(context, photos, rigs, matches, matches_key, settings)
-    if (found := _with_found_cameras(photos, model)) is not None:
+    if (found := with_found_cameras(photos, model)) is not None:
         matches, matches_key = match_pairs(context, found, pairs.rows, verification)
         begun = [replace(p, camera=new.camera) for p, new in zip(photos, found, strict=True)]
         again = make_model(context, begun, rigs, matches, matches_key, settings)
@@ -88,7 +88,7 @@ def landmarks_from_matches(
     return replace(made, notes=(*notes, *made.notes))
 
 
-def _with_found_cameras(
+def with_found_cameras(
     photos: Sequence[MappingPhoto], model: SparseModel
 ) -> list[MappingPhoto] | None:
     """Return the photos with the cameras that a model found, as known ones.
