@@ -2,7 +2,7 @@
 
     python -m benchmarks.joining hallways DATA/ie_tower --floor floor11
     python -m benchmarks.joining walk DATA/gardenspoint/mapping
-    python -m benchmarks.joining speed --images 500
+    python -m benchmarks.joining speed --images 500 [--code OTHER_VERSION]
 
 ``hallways`` puts the photos of both hallways of a floor into one folder. ``walk`` takes a dataset
 whose photos were taken in order, and whose poses lie in pieces 1000 units apart. Both make all
@@ -12,6 +12,7 @@ builds a map of photos of the sample in a process of its own, without its poses,
 
 from __future__ import annotations
 
+import os
 import re
 import resource
 import shutil
@@ -55,6 +56,14 @@ CONFIG = MAPPER_CONFIGS["config1"]
 # Of the poses of one dataset.
 PIECES_APART = 1000.0
 SETTINGS = SfmSettings(pairs=("retrieval", "sequence"), poses="estimate")
+# The command was in another file in versions before its rooms.
+COMMAND = """
+try:
+    from mapping.cli.main import main
+except ImportError:
+    from mapping.cli import main
+main()
+"""
 WorkOption = Annotated[Path, typer.Option(help="Features and matches, kept for the next run.")]
 app = typer.Typer(add_completion=False, help=__doc__)
 
@@ -177,25 +186,27 @@ def walk(root: Path, work: WorkOption = Path("work/joining/walk")) -> None:
 
 
 @app.command()
-def speed(images: int = 500, work: WorkOption = Path("work/joining/speed")) -> None:
+def speed(
+    images: int = 500,
+    code: Annotated[
+        Path | None, typer.Option(help="Folder of another version's code, which builds the map.")
+    ] = None,
+    work: WorkOption = Path("work/joining/speed"),
+) -> None:
     """Build a map of photos of the sample without poses; print seconds, GiB, silence."""
-    shutil.rmtree(work, ignore_errors=True)
-    write_sample(work / "sample", images=images)
-    sensors = work / "sample" / "mapping" / "sensors"
-    for name in ("trajectories.txt", "rigs.txt", "records_gnss.txt", "records_depth.txt"):
-        (sensors / name).unlink()
-    listed = (sensors / "sensors.txt").read_text().splitlines(keepends=True)
-    cameras = [line for line in listed if ", depth," not in line and ", gnss," not in line]
-    (sensors / "sensors.txt").write_text("".join(cameras))
-    arguments = ["build", str(sensors.parent), "--map", "speed", "--maps-dir", str(work / "maps")]
-    command = Path(sys.executable).with_name("mapping")
+    work = work.resolve()
+    mapping = _sample_without_poses(work / f"sample{images}", images)
+    shutil.rmtree(work / "maps", ignore_errors=True)
+    arguments = ["build", str(mapping), "--map", "speed", "--maps-dir", str(work / "maps")]
     started = last = time.perf_counter()
     silence, counts = 0.0, ""
     with subprocess.Popen(
-        [command, *arguments, "--method", "sfm", "--poses", "estimate"],
+        [sys.executable, "-c", COMMAND, *arguments, "--method", "sfm", "--poses", "estimate"],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
+        cwd=code,
+        env=os.environ if code is None else {**os.environ, "PYTHONPATH": str(code.resolve())},
     ) as process:
         assert process.stdout is not None
         for line in process.stdout:
@@ -211,6 +222,20 @@ def speed(images: int = 500, work: WorkOption = Path("work/joining/speed")) -> N
         f"{(used.ru_utime + used.ru_stime) / 60:.1f} min of processors, "
         f"{used.ru_maxrss / 2**20:.1f} GiB in the largest process, longest silence {silence:.0f} s"
     )
+
+
+def _sample_without_poses(root: Path, images: int) -> Path:
+    """The folder of the sample's mapping photos, without what tells where they were taken."""
+    mapping = root / "mapping"
+    if not root.exists():
+        write_sample(root, images=images)
+        sensors = mapping / "sensors"
+        for name in ("trajectories.txt", "rigs.txt", "records_gnss.txt", "records_depth.txt"):
+            (sensors / name).unlink()
+        listed = (sensors / "sensors.txt").read_text().splitlines(keepends=True)
+        cameras = [line for line in listed if ", depth," not in line and ", gnss," not in line]
+        (sensors / "sensors.txt").write_text("".join(cameras))
+    return mapping
 
 
 if __name__ == "__main__":

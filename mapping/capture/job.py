@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -26,7 +27,7 @@ from mapping.progress import Progress
 from mapping.stages.photos import collect_photos
 from mapping.stages.work_folder import WorkFolder, exclusive
 from visloc.archive import MapStore
-from visloc.errors import refuse
+from visloc.errors import VislocError, refuse
 from visloc.kapture import read_dataset
 
 # Rough: 14 photos of 1600 x 900 took five seconds of one core each, smaller ones less; incremental
@@ -37,6 +38,9 @@ _DISK_PER_PHOTO, _MEMORY, _MEMORY_PER_PHOTO = 5 * 2**20, 2**30, 4 * 2**20
 _TOP_K = 12
 # A frame is shown for less than that.
 _PAST_END_S = 1.0
+# Refusals of photos that do not join, and what would.
+_NOT_JOINED = ("sfm.no_matches", "sfm.no_model", "sfm.no_points")
+_OVERLAP = "photos or a film in which each view overlaps the next, taken while walking, not turning"
 # Says which versions there were when a capture began.
 _BEGUN = "begun.json"
 
@@ -127,14 +131,36 @@ def capture_map(
         notes = write_imported(model, dataset)
         if marker_m is not None:
             yardstick = _with_markers(dataset, marker_m, progress)
-        folder = build_map(
-            _build_settings(settings, model, dataset),
-            progress,
-            costs,
-            partial(place, yardstick),
-            partial(doubts_of_capture, films=studied, measured=_measured(yardstick)),
-        )
+        with _told_of_a_capture(notes):
+            folder = build_map(
+                _build_settings(settings, model, dataset),
+                progress,
+                costs,
+                partial(place, yardstick),
+                partial(doubts_of_capture, films=studied, measured=_measured(yardstick)),
+            )
     return Captured(folder, studied, names, notes, root)
+
+
+@contextmanager
+def _told_of_a_capture(notes: Sequence[str]) -> Iterator[None]:
+    """Let a refusal tell what was left out, and what to film instead of options of other commands.
+
+    The notes become those of the exception.
+    """
+    try:
+        yield
+    except VislocError as error:
+        told = _in_words_of_a_capture(error)
+        for note in notes:
+            told.add_note(note)
+        raise told from error.__cause__
+
+
+def _in_words_of_a_capture(error: VislocError) -> VislocError:
+    if error.code not in _NOT_JOINED:
+        return error
+    return refuse(error.code, error.message, field="SOURCE", expected=_OVERLAP, got=error.got)
 
 
 def _published_before(settings: CaptureSettings, root: Path, store: MapStore) -> Path | None:

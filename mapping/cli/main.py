@@ -64,6 +64,8 @@ def main() -> None:
     try:
         app()
     except VislocError as error:
+        for note in getattr(error, "__notes__", ()):
+            ERR.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
         _fail(error.code, str(error))
     except OSError as error:  # a full disk, a folder without permission
         _fail("system", str(error))

@@ -76,6 +76,9 @@ class StageProgress:
         if stage not in self._tasks:
             self._tasks[stage] = self._bars.add_task(stage, total=total)
             self._started[stage] = time.monotonic()
+        elif done < total and self._bars.tasks[self._tasks[stage]].finished:
+            self._bars.reset(self._tasks[stage])  # a stage that is done once more
+            self._started[stage] = time.monotonic()
         self._bars.update(self._tasks[stage], completed=done, total=total)
         seconds = time.monotonic() - self._started[stage]
         # A single step that ends before its first line gets no line at all.

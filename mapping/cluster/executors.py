@@ -9,7 +9,7 @@ from typing import Protocol, TypeVar
 
 from mapping.cluster.stage_timings import Spent
 from mapping.cluster.workers import Workers
-from mapping.progress import ItemProgress
+from mapping.progress import ItemProgress, Progress
 from visloc.errors import refuse
 
 T = TypeVar("T")
@@ -47,9 +47,9 @@ class Executor(Protocol):
         """
 
     def run_one(
-        self, task: Callable[[T, ItemProgress], object], item: T, progress: ItemProgress
+        self, task: Callable[[T, Progress], object], item: T, stage: str, progress: Progress
     ) -> None:
-        """Do one long task. It reports progress itself if it runs in this process.
+        """Do one long task. In this process it reports its stages itself; else it is one stage.
 
         Raises:
             Unavailable: ``build.worker_died``.

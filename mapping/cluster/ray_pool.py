@@ -16,7 +16,7 @@ import ray
 
 from mapping.cluster.stage_timings import Spent
 from mapping.cluster.workers import ONE_THREAD, do_batch, in_batches
-from mapping.progress import ItemProgress
+from mapping.progress import ItemProgress, Progress
 from visloc import __version__
 from visloc.errors import refuse
 
@@ -108,13 +108,13 @@ class RayPool:
             raise
 
     def run_one(
-        self, task: Callable[[T, ItemProgress], object], item: T, progress: ItemProgress
+        self, task: Callable[[T, Progress], object], item: T, stage: str, progress: Progress
     ) -> None:
-        self.run(partial(_do_one, task), [item], progress)
+        self.run(partial(_do_one, task), [item], partial(progress, stage))
 
 
-def _do_one(task: Callable[[T, ItemProgress], object], item: T) -> None:
-    task(item, lambda _done, _total: None)  # progress is not sent between machines
+def _do_one(task: Callable[[T, Progress], object], item: T) -> None:
+    task(item, lambda _stage, _done, _total: None)  # progress is not sent between machines
 
 
 def _reason(error: BaseException) -> str:

@@ -75,7 +75,12 @@ class Costs:
         def note(stage: str, done: int, total: int) -> None:
             begin = self._begun.setdefault(stage, self._now())
             if done == total:
-                self._stages[stage] = _cost(stage, total, begin, self._now())
+                del self._begun[stage]
+                cost = _cost(stage, total, begin, self._now())
+                if (before := self._stages.get(stage)) is not None:  # it was done once more
+                    wall_s, spent = before.wall_s + cost.wall_s, before.spent + cost.spent
+                    cost = StageCost(stage, total, wall_s, spent)
+                self._stages[stage] = cost
             progress(stage, done, total)
 
         return note

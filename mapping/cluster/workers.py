@@ -17,7 +17,7 @@ import cv2
 from threadpoolctl import threadpool_limits
 
 from mapping.cluster.stage_timings import Spent, spent_here
-from mapping.progress import ItemProgress
+from mapping.progress import ItemProgress, Progress
 from visloc.errors import refuse
 
 T = TypeVar("T")
@@ -89,7 +89,11 @@ class Workers:
             raise refuse("build.worker_died", field="--workers") from error
 
     def run_one(
-        self, task: Callable[[T, ItemProgress], object], item: T, progress: ItemProgress
+        self,
+        task: Callable[[T, Progress], object],
+        item: T,
+        stage: str,  # noqa: ARG002  the task reports its own
+        progress: Progress,
     ) -> None:
         with one_thread_here():
             task(item, progress)

@@ -13,8 +13,8 @@ from mapping.methods.intrinsics import Doubt
 from mapping.methods.matching import Matches, camera_values, pose_values
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
-from mapping.methods.triangulation import reconstruct, triangulate
-from mapping.progress import ItemProgress
+from mapping.methods.triangulation import MAPPING, TRIANGULATION, reconstruct, triangulate
+from mapping.progress import Progress
 from mapping.stages.context import BuildContext
 from mapping.stages.landmarks import Observations, View
 from mapping.stages.local_features import LocalFeaturesSource
@@ -23,7 +23,7 @@ from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc.geometry import Camera, Pose
 
 # Raised when the code of the stage changes what comes out.
-_REVISION = 5
+_REVISION = 6
 
 
 def make_model(
@@ -45,8 +45,8 @@ def make_model(
     sent = replace(settings, covisible_in=None)
     task = _ModelTask(context.work, tuple(photos), context.features, rigs, matches, sent)
     key = _model_key(matches_key, photos, rigs, settings)
-    stage = "incremental mapping" if settings.estimate_poses else "triangulation"
-    context.workers.run_one(task.make, key, partial(context.progress, stage))
+    stage = MAPPING if settings.estimate_poses else TRIANGULATION
+    context.workers.run_one(task.make, key, stage, context.progress)
     return _from_item(context.work.read(key), photos)
 
 
@@ -61,19 +61,22 @@ class _ModelTask:
     matches: Sequence[Matches]
     settings: SfmSettings
 
-    def make(self, key: str, progress: ItemProgress) -> None:
+    def make(self, key: str, progress: Progress) -> None:
         def compute() -> Item:
             given = [self._given(photo) for photo in self.photos]
             config, refine = MAPPER_CONFIGS[self.settings.mapper], self.settings.refine
             inputs = given, self.rigs, self.matches, config, refine, self.work.scratch
             if self.settings.estimate_poses:
                 return _to_item(reconstruct(*inputs, progress))
-            return _to_item(triangulate(*inputs))
+            return _to_item(triangulate(*inputs, partial(progress, TRIANGULATION)))
 
-        total = len(self.photos) if self.settings.estimate_poses else 1
-        progress(0, total)
+        stages = (MAPPING, TRIANGULATION) if self.settings.estimate_poses else (TRIANGULATION,)
+        if self.work.has(key):
+            for stage in stages:
+                progress(stage, len(self.photos), len(self.photos))
+            return
+        progress(stages[0], 0, len(self.photos))
         self.work.get(key, compute)
-        progress(total, total)
 
     def _given(self, photo: MappingPhoto) -> SfmPhoto:
         return SfmPhoto(

@@ -70,6 +70,11 @@ def landmarks_from_matches(
     matches, matches_key = match_pairs(context, photos, pairs.rows, verification)
     rigs = known_rigs(dataset, {photo.record.sensor_id for photo in photos})
     model = make_model(context, photos, rigs, matches, matches_key, settings)
+    if (found := with_found_cameras(photos, model)) is not None:
+        matches, matches_key = match_pairs(context, found, pairs.rows, verification)
+        begun = [replace(p, camera=new.camera) for p, new in zip(photos, found, strict=True)]
+        again = make_model(context, begun, rigs, matches, matches_key, settings)
+        model = min(again, model, key=lambda each: each.views.count(None))
     names = names_by_sensor((photo.record.sensor_id, photo.name) for photo in photos)
     origins = {
         sensor: origin_of(dataset.sensors[sensor], model.doubts.get(sensor)) for sensor in names
@@ -81,6 +86,34 @@ def landmarks_from_matches(
         pairs=(scene, pairs),
     )
     return replace(made, notes=(*notes, *made.notes))
+
+
+def with_found_cameras(
+    photos: Sequence[MappingPhoto], model: SparseModel
+) -> list[MappingPhoto] | None:
+    """Return the photos with the cameras that a model found, as known ones.
+
+    Between photos of known cameras, an essential matrix tells true matches from false ones better
+    than a fundamental matrix: it has two degrees of freedom less. So photos that found no place may
+    find one.
+
+    Returns:
+        None when all photos have a place, or nothing was learnt of any camera.
+    """
+    learnt = {
+        photo.record.sensor_id: view.camera
+        for photo, view in zip(photos, model.views, strict=True)
+        if view is not None and not photo.camera_known
+    }
+    usable = learnt.keys() - model.doubts.keys()
+    if not usable or None not in model.views:
+        return None
+    return [
+        replace(photo, camera=learnt[sensor], camera_known=True)
+        if (sensor := photo.record.sensor_id) in usable
+        else photo
+        for photo in photos
+    ]
 
 
 def _placed_landmarks(

@@ -15,42 +15,44 @@ from mapping.methods.matching import Matches
 from mapping.methods.sparse_model import SfmPhoto
 from visloc.geometry import Camera
 
-# Keypoints of a photo that take part.
-MOST = 1000
-# Pairs with so few matches keep all: they may be all that links two parts.
+# Keypoints that take part: of all photos together, and of each at least. Adjusting few photos takes
+# little time with all that they have, and each of their links counts.
+ALL, MOST = 100_000, 1000
+# Every pair keeps so many matches, if it has them: they may be all that places a photo.
 FEW = 200
 # The longer side of a photo is divided into so many cells, which have equal parts of them.
 _CELLS = 8
 
 
 def thin(photos: Sequence[SfmPhoto], matches: Sequence[Matches]) -> list[Matches]:
-    """Return the pairs with the matches between the ``MOST`` best keypoints of both photos.
+    """Return the pairs with the matches between the best keypoints of both photos.
 
-    Pairs with ``FEW`` matches or fewer stay as they are. The best of a cell are those matched in
-    most pairs, which make the longest tracks.
+    The best of a cell are those matched in most pairs, which make the longest tracks. A pair that
+    is left with fewer than ``FEW`` matches gets the best of its others back.
     """
     counts = [np.zeros(len(photo.keypoints), dtype=np.int64) for photo in photos]
     for pair in matches:
         counts[pair.first][pair.rows[:, 0]] += 1
         counts[pair.second][pair.rows[:, 1]] += 1
+    most = max(MOST, ALL // max(len(photos), 1))
     kept = [
-        _best_of_cells(photo.camera, photo.keypoints, count)
+        _best_of_cells(photo.camera, photo.keypoints, count, most)
         for photo, count in zip(photos, counts, strict=True)
     ]
     thinned = []
     for pair in matches:
-        if len(pair.rows) <= FEW:
-            thinned.append(pair)
-            continue
-        both = kept[pair.first][pair.rows[:, 0]] & kept[pair.second][pair.rows[:, 1]]
-        thinned.append(Matches(pair.first, pair.second, pair.rows[both]))
+        first, second = pair.rows.T
+        both = kept[pair.first][first] & kept[pair.second][second]
+        often = np.minimum(counts[pair.first][first], counts[pair.second][second])
+        best = np.lexsort((-often, ~both))[: max(FEW, int(both.sum()))]
+        thinned.append(Matches(pair.first, pair.second, pair.rows[np.sort(best)]))
     return thinned
 
 
 def _best_of_cells(
-    camera: Camera, keypoints: NDArray[np.float32], counts: NDArray[np.int64]
+    camera: Camera, keypoints: NDArray[np.float32], counts: NDArray[np.int64], most: int
 ) -> NDArray[np.bool_]:
-    """Return (n,) which keypoints are kept: the first of all cells, then the second of all, ..."""
+    """Return (n,) which ``most`` are kept: the first of all cells, then the second of all, ..."""
     side = max(camera.width, camera.height) / _CELLS
     column, row = np.floor_divide(keypoints.T, side).astype(np.int64)
     cells = row * (_CELLS + 1) + column
@@ -59,7 +61,7 @@ def _best_of_cells(
     rank = np.arange(len(order)) - np.searchsorted(grouped, grouped)
     matched = counts[order] > 0
     order, rank = order[matched], rank[matched]
-    best = order[np.lexsort((-counts[order], rank))[:MOST]]
+    best = order[np.lexsort((-counts[order], rank))[:most]]
     kept = np.zeros(len(keypoints), dtype=bool)
     kept[best] = True
     return kept

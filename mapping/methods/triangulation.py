@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -24,11 +25,14 @@ from mapping.methods.intrinsics import (
 )
 from mapping.methods.look_alikes import without_look_alikes
 from mapping.methods.matching import Matches
+from mapping.methods.points import triangulate_points
 from mapping.methods.sparse_model import MapperConfig, SfmPhoto, SparseModel, without_bad_points
 from mapping.methods.thinning import thin
-from mapping.progress import ItemProgress
+from mapping.progress import ItemProgress, Progress
 from visloc.errors import refuse
 
+# Stages of a build.
+MAPPING, TRIANGULATION = "incremental mapping", "triangulation"
 # After so many models that put cameras in doubt, no camera with a prior is refined any more.
 _MAX_JUDGEMENTS = 3
 # Photos of another model that are worth telling.
@@ -42,6 +46,7 @@ def triangulate(
     config: MapperConfig,
     refine: Sequence[str],
     work: Path,
+    progress: ItemProgress,
 ) -> SparseModel:
     """Triangulate points with the poses of the photos.
 
@@ -53,6 +58,7 @@ def triangulate(
         refine: names of ``REFINABLE``: what bundle adjustment may change afterwards. Refined poses
             are aligned to the given ones again. Intrinsics in doubt (``SparseModel.doubts``) stay.
         work: folder for temporary files.
+        progress: as ``triangulate_points``.
 
     Raises:
         InvalidInput: ``sfm.no_matches``, ``sfm.no_points``.
@@ -62,14 +68,10 @@ def triangulate(
 
         def solve(held: Collection[str]) -> pycolmap.Reconstruction:
             model = scene.with_poses(photos)
-            result = interruptible(
-                lambda token: pycolmap.triangulate_points(
-                    model, path, path.parent, path.parent, options=options, cancellation_token=token
-                )
-            )
+            triangulate_points(model, path, options, progress)
             if refine:
-                refine_model(result, photos, scene, refine, held)
-            return result
+                refine_model(model, photos, scene, refine, held)
+            return model
 
         refined = set(scene.cameras) if "intrinsics" in refine else set()
         result, doubts = solve_with_priors(solve, scene, photos, refined, poses="poses" in refine)
@@ -83,14 +85,15 @@ def reconstruct(
     config: MapperConfig,
     refine: Sequence[str],
     work: Path,
-    progress: ItemProgress,
+    progress: Progress,
 ) -> SparseModel:
     """Find poses and points by incremental mapping, in an arbitrary frame and unit.
 
     Known intrinsics stay unless ``refine`` names them, and also if they are in doubt
     (``SparseModel.doubts``). Pairs that seem to show two places are not used
     (``mapping.methods.look_alikes``). Of several models that do not connect, the largest is taken.
-    ``progress`` is called with the number of photos in the current model, and of all photos.
+    ``progress`` is called with the number of photos in the current model, and of all photos, and
+    then as by ``triangulate_points``; the stages are ``MAPPING`` and ``TRIANGULATION``.
 
     Raises:
         InvalidInput: ``sfm.no_matches``, ``sfm.no_model``, ``sfm.camera``, ``sfm.no_points``.
@@ -99,7 +102,7 @@ def reconstruct(
     with colmap_database(photos, rigs, thin(photos, matches), work) as (path, scene):
         known = {photo.sensor for photo in photos if photo.camera_known}
         constant = set() if "intrinsics" in refine else known
-        placed = _Placed(len(photos), progress)
+        placed = _Placed(len(photos), partial(progress, MAPPING))
         apart: list[int] = []
 
         def solve(doubts: Mapping[str, Doubt]) -> pycolmap.Reconstruction:
@@ -131,7 +134,10 @@ def reconstruct(
         result, doubts = solve_with_priors(solve, scene, photos, refined, poses=True)
         found = scene.read(result, photos, ("poses", "intrinsics"), doubts)
         found = replace(found, apart=tuple(apart))
-    return _with_all_points(found, photos, rigs, matches, config, work)
+    progress(MAPPING, len(photos), len(photos))
+    return _with_all_points(
+        found, photos, rigs, matches, config, work, partial(progress, TRIANGULATION)
+    )
 
 
 def _with_all_points(
@@ -141,6 +147,7 @@ def _with_all_points(
     matches: Sequence[Matches],
     config: MapperConfig,
     work: Path,
+    progress: ItemProgress,
 ) -> SparseModel:
     """Triangulate all matches with the poses and cameras that a part of them gave."""
     rows = [row for row, view in enumerate(found.views) if view is not None]
@@ -156,7 +163,7 @@ def _with_all_points(
         if pair.first in number and pair.second in number
     ]
     # On rigs, if at all, as in the model: they have its unit.
-    made = triangulate(placed, rigs if found.on_rigs else {}, among, config, (), work)
+    made = triangulate(placed, rigs if found.on_rigs else {}, among, config, (), work, progress)
     views = np.array(rows)[made.observations.views]
     return replace(
         made,

@@ -6,14 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 
 from mapping.capture import job
 from mapping.capture.job import capture_map
 from mapping.capture.settings import CaptureSettings
-from tests.mapping.capture.conftest import panned
+from tests.mapping.capture.conftest import panned, texture
 from visloc.archive import MapStore
-from visloc.errors import Conflict
+from visloc.errors import Conflict, InvalidInput
 
 
 class Killed(Exception):
@@ -59,3 +60,19 @@ def test_a_capture_that_was_killed_after_publishing_is_told_and_not_made_again(
     told.forget()
     with pytest.raises(Conflict, match="exists"):
         capture_map(settings, quiet, quiet)
+
+
+def test_photos_that_do_not_join_are_refused_with_what_to_film_and_what_was_left_out(
+    tmp_path: Path,
+) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for seed in range(2):
+        cv2.imwrite(str(photos / f"{seed}.png"), texture(320, 240, seed))
+    (photos / "broken.jpg").write_bytes(b"no photo")
+    with pytest.raises(InvalidInput) as refused:
+        capture_map(CaptureSettings([photos], "room", tmp_path / "maps"), quiet, quiet)
+    assert refused.value.code == "sfm.no_matches"
+    assert "overlaps the next" in str(refused.value)
+    assert "--pairs" not in str(refused.value)
+    assert any("broken.jpg" in note for note in refused.value.__notes__)

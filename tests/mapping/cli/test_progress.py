@@ -69,3 +69,12 @@ def test_a_terminal_shows_a_bar_that_moves() -> None:
     console = Console(file=io.StringIO(), width=120, force_terminal=True)
     with StageProgress(console) as told, one_step(told, "triangulation"):
         wait_for(console, lambda line: "triangulation" in line and "0/1" in line)
+
+
+def test_a_stage_that_is_done_once_more_is_told_again(log: Console) -> None:
+    with StageProgress(log) as told:
+        told("matches", 10, 10)
+        told("matches", 0, 10)
+        wait_for(log, lambda line: line.startswith("matches: 0/10 after "))
+        told("matches", 10, 10)
+    assert sum(line.startswith("matches: 10/10 in ") for line in lines_of(log)) == 2

@@ -15,7 +15,7 @@ from mapping.methods.colmap_scene import colmap_database
 from mapping.methods.intrinsics import CameraOrigin, Doubt, is_plausible, notes_on, origin_of
 from mapping.methods.matching import Matches
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
-from mapping.methods.triangulation import reconstruct, solve_with_priors, triangulate
+from mapping.methods.triangulation import MAPPING, reconstruct, solve_with_priors, triangulate
 from visloc.errors import InvalidInput
 from visloc.geometry import Camera, Pose
 from visloc.kapture import Sensor
@@ -92,7 +92,7 @@ def around_an_object() -> tuple[NDArray[np.float64], list[Pose]]:
     ]
 
 
-def quiet(_done: int, _total: int) -> None:
+def quiet(_stage: str, _done: int, _total: int) -> None:
     pass
 
 
@@ -192,7 +192,9 @@ def test_with_given_poses_the_same_holds(tmp_path: Path) -> None:
     for off, reason in ((1.03, None), (1.15, "moved")):
         photos, shown = taken(*around_an_object(), camera(FOCAL), camera(off * FOCAL))
         wide = MAPPER_CONFIGS["config2"]
-        model = triangulate(photos, {}, matched(shown), wide, ("intrinsics",), tmp_path)
+        model = triangulate(
+            photos, {}, matched(shown), wide, ("intrinsics",), tmp_path, lambda *_: None
+        )
         (found,) = cameras_in(model)
         expected = FOCAL if reason is None else off * FOCAL
         assert found.focal_length == pytest.approx(expected, rel=0.01)
@@ -233,9 +235,14 @@ def test_the_first_pair_of_two_photos_is_not_yet_all(tmp_path: Path) -> None:
     points, poses = around_an_object()
     photos, shown = taken(points, poses[:4:3], camera(FOCAL), camera(FOCAL))
     told: list[tuple[int, int]] = []
-    reconstruct(photos, {}, matched(shown), CONFIG, (), tmp_path, lambda *done: told.append(done))
-    assert told
-    assert set(told) == {(1, 2)}
+
+    def tell(stage: str, done: int, total: int) -> None:
+        if stage == MAPPING:
+            told.append((done, total))
+
+    reconstruct(photos, {}, matched(shown), CONFIG, (), tmp_path, tell)
+    assert set(told[:-1]) == {(1, 2)}
+    assert told[-1] == (2, 2)
 
 
 def test_the_same_photos_give_the_same_bits(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from mapping.methods import thinning
 from mapping.methods.matching import Matches
@@ -10,6 +11,11 @@ from visloc.geometry import Camera
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
 COUNT = 3 * thinning.MOST
+
+
+@pytest.fixture(autouse=True)
+def _of_many_photos(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(thinning, "ALL", 0)
 
 
 def photo_of(number: int, keypoints: np.ndarray) -> SfmPhoto:
@@ -36,6 +42,15 @@ def test_those_that_match_in_more_pairs_stay() -> None:
         np.testing.assert_array_equal(pair.rows[:, 0], often)
 
 
+def test_few_photos_keep_more_keypoints(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(thinning, "ALL", 4 * thinning.MOST)
+    keypoints = np.random.default_rng(0).uniform(0, 480, (COUNT, 2)).astype(np.float32)
+    (kept,) = thin(
+        [photo_of(0, keypoints), photo_of(1, keypoints)], [all_of(0, 1, np.arange(COUNT))]
+    )
+    assert len(kept.rows) == 2 * thinning.MOST
+
+
 def test_they_are_spread_over_the_photo() -> None:
     random = np.random.default_rng(0)
     crowded = random.uniform([0, 0], [79, 79], (COUNT - 200, 2))
@@ -46,6 +61,16 @@ def test_they_are_spread_over_the_photo() -> None:
     )
     assert len(kept.rows) == thinning.MOST
     assert set(range(COUNT - 200, COUNT)) <= set(kept.rows[:, 0].tolist())
+
+
+def test_a_pair_that_shares_few_of_the_best_keeps_enough_to_place_a_photo() -> None:
+    # The best keypoints of photo 0 are in photos 1 and 2, and none of them in photo 3.
+    keypoints = np.random.default_rng(0).uniform(1, 70, (COUNT, 2)).astype(np.float32)
+    often, others = np.arange(thinning.MOST), np.arange(thinning.MOST, COUNT)
+    matches = [all_of(0, 1, often), all_of(0, 2, often), all_of(0, 3, others)]
+    kept = thin([photo_of(number, keypoints) for number in range(4)], matches)
+    assert [len(pair.rows) for pair in kept] == [thinning.MOST, thinning.MOST, thinning.FEW]
+    assert set(kept[2].rows[:, 0].tolist()) <= set(others.tolist())
 
 
 def test_a_photo_without_matches_is_no_harm() -> None:

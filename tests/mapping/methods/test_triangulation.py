@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from mapping.frames.anchor import Alignment, align_positions
 from mapping.methods.matching import Matches
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
-from mapping.methods.triangulation import reconstruct, triangulate
+from mapping.methods.triangulation import MAPPING, TRIANGULATION, reconstruct, triangulate
 from visloc.errors import InvalidInput
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
@@ -64,9 +65,13 @@ def make_world(
     )
 
 
+def triangulated(*inputs: Any) -> SparseModel:
+    return triangulate(*inputs, lambda *_: None)
+
+
 def test_points_come_back_where_they_were_and_given_poses_stay_as_they_are(tmp_path: Path) -> None:
     world = make_world()
-    model = triangulate(world.photos, {}, world.matches, CONFIG, (), tmp_path)
+    model = triangulated(world.photos, {}, world.matches, CONFIG, (), tmp_path)
     assert len(model.points) == 300
     np.testing.assert_allclose(model.points, world.truth(model), atol=1e-5)
     for view, photo in zip(model.views, world.photos, strict=True):
@@ -80,7 +85,7 @@ def test_points_come_back_where_they_were_and_given_poses_stay_as_they_are(tmp_p
 
 def test_far_from_the_origin_points_are_as_exact(tmp_path: Path) -> None:
     world = make_world(offset=(5e5, 5e6, 100.0))
-    model = triangulate(world.photos, {}, world.matches, CONFIG, (), tmp_path)
+    model = triangulated(world.photos, {}, world.matches, CONFIG, (), tmp_path)
     np.testing.assert_allclose(model.points, world.truth(model), atol=1e-4)
 
 
@@ -100,7 +105,7 @@ def test_wrong_matches_make_no_points(tmp_path: Path) -> None:
         for pair in world.matches
     ]
     strict = replace(CONFIG, min_track_length=3)  # no verification has dropped anything
-    model = triangulate(world.photos, {}, wrong, strict, (), tmp_path)
+    model = triangulated(world.photos, {}, wrong, strict, (), tmp_path)
     errors = np.linalg.norm(model.points - world.truth(model), axis=1)
     assert len(model.points) <= 260
     assert (errors < 1e-3).sum() >= 225
@@ -109,10 +114,10 @@ def test_wrong_matches_make_no_points(tmp_path: Path) -> None:
 def test_tracks_of_two_photos_are_points_unless_more_are_asked_for(tmp_path: Path) -> None:
     world = make_world(num_photos=2)
     with pytest.raises(InvalidInput, match="too few matches for triangulation"):
-        triangulate(
+        triangulated(
             world.photos, {}, world.matches, replace(CONFIG, min_track_length=3), (), tmp_path
         )
-    model = triangulate(world.photos, {}, world.matches, CONFIG, (), tmp_path)
+    model = triangulated(world.photos, {}, world.matches, CONFIG, (), tmp_path)
     np.testing.assert_allclose(model.points, world.truth(model), atol=1e-4)
     np.testing.assert_allclose(model.angles_deg, 12, atol=5)
 
@@ -128,7 +133,7 @@ def test_photos_of_one_centre_make_no_points(tmp_path: Path) -> None:
         pixels = project(CAMERA, turned.apply(world.points)).astype(np.float32)
         photos.append(replace(photo, cam_from_world=turned, keypoints=pixels))
     with pytest.raises(InvalidInput) as caught:
-        triangulate(photos, {}, world.matches, MAPPER_CONFIGS["config2"], (), tmp_path)
+        triangulated(photos, {}, world.matches, MAPPER_CONFIGS["config2"], (), tmp_path)
     assert caught.value.code == "sfm.no_points"
 
 
@@ -147,8 +152,8 @@ def test_a_rig_gives_the_same_points_as_its_cameras_alone(tmp_path: Path) -> Non
             photos.append(
                 replace(photo, name=name, sensor=sensor, cam_from_world=pose, keypoints=pixels)
             )
-    on_rig = triangulate(photos, rigs, world.matches, CONFIG, (), tmp_path)
-    alone = triangulate(photos, {}, world.matches, CONFIG, (), tmp_path)
+    on_rig = triangulated(photos, rigs, world.matches, CONFIG, (), tmp_path)
+    alone = triangulated(photos, {}, world.matches, CONFIG, (), tmp_path)
     np.testing.assert_allclose(on_rig.points, world.truth(on_rig), atol=1e-4)
     assert len(on_rig.points) == len(alone.points) == 300
 
@@ -167,7 +172,7 @@ def test_refined_poses_are_better_than_the_noisy_ones_given_and_stay_in_their_fr
             photo.cam_from_world.translation + random.normal(0, 0.02, 3),
         )
         noisy.append(replace(photo, cam_from_world=pose))
-    model = triangulate(noisy, {}, world.matches, MAPPER_CONFIGS["config2"], ("poses",), tmp_path)
+    model = triangulated(noisy, {}, world.matches, MAPPER_CONFIGS["config2"], ("poses",), tmp_path)
 
     def errors(poses: Sequence[Pose | None]) -> list[float]:
         truth = [photo.cam_from_world for photo in world.photos]
@@ -188,7 +193,7 @@ def test_refined_intrinsics_come_nearer_to_the_truth(tmp_path: Path) -> None:
     world = make_world()
     params = (510.0, 520.0, *CAMERA.params[2:])
     wrong = [replace(photo, camera=replace(CAMERA, params=params)) for photo in world.photos]
-    model = triangulate(
+    model = triangulated(
         wrong, {}, world.matches, MAPPER_CONFIGS["config2"], ("intrinsics",), tmp_path
     )
     assert model.views[0] is not None
@@ -199,15 +204,21 @@ def test_refined_intrinsics_come_nearer_to_the_truth(tmp_path: Path) -> None:
 def test_without_poses_the_same_world_comes_back_up_to_a_similarity(tmp_path: Path) -> None:
     world = make_world()
     photos = [replace(photo, cam_from_world=None) for photo in world.photos]
-    told: list[tuple[int, int]] = []
+    told: list[tuple[str, int, int]] = []
     model = reconstruct(
         photos, {}, world.matches, CONFIG, (), tmp_path, lambda *now: told.append(now)
     )
-    placed = [done for done, total in told if total == len(photos)]
+    placed = [done for stage, done, _ in told if stage == MAPPING]
     assert placed[0] == 2
-    assert len(placed) >= len(photos) - 1
+    assert len(placed) >= len(photos)
     assert placed == sorted(placed)
-    assert placed[-1] == len(photos) - 1  # the end is told by whoever reads the result
+    assert placed[-1] == len(photos)
+    # Every photo is a sign of progress of its own, and the end is told once.
+    triangulated_now = [(done, total) for stage, done, total in told if stage == TRIANGULATION]
+    total = triangulated_now[0][1]
+    assert {(done, total) for done in range(len(photos) + 1)} <= set(triangulated_now)
+    assert triangulated_now == sorted(triangulated_now)
+    assert triangulated_now.count((total, total)) == 1
     assert all(view is not None for view in model.views)
     centers = np.array([view.cam_from_world.center for view in model.views if view])
     known = np.array([p.cam_from_world.center for p in world.photos if p.cam_from_world])

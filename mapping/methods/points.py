@@ -1,0 +1,85 @@
+"""Points of photos whose poses are known, triangulated in steps that report progress.
+
+The steps are those of COLMAP's point triangulator, which reports nothing (Schönberger and Frahm,
+"Structure-from-Motion Revisited", 2016, sections 4.2 and 4.4). While poses and cameras stay, points
+do not depend on each other, so they are adjusted some at a time.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
+import pycolmap
+
+from mapping.progress import ItemProgress
+
+# Points that are adjusted at a time: about a second of work.
+_BATCH = 10_000
+
+
+def triangulate_points(
+    model: pycolmap.Reconstruction,
+    path: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+    progress: ItemProgress,
+) -> None:
+    """Give a model of photos with poses the points of their matches.
+
+    Args:
+        model: changed in place.
+        path: of the database with the matches.
+        progress: called with how much is done, in photos: each is counted once when its matches
+            are triangulated, and once in each round of adjustment.
+    """
+    images = sorted(model.reg_image_ids())
+    rounds = options.ba_global_max_refinements
+    total = len(images) * (1 + rounds)
+    progress(0, total)
+    with pycolmap.Database.open(path) as database:
+        cache = pycolmap.DatabaseCache.create(database, _cache_options(options))
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(model)
+    for done, image_id in enumerate(images, 1):
+        mapper.triangulate_image(options.triangulation, image_id)
+        progress(done, total)
+    mapper.complete_and_merge_tracks(options.triangulation)
+    for number in range(1, rounds + 1):
+        mapper.observation_manager.filter_observations_with_negative_depth()
+        observations = model.compute_num_observations()
+        points = sorted(model.point3D_ids())
+        for start in range(0, len(points), _BATCH):
+            _adjust(model, points[start : start + _BATCH], options)
+            share = min(start + _BATCH, len(points)) / len(points)
+            # Never all: the last of these rounds is not yet the end.
+            progress(min(int(len(images) * (number + share)), total - 1), total)
+        changed = mapper.complete_and_merge_tracks(options.triangulation)
+        changed += mapper.filter_points(options.mapper)
+        if changed <= options.ba_global_max_refinement_change * observations:
+            break
+    mapper.end_reconstruction(discard=False)
+    progress(total, total)
+
+
+def _cache_options(options: pycolmap.IncrementalPipelineOptions) -> pycolmap.DatabaseCacheOptions:
+    cache = pycolmap.DatabaseCacheOptions()
+    cache.min_num_matches = options.min_num_matches
+    cache.load_all_images = True
+    return cache
+
+
+def _adjust(
+    model: pycolmap.Reconstruction,
+    points: list[int],
+    options: pycolmap.IncrementalPipelineOptions,
+) -> None:
+    """Move some points to where their reprojection errors are least."""
+    adjustment = options.get_global_bundle_adjustment()
+    adjustment.print_summary = False
+    adjustment.refine_focal_length = adjustment.refine_extra_params = False
+    adjustment.refine_rig_from_world = adjustment.refine_sensor_from_rig = False
+    adjustment.ceres.solver_options.num_threads = options.num_threads
+    config = pycolmap.BundleAdjustmentConfig()
+    for point_id in points:
+        config.add_variable_point(point_id)
+    pycolmap.create_default_bundle_adjuster(adjustment, config, model).solve()

@@ -1,0 +1,53 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from mapping.methods.intrinsics import Doubt
+from mapping.methods.sfm import with_found_cameras
+from mapping.methods.sparse_model import SparseModel
+from mapping.stages.landmarks import Observations, View
+from mapping.stages.photos import MappingPhoto
+from visloc.geometry import Camera, Pose
+from visloc.kapture import FileRecord
+
+GUESS = Camera("SIMPLE_RADIAL", 640, 480, (768.0, 320.0, 240.0, 0.0))
+FOUND = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.1))
+
+
+def photo_of(number: int, sensor: str, *, known: bool = False) -> MappingPhoto:
+    record = FileRecord(number, sensor, f"{sensor}/{number}.jpg")
+    return MappingPhoto(record, Path(record.path), "", GUESS, known, None, None, None)
+
+
+def model_of(*cameras: Camera | None, doubts: dict[str, Doubt] | None = None) -> SparseModel:
+    views = tuple(None if camera is None else View(camera, Pose.identity()) for camera in cameras)
+    none = np.empty(0, np.int64)
+    seen = Observations(none, none, none, np.empty((0, 2), np.float32))
+    angles = np.empty(0, np.float32)
+    return SparseModel(views, np.empty((0, 3)), seen, angles, False, doubts or {})
+
+
+def test_a_photo_without_a_place_gets_the_camera_that_others_found() -> None:
+    photos = [photo_of(0, "film"), photo_of(1, "film"), photo_of(0, "other")]
+    found = with_found_cameras(photos, model_of(FOUND, None, None))
+    assert found is not None
+    assert [photo.camera for photo in found] == [FOUND, FOUND, GUESS]
+    assert [photo.camera_known for photo in found] == [True, True, False]
+
+
+def test_where_all_photos_have_a_place_nothing_is_done_again() -> None:
+    photos = [photo_of(0, "film"), photo_of(1, "film")]
+    assert with_found_cameras(photos, model_of(FOUND, FOUND)) is None
+
+
+def test_a_camera_that_was_known_teaches_nothing() -> None:
+    photos = [photo_of(0, "film", known=True), photo_of(1, "film", known=True)]
+    assert with_found_cameras(photos, model_of(FOUND, None)) is None
+
+
+def test_a_camera_in_doubt_stays_unknown() -> None:
+    photos = [photo_of(0, "film"), photo_of(1, "film")]
+    doubts = {"film": Doubt("undetermined", 500.0)}
+    assert with_found_cameras(photos, model_of(FOUND, None, doubts=doubts)) is None
