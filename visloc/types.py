@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Literal
 
@@ -34,6 +34,16 @@ class LocalFeatures:
 
     def __len__(self) -> int:
         return len(self.keypoints)
+
+    def reduced(self, by: float) -> LocalFeatures:
+        """Return these features in a photo whose sides are divided by a number."""
+        if by == 1.0:
+            return self
+        return replace(
+            self,
+            keypoints=(self.keypoints / by).astype(np.float32),
+            scales=(self.scales / by).astype(np.float32),
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,8 +33,10 @@ class FoundFeatures:
     rgb: NDArray[np.uint8]
 
 
-# The features of one photo, by extractor and settings.
-FeatureCache = dict[tuple[LocalFeatureExtractor, ReadAs, Extraction], FoundFeatures]
+# The features of one photo, by extractor, settings, and the size at which they were found.
+FeatureCache = dict[
+    tuple[LocalFeatureExtractor, ReadAs, Extraction, tuple[int, int] | None], FoundFeatures
+]
 
 
 def find_features(
@@ -43,6 +45,7 @@ def find_features(
     most: int,
     options: LocalizeOptions,
     found: FeatureCache | None = None,
+    size: tuple[int, int] | None = None,
 ) -> tuple[LocalFeatures, NDArray[np.uint8]]:
     """Find the local features of a photo, or take them from the cache.
 
@@ -51,12 +54,13 @@ def find_features(
         most: keypoints of a mapping image.
         options: the effort and the orientation.
         found: the cache of this photo; new features are added to it.
+        size: width and height at which features are found; None for the photo's own.
 
     Returns:
         Features with keypoints in the stored pixels, and the image they were found in.
     """
     most = min(most, _MOST_KEYPOINTS.get(options.extraction, most))
-    key = extractor, options.read_as, options.extraction
+    key = extractor, options.read_as, options.extraction, size
     known = None if found is None else found.get(key)
     if known is None or known.max_keypoints < most:
         local, rgb = extract_features(
@@ -65,6 +69,7 @@ def find_features(
             max_keypoints=most,
             read_as=options.read_as,
             extraction=options.extraction,
+            size=size,
         )
         known = FoundFeatures(local, most, rgb)
         if found is not None:

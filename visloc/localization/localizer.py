@@ -18,6 +18,7 @@ from visloc.errors import VislocError, refuse
 from visloc.features import GlobalDescriptor, LocalFeatureExtractor, make_global_descriptor
 from visloc.features.local.readymade import is_ready_made
 from visloc.features.networks.lightglue.load import make_lightglue
+from visloc.features.resolution import Resolution
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo
 from visloc.localization.constraints import Constraints, MapGeometry
@@ -49,6 +50,7 @@ from visloc.matching.correspondences import (
 from visloc.matching.products import round_descriptors, start_threads
 from visloc.options import LocalizeOptions, Matcher, ReadAs
 from visloc.priors import NO_PRIORS, Priors
+from visloc.retrieval.excluded import excluded_photos
 from visloc.retrieval.fusion import LateFusion, chosen_fusion
 from visloc.retrieval.index import Retrieved, retrieve
 from visloc.timing import timed
@@ -71,9 +73,6 @@ if TYPE_CHECKING:
 
 # For global descriptors that do not look at the photo.
 _NO_PIXELS = np.empty((0, 0, 3), np.uint8)
-# When priors narrow the search, excluded photos among this many most similar ones are matched too:
-# they may show that the priors are wrong.
-_NUM_ELSEWHERE = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,10 +80,11 @@ class _Features:
     """The features of one query.
 
     Attributes:
-        local: with keypoints in the stored pixels.
+        local: with keypoints in the stored pixels, reduced by ``reduced``.
         sent: global descriptors by name; missing ones are computed.
         rgb: (height, width, 3) pixels for descriptors that look at them.
         seconds: of ``evidence``, to be added to.
+        reduced: how many stored pixels each side of a pixel of the keypoints spans.
     """
 
     local: LocalFeatures
@@ -92,6 +92,7 @@ class _Features:
     rgb: NDArray[np.uint8]
     evidence: Evidence
     seconds: dict[str, float]
+    reduced: float
 
 
 class Localizer:
@@ -237,10 +238,13 @@ class Localizer:
         used, source = resolve_camera(photo, camera)
         seconds: dict[str, float] = {}
         evidence = Evidence(used, source, photo.exif_orientation, options.read_as, seconds=seconds)
+        resolution, mapped = _resolution_of(evidence), self.geometry.resolution
         with timed(seconds, "local_features"):
             most = self.map.manifest.local_features.max_keypoints
-            local, rgb = find_features(photo, self._extractor, most, options, cache)
-        found = _Features(local, {}, rgb, evidence, seconds)
+            size = mapped.feature_size(resolution, photo.width, photo.height)
+            local, rgb = find_features(photo, self._extractor, most, options, cache, size)
+        reduced = mapped.finer(resolution)
+        found = _Features(local.reduced(reduced), {}, rgb, evidence, seconds, reduced)
         return self._match(found, options, fusion, constraints)
 
     def look_at_features(
@@ -266,7 +270,8 @@ class Localizer:
         with timed(seconds, "local_features"):
             local = checked_local_features(features, camera, self.map.manifest)
             sent = checked_global_descriptors(features, self.map.manifest, optional)
-        found = _Features(local, sent, _NO_PIXELS, evidence, seconds)
+        reduced = self.geometry.resolution.finer(_resolution_of(evidence))
+        found = _Features(local.reduced(reduced), sent, _NO_PIXELS, evidence, seconds, reduced)
         return self._match(found, options, fusion, constraints)
 
     def solve(
@@ -310,7 +315,7 @@ class Localizer:
             covariance=pose.covariance,
             position_std=pose.position_std,
             orientation_std=pose.orientation_std,
-            inlier_keypoints=look.matches.pixels[inliers].astype(np.float32),
+            inlier_keypoints=(look.matches.pixels[inliers] * look.reduced).astype(np.float32),
             inlier_points=look.matches.points[inliers] + self.geometry.origin,
             photo_covariance=pose.photo_covariance,
             uncertainty=pose.uncertainty,
@@ -330,7 +335,8 @@ class Localizer:
         rematching = None
         if options.matcher is Matcher.LIGHTGLUE:
             network = self._make_matcher(self.map.manifest.local_features.fingerprint.name)
-            rematching = Rematching(network, self.map, seen_as_found(local, evidence))
+            seen = seen_as_found(local, evidence, features.reduced)
+            rematching = Rematching(network, self.map, seen)
         evidence = replace(evidence, num_keypoints=len(local))
         if len(local) == 0:
             blank = _nothing(
@@ -349,7 +355,7 @@ class Localizer:
         with timed(seconds, "retrieval"):
             index, weights = self.map.global_descriptors, constraints.photo_weights
             retrieved = retrieve(query, index, options.top_k, weights, fusion)
-            elsewhere = self._elsewhere(query, retrieved, weights, fusion)
+            elsewhere = excluded_photos(query, index, retrieved, weights, fusion)
         if len(retrieved.images) == 0:
             return _nothing(
                 evidence,
@@ -373,6 +379,7 @@ class Localizer:
             self._matches(shown, others.settled()),
             shown=shown,
             proposed=Proposed(shown, pairs, points, retrieved.images, ratio),
+            reduced=features.reduced,
         )
 
     def _match_photos(
@@ -395,28 +402,6 @@ class Localizer:
             shown.keypoints[pairs.keypoints].astype(np.float64),
             self.map.landmarks[pairs.landmarks].astype(np.float64),
         )
-
-    def _elsewhere(
-        self,
-        query: Mapping[str, NDArray[np.float32]],
-        retrieved: Retrieved,
-        weights: NDArray[np.float64] | None,
-        fusion: LateFusion,
-    ) -> NDArray[np.int64]:
-        """Photos that the priors exclude although they look very much like the query.
-
-        On look-alike floors the most similar photo is a coin toss, so a photo need not be the very
-        best to count.
-        """
-        if weights is None:
-            return np.empty(0, dtype=np.int64)
-        excluded, index = np.asarray(weights == 0, dtype=np.float64), self.map.global_descriptors
-        others = retrieve(query, index, _NUM_ELSEWHERE, excluded, fusion)
-        # Fuse both lists together: scores that are ranks only compare within one ranking.
-        both, num = (retrieved.similarities, others.similarities), len(retrieved.images)
-        scores = fusion.scores({name: np.concatenate([f[name] for f in both]) for name in query})
-        best = np.sort(scores[:num])[::-1][:_NUM_ELSEWHERE]
-        return np.asarray(others.images[scores[num:] > best.min(initial=np.inf)])
 
     def _describe(self, name: str, features: _Features) -> NDArray[np.float32]:
         if name in features.sent:
@@ -443,6 +428,11 @@ class Localizer:
             similarities = {name: float(row[rank]) for name, row in retrieved.similarities.items()}
             score = float(retrieved.scores[rank])
             yield RetrievedImage(self.map.images[image].name, score, similarities)
+
+
+def _resolution_of(evidence: Evidence) -> Resolution:
+    known = evidence.camera_source is not CameraSource.GUESS
+    return Resolution.of(evidence.camera, known=known)
 
 
 def _nothing(evidence: Evidence, stage: Stage, reason: Reason, message: str) -> Look:

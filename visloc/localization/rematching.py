@@ -54,10 +54,15 @@ class Rematching:
         return i, landmarks[j].astype(np.int64), similarities
 
 
-def seen_as_found(local: LocalFeatures, evidence: Evidence) -> SeenKeypoints:
-    """Return a query's keypoints in the frame of its descriptors: the photo as it was read."""
+def seen_as_found(local: LocalFeatures, evidence: Evidence, reduced: float) -> SeenKeypoints:
+    """Return a query's keypoints in the frame of its descriptors: the photo as it was read.
+
+    Args:
+        local: in the pixels of the photo reduced by ``reduced``.
+    """
     turn = turn_of(evidence.exif_orientation) if evidence.read_as is ReadAs.UPRIGHT else 1
-    return _seen_upright(local.keypoints, local.descriptors, evidence.camera, turn)
+    camera = evidence.camera.reduced(reduced)
+    return _seen_upright(local.keypoints, local.descriptors, camera, turn)
 
 
 def _seen_upright(
