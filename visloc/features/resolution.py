@@ -103,7 +103,8 @@ class WorkingResolution:
         most = max(_MOST_ENLARGED * self.seen.long_side, seen.long_side)
         if self.most_px is not None:
             most = min(most, self.most_px)
-        least, long_side = min(_LEAST_LONG_SIDE_PX, seen.long_side), max(width, height)
+        least = min(_LEAST_LONG_SIDE_PX, seen.long_side, self.seen.long_side)
+        long_side = max(width, height)
         scale = min(max(seen.long_side / finer, least), most) / long_side
         size = max(1, round(width * scale)), max(1, round(height * scale))
         return None if size == (width, height) else size

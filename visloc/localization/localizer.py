@@ -18,14 +18,13 @@ from visloc.errors import VislocError, refuse
 from visloc.features import GlobalDescriptor, LocalFeatureExtractor, make_global_descriptor
 from visloc.features.local.readymade import is_ready_made
 from visloc.features.networks.lightglue.load import make_lightglue
-from visloc.features.resolution import Resolution
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo
 from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.evidence import Shown
 from visloc.localization.feature_cache import FeatureCache, find_features
 from visloc.localization.fingerprints import check_fingerprint
-from visloc.localization.query_camera import resolve_camera
+from visloc.localization.query_camera import query_resolution, resolve_camera
 from visloc.localization.query_features import (
     checked_global_descriptors,
     checked_local_features,
@@ -238,7 +237,7 @@ class Localizer:
         used, source = resolve_camera(photo, camera)
         seconds: dict[str, float] = {}
         evidence = Evidence(used, source, photo.exif_orientation, options.read_as, seconds=seconds)
-        resolution, mapped = _resolution_of(evidence), self.geometry.resolution
+        resolution, mapped = query_resolution(used, source), self.geometry.resolution
         with timed(seconds, "local_features"):
             most = self.map.manifest.local_features.max_keypoints
             size = mapped.feature_size(resolution, photo.width, photo.height)
@@ -270,7 +269,8 @@ class Localizer:
         with timed(seconds, "local_features"):
             local = checked_local_features(features, camera, self.map.manifest)
             sent = checked_global_descriptors(features, self.map.manifest, optional)
-        reduced = self.geometry.resolution.finer(_resolution_of(evidence))
+        seen = query_resolution(camera, CameraSource.GIVEN)
+        reduced = self.geometry.resolution.finer(seen)
         found = _Features(local.reduced(reduced), sent, _NO_PIXELS, evidence, seconds, reduced)
         return self._match(found, options, fusion, constraints)
 
@@ -428,11 +428,6 @@ class Localizer:
             similarities = {name: float(row[rank]) for name, row in retrieved.similarities.items()}
             score = float(retrieved.scores[rank])
             yield RetrievedImage(self.map.images[image].name, score, similarities)
-
-
-def _resolution_of(evidence: Evidence) -> Resolution:
-    known = evidence.camera_source is not CameraSource.GUESS
-    return Resolution.of(evidence.camera, known=known)
 
 
 def _nothing(evidence: Evidence, stage: Stage, reason: Reason, message: str) -> Look:
