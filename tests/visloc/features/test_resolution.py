@@ -54,10 +54,10 @@ def test_without_a_camera_the_width_counts() -> None:
     assert KITCHEN.finer(film(1280, None)) == pytest.approx(2.0)
 
 
-def test_a_network_that_shrinks_both_alike_needs_no_other_size() -> None:
+def test_what_a_network_shrinks_alike_is_reduced_to_the_maps_size() -> None:
     phone = of(film(4000, 3000.0))
     assert phone.feature_size(film(4000, 3000.0), 4000, 3000) is None
-    assert phone.feature_size(film(8000, 6000.0), 8000, 6000) is None
+    assert phone.feature_size(film(8000, 6000.0), 8000, 6000) == (4000, 3000)
     assert phone.finer(film(8000, 6000.0)) == pytest.approx(2.0)
     # What the network saw of the map's photos is as fine as this photo.
     assert phone.feature_size(film(1280, 960.0), 1280, 960) is None
