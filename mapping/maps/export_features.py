@@ -19,6 +19,7 @@ from visloc.features import (
     make_global_descriptor,
     make_local_features,
 )
+from visloc.features.framing import Framing
 from visloc.features.photo import extract_features
 from visloc.features.resolution import Resolution, WorkingResolution
 from visloc.kapture import (
@@ -118,7 +119,9 @@ def _export_photo(
     assert size is not None  # every sensor of a photo has one
     photo = read_in_frame(dataset.path_of(record), size, record.sensor_id)
     feature_size = resolution.feature_size(_seen_by(sensor), *size)
-    local, rgb = extract_features(photo, extractor, max_keypoints=max_keypoints, size=feature_size)
+    local, rgb = extract_features(
+        photo, extractor, max_keypoints=max_keypoints, framing=Framing(feature_size)
+    )
     for name, (descriptor, model) in descriptors.items():
         vector = descriptor.describe(rgb, local, model)
         write_global_features(output, name, record.path, vector, name=name)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from service.workers.photos import DecodedQuery, ExtractorOf
 from visloc.archive import MapSet, open_map
 from visloc.errors import InvalidInput, MapCorrupt
+from visloc.features.framing import Framing
 from visloc.features.local.readymade import (
     MAX_READY_MADE_KEYPOINTS,
     is_ready_made,
@@ -125,7 +126,7 @@ class TileRanker:
                 _MOST_KEYPOINTS,
                 options,
                 decoded.found,
-                self._feature_size(query),
+                Framing(self._feature_size(query)),
             )
             if len(decoded.found) > known:
                 decoded.seconds["local_features"] = perf_counter() - began

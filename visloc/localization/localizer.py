@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from visloc.archive import Map
 from visloc.errors import VislocError, refuse
 from visloc.features import GlobalDescriptor, LocalFeatureExtractor, make_global_descriptor
+from visloc.features.framing import Framing
 from visloc.features.local.readymade import is_ready_made
 from visloc.features.networks.lightglue.load import make_lightglue
 from visloc.geometry import Camera, Pose
@@ -40,6 +41,7 @@ from visloc.localization.solving import (
     check_solver,
     solve_instant,
 )
+from visloc.localization.turning import TurnFinder
 from visloc.matching.correspondences import (
     CLEAR_RATIO,
     Correspondences,
@@ -64,7 +66,6 @@ from visloc.types import (
     Reason,
     Refusal,
     RetrievedImage,
-    Stage,
 )
 
 if TYPE_CHECKING:
@@ -133,6 +134,9 @@ class Localizer:
                 check_fingerprint(record.fingerprint, descriptor.fingerprint, opened.ref)
                 self._descriptors[name] = descriptor
         self.geometry = MapGeometry(opened)
+        self.turns = (
+            None if extractor is None else TurnFinder(self.geometry, extractor, self._descriptors)
+        )
         start_threads()
 
     def warm_up(self) -> None:
@@ -194,7 +198,18 @@ class Localizer:
                 are not computed here; ``options.fusion_weights`` of global descriptors that it
                 does not have; ``priors.*`` that mean nothing in this map.
         """
-        return self.solve_look(self.look(photo, camera, options, priors, cache), options, priors)[0]
+        cache = {} if cache is None else cache
+        look = self.look(photo, camera, options, priors, cache)
+        answer = self.solve_look(look, options, priors)[0]
+        if isinstance(answer, Localized):
+            return answer
+        assert self.turns is not None  # the photo was looked at
+        turned = self.turns.find(photo, answer.evidence, answer.reason, options, priors, cache)
+        if turned == 0:
+            return answer
+        look = self.look(photo, camera, options, priors, cache, turned)
+        again = self.solve_look(look, options, priors)[0]
+        return again if isinstance(again, Localized) else answer
 
     def localize_features(
         self,
@@ -228,20 +243,26 @@ class Localizer:
         options: LocalizeOptions,
         priors: Priors = NO_PRIORS,
         cache: FeatureCache | None = None,
+        turned: int = 0,
     ) -> Look:
-        """Match one photo with the map; arguments and errors as for ``localize``."""
+        """Match one photo with the map; arguments and errors as for ``localize``.
+
+        ``turned`` is what ``turns`` found, or 0.
+        """
         fusion = self._fusion(options)
         if self._extractor is None or not self._takes_photos(fusion):
             raise self._features_required(fusion)
         constraints = Constraints(self.geometry, priors)
         used, source = resolve_camera(photo, camera)
         seconds: dict[str, float] = {}
-        evidence = Evidence(used, source, photo.exif_orientation, options.read_as, seconds=seconds)
+        evidence = Evidence(used, source, photo.exif_orientation, options.orientation)
+        evidence = replace(evidence, turned=turned, seconds=seconds)
         resolution, mapped = query_resolution(used, source), self.geometry.resolution
         with timed(seconds, "local_features"):
             most = self.map.manifest.local_features.max_keypoints
             size = mapped.feature_size(resolution, photo.width, photo.height)
-            local, rgb = find_features(photo, self._extractor, most, options, cache, size)
+            framing = Framing(size, turned)
+            local, rgb = find_features(photo, self._extractor, most, options, cache, framing)
         reduced = mapped.finer(resolution)
         found = _Features(local.reduced(reduced), {}, rgb, evidence, seconds, reduced)
         return self._match(found, options, fusion, constraints)
@@ -339,14 +360,10 @@ class Localizer:
             rematching = Rematching(network, self.map, seen)
         evidence = replace(evidence, num_keypoints=len(local))
         if len(local) == 0:
-            blank = _nothing(
-                evidence,
-                "features",
-                Reason.NO_KEYPOINTS,
-                "no keypoints were found: the photo is blank, dark, blurred or too small",
-            )
+            why = "no keypoints were found: the photo is blank, dark, blurred or too small"
+            refusal = Refusal("features", Reason.NO_KEYPOINTS, why)
             # Other cameras of the rig may show two places.
-            return replace(blank, proposed=Proposed.none(local))
+            return replace(Look.nothing(evidence, refusal), proposed=Proposed.none(local))
         with timed(seconds, "global_features"):
             query = {
                 name: self._describe(name, features)
@@ -357,12 +374,8 @@ class Localizer:
             retrieved = retrieve(query, index, options.top_k, weights, fusion)
             elsewhere = excluded_photos(query, index, retrieved, weights, fusion)
         if len(retrieved.images) == 0:
-            return _nothing(
-                evidence,
-                "retrieval",
-                Reason.NO_PHOTO_NEAR,
-                "the map has no photo in the area that the priors allow",
-            )
+            why = "the map has no photo in the area that the priors allow"
+            return Look.nothing(evidence, Refusal("retrieval", Reason.NO_PHOTO_NEAR, why))
         evidence = replace(evidence, retrieved=tuple(self._describe_retrieved(retrieved)))
         with timed(seconds, "matching"):
             shown = Shown(local.keypoints, round_descriptors(local.descriptors))
@@ -428,8 +441,3 @@ class Localizer:
             similarities = {name: float(row[rank]) for name, row in retrieved.similarities.items()}
             score = float(retrieved.scores[rank])
             yield RetrievedImage(self.map.images[image].name, score, similarities)
-
-
-def _nothing(evidence: Evidence, stage: Stage, reason: Reason, message: str) -> Look:
-    refusal = Refusal(stage, reason, message)
-    return Look(evidence, Matches.none(), np.empty(0, np.int64), Matches.none(), refusal)

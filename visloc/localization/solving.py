@@ -16,6 +16,7 @@ from visloc.localization.evidence import Shown
 from visloc.localization.gates import Problem, accepted, not_better_elsewhere
 from visloc.localization.judge import not_probable_enough
 from visloc.localization.rivals import Proposed, stronger_place
+from visloc.localization.turning import REASONS_OF_TURNED_PHOTOS
 from visloc.options import LocalizeOptions, ReadAs, Solver
 from visloc.pose.centre import position_covariance, with_origin
 from visloc.pose.generalized import GeneralizedPose
@@ -31,11 +32,6 @@ from visloc.types import (
     Reason,
     Refusal,
     RigPose,
-)
-
-# Usual refusals of a photo whose features were found on its side.
-_REASONS_OF_TURNED_PHOTOS = (
-    *(Reason.TOO_FEW_MATCHES, Reason.NO_POSE, Reason.TOO_FEW_INLIERS, Reason.LOW_INLIER_RATIO),
 )
 
 
@@ -84,6 +80,11 @@ class Look:
     shown: Shown | None = None
     proposed: Proposed | None = None
     reduced: float = 1.0
+
+    @staticmethod
+    def nothing(evidence: Evidence, refusal: Refusal) -> Look:
+        """Return what an image shows in which there is nothing to solve."""
+        return Look(evidence, Matches.none(), np.empty(0, np.int64), Matches.none(), refusal)
 
     @property
     def camera(self) -> Camera:
@@ -413,7 +414,7 @@ def _with_turned_photos(refusal: Refusal, looks: Sequence[Look]) -> Refusal:
             if look.evidence.read_as is ReadAs.STORED and look.evidence.exif_orientation != 1
         }
     )
-    if not orientations or refusal.reason not in _REASONS_OF_TURNED_PHOTOS:
+    if not orientations or refusal.reason not in REASONS_OF_TURNED_PHOTOS:
         return refusal
     exif = ", ".join(map(str, orientations))
     hint = f"stored rotated (EXIF orientation {exif}) and read as stored: try read_as=upright"
