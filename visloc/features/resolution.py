@@ -130,12 +130,12 @@ def resized(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8
 
 
 def _middle(photos: Sequence[Resolution]) -> Resolution:
-    long_side = _lower_median(photo.long_side for photo in photos)
+    long_side = _upper_median(photo.long_side for photo in photos)
     focal = [photo.focal_length for photo in photos if photo.focal_length is not None]
-    return Resolution(long_side, _lower_median(focal) if focal else None)
+    return Resolution(long_side, _upper_median(focal) if focal else None)
 
 
-def _lower_median(values: Iterable[float]) -> float:
-    # Of two sizes that are equally common, the smaller one: detail can be left out, but not made.
+def _upper_median(values: Iterable[float]) -> float:
+    # Of two sizes that are equally common, the larger one: reduced photos are placed less exactly.
     ordered = sorted(values)
-    return ordered[(len(ordered) - 1) // 2]
+    return ordered[len(ordered) // 2]

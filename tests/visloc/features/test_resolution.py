@@ -64,10 +64,14 @@ def test_what_a_network_shrinks_alike_is_reduced_to_the_maps_size() -> None:
     assert phone.finer(film(1280, 960.0)) == 1.0
 
 
-def test_photos_of_equally_many_cameras_count_as_the_coarser_one() -> None:
-    mixed = of(film(640, 500.0), film(4000, 3000.0), film(640, 500.0), film(4000, 3000.0))
-    assert mixed.feature_size(film(4000, 3000.0), 4000, 3000) == (667, 500)
-    assert mixed.finer(film(4000, 3000.0)) == pytest.approx(6.0)
+def test_the_camera_of_most_photos_counts_and_of_two_the_finer_one() -> None:
+    small, large = film(640, 500.0), film(4000, 3000.0)
+    mixed = of(small, large, small, large)
+    assert mixed.feature_size(large, 4000, 3000) is None
+    assert mixed.feature_size(small, 640, 480) == (1229, 922)
+    mixed = of(small, large, small)
+    assert mixed.feature_size(large, 4000, 3000) == (667, 500)
+    assert mixed.finer(large) == pytest.approx(6.0)
 
 
 @pytest.mark.parametrize("focal", [1e-300, 1e-9, 1.0, 1e9, 1e300])
