@@ -36,8 +36,8 @@ _TURNS = (90, 180, 270, 45, 315)
 _STEP_DEG = 45
 _NUM_KEYPOINTS, _NUM_PHOTOS = 1000, 3
 # A turn is worth a try with this many clear matches with one photo, and with so many times as many
-# as the photo has that was not turned.
-_LEAST_CLEAR, _TIMES_AS_MANY = 20, 2
+# as come by chance, if the photo as it was has fewer.
+_LEAST_CLEAR, _TIMES_BY_CHANCE = 20, 2
 # With so many, no other turn is looked at.
 _SURELY_CLEAR = 100
 # Of a unit vector: gravity that lies nearer to the optical axis does not tell the roll.
@@ -100,13 +100,15 @@ class TurnFinder:
 
         if not turns:
             return 0
-        counts: dict[int, int] = {}
+        counts = {0: clear(0)}
         for turned in turns:
             counts[turned] = clear(turned)
             if counts[turned] >= _SURELY_CLEAR:
                 break
+        # Most turns show nothing of the map, so that half of them have what comes by chance.
+        by_chance = sorted(counts.values())[(len(counts) - 1) // 2]
         best = max(counts, key=lambda turned: counts[turned])
-        promises = counts[best] >= max(_LEAST_CLEAR, _TIMES_AS_MANY * clear(0))
+        promises = counts[best] >= max(_LEAST_CLEAR, _TIMES_BY_CHANCE * by_chance)
         return best if promises else 0
 
     def _clear_matches(
