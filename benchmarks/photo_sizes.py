@@ -64,10 +64,11 @@ def ask(
         photo, own = resized(read_photo_file(dataset.path_of(record)), camera, times)
         began = perf_counter()
         answer = localizer.localize(photo, own if known else None, LocalizeOptions())
-        yield _row(answer, truth, perf_counter() - began)
+        yield row_of(answer, truth, perf_counter() - began)
 
 
-def _row(answer: object, truth: Pose, seconds: float) -> Row:
+def row_of(answer: object, truth: Pose, seconds: float) -> Row:
+    """Compare an answer with the truth."""
     if not isinstance(answer, Localized):
         return Row(False, False, np.nan, np.nan, 0, seconds)
     units, degrees = pose_error(answer.cam_from_world, truth)
