@@ -273,12 +273,14 @@ class Camera:
         """
         return self._times(width / self.width, height / self.height, width, height)
 
-    def reduced(self, by: int) -> Camera:
-        """Return this camera for its image with sides divided by a whole number.
+    def reduced(self, by: float) -> Camera:
+        """Return this camera for its image with sides divided by a number.
 
-        (u, v) goes to (u / by, v / by). Columns and rows that fill no pixel are left out.
+        (u, v) goes to (u / by, v / by). Columns and rows that fill no pixel are left out, except
+        the first ones.
         """
-        return self._times(1 / by, 1 / by, self.width // by, self.height // by)
+        width, height = (max(1, int(side / by)) for side in (self.width, self.height))
+        return self._times(1 / by, 1 / by, width, height)
 
     def _times(self, sx: float, sy: float, width: int, height: int) -> Camera:
         factors = dict.fromkeys(_SCALES_WITH_WIDTH, sx) | dict.fromkeys(_SCALES_WITH_HEIGHT, sy)

@@ -11,10 +11,11 @@ from visloc.errors import refuse
 
 
 class ReadAs(StrEnum):
-    """The orientation in which the features of a photo were found."""
+    """The orientation in which the features of a photo are found."""
 
     STORED = "stored"
     UPRIGHT = "upright"  # turned by the photo's EXIF orientation
+    ANY = "any"  # upright; a refused photo also in other turns that the map seems to know
 
 
 class Extraction(StrEnum):
@@ -198,11 +199,11 @@ class LocalizeOptions:
         unset=f"{LEAST_PROBABILITY:g}; 0 with another preset or with min_inliers",
     )
     read_as: ReadAs = _option(
-        ReadAs.UPRIGHT,
+        ReadAs.ANY,
         "orientation in which features are found",
-        details="upright rotates the photo by its EXIF orientation first. Camera, "
-        "keypoints and pose refer to the stored pixels either way. Ignored for "
-        "features that are sent.",
+        details="upright rotates the photo by its EXIF orientation first; any also tries other "
+        "turns of a photo on its own that is refused. Camera, keypoints and pose refer to the "
+        "stored pixels in any case. Ignored for features that are sent.",
     )
     extraction: Extraction = _option(
         Extraction.DEFAULT,
@@ -265,6 +266,11 @@ class LocalizeOptions:
             return self.min_probability
         has_own_thresholds = self.preset != DEFAULT_PRESET or self.min_inliers is not None
         return 0.0 if has_own_thresholds else LEAST_PROBABILITY
+
+    @property
+    def orientation(self) -> ReadAs:
+        """``STORED`` or ``UPRIGHT``: how a photo is read before any other turn is tried."""
+        return ReadAs.STORED if self.read_as is ReadAs.STORED else ReadAs.UPRIGHT
 
     def before_rivals(self) -> LocalizeOptions:
         """Return the options for one of several places, before their poses are compared.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Literal
 
@@ -34,6 +34,31 @@ class LocalFeatures:
 
     def __len__(self) -> int:
         return len(self.keypoints)
+
+    def of(self, which: NDArray[np.bool_]) -> LocalFeatures:
+        """Keep some of the keypoints, by mask (N,)."""
+        return LocalFeatures(
+            self.keypoints[which],
+            self.descriptors[which],
+            self.scores[which],
+            self.scales[which],
+        )
+
+    def strongest(self, most: int) -> LocalFeatures:
+        """Keep the first ``most`` keypoints: extractors return the strongest first."""
+        return LocalFeatures(
+            self.keypoints[:most], self.descriptors[:most], self.scores[:most], self.scales[:most]
+        )
+
+    def reduced(self, by: float) -> LocalFeatures:
+        """Return these features in a photo whose sides are divided by a number."""
+        if by == 1.0:
+            return self
+        return replace(
+            self,
+            keypoints=(self.keypoints / by).astype(np.float32),
+            scales=(self.scales / by).astype(np.float32),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +235,9 @@ class Evidence:
         camera: the intrinsics used, for the pixels as stored.
         camera_source: where they came from.
         exif_orientation: the photo's EXIF orientation, 1 to 8; 1 when it has none or was not sent.
-        read_as: the orientation in which features were found.
+        read_as: the orientation in which features were found, ``UPRIGHT`` or ``STORED``.
+        turned: degrees clockwise by which the photo was turned beyond that, because the map did
+            not know it otherwise; 0 to 315.
         num_keypoints: keypoints found in the photo, or sent.
         num_correspondences: 2D-3D correspondences given to the solver.
         num_inliers: those that agree with the pose (of the best pose, when it was refused).
@@ -226,6 +253,7 @@ class Evidence:
     num_correspondences: int = 0
     num_inliers: int = 0
     retrieved: tuple[RetrievedImage, ...] = ()
+    turned: int = 0
     seconds: Mapping[str, float] = field(default_factory=dict)
 
     @property

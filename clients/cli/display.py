@@ -74,6 +74,13 @@ def print_result(console: Console, result: LocalizeResult, unit: str) -> None:
         f"{camera.model} {camera.width} x {camera.height}  {_numbers(camera.params, 6)}  "
         f"({_CAMERA_SOURCES.get(result.camera.source, result.camera.source)})",
     )
+    if result.orientation.turned:
+        print_line(
+            console,
+            "turned",
+            f"by {result.orientation.turned} degrees clockwise: the map knew the photo only so; "
+            "camera and pose are those of the photo as sent",
+        )
     if result.orientation.exif != 1:
         print_line(
             console,

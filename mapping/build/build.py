@@ -40,6 +40,7 @@ from mapping.stages.networks import Networks
 from mapping.stages.photos import MappingPhoto, collect_photos, masked
 from mapping.stages.previews import keep_photos
 from mapping.stages.publishing import PAIRS
+from mapping.stages.resolution import at_one_resolution
 from mapping.stages.work_folder import WorkFolder, exclusive
 from visloc.archive import GlobalFeatures, MapContent, MapStore
 from visloc.errors import refuse
@@ -167,6 +168,7 @@ class _Job:
         if settings.masks is not None:
             photos, more = masked(photos, settings.masks)
             notes = [*notes, *more]
+        photos = at_one_resolution(photos, context.features)
         # Inputs that cannot give a map are refused before the long work begins.
         ready_made = {
             name: read_global_features(self.dataset, name, settings.features_dir, photos)

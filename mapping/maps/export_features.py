@@ -19,15 +19,19 @@ from visloc.features import (
     make_global_descriptor,
     make_local_features,
 )
+from visloc.features.framing import Framing
 from visloc.features.photo import extract_features
+from visloc.features.resolution import Resolution, WorkingResolution
 from visloc.kapture import (
     Dataset,
     FileRecord,
+    Sensor,
     read_dataset,
     write_dataset,
     write_global_features,
     write_local_features,
 )
+from visloc.localization.constraints import MapGeometry
 from visloc.options import Inference, ReadAs
 
 
@@ -80,12 +84,15 @@ def export_features(
         "global_from": global_from and global_from.manifest.content_hash,
     }
     _claim(reconstruction / f"{local_features}.json", settings)
+    resolution = _resolution_of(dataset, extractor, global_from)
     absent = []
     for done, record in enumerate(dataset.images, 1):
         if not dataset.has_file(record):
             absent.append(record.path)
         else:
-            _export_photo(dataset, record, output, extractor, max_keypoints, descriptors)
+            _export_photo(
+                dataset, record, output, extractor, max_keypoints, descriptors, resolution
+            )
         progress("features", done, len(dataset.images))
     return absent
 
@@ -97,6 +104,7 @@ def _export_photo(
     extractor: LocalFeatureExtractor,
     max_keypoints: int,
     descriptors: Mapping[str, tuple[GlobalDescriptor, Mapping[str, NDArray[np.float32]]]],
+    resolution: WorkingResolution,
 ) -> None:
     """Write the features of one photo, unless they are there."""
     kind, root = extractor.fingerprint.name, output / "reconstruction"
@@ -106,15 +114,37 @@ def _export_photo(
     ]
     if all(path.is_file() for path in last_written):
         return
-    size = dataset.sensors[record.sensor_id].image_size
+    sensor = dataset.sensors[record.sensor_id]
+    size = sensor.image_size
     assert size is not None  # every sensor of a photo has one
     photo = read_in_frame(dataset.path_of(record), size, record.sensor_id)
-    local, rgb = extract_features(photo, extractor, max_keypoints=max_keypoints)
+    feature_size = resolution.feature_size(_seen_by(sensor), *size)
+    local, rgb = extract_features(
+        photo, extractor, max_keypoints=max_keypoints, framing=Framing(feature_size)
+    )
     for name, (descriptor, model) in descriptors.items():
         vector = descriptor.describe(rgb, local, model)
         write_global_features(output, name, record.path, vector, name=name)
     keypoints = np.column_stack([local.keypoints, local.scales])
     write_local_features(output, kind, record.path, keypoints, local.descriptors, name=kind)
+
+
+def _resolution_of(
+    dataset: Dataset, extractor: LocalFeatureExtractor, global_from: Map | None
+) -> WorkingResolution:
+    """How finely the map sees that will be asked; without one, how the photos do."""
+    if global_from is not None:
+        return MapGeometry(global_from).resolution
+    photos = [_seen_by(dataset.sensors[record.sensor_id]) for record in dataset.images]
+    return WorkingResolution.of(photos, extractor.fingerprint.parameters)
+
+
+def _seen_by(sensor: Sensor) -> Resolution:
+    if sensor.camera is not None:
+        return Resolution.of(sensor.camera)
+    size = sensor.image_size
+    assert size is not None  # every sensor of a photo has one
+    return Resolution(max(size), None)
 
 
 def _refuse_other_features(

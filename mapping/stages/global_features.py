@@ -24,6 +24,7 @@ from visloc.features.local.readymade import (
     ready_made_type,
     to_global_descriptor,
 )
+from visloc.features.resolution import resized
 from visloc.images import turn_of, upright
 from visloc.kapture import Dataset, open_features
 from visloc.types import LocalFeatures
@@ -208,7 +209,7 @@ class DescribeTask:
             "fingerprint": self.fingerprint,
             "computed_with": self.computed_with,
             "photo": photo.sha256 if self.needs_image else None,
-            "size": [photo.camera.width, photo.camera.height] if self.needs_image else None,
+            "size": _described_size(photo) if self.needs_image else None,
             "local": self.features.key(photo) if self.needs_local_features else None,
         }
 
@@ -219,7 +220,11 @@ class DescribeTask:
 
 def _upright_pixels(photo: MappingPhoto) -> NDArray[np.uint8]:
     pixels = photo.read()
-    return upright(pixels.rgb, turn_of(pixels.exif_orientation))
+    return upright(resized(pixels.rgb, *_described_size(photo)), turn_of(pixels.exif_orientation))
+
+
+def _described_size(photo: MappingPhoto) -> tuple[int, int]:
+    return photo.feature_size or (photo.camera.width, photo.camera.height)
 
 
 def _evenly(items: Sequence[T], count: int) -> list[T]:

@@ -16,6 +16,7 @@ from mapping.stages.photos import MappingPhoto
 from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc.archive import FingerprintRecord
 from visloc.errors import DatasetError, InvalidInput, refuse
+from visloc.features.framing import Framing
 from visloc.features.local.readymade import (
     MAX_READY_MADE_KEYPOINTS,
     is_ready_made,
@@ -65,6 +66,7 @@ class ExtractedFeatures:
             computed_with=self.computed_with,
             max_keypoints=self.max_keypoints,
             **({} if photo.mask_sha256 is None else {"mask": photo.mask_sha256}),
+            **({} if photo.feature_size is None else {"feature_size": photo.feature_size}),
         )
 
     def prepare(self, photo: MappingPhoto) -> None:
@@ -91,7 +93,9 @@ class ExtractedFeatures:
         extractor = self.networks.extractor(self.name)
         refuse_other_computing(self.name, self.computed_with, extractor.computed_with)
         pixels = photo.read()
-        local, _ = extract_features(pixels, extractor, max_keypoints=self.max_keypoints)
+        local, _ = extract_features(
+            pixels, extractor, max_keypoints=self.max_keypoints, framing=Framing(photo.feature_size)
+        )
         return asdict(local) | {_TURN: np.array(turn_of(pixels.exif_orientation))}
 
 

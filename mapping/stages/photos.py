@@ -28,6 +28,7 @@ class MappingPhoto:
         sha256: of the file; for a dataset at a URL, the storage's own tag of the content.
         camera_known: whether the intrinsics are the dataset's; else they are a guess.
         mask: the file of its mask, if any.
+        feature_size: width and height at which its features are found; None for its own.
     """
 
     record: FileRecord
@@ -40,6 +41,7 @@ class MappingPhoto:
     depth_sha256: str | None
     mask: Path | None = None
     mask_sha256: str | None = None
+    feature_size: tuple[int, int] | None = None
 
     @property
     def name(self) -> str:

@@ -147,7 +147,9 @@ def _camera(evidence: visloc.types.Evidence) -> CameraUsed:
 
 
 def _orientation(evidence: visloc.types.Evidence) -> Orientation:
-    return Orientation(exif=evidence.exif_orientation, read_as=evidence.read_as)
+    return Orientation(
+        exif=evidence.exif_orientation, read_as=evidence.read_as, turned=evidence.turned
+    )
 
 
 def _image_answer(

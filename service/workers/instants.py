@@ -6,8 +6,6 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from service.values import ONLY_SENSOR, ImageJob, Localization, Rig
 from service.workers.photos import DecodedQuery, summed
 from visloc.archive import Map
@@ -16,7 +14,7 @@ from visloc.errors import InvalidInput, refuse
 from visloc.geometry import Pose
 from visloc.localization.constraints import Constraints
 from visloc.localization.localizer import Localizer
-from visloc.localization.solving import Look, Matches, SeenImage
+from visloc.localization.solving import Look, SeenImage
 from visloc.options import LocalizeOptions
 from visloc.priors import Priors
 from visloc.types import InstantAnswer, QueryFeatures, Reason, Refusal, RigSensor
@@ -53,11 +51,12 @@ class Target:
         options: LocalizeOptions,
         priors: Priors,
         seconds: Mapping[str, float],
+        turned: int = 0,
     ) -> SeenImage:
         """Look at one image of an instant; an unusable image is returned with its error.
 
         Errors of the whole request are raised. ``seconds`` is the wall time, by stage, that the
-        image took before.
+        image took before; ``turned`` is what ``Localizer.turns`` found.
         """
         sensor = self.rig.get(image.sensor) or RigSensor(Pose.identity(), None)
         camera = image.camera or sensor.camera
@@ -68,7 +67,7 @@ class Target:
             if isinstance(query, QueryFeatures):
                 look = self.localizer.look_at_features(query, camera, options, priors)
             else:
-                look = self.localizer.look(query, camera, options, priors, decoded.found)
+                look = self.localizer.look(query, camera, options, priors, decoded.found, turned)
         except InvalidInput as error:
             if error.code.startswith(_OF_ALL_IMAGES):
                 raise
@@ -169,11 +168,8 @@ def check_priors(targets: Sequence[Target], priors: Priors) -> None:
 
 def _nothing_here(look: Look) -> Look:
     """Return what an image shows of a tile that the priors exclude."""
-    return Look(
+    return Look.nothing(
         replace(look.evidence, num_correspondences=0, retrieved=()),
-        Matches.none(),
-        np.empty(0, np.int64),
-        Matches.none(),
         Refusal(
             "retrieval", Reason.NO_PHOTO_NEAR, "the priors name other tiles, which do not show this"
         ),

@@ -10,7 +10,7 @@ from functools import partial
 from time import perf_counter
 
 from service.values import MapFolder, OpenMap, WorkerSettings
-from service.workers.tiles import TileRanker
+from service.workers.tiles import TileRanker, resolution_beside
 from visloc.archive.store import open_published, open_published_set
 from visloc.errors import Conflict, InvalidInput, VislocError, refuse
 from visloc.features import (
@@ -107,7 +107,9 @@ class OpenMaps:
         return Localizer(opened, extractor, self._descriptor, matcher)
 
     def _open_set(self, version: MapFolder) -> TileRanker:
-        return TileRanker(open_published_set(version.folder), self.extractor)
+        opened = open_published_set(version.folder)
+        resolution = resolution_beside(opened, version.folder)
+        return TileRanker(opened, self.extractor, resolution)
 
     def _descriptor(self, name: str) -> GlobalDescriptor:
         if name not in self._descriptors:

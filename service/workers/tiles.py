@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.workers.photos import DecodedQuery, ExtractorOf
-from visloc.archive import MapSet
-from visloc.errors import InvalidInput
+from visloc.archive import MapSet, open_map
+from visloc.errors import InvalidInput, MapCorrupt
+from visloc.features.framing import Framing
 from visloc.features.local.readymade import (
     MAX_READY_MADE_KEYPOINTS,
     is_ready_made,
     to_local_features,
 )
+from visloc.features.resolution import WorkingResolution
 from visloc.images import Photo
+from visloc.localization.constraints import MapGeometry
 from visloc.localization.feature_cache import find_features
 from visloc.localization.fingerprints import check_fingerprint
+from visloc.localization.query_camera import query_resolution, resolve_camera
 from visloc.options import LocalizeOptions
 from visloc.sets.choosing import TileScore
 from visloc.sets.coarse import rank_tiles
@@ -29,16 +34,43 @@ from visloc.types import LocalFeatures
 _MOST_KEYPOINTS = 5000
 
 
+def resolution_beside(opened: MapSet, folder: Path) -> WorkingResolution | None:
+    """Return how finely the largest tile of a set sees.
+
+    Args:
+        opened: the set.
+        folder: its version's, ``<id>/<version>`` beside those of its tiles.
+
+    Returns:
+        None while that tile of a remote store has no copy here, and when it is damaged, which the
+        search of the tile reports.
+    """
+    largest = max(opened.tiles, key=lambda tile: tile.images)
+    path = folder.parent.parent / largest.map / largest.version
+    try:
+        return MapGeometry(open_map(path)).resolution if path.is_dir() else None
+    except MapCorrupt:
+        return None
+
+
 class TileRanker:
     """Ranks the tiles of an open set.
+
+    Args:
+        opened: the set.
+        extractor_of: returns the extractor of its local features.
+        resolution: how finely its tiles see; None to find features in photos of any size.
 
     Raises:
         Conflict: ``map.features`` when the set's maps were built with other features than those
             that are installed.
     """
 
-    def __init__(self, opened: MapSet, extractor_of: ExtractorOf) -> None:
+    def __init__(
+        self, opened: MapSet, extractor_of: ExtractorOf, resolution: WorkingResolution | None
+    ) -> None:
         self._set = opened
+        self._resolution = resolution
         self.size_bytes = opened.size_bytes  # without its tiles
         fingerprint = opened.manifest.local_features
         self._extractor = None
@@ -73,6 +105,14 @@ class TileRanker:
         with timed(decoded.seconds, "choose_tiles"):
             return rank_tiles(self._set, local, allowed)
 
+    def _feature_size(self, photo: Photo) -> tuple[int, int] | None:
+        if self._resolution is None:
+            return None
+        # The camera that was sent is not known here; a tile to which it matters looks again.
+        camera, source = resolve_camera(photo, None)
+        resolution = query_resolution(camera, source)
+        return self._resolution.feature_size(resolution, photo.width, photo.height)
+
     def _features(self, decoded: DecodedQuery, options: LocalizeOptions) -> LocalFeatures | None:
         """Return local features; None for a query that no map of the set takes."""
         query = decoded.query
@@ -81,7 +121,12 @@ class TileRanker:
                 return None
             known, began = len(decoded.found), perf_counter()
             local, _ = find_features(
-                query, self._extractor, _MOST_KEYPOINTS, options, decoded.found
+                query,
+                self._extractor,
+                _MOST_KEYPOINTS,
+                options,
+                decoded.found,
+                Framing(self._feature_size(query)),
             )
             if len(decoded.found) > known:
                 decoded.seconds["local_features"] = perf_counter() - began

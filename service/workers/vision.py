@@ -47,6 +47,7 @@ from visloc.localization.localizer import Localizer
 from visloc.localization.solving import Look, SeenImage, Solved
 from visloc.options import LocalizeOptions
 from visloc.priors import Priors
+from visloc.types import InstantAnswer
 
 logger = logging.getLogger(__name__)
 
@@ -121,12 +122,46 @@ class Vision:
             if seen[-1].error is not None:
                 raise seen[-1].error
         row, best, solved = self._solve(job, targets, [(one,) for one in seen])
+        turned = self._turned(job, targets, decoded, seen, best.answer)
+        if turned is not None:
+            again = self._solve(job, targets, [(one,) for one in turned])
+            if again[1].answer.pose is not None:
+                seen, (row, best, solved) = turned, again
         look = seen[row].look
         if not job.debug or look is None or not isinstance(decoded.query, Photo):
             return best
         self._step()
         told = gated(best, job.options)
         return replace(best, debug=_picture(decoded.query, targets[row], look, told, solved))
+
+    def _turned(
+        self,
+        job: RigJob,
+        targets: Sequence[Target],
+        decoded: DecodedQuery,
+        seen: Sequence[SeenImage],
+        answer: InstantAnswer,
+    ) -> list[SeenImage] | None:
+        """Look at a refused photo again, turned as each map seems to know it; None if none does."""
+        photo, refusal = decoded.query, answer.refusal
+        if refusal is None or not isinstance(photo, Photo):
+            return None
+        (image,), again, any_turned = job.images, list[SeenImage](), False
+        began = perf_counter()
+        for target, one in zip(targets, seen, strict=True):
+            self._step()
+            turns, look = target.localizer.turns, one.look
+            assert turns is not None  # the photo was looked at
+            assert look is not None
+            turned = turns.find(
+                photo, look.evidence, refusal.reason, job.options, job.priors, decoded.found
+            )
+            seconds = {**look.evidence.seconds, "turns": perf_counter() - began}
+            if turned:
+                any_turned = True
+                one = target.look(image, decoded, job.options, job.priors, seconds, turned)
+            again.append(one)
+        return again if any_turned else None
 
     def check_rig(self, job: RigJob, maps: Sequence[MapFolder]) -> None:
         """Refuse a rig's images, which come without their photos, or options that do not fit."""

@@ -168,7 +168,7 @@ class CannedService:
                 or {"model": "SIMPLE_PINHOLE", "width": 64, "height": 48, "params": [76.8, 32, 24]}
             )
             | {"source": "given" if asked["camera"] else "guess"},
-            "orientation": {"exif": 6, "read_as": "stored"},
+            "orientation": {"exif": 6, "read_as": "stored", "turned": 0},
             "map": {"id": "room", "version": self.version},
             "seconds": {"features": 0.25, "pose": 0.0} if refusal is None else {"features": 0.75},
             "geopose": None if pose is None else GEOPOSE,
@@ -223,7 +223,7 @@ class CannedService:
                     if error
                     else {"model": "SIMPLE_PINHOLE", "width": 64, "height": 48}
                     | {"params": [60.0, 32.0, 24.0], "source": "given"},
-                    "orientation": None if error else {"exif": 1, "read_as": "stored"},
+                    "orientation": None if error else {"exif": 1, "read_as": "stored", "turned": 0},
                 }
             )
         is_filled = bool(images) and images[0]["image"].startswith(b"filled")

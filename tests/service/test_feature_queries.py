@@ -132,7 +132,7 @@ def test_features_are_localized_where_the_photo_was_taken(
     assert np.linalg.norm(found.center - truth.center) < 0.005
     assert rotation_angle(found.rotation @ truth.rotation.T) < np.radians(0.2)
     assert answer["camera"] == camera_of(query) | {"source": "given"}
-    assert answer["orientation"] == {"exif": 1, "read_as": "stored"}
+    assert answer["orientation"] == {"exif": 1, "read_as": "stored", "turned": 0}
     assert answer["retrieved"][0]["similarities"].keys() == {"densevlad", "localvlad"}
 
 

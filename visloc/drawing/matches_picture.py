@@ -152,7 +152,7 @@ def draw_overlay(
 
 def _as_looked_at(photo: Photo, look: Look) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """The pixels that features were extracted from, and the keypoints of the matches in them."""
-    pixels = look.matches.pixels
+    pixels = look.matches.pixels * look.reduced
     turn = turn_of(photo.exif_orientation) if look.evidence.read_as is ReadAs.UPRIGHT else 1
     turned = upright_from_stored(pixels, turn, photo.width, photo.height)
     return upright(photo.rgb, turn), turned.astype(np.float64)

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from visloc.archive import Map
 from visloc.errors import refuse
+from visloc.features.resolution import Resolution, WorkingResolution
 from visloc.geometry import Pose
 from visloc.localization.viewpoints import Viewpoints
 from visloc.matching.products import EightBitRows
@@ -86,6 +87,14 @@ class MapGeometry:
         """Where the photos were taken, and which way they look, relative to the origin."""
         rotations = Rotation.from_quat(self.opened.image_poses[:, :4], scalar_first=True)
         return Viewpoints(self.centers, rotations.as_matrix(), max(self.reach, _LEAST_REACH))
+
+    @cached_property
+    def resolution(self) -> WorkingResolution:
+        """How finely the photos see."""
+        cameras = {key: Resolution.of(camera) for key, camera in self.opened.cameras.items()}
+        photos = [cameras[image.camera] for image in self.opened.images]
+        features = self.opened.manifest.local_features.fingerprint
+        return WorkingResolution.of(photos, features.parameters)
 
     @cached_property
     def centers(self) -> NDArray[np.float64]:

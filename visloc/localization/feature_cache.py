@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.features import LocalFeatureExtractor
+from visloc.features.framing import AS_IT_IS, Framing
 from visloc.features.photo import extract_features
 from visloc.images import Photo
 from visloc.options import Extraction, LocalizeOptions, ReadAs
@@ -33,8 +34,8 @@ class FoundFeatures:
     rgb: NDArray[np.uint8]
 
 
-# The features of one photo, by extractor and settings.
-FeatureCache = dict[tuple[LocalFeatureExtractor, ReadAs, Extraction], FoundFeatures]
+# The features of one photo, by extractor, settings, and how it was resized and turned.
+FeatureCache = dict[tuple[LocalFeatureExtractor, ReadAs, Extraction, Framing], FoundFeatures]
 
 
 def find_features(
@@ -43,6 +44,7 @@ def find_features(
     most: int,
     options: LocalizeOptions,
     found: FeatureCache | None = None,
+    framing: Framing = AS_IT_IS,
 ) -> tuple[LocalFeatures, NDArray[np.uint8]]:
     """Find the local features of a photo, or take them from the cache.
 
@@ -51,30 +53,25 @@ def find_features(
         most: keypoints of a mapping image.
         options: the effort and the orientation.
         found: the cache of this photo; new features are added to it.
+        framing: how the photo is resized and turned before.
 
     Returns:
         Features with keypoints in the stored pixels, and the image they were found in.
     """
     most = min(most, _MOST_KEYPOINTS.get(options.extraction, most))
-    key = extractor, options.read_as, options.extraction
+    key = extractor, options.orientation, options.extraction, framing
     known = None if found is None else found.get(key)
     if known is None or known.max_keypoints < most:
         local, rgb = extract_features(
             photo,
             extractor,
             max_keypoints=most,
-            read_as=options.read_as,
+            read_as=options.orientation,
             extraction=options.extraction,
+            framing=framing,
         )
         known = FoundFeatures(local, most, rgb)
         if found is not None:
             found[key] = known
-    local = known.local if known.max_keypoints == most else _strongest(known.local, most)
+    local = known.local if known.max_keypoints == most else known.local.strongest(most)
     return local, known.rgb
-
-
-def _strongest(local: LocalFeatures, most: int) -> LocalFeatures:
-    """Keep the first ``most`` keypoints: extractors return the strongest first."""
-    return LocalFeatures(
-        local.keypoints[:most], local.descriptors[:most], local.scores[:most], local.scales[:most]
-    )

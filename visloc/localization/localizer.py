@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from visloc.archive import Map
 from visloc.errors import VislocError, refuse
 from visloc.features import GlobalDescriptor, LocalFeatureExtractor, make_global_descriptor
+from visloc.features.framing import Framing
 from visloc.features.local.readymade import is_ready_made
 from visloc.features.networks.lightglue.load import make_lightglue
 from visloc.geometry import Camera, Pose
@@ -24,7 +25,7 @@ from visloc.localization.constraints import Constraints, MapGeometry
 from visloc.localization.evidence import Shown
 from visloc.localization.feature_cache import FeatureCache, find_features
 from visloc.localization.fingerprints import check_fingerprint
-from visloc.localization.query_camera import resolve_camera
+from visloc.localization.query_camera import query_resolution, resolve_camera
 from visloc.localization.query_features import (
     checked_global_descriptors,
     checked_local_features,
@@ -40,6 +41,7 @@ from visloc.localization.solving import (
     check_solver,
     solve_instant,
 )
+from visloc.localization.turning import TurnFinder
 from visloc.matching.correspondences import (
     CLEAR_RATIO,
     Correspondences,
@@ -49,6 +51,7 @@ from visloc.matching.correspondences import (
 from visloc.matching.products import round_descriptors, start_threads
 from visloc.options import LocalizeOptions, Matcher, ReadAs
 from visloc.priors import NO_PRIORS, Priors
+from visloc.retrieval.excluded import excluded_photos
 from visloc.retrieval.fusion import LateFusion, chosen_fusion
 from visloc.retrieval.index import Retrieved, retrieve
 from visloc.timing import timed
@@ -63,7 +66,6 @@ from visloc.types import (
     Reason,
     Refusal,
     RetrievedImage,
-    Stage,
 )
 
 if TYPE_CHECKING:
@@ -71,9 +73,6 @@ if TYPE_CHECKING:
 
 # For global descriptors that do not look at the photo.
 _NO_PIXELS = np.empty((0, 0, 3), np.uint8)
-# When priors narrow the search, excluded photos among this many most similar ones are matched too:
-# they may show that the priors are wrong.
-_NUM_ELSEWHERE = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,10 +80,11 @@ class _Features:
     """The features of one query.
 
     Attributes:
-        local: with keypoints in the stored pixels.
+        local: with keypoints in the stored pixels, reduced by ``reduced``.
         sent: global descriptors by name; missing ones are computed.
         rgb: (height, width, 3) pixels for descriptors that look at them.
         seconds: of ``evidence``, to be added to.
+        reduced: how many stored pixels each side of a pixel of the keypoints spans.
     """
 
     local: LocalFeatures
@@ -92,6 +92,7 @@ class _Features:
     rgb: NDArray[np.uint8]
     evidence: Evidence
     seconds: dict[str, float]
+    reduced: float
 
 
 class Localizer:
@@ -133,6 +134,9 @@ class Localizer:
                 check_fingerprint(record.fingerprint, descriptor.fingerprint, opened.ref)
                 self._descriptors[name] = descriptor
         self.geometry = MapGeometry(opened)
+        self.turns = (
+            None if extractor is None else TurnFinder(self.geometry, extractor, self._descriptors)
+        )
         start_threads()
 
     def warm_up(self) -> None:
@@ -194,7 +198,18 @@ class Localizer:
                 are not computed here; ``options.fusion_weights`` of global descriptors that it
                 does not have; ``priors.*`` that mean nothing in this map.
         """
-        return self.solve_look(self.look(photo, camera, options, priors, cache), options, priors)[0]
+        cache = {} if cache is None else cache
+        look = self.look(photo, camera, options, priors, cache)
+        answer = self.solve_look(look, options, priors)[0]
+        if isinstance(answer, Localized):
+            return answer
+        assert self.turns is not None  # the photo was looked at
+        turned = self.turns.find(photo, answer.evidence, answer.reason, options, priors, cache)
+        if turned == 0:
+            return answer
+        look = self.look(photo, camera, options, priors, cache, turned)
+        again = self.solve_look(look, options, priors)[0]
+        return again if isinstance(again, Localized) else answer
 
     def localize_features(
         self,
@@ -228,19 +243,28 @@ class Localizer:
         options: LocalizeOptions,
         priors: Priors = NO_PRIORS,
         cache: FeatureCache | None = None,
+        turned: int = 0,
     ) -> Look:
-        """Match one photo with the map; arguments and errors as for ``localize``."""
+        """Match one photo with the map; arguments and errors as for ``localize``.
+
+        ``turned`` is what ``turns`` found, or 0.
+        """
         fusion = self._fusion(options)
         if self._extractor is None or not self._takes_photos(fusion):
             raise self._features_required(fusion)
         constraints = Constraints(self.geometry, priors)
         used, source = resolve_camera(photo, camera)
         seconds: dict[str, float] = {}
-        evidence = Evidence(used, source, photo.exif_orientation, options.read_as, seconds=seconds)
+        evidence = Evidence(used, source, photo.exif_orientation, options.orientation)
+        evidence = replace(evidence, turned=turned, seconds=seconds)
+        resolution, mapped = query_resolution(used, source), self.geometry.resolution
         with timed(seconds, "local_features"):
             most = self.map.manifest.local_features.max_keypoints
-            local, rgb = find_features(photo, self._extractor, most, options, cache)
-        found = _Features(local, {}, rgb, evidence, seconds)
+            size = mapped.feature_size(resolution, photo.width, photo.height)
+            framing = Framing(size, turned)
+            local, rgb = find_features(photo, self._extractor, most, options, cache, framing)
+        reduced = mapped.finer(resolution)
+        found = _Features(local.reduced(reduced), {}, rgb, evidence, seconds, reduced)
         return self._match(found, options, fusion, constraints)
 
     def look_at_features(
@@ -266,7 +290,9 @@ class Localizer:
         with timed(seconds, "local_features"):
             local = checked_local_features(features, camera, self.map.manifest)
             sent = checked_global_descriptors(features, self.map.manifest, optional)
-        found = _Features(local, sent, _NO_PIXELS, evidence, seconds)
+        seen = query_resolution(camera, CameraSource.GIVEN)
+        reduced = self.geometry.resolution.finer(seen)
+        found = _Features(local.reduced(reduced), sent, _NO_PIXELS, evidence, seconds, reduced)
         return self._match(found, options, fusion, constraints)
 
     def solve(
@@ -310,7 +336,7 @@ class Localizer:
             covariance=pose.covariance,
             position_std=pose.position_std,
             orientation_std=pose.orientation_std,
-            inlier_keypoints=look.matches.pixels[inliers].astype(np.float32),
+            inlier_keypoints=(look.matches.pixels[inliers] * look.reduced).astype(np.float32),
             inlier_points=look.matches.points[inliers] + self.geometry.origin,
             photo_covariance=pose.photo_covariance,
             uncertainty=pose.uncertainty,
@@ -330,17 +356,14 @@ class Localizer:
         rematching = None
         if options.matcher is Matcher.LIGHTGLUE:
             network = self._make_matcher(self.map.manifest.local_features.fingerprint.name)
-            rematching = Rematching(network, self.map, seen_as_found(local, evidence))
+            seen = seen_as_found(local, evidence, features.reduced)
+            rematching = Rematching(network, self.map, seen)
         evidence = replace(evidence, num_keypoints=len(local))
         if len(local) == 0:
-            blank = _nothing(
-                evidence,
-                "features",
-                Reason.NO_KEYPOINTS,
-                "no keypoints were found: the photo is blank, dark, blurred or too small",
-            )
+            why = "no keypoints were found: the photo is blank, dark, blurred or too small"
+            refusal = Refusal("features", Reason.NO_KEYPOINTS, why)
             # Other cameras of the rig may show two places.
-            return replace(blank, proposed=Proposed.none(local))
+            return replace(Look.nothing(evidence, refusal), proposed=Proposed.none(local))
         with timed(seconds, "global_features"):
             query = {
                 name: self._describe(name, features)
@@ -349,14 +372,10 @@ class Localizer:
         with timed(seconds, "retrieval"):
             index, weights = self.map.global_descriptors, constraints.photo_weights
             retrieved = retrieve(query, index, options.top_k, weights, fusion)
-            elsewhere = self._elsewhere(query, retrieved, weights, fusion)
+            elsewhere = excluded_photos(query, index, retrieved, weights, fusion)
         if len(retrieved.images) == 0:
-            return _nothing(
-                evidence,
-                "retrieval",
-                Reason.NO_PHOTO_NEAR,
-                "the map has no photo in the area that the priors allow",
-            )
+            why = "the map has no photo in the area that the priors allow"
+            return Look.nothing(evidence, Refusal("retrieval", Reason.NO_PHOTO_NEAR, why))
         evidence = replace(evidence, retrieved=tuple(self._describe_retrieved(retrieved)))
         with timed(seconds, "matching"):
             shown = Shown(local.keypoints, round_descriptors(local.descriptors))
@@ -373,6 +392,7 @@ class Localizer:
             self._matches(shown, others.settled()),
             shown=shown,
             proposed=Proposed(shown, pairs, points, retrieved.images, ratio),
+            reduced=features.reduced,
         )
 
     def _match_photos(
@@ -395,28 +415,6 @@ class Localizer:
             shown.keypoints[pairs.keypoints].astype(np.float64),
             self.map.landmarks[pairs.landmarks].astype(np.float64),
         )
-
-    def _elsewhere(
-        self,
-        query: Mapping[str, NDArray[np.float32]],
-        retrieved: Retrieved,
-        weights: NDArray[np.float64] | None,
-        fusion: LateFusion,
-    ) -> NDArray[np.int64]:
-        """Photos that the priors exclude although they look very much like the query.
-
-        On look-alike floors the most similar photo is a coin toss, so a photo need not be the very
-        best to count.
-        """
-        if weights is None:
-            return np.empty(0, dtype=np.int64)
-        excluded, index = np.asarray(weights == 0, dtype=np.float64), self.map.global_descriptors
-        others = retrieve(query, index, _NUM_ELSEWHERE, excluded, fusion)
-        # Fuse both lists together: scores that are ranks only compare within one ranking.
-        both, num = (retrieved.similarities, others.similarities), len(retrieved.images)
-        scores = fusion.scores({name: np.concatenate([f[name] for f in both]) for name in query})
-        best = np.sort(scores[:num])[::-1][:_NUM_ELSEWHERE]
-        return np.asarray(others.images[scores[num:] > best.min(initial=np.inf)])
 
     def _describe(self, name: str, features: _Features) -> NDArray[np.float32]:
         if name in features.sent:
@@ -443,8 +441,3 @@ class Localizer:
             similarities = {name: float(row[rank]) for name, row in retrieved.similarities.items()}
             score = float(retrieved.scores[rank])
             yield RetrievedImage(self.map.images[image].name, score, similarities)
-
-
-def _nothing(evidence: Evidence, stage: Stage, reason: Reason, message: str) -> Look:
-    refusal = Refusal(stage, reason, message)
-    return Look(evidence, Matches.none(), np.empty(0, np.int64), Matches.none(), refusal)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from visloc.errors import refuse
+from visloc.features.resolution import Resolution
 from visloc.geometry import Camera
 from visloc.images import Photo
 from visloc.types import CameraSource
@@ -10,6 +11,11 @@ from visloc.types import CameraSource
 # Focal length in units of the longer side when nothing is known: a view of 45 degrees, between a
 # phone's main camera (0.7 to 0.8) and a long lens. COLMAP guesses the same.
 GUESSED_FOCAL = 1.2
+
+
+def query_resolution(camera: Camera, source: CameraSource) -> Resolution:
+    """Return how finely a photo sees, by its width where the focal length is a guess."""
+    return Resolution.of(camera, known=source is not CameraSource.GUESS)
 
 
 def resolve_camera(photo: Photo, given: Camera | None) -> tuple[Camera, CameraSource]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.archive import Map
+from visloc.features.framing import turned_points, turned_size
 from visloc.features.networks.lightglue.model import SeenKeypoints
 from visloc.geometry import Camera
 from visloc.images import turn_of, upright_from_stored
@@ -54,10 +55,23 @@ class Rematching:
         return i, landmarks[j].astype(np.int64), similarities
 
 
-def seen_as_found(local: LocalFeatures, evidence: Evidence) -> SeenKeypoints:
-    """Return a query's keypoints in the frame of its descriptors: the photo as it was read."""
+def seen_as_found(local: LocalFeatures, evidence: Evidence, reduced: float) -> SeenKeypoints:
+    """Return a query's keypoints in the frame of its descriptors: the photo as it was read.
+
+    Args:
+        local: in the pixels of the photo reduced by ``reduced``.
+    """
     turn = turn_of(evidence.exif_orientation) if evidence.read_as is ReadAs.UPRIGHT else 1
-    return _seen_upright(local.keypoints, local.descriptors, evidence.camera, turn)
+    camera = evidence.camera.reduced(reduced)
+    seen = _seen_upright(local.keypoints, local.descriptors, camera, turn)
+    return seen if evidence.turned == 0 else _turned(seen, evidence.turned)
+
+
+def _turned(seen: SeenKeypoints, degrees: int) -> SeenKeypoints:
+    """Turn keypoints clockwise, as the picture was in which they were found."""
+    keypoints = turned_points(seen.keypoints, degrees, seen.width, seen.height)
+    size = turned_size(seen.width, seen.height, degrees)
+    return SeenKeypoints(keypoints.astype(np.float32), seen.descriptors, *size)
 
 
 def _seen_upright(

@@ -16,6 +16,7 @@ from visloc.localization.evidence import Shown
 from visloc.localization.gates import Problem, accepted, not_better_elsewhere
 from visloc.localization.judge import not_probable_enough
 from visloc.localization.rivals import Proposed, stronger_place
+from visloc.localization.turning import REASONS_OF_TURNED_PHOTOS
 from visloc.options import LocalizeOptions, ReadAs, Solver
 from visloc.pose.centre import position_covariance, with_origin
 from visloc.pose.generalized import GeneralizedPose
@@ -31,11 +32,6 @@ from visloc.types import (
     Reason,
     Refusal,
     RigPose,
-)
-
-# Usual refusals of a photo whose features were found on its side.
-_REASONS_OF_TURNED_PHOTOS = (
-    *(Reason.TOO_FEW_MATCHES, Reason.NO_POSE, Reason.TOO_FEW_INLIERS, Reason.LOW_INLIER_RATIO),
 )
 
 
@@ -61,8 +57,11 @@ class Matches:
 class Look:
     """What one image shows of the map, before a pose is solved.
 
+    Pixels are those of the image reduced by ``reduced``, in which thresholds mean the same as in
+    mapping photos (``visloc.features.resolution``).
+
     Attributes:
-        evidence: without inliers.
+        evidence: without inliers; its camera is that of the stored pixels.
         matches: with landmarks.
         landmarks: (n,) int64 rows of the map's landmarks, those of ``matches``.
         elsewhere: with landmarks of photos that look more like the query but that the priors
@@ -70,6 +69,7 @@ class Look:
         refusal: why there is nothing to solve; None otherwise.
         shown: all that was found in the image; None when a pose shall not be compared with it.
         proposed: all pairs that the searched photos proposed; None when they were not kept.
+        reduced: how many stored pixels each side of a pixel spans.
     """
 
     evidence: Evidence
@@ -79,6 +79,18 @@ class Look:
     refusal: Refusal | None = None
     shown: Shown | None = None
     proposed: Proposed | None = None
+    reduced: float = 1.0
+
+    @staticmethod
+    def nothing(evidence: Evidence, refusal: Refusal) -> Look:
+        """Return what an image shows in which there is nothing to solve."""
+        return Look(evidence, Matches.none(), np.empty(0, np.int64), Matches.none(), refusal)
+
+    @property
+    def camera(self) -> Camera:
+        """The intrinsics for the pixels of ``matches``."""
+        camera = self.evidence.camera
+        return camera if self.reduced == 1.0 else camera.reduced(self.reduced)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,7 +227,7 @@ def _views_of(
         counted = of_image if finds_focal or not guessed else Matches.none()
         views.append(
             MatchedView(
-                look.evidence.camera,
+                look.camera,
                 cam_from_rig,
                 counted.pixels,
                 counted.points,
@@ -247,10 +259,12 @@ def _is_guessed(look: Look) -> bool:
 
 
 def _shown(image: SeenImage, found: Camera | None) -> ImageAnswer:
-    """An image's evidence, with the camera ``found`` together with the pose."""
+    """An image's evidence, with the camera ``found`` together with the pose of the reduced one."""
     evidence = None if image.look is None else image.look.evidence
-    if evidence is not None and found is not None:
-        evidence = replace(evidence, camera=found, camera_source=CameraSource.ESTIMATED)
+    if image.look is not None and evidence is not None and found is not None:
+        size = evidence.camera.width, evidence.camera.height
+        stored = replace(found.reduced(1 / image.look.reduced), width=size[0], height=size[1])
+        evidence = replace(evidence, camera=stored, camera_source=CameraSource.ESTIMATED)
     return ImageAnswer(image.sensor, image.cam_from_rig, evidence, image.error)
 
 
@@ -400,7 +414,7 @@ def _with_turned_photos(refusal: Refusal, looks: Sequence[Look]) -> Refusal:
             if look.evidence.read_as is ReadAs.STORED and look.evidence.exif_orientation != 1
         }
     )
-    if not orientations or refusal.reason not in _REASONS_OF_TURNED_PHOTOS:
+    if not orientations or refusal.reason not in REASONS_OF_TURNED_PHOTOS:
         return refusal
     exif = ", ".join(map(str, orientations))
     hint = f"stored rotated (EXIF orientation {exif}) and read as stored: try read_as=upright"

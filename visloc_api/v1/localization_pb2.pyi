@@ -106,7 +106,8 @@ class LocalizeOptions(_message.Message):
     """smallest probability of an accepted pose, 0 to 1"""
     read_as: _builtins.str
     """Orientation in which features are found: the photo's as stored, or rotated by its EXIF
-    orientation. Camera, keypoints and pose refer to the stored pixels either way.
+    orientation; any: then also in other turns, if it is refused. Camera, keypoints and pose refer to
+    the stored pixels in any case.
     """
     extraction: _builtins.str
     """effort to find features"""
@@ -1240,19 +1241,23 @@ class Orientation(_message.Message):
 
     EXIF_FIELD_NUMBER: _builtins.int
     READ_AS_FIELD_NUMBER: _builtins.int
+    TURNED_FIELD_NUMBER: _builtins.int
     exif: _builtins.int
     """1 to 8 as stored in the photo, 1 when absent"""
     read_as: _builtins.str
     """upright: by its EXIF orientation; stored: not at all, or features were sent"""
+    turned: _builtins.int
+    """degrees clockwise beyond that, because the map knew it only so"""
     def __init__(
         self,
         *,
         exif: _builtins.int = ...,
         read_as: _builtins.str = ...,
+        turned: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["exif", b"exif", "read_as", b"read_as"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["exif", b"exif", "read_as", b"read_as", "turned", b"turned"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

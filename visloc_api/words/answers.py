@@ -291,6 +291,13 @@ class Orientation(Answer):
             "stored: in the pixels as stored, or the features were sent"
         ),
     ]
+    turned: Annotated[
+        int,
+        Field(
+            description="degrees clockwise, 0 to 315, by which the photo was turned beyond that, "
+            "because the map knew it only so"
+        ),
+    ] = 0
 
 
 # In Python, keypoints are (n, 2), points (n, 3) and inliers (n,).

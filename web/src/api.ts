@@ -108,7 +108,7 @@ export interface LocalizeResponse {
   inlier_ratio: number;
   retrieved: { image: string; score: number; similarities: Record<string, number> }[];
   camera: Camera & { source: "given" | "given_scaled" | "exif" | "estimated" | "guess" };
-  orientation: { exif: number; read_as: string };
+  orientation: { exif: number; read_as: string; turned: number };
   map: { id: string; version: string };
   /** Of a set: `id@version` of the map in it that the answer rests on. */
   tile: string | null;

@@ -20,6 +20,7 @@ from mapping.stages.local_features import (
 )
 from mapping.stages.networks import Networks
 from mapping.stages.photos import MappingPhoto, collect_photos, some
+from mapping.stages.resolution import at_resolution_of
 from mapping.stages.work_folder import WorkFolder
 from visloc.archive import Map
 from visloc.archive.schema import photo_file
@@ -87,6 +88,7 @@ def collect_capture(
     photos = [photo for photo in photos if photo.camera_known]
     if not photos:
         raise refuse("dataset.no_photos", field=str(dataset.root / "sensors" / "sensors.txt"))
+    photos = at_resolution_of(opened, photos, features)
     names = [
         photo.name if settings.capture is None else f"{settings.capture}/{photo.name}"
         for photo in photos

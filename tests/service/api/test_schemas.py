@@ -135,7 +135,7 @@ def test_options_may_be_text() -> None:
             request(options={"read_as": "sideways"}),
             "options.read_as",
             "options.read_as",
-            "one of stored, upright",
+            "one of stored, upright, any",
         ),
         (
             request(options={"fusion": "vote"}),

@@ -263,16 +263,16 @@ function cameraWords(answer: LocalizeResponse, actions: AnswerActions): HTMLElem
   );
 }
 
-/** Of a photo that is stored rotated: how it was read. */
+/** Of a photo that is stored rotated, or that the map knew only when turned: how it was read. */
 function orientationWords({ orientation }: LocalizeResponse): [string, string][] {
-  const { exif, read_as } = orientation;
-  if (exif === 1) return [];
-  return [
-    [
-      "Orientation",
-      `stored rotated (EXIF ${exif}), read ${read_as === "upright" ? read_as : "as stored"}`,
-    ],
-  ];
+  const { exif, read_as, turned } = orientation;
+  const words: [string, string][] = [];
+  if (exif !== 1) {
+    const read = read_as === "upright" ? read_as : "as stored";
+    words.push(["Orientation", `stored rotated (EXIF ${exif}), read ${read}`]);
+  }
+  if (turned) words.push(["Turned", `by ${turned}° clockwise: the map knew the photo only so`]);
+  return words;
 }
 
 /** The number that the service's log knows the request by. */

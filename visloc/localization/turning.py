@@ -1,0 +1,144 @@
+"""In which turn a map knows a photo of a camera that was held turned, without EXIF.
+
+Local features tolerate rolls of about 30 degrees. To look at every turn as thoroughly as at the
+photo itself would multiply the time of each hopeless photo. Telling whether a turn is worth it
+takes little: the strongest keypoints, the most similar mapping photos, and how many matches are
+clear (docs/decisions/0036-turned-cameras.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.features import GlobalDescriptor, LocalFeatureExtractor
+from visloc.features.framing import Framing
+from visloc.images import Photo, turn_of, upright_from_stored
+from visloc.localization.constraints import Constraints, MapGeometry
+from visloc.localization.feature_cache import FeatureCache, find_features
+from visloc.localization.query_camera import query_resolution
+from visloc.matching.correspondences import CLEAR_RATIO, propose_landmarks
+from visloc.matching.products import round_descriptors
+from visloc.options import LocalizeOptions, ReadAs
+from visloc.pose.gravity import KnownGravity
+from visloc.priors import Priors
+from visloc.retrieval.index import retrieve
+from visloc.types import Evidence, LocalFeatures, Reason
+
+# Usual refusals of a photo whose features were found in another turn than the map's.
+REASONS_OF_TURNED_PHOTOS = (
+    *(Reason.TOO_FEW_MATCHES, Reason.NO_POSE, Reason.TOO_FEW_INLIERS, Reason.LOW_INLIER_RATIO),
+)
+# Degrees clockwise. Whoever holds a camera upside down does not hold it askew as well.
+_TURNS = (90, 180, 270, 45, 315)
+_STEP_DEG = 45
+_NUM_KEYPOINTS, _NUM_PHOTOS = 1000, 3
+# A turn is worth a try with this many clear matches with one photo, and with so many times as many
+# as come by chance, if the photo as it was has fewer.
+_LEAST_CLEAR, _TIMES_BY_CHANCE = 20, 2
+# With so many, no other turn is looked at.
+_SURELY_CLEAR = 100
+# Of a unit vector: gravity that lies nearer to the optical axis does not tell the roll.
+_LEAST_ACROSS = 0.4
+
+
+class TurnFinder:
+    """Looks for the turn in which a map knows photos.
+
+    Args:
+        geometry: of the map.
+        extractor: of its local features.
+        descriptors: its global descriptors that can be computed, by name.
+    """
+
+    def __init__(
+        self,
+        geometry: MapGeometry,
+        extractor: LocalFeatureExtractor,
+        descriptors: Mapping[str, GlobalDescriptor],
+    ) -> None:
+        self._geometry, self._extractor = geometry, extractor
+        opened = geometry.opened
+        # Those that are made of local features come nearly for free.
+        cheap = {name: d for name, d in descriptors.items() if not d.needs_image}
+        self._descriptors = cheap or descriptors
+        self._index = {name: opened.global_descriptors[name] for name in self._descriptors}
+
+    def find(
+        self,
+        photo: Photo,
+        evidence: Evidence,
+        reason: Reason,
+        options: LocalizeOptions,
+        priors: Priors,
+        cache: FeatureCache,
+    ) -> int:
+        """Return the degrees clockwise by which to turn a refused photo; 0 when nothing promises.
+
+        Args:
+            photo: pixels as stored.
+            evidence: of the refusal.
+            reason: of the refusal.
+            options: those of the query.
+            priors: gravity tells the turn, and others exclude mapping photos.
+            cache: features of this photo; those of the turns are added.
+        """
+        if options.read_as is not ReadAs.ANY or reason not in REASONS_OF_TURNED_PHOTOS:
+            return 0
+        constraints = Constraints(self._geometry, priors)
+        turns = _turns_by(constraints.gravity, photo)
+        resolution = query_resolution(evidence.camera, evidence.camera_source)
+        size = self._geometry.resolution.feature_size(resolution, photo.width, photo.height)
+
+        def clear(turned: int) -> int:
+            most = self._geometry.opened.manifest.local_features.max_keypoints
+            framing = Framing(size, turned)
+            local, rgb = find_features(photo, self._extractor, most, options, cache, framing)
+            return self._clear_matches(local.strongest(_NUM_KEYPOINTS), rgb, constraints)
+
+        if not turns:
+            return 0
+        counts = {0: clear(0)}
+        for turned in turns:
+            counts[turned] = clear(turned)
+            if counts[turned] >= _SURELY_CLEAR:
+                break
+        # Most turns show nothing of the map, so that half of them have what comes by chance.
+        by_chance = sorted(counts.values())[(len(counts) - 1) // 2]
+        best = max(counts, key=lambda turned: counts[turned])
+        promises = counts[best] >= max(_LEAST_CLEAR, _TIMES_BY_CHANCE * by_chance)
+        return best if promises else 0
+
+    def _clear_matches(
+        self, local: LocalFeatures, rgb: NDArray[np.uint8], constraints: Constraints
+    ) -> int:
+        """Count the clear matches with the mapping photo that has most of them."""
+        if len(local) == 0:
+            return 0
+        opened = self._geometry.opened
+        query = {
+            name: descriptor.describe(rgb, local, opened.global_models[name])
+            for name, descriptor in self._descriptors.items()
+        }
+        retrieved = retrieve(query, self._index, _NUM_PHOTOS, constraints.photo_weights)
+        pairs = propose_landmarks(
+            round_descriptors(local.descriptors),
+            (self._geometry.observed(row) for row in retrieved.images),
+            CLEAR_RATIO,
+        )
+        return int(np.bincount(pairs.ranks, minlength=1).max())
+
+
+def _turns_by(gravity: KnownGravity | None, photo: Photo) -> tuple[int, ...]:
+    """Return the turns to look at: the one that gravity tells, else all."""
+    if gravity is None or np.linalg.norm(gravity.rig[:2]) < _LEAST_ACROSS:
+        return _TURNS
+    size = photo.width, photo.height
+    ends = np.array([[0.0, 0.0], gravity.rig[:2]])
+    start, end = upright_from_stored(ends, turn_of(photo.exif_orientation), *size)
+    x, y = end - start
+    # Turned clockwise by this, what points to (x, y) points down.
+    turned = int(np.round(np.degrees(np.arctan2(x, y)) / _STEP_DEG)) * _STEP_DEG % 360
+    return (turned,) if turned else ()

@@ -1,0 +1,46 @@
+"""Photos that priors exclude although they look very much like the query."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.retrieval.fusion import LateFusion
+from visloc.retrieval.index import Retrieved, retrieve
+from visloc.retrieval.rows import GlobalRows
+
+# Excluded photos among this many most similar ones are matched too: they may show that the priors
+# are wrong.
+_NUM_PHOTOS = 5
+
+
+def excluded_photos(
+    query: Mapping[str, NDArray[np.float32]],
+    index: Mapping[str, GlobalRows],
+    retrieved: Retrieved,
+    photo_weights: NDArray[np.float64] | None,
+    fusion: LateFusion,
+) -> NDArray[np.int64]:
+    """Return photos (k,) that the priors exclude and that look as much like the query as others.
+
+    On look-alike floors the most similar photo is a coin toss, so a photo need not be the very
+    best to count.
+
+    Args:
+        query: as for ``retrieve``.
+        index: as for ``retrieve``.
+        retrieved: the best photos that the priors allow.
+        photo_weights: of the priors, 0 for excluded photos; None when there are no priors.
+        fusion: as for ``retrieve``.
+    """
+    if photo_weights is None:
+        return np.empty(0, dtype=np.int64)
+    excluded = np.asarray(photo_weights == 0, dtype=np.float64)
+    others = retrieve(query, index, _NUM_PHOTOS, excluded, fusion)
+    # Fuse both lists together: scores that are ranks only compare within one ranking.
+    both, num = (retrieved.similarities, others.similarities), len(retrieved.images)
+    scores = fusion.scores({name: np.concatenate([f[name] for f in both]) for name in query})
+    best = np.sort(scores[:num])[::-1][:_NUM_PHOTOS]
+    return np.asarray(others.images[scores[num:] > best.min(initial=np.inf)])
