@@ -116,9 +116,10 @@ def test_a_wrong_setting_ends_the_command_with_one_line() -> None:
 @pytest.mark.parametrize("name", ["maps_dir", "weights_dir"])
 def test_what_is_no_folder_is_refused_by_name(name: str, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    given: dict[str, Any] = {"maps_dir": tmp_path, name: tmp_path / "file"}
-    with pytest.raises(SettingsError, match=f"{name}: .* is no folder"):
-        Server(ServiceSettings(**given, http_port=0, grpc_port=0))
+    for path in (tmp_path / "file", tmp_path / "nowhere"):
+        given: dict[str, Any] = {"maps_dir": tmp_path, name: path}
+        with pytest.raises(SettingsError, match=f"{name}: .* is no folder"):
+            Server(ServiceSettings(**given, http_port=0, grpc_port=0))
 
 
 @pytest.mark.parametrize("taken", ["http_port", "grpc_port"])
