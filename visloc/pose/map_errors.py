@@ -30,17 +30,25 @@ class MapErrors:
     orientation_factor: float
     uncertainty: Uncertainty = Uncertainty.WHOLE
 
-    def whole(self, rig_from_world: Pose, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    def whole(
+        self,
+        rig_from_world: Pose,
+        covariance: NDArray[np.float64],
+        of_camera: NDArray[np.float64] | None = None,
+    ) -> NDArray[np.float64]:
         """Widen the covariance (6, 6) of a pose by the errors of the map.
 
-        Rotation w and centre e, both in the rig's axes, are scaled apart, which keeps how they hang
-        together: e = -(dt + [t] w), with [t] the matrix of the cross product. That matrix is its
-        own inverse.
+        The part of it that comes from the doubt in the camera, ``of_camera``, stays: no landmark
+        has a say in it. Rotation w and centre e, both in the rig's axes, are scaled apart, which
+        keeps how they hang together: e = -(dt + [t] w), with [t] the matrix of the cross product.
+        That matrix is its own inverse.
         """
         if self.uncertainty is Uncertainty.PHOTO_ONLY:
             return covariance  # to the last bit
         factors = self.orientation_factor, self.position_factor
-        return _widened(rig_from_world, covariance, *factors)
+        if of_camera is None:
+            return _widened(rig_from_world, covariance, *factors)
+        return _widened(rig_from_world, covariance - of_camera, *factors) + of_camera
 
     def part(self, rig_from_world: Pose, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the part (6, 6) of the whole covariance that is the map's own.
