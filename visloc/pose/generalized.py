@@ -177,7 +177,8 @@ def _register(
     pose, inliers = found
     kept = [views[0].selected(inliers)]
     covariance = pose_covariance(kept, pose, REGISTRATION_LOSS_SCALE_PX)
-    return GeneralizedPose(pose, (inliers,), covariance and covariance.whole)
+    whole = None if covariance is None else covariance.whole
+    return GeneralizedPose(pose, (inliers,), whole)
 
 
 SOLVERS: Mapping[Solver, PoseSolver] = {
