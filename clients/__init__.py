@@ -11,16 +11,15 @@ from visloc_api.words.answers import (
     CameraUsed,
     Debug,
     Orientation,
-    PoseEstimate,
     Refusal,
     RetrievedImage,
-    RigPose,
 )
 from visloc_api.words.answers import MapRef as MapVersion
 from visloc_api.words.geopose import GeoPose, GeoPoseYpr
 from visloc_api.words.maps import Anchor, GeoCircle, Geodetic, MapInfo, RigInfo, VersionInfo
 from visloc_api.words.maps import Tile as TileInfo
 from visloc_api.words.options import LocalizeOptions
+from visloc_api.words.poses import PoseEstimate, RigPose
 
 __all__ = [
     "Anchor",

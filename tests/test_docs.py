@@ -36,9 +36,10 @@ from visloc.geometry import Camera, Pose
 from visloc.options import PRESETS, LocalizeOptions
 from visloc.pose.centre import position_covariance
 from visloc.types import Reason
-from visloc_api.words.answers import InstantAnswer, LocalizeResponse, PoseEstimate
+from visloc_api.words.answers import InstantAnswer, LocalizeResponse
 from visloc_api.words.maps import MapInfo
 from visloc_api.words.photo import LocalizeRequest
+from visloc_api.words.poses import PoseEstimate
 from visloc_api.words.rigs import LocalizeRigRequest
 from visloc_api.words.scenes import MapImages
 from visloc_api.words.sequences import LocalizeSequenceRequest

@@ -200,9 +200,8 @@ def train(
         should_stop: asked after every step.
         validate_every: steps; needs ``validated``. The last step is validated as well.
         validated: the score of a state.
-        fit_seconds: in which the last step is to be done, from now; while the learning rate
-            rises, and for two steps at least, steps are timed. The settings then get as many as
-            fit, if those are fewer.
+        fit_seconds: in which the last step is to be done, from now. The settings get as many steps
+            as fit, if those are fewer.
 
     Raises:
         LossIsNaN: ``training.diverged``.
@@ -212,16 +211,10 @@ def train(
     scores = _Scores(folder / VALIDATION_NAME, trainer.step)
     started = saved = time.monotonic()
     stopped = False
-    timed_step, timed_at = trainer.step, started
-    timed_until = max(trainer.settings.warm_up_steps, _LEAST_TIMED_STEPS)
+    clock = None if fit_seconds is None else _Clock(trainer, log, fit_seconds)
     while trainer.step < trainer.settings.steps and not stopped:
-        if fit_seconds is not None and trainer.step == timed_until // 2:
-            log.write()  # waits for the device
-            timed_step, timed_at = trainer.step, time.monotonic()
-        if fit_seconds is not None and trainer.step == timed_until:
-            log.write()
-            now = time.monotonic()
-            trainer.fit(fit_seconds - (now - started), timed_step, now - timed_at)
+        if clock is not None:
+            clock.look()
         settings = trainer.settings
         if trainer.step == round(settings.decay_from * settings.steps) > 0:
             save_state(folder / BEFORE_DECAY_NAME, trainer.state())
@@ -247,6 +240,28 @@ def train(
 def resume(trainer: Trainer, folder: Path) -> None:
     """Go on with the run of a folder."""
     trainer.restore(load_state(folder / FILE_NAME, trainer.sources.device))
+
+
+class _Clock:
+    """Times steps while the learning rate rises, two at least; then the trainer takes what fits."""
+
+    def __init__(self, trainer: Trainer, log: _Log, seconds: float) -> None:
+        self._trainer, self._log, self._seconds = trainer, log, seconds
+        self._started = self._since = time.monotonic()
+        self._since_step = trainer.step
+        self._until = max(trainer.settings.warm_up_steps, _LEAST_TIMED_STEPS)
+
+    def look(self) -> None:
+        """Be told of every step, before it."""
+        step = self._trainer.step
+        if step == self._until // 2:
+            self._log.write()  # waits for the device
+            self._since_step, self._since = step, time.monotonic()
+        if step == self._until:
+            self._log.write()
+            now = time.monotonic()
+            left = self._seconds - (now - self._started)
+            self._trainer.fit(left, self._since_step, now - self._since)
 
 
 class _Log:

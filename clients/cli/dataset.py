@@ -32,8 +32,8 @@ from clients.evaluation.queries import QuerySet
 from clients.evaluation.results import check_can_be_written, write_poses, write_whole
 from clients.evaluation.run import InstantOutcome, Outcome, QueryClient, localize_all
 from visloc.sequences.filling import DEFAULT_MAX_GAP_S, TimeUnit
-from visloc_api.words.answers import PoseEstimate
 from visloc_api.words.maps import MapInfo
+from visloc_api.words.poses import PoseEstimate
 
 _out = Console()
 _err = Console(stderr=True)

@@ -13,9 +13,10 @@ from rich.text import Text
 from clients.evaluation.run import Outcome
 from clients.wire.answers import LocalizeResult
 from visloc.types import Uncertainty
-from visloc_api.words.answers import Candidate, PoseEstimate
+from visloc_api.words.answers import Candidate
 from visloc_api.words.geopose import GeoPose
 from visloc_api.words.maps import MapInfo
+from visloc_api.words.poses import PoseEstimate
 
 _NUM_RETRIEVED_SHOWN = 3
 _NUM_FAILED_SHOWN = 5

@@ -17,7 +17,7 @@ from clients.wire.rigs import Rig
 from visloc.geometry import Pose, center_covariance
 from visloc.sequences.filling import TracedPose, fill_rig
 from visloc.types import PoseSource, Uncertainty
-from visloc_api.words.answers import PoseEstimate, RigPose
+from visloc_api.words.poses import PoseEstimate, RigPose
 
 
 def measured(pose: PoseEstimate, num_inliers: int) -> TracedPose:

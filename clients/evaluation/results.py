@@ -17,7 +17,7 @@ from clients.wire.answers import parse_pose
 from visloc.errors import InvalidInput, refuse
 from visloc.sequences.filling import TracedPose
 from visloc.types import PoseSource
-from visloc_api.words.answers import PoseEstimate
+from visloc_api.words.poses import PoseEstimate
 
 _LOCALIZED, _NOT_LOCALIZED, _ERROR, _FILLED = "localized", "not_localized", "error", "filled"
 # Errors that say nothing about the photo: it may be answered when it is sent again.

@@ -10,8 +10,9 @@ from pydantic import BeforeValidator, Field, SkipValidation, ValidationError, mo
 from clients.errors import INTERNAL, not_understood, received
 from clients.wire.requests import JsonObject
 from visloc.errors import InvalidInput, VislocError
-from visloc_api.words.answers import ImageAnswer, InstantAnswer, LocalizeResponse, PoseEstimate
+from visloc_api.words.answers import ImageAnswer, InstantAnswer, LocalizeResponse
 from visloc_api.words.maps import ListMapsResponse, MapInfo
+from visloc_api.words.poses import PoseEstimate
 from visloc_api.words.status import Health
 
 _P = ParamSpec("_P")

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mapping.maps.editing import moved_anchor
 from mapping.maps.mistaken import mistaken_for
+from mapping.own_test.verdict import misses_own_photos
 from mapping.progress import one_step
 from mapping.stages.publishing import new_version
 from visloc.archive import (
@@ -216,6 +217,7 @@ def _placed(opened: Map, set_from_tile: Similarity) -> _Placed:
         images=manifest.counts.images,
         landmarks=manifest.counts.landmarks,
         size_bytes=opened.size_bytes,
+        misses_own_photos=misses_own_photos(manifest.parts.own_test),
     )
     anchor = manifest.world.anchor
     return _Placed(

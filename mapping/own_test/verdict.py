@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mapping.own_test.trials import OwnTestRun
 from visloc.archive import Map
-from visloc.archive.schema import Doubt
+from visloc.archive.schema import Doubt, OwnTest
 
 # Shares that no map at hand that localizes well comes near: of 17, those with exact poses have all
 # photos back, and the weakest of look-alike hallways one wrong photo of 12. The painted sample with
@@ -41,6 +41,16 @@ def doubts_about(opened: Map, run: OwnTestRun, left_out: Sequence[str] = ()) -> 
         for doubt in (_not_back(opened, run), _without_place(opened, left_out), _apart(opened))
         if doubt is not None
     )
+
+
+def misses_own_photos(test: OwnTest | None) -> bool:
+    """Tell whether more than a few of a map's own photos did not come back where they were.
+
+    Then right answers of the map are often doubtful: it is sparse. Too few photos tell nothing.
+    """
+    if test is None or test.tested < LEAST_TESTED:
+        return False
+    return test.tested - (test.localized - test.wrong) > MOST_WRONG * test.tested
 
 
 def _not_back(opened: Map, run: OwnTestRun) -> Doubt | None:

@@ -25,12 +25,11 @@ from visloc_api.words.answers import (
     LocalizeResponse,
     MapRef,
     Orientation,
-    PoseEstimate,
     Refusal,
     RetrievedImage,
-    RigPose,
 )
 from visloc_api.words.geopose import GeoAngles, GeoPose, GeoPoseYpr, GeoPosition, GeoQuaternion
+from visloc_api.words.poses import PoseEstimate, RigPose
 
 
 def localize_response(found: Localization, request_id: str) -> LocalizeResponse:

@@ -23,7 +23,7 @@ from visloc.geometry import Pose, Similarity
 from visloc.priors import MAX_TILES
 
 SET_FORMAT = "visloc-set"
-SET_MAJOR, SET_MINOR = 1, 1
+SET_MAJOR, SET_MINOR = 1, 2
 # Scale of a tile. Beyond these, squares and inverses overflow.
 MIN_SCALE, MAX_SCALE = 1e-9, 1e9
 # The time of a query is proportional to it.
@@ -63,6 +63,9 @@ class TileRecord(Record):
         reach: median distance from its photos to the landmarks that they see.
         mistaken_for: refs of the tiles that the set would search, without this one, for more than
             a few of this tile's own photos. Sets of format 1.0 do not say.
+        misses_own_photos: whether more than a few of its own photos were not found where they are
+            by its own test: doubtful answers are usual there. False where no test says, as in sets
+            before format 1.2.
     """
 
     map: Annotated[str, Field(pattern=rf"^{ID_PATTERN.pattern}$")]
@@ -76,6 +79,7 @@ class TileRecord(Record):
     landmarks: Annotated[int, Field(ge=1)]
     size_bytes: Annotated[int, Field(ge=0)]
     mistaken_for: Annotated[tuple[str, ...], Field(max_length=MAX_TILES)] = ()
+    misses_own_photos: bool = False
 
     @property
     def ref(self) -> str:

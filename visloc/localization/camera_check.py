@@ -39,7 +39,7 @@ _SHUTTER_STD = 0.03
 # point and fx / fy there is more freedom to fit wrong matches.
 _MAX_DEVIATIONS, _MIN_FOCAL_GAIN = 4.0, 4.0
 _MAX_DEVIATIONS_OF_ALL, _MIN_GAIN = 4.5, 12.0
-# Fewer say nothing.
+# Fewer than that beyond chance say nothing.
 _MIN_INLIERS = 30
 _SUBJECTS: Mapping[CameraSource, str] = {
     CameraSource.GIVEN: "the given camera",
@@ -111,7 +111,7 @@ def _wrong_parts(found: FoundIntrinsics, source: CameraSource) -> NDArray[np.boo
 def _is_wrong(
     found: FoundIntrinsics, deviations: float, max_deviations: float, min_gain: float
 ) -> bool:
-    enough = found.num_inliers >= _MIN_INLIERS
+    enough = found.num_inliers - found.num_by_chance >= _MIN_INLIERS
     return enough and found.gain > min_gain and deviations > max_deviations
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from visloc.archive import Map
+from visloc.archive import Manifest, Map
 from visloc.errors import refuse
 from visloc.features.resolution import Resolution, WorkingResolution
 from visloc.geometry import Pose
@@ -40,6 +40,24 @@ _LEAST_TANGENT = 1e-12  # of the angle between a ray and the camera's axis
 _NUM_REACH_PHOTOS, _NUM_REACH_LANDMARKS = 100, 200
 
 
+def _errors_of(manifest: Manifest) -> MapErrors:
+    """What a map knows of its own errors.
+
+    Where its photos' poses were estimated and then laid over given positions, these lie off by as
+    much as the map is bent, which its own photos cannot see. Fixes of GNSS scatter by themselves.
+    """
+    test = manifest.parts.own_test
+    if test is None:
+        return PHOTO_ONLY
+    anchor = manifest.world.anchor
+    bent = anchor.rms if anchor is not None and anchor.kind == "positions" else None
+    return MapErrors(
+        test.position_factor,
+        test.orientation_factor,
+        position_std=(bent or 0.0) / math.sqrt(3.0),
+    )
+
+
 class MapGeometry:
     """Where a map's photos were taken and how far they see; in the map's own coordinates.
 
@@ -51,10 +69,7 @@ class MapGeometry:
         self.opened = opened
         self.origin = np.array(opened.manifest.world.origin)
         self.down = opened.gravity
-        test = opened.manifest.parts.own_test
-        self.errors = (
-            PHOTO_ONLY if test is None else MapErrors(test.position_factor, test.orientation_factor)
-        )
+        self.errors = _errors_of(opened.manifest)
 
     @property
     def ref(self) -> str:

@@ -167,7 +167,8 @@ def within_the_priors(problem: Problem, pose: GeneralizedPose) -> Refusal | None
     """Refuse a pose that contradicts a prior."""
     assert pose.covariance is not None  # ``determined`` comes first
     constraints, where = problem.constraints, pose.rig_from_world
-    return contradicts_priors(constraints, where, constraints.errors.whole(where, pose.covariance))
+    whole = constraints.errors.whole(where, pose.covariance, pose.of_camera)
+    return contradicts_priors(constraints, where, whole)
 
 
 def not_better_without_gravity(problem: Problem, pose: GeneralizedPose) -> Refusal | None:

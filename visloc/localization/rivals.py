@@ -385,7 +385,7 @@ def _is_rival(
     turned = rotation_angle(a.rotation @ b.rotation.T)
     if away <= _APART_REACH_SHARE * reach + _STDS * std and turned <= _APART_ANGLE:
         return False
-    whole = problem.constraints.errors.whole(b, other.covariance)
+    whole = problem.constraints.errors.whole(b, other.covariance, other.of_camera)
     return contradicts_priors(problem.constraints, b, whole) is None
 
 

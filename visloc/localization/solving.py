@@ -185,7 +185,7 @@ def solve_instant(
         refusal = refusal and _with_turned_photos(refusal, looks)
     pose = None
     if refusal is None and found is not None and found.covariance is not None:
-        pose = measured_pose(found.rig_from_world, found.covariance, geometry)
+        pose = measured_pose(found, found.covariance, geometry)
         pose = replace(pose, probability=found.probability)
     inliers = () if found is None else tuple(found.inliers)
     camera = None if refusal is not None or found is None else found.camera
@@ -287,17 +287,18 @@ def with_inliers(
 
 
 def measured_pose(
-    rig_from_local: Pose, photo_covariance: NDArray[np.float64], geometry: MapGeometry
+    found: GeneralizedPose, photo_covariance: NDArray[np.float64], geometry: MapGeometry
 ) -> RigPose:
     """State a pose that images measured, in the world.
 
     Args:
-        rig_from_local: in the map's own coordinates.
+        found: in the map's own coordinates.
         photo_covariance: (6, 6), what the scatter of the images leaves open; the errors of the map
             are added here.
         geometry: of the map.
     """
-    whole = geometry.errors.whole(rig_from_local, photo_covariance)
+    rig_from_local = found.rig_from_world
+    whole = geometry.errors.whole(rig_from_local, photo_covariance, found.of_camera)
     return rig_pose(rig_from_local, whole, geometry, PoseSource.ESTIMATED, photo_covariance)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +30,23 @@ _MAX_FOCAL_STD = 0.03
 _PRINCIPAL_POINT_STD = 0.01
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseCovariance:
+    """What leaves a pose open.
+
+    Attributes:
+        whole: (6, 6).
+        of_camera: (6, 6) of it, what the doubt in the principal point adds. It says nothing of the
+            matches. None where the camera is known.
+    """
+
+    whole: NDArray[np.float64]
+    of_camera: NDArray[np.float64] | None
+
+
 def pose_covariance(
     views: Sequence[MatchedView], rig_from_world: Pose, loss_scale_px: float
-) -> NDArray[np.float64] | None:
+) -> PoseCovariance | None:
     """Return the covariance of a rig's pose that was refined on these inliers with a Cauchy loss.
 
     There are two classical estimates for an M-estimator. Huber's (Huber 1981, section 7.6) assumes
@@ -48,7 +63,7 @@ def pose_covariance(
         loss_scale_px: scale c of the loss c^2 / 2 log(1 + r^2 / c^2).
 
     Returns:
-        (6, 6) of ``rig_from_world``, or None when the inliers leave the pose undetermined, or an
+        That of ``rig_from_world``, or None when the inliers leave the pose undetermined, or an
         unknown focal length, and with it the distance, by more than 3 %.
     """
     if not views:
@@ -81,28 +96,28 @@ def pose_covariance(
     # too wide by that in half of them, were it not taken off first.
     wider = _wider(root, sandwich / (1.0 + _SANDWICH_SCATTER / math.sqrt(num_points)))
     if num_parameters == 6:
-        return wider
+        return PoseCovariance(wider, None)
     if wider[6, 6] > _MAX_FOCAL_STD**2:
         return None
     # Projections move as the principal point does, and the best pose moves with them.
     moves = np.einsum("n,nai->ia", weight, jacobian)
     moves -= 2.0 / loss_scale_px**2 * np.einsum("ni,na->ia", gradients, psi)
-    return _with_principal_point(wider, bread @ moves, views)
+    of_camera = _of_principal_point((bread @ moves)[:6], views)
+    return PoseCovariance(wider[:6, :6] + of_camera, of_camera)
 
 
-def _with_principal_point(
-    covariance: NDArray[np.float64], by_point: NDArray[np.float64], views: Sequence[MatchedView]
+def _of_principal_point(
+    by_point: NDArray[np.float64], views: Sequence[MatchedView]
 ) -> NDArray[np.float64]:
-    """Add the doubt in the principal point; return the pose's part (6, 6).
+    """What the doubt in the principal point adds (6, 6).
 
     Args:
-        covariance: (7, 7) of the pose and the focal length.
-        by_point: (7, 2) derivative of these by the principal point.
+        by_point: (6, 2) derivative of the pose by the principal point.
         views: one of them has inliers.
     """
     (camera,) = (view.camera for view in views if len(view))
     std_px = _PRINCIPAL_POINT_STD * max(camera.width, camera.height)
-    return np.asarray((covariance + std_px**2 * by_point @ by_point.T)[:6, :6])
+    return np.asarray(std_px**2 * by_point @ by_point.T)
 
 
 def _squared(rows: NDArray[np.float64]) -> NDArray[np.float64]:

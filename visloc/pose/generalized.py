@@ -49,6 +49,8 @@ class GeneralizedPose:
         camera: with the focal length that was found together with the pose; None where it was
             known.
         probability: that it is right, 0 to 1; None when it was not judged.
+        of_camera: (6, 6) of ``covariance``, what the doubt in the principal point adds; None where
+            the camera was known.
     """
 
     rig_from_world: Pose
@@ -56,6 +58,7 @@ class GeneralizedPose:
     covariance: NDArray[np.float64] | None
     camera: Camera | None = None
     probability: float | None = None
+    of_camera: NDArray[np.float64] | None = None
 
     @property
     def num_inliers(self) -> int:
@@ -173,9 +176,9 @@ def _register(
         return None
     pose, inliers = found
     kept = [views[0].selected(inliers)]
-    return GeneralizedPose(
-        pose, (inliers,), pose_covariance(kept, pose, REGISTRATION_LOSS_SCALE_PX)
-    )
+    covariance = pose_covariance(kept, pose, REGISTRATION_LOSS_SCALE_PX)
+    whole = None if covariance is None else covariance.whole
+    return GeneralizedPose(pose, (inliers,), whole)
 
 
 SOLVERS: Mapping[Solver, PoseSolver] = {
@@ -236,4 +239,8 @@ def _judged(views: Sequence[MatchedView], best: RefinedPose) -> GeneralizedPose 
             return None
     kept = [view.selected(mask) for view, mask in zip(views, best.inliers, strict=True)]
     covariance = pose_covariance(kept, best.rig_from_world, LOSS_SCALE_PX)
-    return GeneralizedPose(best.rig_from_world, best.inliers, covariance, camera)
+    if covariance is None:
+        return GeneralizedPose(best.rig_from_world, best.inliers, None, camera)
+    return GeneralizedPose(
+        best.rig_from_world, best.inliers, covariance.whole, camera, of_camera=covariance.of_camera
+    )

@@ -57,12 +57,15 @@ class FoundIntrinsics:
         gain: how much less the given camera explains: difference of the losses of both best poses,
             in units of chi-square, with the same errors.
         num_inliers: of the matches that were looked at.
+        num_by_chance: as many of these as wrong matches have near any pose: they lie evenly around
+            where they would be inliers.
     """
 
     change: NDArray[np.float64]
     covariance: NDArray[np.float64]
     gain: float
     num_inliers: int
+    num_by_chance: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -276,4 +279,6 @@ def _found(
     covariance = np.zeros((len(_ALL), len(_ALL)))
     covariance[np.ix_(free, free)] = normal.variance * inverse[6:, 6:]
     gain = 2.0 * (given_loss - _loss(found, max_error_px)) / normal.variance
-    return FoundIntrinsics(found.change, covariance, gain, normal.num_inliers)
+    ring = np.sum(np.hypot(*found.errors.T) <= _WIDTHS[0] * max_error_px) - normal.num_inliers
+    by_chance = max(float(ring), 0.0) / (_WIDTHS[0] ** 2 - 1.0)  # of the areas
+    return FoundIntrinsics(found.change, covariance, gain, normal.num_inliers, by_chance)

@@ -184,7 +184,7 @@ def _measured(
     """A pose that an instant's own images measured, with the errors of the map."""
     return WindowPose(
         pose.rig_from_world,
-        errors.whole(pose.rig_from_world, photo_covariance),
+        errors.whole(pose.rig_from_world, photo_covariance, pose.of_camera),
         pose.inliers,
         measured=True,
         supported=True,

@@ -53,9 +53,11 @@ def left_open(
     """Refuse a doubtful answer that leaves another tile open.
 
     A tile that does not agree stays open when its own photos are mistaken for those of the tile
-    that answers, even if it has a pose that explains much less: it is poor. So does one that looks
-    about as much like the photo, if the answer is more likely wrong than right. Tiles of the same
-    place, whose photos lie among each other, are no contradiction.
+    that answers, even if it has a pose that explains much less: it is poor. But where the tile that
+    answers misses photos of its own, doubtful answers to these are usual, and no sign of another
+    place: there a tile stays open only if the answer is more likely wrong than right. Then, so does
+    one that looks about as much like the photo. Tiles of the same place, whose photos lie among
+    each other, are no contradiction.
 
     Args:
         outline: the set.
@@ -72,10 +74,12 @@ def left_open(
     pose = measured_pose(place.answer)
     if pose is None or pose.probability is None or not is_doubtful(place.answer):
         return None
+    more_likely_wrong = pose.probability < _MORE_LIKELY_RIGHT
+    telling = more_likely_wrong or not tiles[row].misses_own_photos
     for other in np.flatnonzero(elsewhere & apart(outline.photo_boxes, row)).tolist():
-        if tiles[row].ref in tiles[other].mistaken_for:
+        if telling and tiles[row].ref in tiles[other].mistaken_for:
             why = f"whose own photos look like those of {place.ref}"
-        elif other in close and pose.probability < _MORE_LIKELY_RIGHT:
+        elif more_likely_wrong and other in close:
             why = "which looks about as much like it"
         else:
             continue

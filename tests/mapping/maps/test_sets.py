@@ -22,6 +22,7 @@ from mapping.maps.editing import content_of, moved
 from mapping.maps.sets import publish_set
 from mapping.maps.splitting import cut, split_map
 from mapping.own_test.publishing import publish_edited
+from mapping.own_test.verdict import misses_own_photos
 from mapping.sample import write_sample
 from visloc.archive import Anchor, Geodetic, Map, MapStore, SetOutline
 from visloc.archive.places import enu_of
@@ -198,6 +199,7 @@ def test_tiles_carry_the_test_of_their_map(store: MapStore, hall: Map) -> None:
     assert hall.manifest.parts.own_test is not None
     for tile in tiles.tiles:
         assert store.open(tile.ref).manifest.parts.own_test == hall.manifest.parts.own_test
+        assert tile.misses_own_photos == misses_own_photos(hall.manifest.parts.own_test)
 
 
 def test_an_interrupted_split_goes_on(store: MapStore) -> None:

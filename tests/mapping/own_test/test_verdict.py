@@ -17,7 +17,7 @@ from mapping.cli.acceptance import require_acceptance, use
 from mapping.maps.editing import content_of
 from mapping.own_test.publishing import publish_edited
 from mapping.own_test.trials import OwnTestRun, run_own_test
-from mapping.own_test.verdict import doubts_about
+from mapping.own_test.verdict import doubts_about, misses_own_photos
 from visloc.archive import Map, MapStore, OwnTest, open_map
 from visloc.errors import Conflict, InvalidInput, NotFound
 from visloc.geometry import Pose
@@ -77,6 +77,26 @@ def test_photos_that_do_not_come_back_speak_against_a_map(
         (doubt,) = found
         assert f"of {tested} photos" in doubt.message
         assert doubt.photos == tuple(square.images[i].name for i in range(refused + wrong))[:100]
+
+
+@pytest.mark.parametrize(
+    ("tested", "refused", "wrong", "misses"),
+    [
+        (12, 0, 0, False),
+        (12, 1, 0, False),
+        (12, 2, 0, True),  # nowhere and elsewhere count alike
+        (12, 0, 2, True),
+        (12, 1, 1, True),
+        (20, 2, 1, False),
+        (8, 8, 0, True),
+        (7, 7, 0, False),  # too few to say
+    ],
+)
+def test_a_map_that_misses_more_than_a_few_of_its_photos_says_so(
+    tested: int, refused: int, wrong: int, misses: bool
+) -> None:
+    assert misses_own_photos(ran(tested, refused, wrong).test) == misses
+    assert not misses_own_photos(None)
 
 
 @pytest.mark.parametrize(("absent", "doubted"), [(0, False), (16, False), (17, True)])

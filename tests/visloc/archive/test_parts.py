@@ -54,6 +54,17 @@ def test_a_tested_map_widens_poses_by_what_it_learned(folder: Path) -> None:
     assert errors.uncertainty is Uncertainty.WHOLE
 
 
+@pytest.mark.parametrize(("kind", "bent"), [("positions", 0.3), ("gnss", 0.0), ("dataset", 0.0)])
+def test_only_a_map_laid_over_given_positions_knows_how_bent_it_is(
+    folder: Path, kind: str, bent: float
+) -> None:
+    """Fixes of GNSS scatter by themselves."""
+    add_own_test(folder, OwnTest(**GOOD), version="v2")
+    anchor = {"kind": kind, "images": 5, "rms": 0.3 * 3**0.5}
+    edit(folder, lambda manifest: manifest["world"].update(anchor=anchor))
+    assert MapGeometry(open_map(folder)).errors.position_std == pytest.approx(bent)
+
+
 @pytest.mark.parametrize("version", ["1.0", "1.3", "2.2"])
 def test_older_maps_open_and_say_photo_only(folder: Path, version: str) -> None:
     def older(manifest: dict[str, Any]) -> None:

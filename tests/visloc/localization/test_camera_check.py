@@ -150,6 +150,25 @@ def test_each_part_of_the_intrinsics_is_found() -> None:
     np.testing.assert_array_less(np.abs(with_all.change - expected), 0.01)
 
 
+@pytest.mark.parametrize("right", [60, 160])
+def test_wrong_matches_that_lie_evenly_about_a_pose_are_not_counted(right: int) -> None:
+    """As where hundreds of them fill the picture: a sixteenth of those near are inliers."""
+    wrong = 600
+    seen = seen_by(RIGHT, num=right + wrong, wrong=0, noise=0.3)
+    rng = np.random.default_rng(0)
+    away, turn = 48.0 * np.sqrt(rng.random(wrong)), rng.uniform(0, 2 * np.pi, wrong)
+    pixels = seen.pixels.copy()
+    pixels[right:] += away[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+    view = MatchedView(changed(RIGHT, f=1.05), Pose.identity(), pixels, seen.points)
+
+    found = find_intrinsics(view, TRUTH, max_error_px=12.0)
+
+    assert found is not None
+    for each in found:
+        assert each.num_inliers == pytest.approx(right + wrong / 16, abs=25)
+        assert each.num_by_chance == pytest.approx(wrong / 16, abs=8)  # some lie outside now
+
+
 @pytest.mark.parametrize(
     ("camera", "said"),
     [

@@ -15,6 +15,7 @@ from visloc.localization.solving import Matches, Solved, measured_pose, solve_in
 from visloc.options import LocalizeOptions
 from visloc.pose.centre import with_origin
 from visloc.pose.colmap import normalized_rays
+from visloc.pose.generalized import GeneralizedPose
 from visloc.pose.map_errors import MapErrors
 from visloc.priors import (
     NO_PRIORS,
@@ -696,7 +697,7 @@ def test_the_whole_uncertainty_and_the_photos_part_are_told_apart(place: Any) ->
     root = 0.01 * np.random.default_rng(0).normal(size=(6, 6))
     found = Pose(np.eye(3), np.array([1.0, 2.0, 3.0]))
 
-    pose = measured_pose(found, root @ root.T, geometry)
+    pose = measured_pose(GeneralizedPose(found, (), None), root @ root.T, geometry)
 
     assert pose.uncertainty is Uncertainty.WHOLE
     assert pose.photo_covariance is not None

@@ -29,6 +29,31 @@ def test_how_position_and_rotation_hang_together_stays() -> None:
     assert after[:3, 3:] == pytest.approx(15.0 * before[:3, 3:])
 
 
+def test_a_doubt_in_the_camera_is_not_the_maps() -> None:
+    """Noise of 1 that the map makes 5, and a camera's 2 that stays: 25 + 4."""
+    still = Pose(np.eye(3), np.zeros(3))
+    of_camera = np.diag([4.0, 0, 0, 4.0, 0, 0])
+
+    whole = MapErrors(5.0, 3.0).whole(still, np.eye(6) + of_camera, of_camera)
+
+    assert np.diag(whole).tolist() == [9.0 + 4, 9, 9, 25.0 + 4, 25, 25]
+    assert (PHOTO_ONLY.whole(POSE, COVARIANCE, of_camera) == COVARIANCE).all()
+
+
+def test_a_bent_map_adds_its_bend_to_every_position_alike() -> None:
+    bent, straight = MapErrors(5.0, 3.0, position_std=0.3), MapErrors(5.0, 3.0)
+    before, after = straight.whole(POSE, COVARIANCE), bent.whole(POSE, COVARIANCE)
+
+    assert position_covariance(POSE, after) == pytest.approx(
+        position_covariance(POSE, before) + 0.09 * np.eye(3)
+    )
+    assert after[:3] == pytest.approx(before[:3])
+    # All instants share it, however many there are.
+    assert bent.part(POSE, COVARIANCE) - straight.part(POSE, COVARIANCE) == pytest.approx(
+        np.diag([0, 0, 0, 0.09, 0.09, 0.09])
+    )
+
+
 def test_without_a_test_of_the_map_nothing_changes_in_the_last_bit() -> None:
     assert (PHOTO_ONLY.whole(POSE, COVARIANCE) == COVARIANCE).all()
     assert PHOTO_ONLY.uncertainty is Uncertainty.PHOTO_ONLY

@@ -20,6 +20,7 @@ from visloc.pose.generalized import (
     estimate_generalized_pose,
     refine_generalized_pose,
 )
+from visloc.pose.map_errors import MapErrors
 from visloc.pose.views import MatchedView
 from visloc.priors import GravityPrior, Priors
 from visloc.types import CameraSource, Reason
@@ -298,6 +299,25 @@ def test_the_covariance_holds_a_principal_point_off_the_centre(
         normalized.append(error @ np.linalg.solve(covariance, error))
     assert np.mean(np.array(normalized) < CHI2_6_95) >= 0.85
     assert 3.5 < np.mean(normalized) < 7.5
+
+
+def test_no_map_widens_the_doubt_in_the_principal_point() -> None:
+    """Exact matches leave nothing else open, so a bad map makes the pose no less sure."""
+    views, _ = look(300, [Pose.identity()], 150, true_camera(600.0), noise_px=0.0)
+    found = solve(without_focal(views), Solver.PYCOLMAP)
+    assert found is not None
+    assert found.covariance is not None
+    assert found.of_camera is not None
+    bad = MapErrors(20.0, 20.0)
+
+    whole = bad.whole(found.rig_from_world, found.covariance, found.of_camera)
+
+    np.testing.assert_allclose(whole, found.covariance, rtol=1e-3, atol=1e-12)
+    # 6.4 of 600 pixels, which a turn of the camera hides.
+    assert np.degrees(np.sqrt(np.diag(whole)[:2])) == pytest.approx([0.6, 0.6], abs=0.15)
+    known = solve(views, Solver.PYCOLMAP)
+    assert known is not None
+    assert known.of_camera is None
 
 
 # In an answer

@@ -370,7 +370,7 @@ def test_an_instant_that_only_its_neighbours_make_findable_counts_as_measured() 
         LOSS_SCALE_PX,
     )
     assert alone is not None
-    assert found.covariance == pytest.approx(alone, rel=1e-6)  # motion adds nothing to it
+    assert found.covariance == pytest.approx(alone.whole, rel=1e-6)  # motion adds nothing to it
 
 
 def test_covariances_agree_with_monte_carlo() -> None:

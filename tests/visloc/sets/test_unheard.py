@@ -70,6 +70,21 @@ def test_a_sure_answer_stands(floors: SetOutline, probability: float | None) -> 
     assert left_open(floors, GOOD, answer, elsewhere(POOR, OTHER), (GOOD, OTHER)) is None
 
 
+def test_a_doubtful_answer_of_a_tile_that_misses_its_own_photos_is_nothing_unusual(
+    floors: SetOutline,
+) -> None:
+    tiles = list(floors.tiles)
+    tiles[GOOD] = tiles[GOOD].model_copy(update={"misses_own_photos": True})
+    sparse = replace(floors, manifest=floors.manifest.model_copy(update={"tiles": tuple(tiles)}))
+
+    for probability, is_refused in ((0.89, False), (0.5, False), (0.49, True)):
+        answer = place(sparse, GOOD, probability)
+        refusal = left_open(sparse, GOOD, answer, elsewhere(POOR, OTHER), (GOOD,))
+        assert (refusal is not None) == is_refused
+        if refusal is not None:
+            assert "whose own photos look like those of good@v1" in refusal.message
+
+
 def test_a_tile_that_agrees_or_is_excluded_is_not_left_open(floors: SetOutline) -> None:
     assert left_open(floors, GOOD, place(floors, GOOD, 0.3), elsewhere(OTHER), (GOOD,)) is None
 

@@ -13,8 +13,9 @@ import pytest
 from clients.wire.answers import parse_answer, parse_instant, parse_map, parse_result
 from service.http.openapi import example
 from visloc.errors import Unavailable
-from visloc_api.words.answers import InstantAnswer, LocalizeResponse, PoseEstimate
+from visloc_api.words.answers import InstantAnswer, LocalizeResponse
 from visloc_api.words.maps import MapInfo
+from visloc_api.words.poses import PoseEstimate
 
 PARSERS = {
     "localized": parse_result,
