@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
@@ -19,6 +20,9 @@ from mapping.methods.sparse_model import SfmPhoto
 from visloc.pose.colmap import pose_from_colmap
 
 REFINABLE = ("poses", "points", "intrinsics")
+# Fewer photos of a camera do not tell its principal point; in lenses it lies nearer to the middle
+# than this share of the longer side.
+_MANY_PHOTOS, _MAX_SHIFT = 30, 0.02
 # Scale of the robust loss.
 _LOSS_SCALE_PX = 1.0
 
@@ -81,6 +85,36 @@ def error_rises(
         camera_id: math.sqrt(max(errors[1].get(camera_id, 0.0) - errors[0].get(camera_id, 0.0), 0))
         for camera_id in camera_ids
     }
+
+
+def with_principal_points(
+    model: pycolmap.Reconstruction, camera_ids: Collection[int]
+) -> pycolmap.Reconstruction:
+    """Return a model adjusted once more, with the principal points of some cameras free.
+
+    A principal point that is two pixels off bends the paths of cameras, so that lengths differ from
+    place to place. It is refined at the end, of cameras with many photos: before, it would take up
+    errors of poses. The model stays as it is when a principal point moves further than in lenses.
+    """
+    photos = Counter(model.image(image_id).camera_id for image_id in model.reg_image_ids())
+    free = {camera_id for camera_id in camera_ids if photos[camera_id] >= _MANY_PHOTOS}
+    if not free:
+        return model
+    adjusted = pycolmap.Reconstruction(model)
+    options = _options(poses=True, intrinsics=True)
+    options.refine_principal_point = True
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = _LOSS_SCALE_PX
+    with quiet():
+        _adjust(adjusted, options, set(model.cameras) - free, poses=True)
+    for camera_id in free:
+        before, after = model.camera(camera_id), adjusted.camera(camera_id)
+        moved = math.hypot(
+            *(after.params[i] - before.params[i] for i in before.principal_point_idxs())
+        )
+        if not moved <= _MAX_SHIFT * max(before.width, before.height):
+            return model
+    return adjusted
 
 
 def _squared_errors(model: pycolmap.Reconstruction) -> dict[int, float]:

@@ -335,3 +335,27 @@ def test_notes_name_cameras_values_and_what_to_do() -> None:
         assert "import photos with --output first" in note
     for origin in origins.values():
         assert CameraOrigin.model_validate(origin.model_dump()) == origin
+
+
+def around_an_object_in_many_photos() -> tuple[NDArray[np.float64], list[Pose]]:
+    points, _ = around_an_object()
+    return points, [
+        looking((8 * np.sin(a), -8 * np.cos(a), 2 * np.sin(3 * a)), (0, 0, 0), (0, 0, 1))
+        for a in np.radians(5 * np.arange(32))
+    ]
+
+
+def test_many_photos_tell_where_the_principal_point_is(tmp_path: Path) -> None:
+    x, y = WIDTH / 2 + 0.006 * WIDTH, HEIGHT / 2 - 0.004 * WIDTH
+    lens = Camera("SIMPLE_RADIAL", WIDTH, HEIGHT, (FOCAL, x, y, 0.0))
+    model = solved(around_an_object_in_many_photos(), None, tmp_path, lens)
+    (found,) = cameras_in(model)
+    np.testing.assert_allclose(found.params[1:3], (x, y), atol=0.001 * WIDTH)
+
+
+def test_a_principal_point_that_no_lens_has_is_not_taken(tmp_path: Path) -> None:
+    x = WIDTH / 2 + 0.05 * WIDTH
+    lens = Camera("SIMPLE_RADIAL", WIDTH, HEIGHT, (FOCAL, x, HEIGHT / 2, 0.0))
+    model = solved(around_an_object_in_many_photos(), None, tmp_path, lens)
+    (found,) = cameras_in(model)
+    assert found.params[1:3] == (WIDTH / 2, HEIGHT / 2)
