@@ -58,7 +58,7 @@ class Resolution:
 
 @dataclass(frozen=True, slots=True)
 class WorkingResolution:
-    """How finely the photos of a map see, in the middle of their order.
+    """How finely the photos of a map see: as finely as a quarter of them or more.
 
     Attributes:
         stored: in the pixels of their files.
@@ -83,7 +83,7 @@ class WorkingResolution:
         most = parameters.get("max_long_side_px")
         most_px = float(most) if isinstance(most, int | float) and most > 0 else None
         seen = [photo.shrunk_to(most_px) for photo in photos]
-        return WorkingResolution(_middle(photos), _middle(seen), most_px)
+        return WorkingResolution(_finer(photos), _finer(seen), most_px)
 
     def feature_size(self, photo: Resolution, width: int, height: int) -> tuple[int, int] | None:
         """Return the width and height at which the features of a photo are to be found.
@@ -129,13 +129,14 @@ def resized(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8
     return np.asarray(cv2.resize(rgb, (width, height), interpolation=method), np.uint8)
 
 
-def _middle(photos: Sequence[Resolution]) -> Resolution:
-    long_side = _upper_median(photo.long_side for photo in photos)
+def _finer(photos: Sequence[Resolution]) -> Resolution:
+    long_side = _upper_quartile(photo.long_side for photo in photos)
     focal = [photo.focal_length for photo in photos if photo.focal_length is not None]
-    return Resolution(long_side, _upper_median(focal) if focal else None)
+    return Resolution(long_side, _upper_quartile(focal) if focal else None)
 
 
-def _upper_median(values: Iterable[float]) -> float:
-    # Of two sizes that are equally common, the larger one: reduced photos are placed less exactly.
+def _upper_quartile(values: Iterable[float]) -> float:
+    # Of two sizes, the larger one if a quarter of the photos have it: photos that are enlarged
+    # match nearly as well, but those that are reduced are placed less exactly.
     ordered = sorted(values)
-    return ordered[len(ordered) // 2]
+    return ordered[3 * len(ordered) // 4]

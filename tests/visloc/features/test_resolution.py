@@ -64,12 +64,12 @@ def test_what_a_network_shrinks_alike_is_reduced_to_the_maps_size() -> None:
     assert phone.finer(film(1280, 960.0)) == 1.0
 
 
-def test_the_camera_of_most_photos_counts_and_of_two_the_finer_one() -> None:
+def test_the_finest_camera_of_a_quarter_of_the_photos_counts() -> None:
     small, large = film(640, 500.0), film(4000, 3000.0)
     mixed = of(small, large, small, large)
     assert mixed.feature_size(large, 4000, 3000) is None
     assert mixed.feature_size(small, 640, 480) == (1229, 922)
-    mixed = of(small, large, small)
+    mixed = of(small, large, small, small, small)
     assert mixed.feature_size(large, 4000, 3000) == (667, 500)
     assert mixed.finer(large) == pytest.approx(6.0)
 
