@@ -19,6 +19,8 @@ from visloc.geometry import Camera
 # Resolutions that differ by less count as the same: matches are not lost yet, and a photo that was
 # not resized has the sharper pixels.
 _ALIKE = 1.1
+# A reduction that is so near to a whole number is taken for it.
+_NEARLY = 1.05
 # No photo is reduced to less. A long lens shows little of what a mapping photo shows.
 _LEAST_LONG_SIDE_PX = 320
 # A wide-angle photo is enlarged to at most this many times the longer side of mapping photos.
@@ -107,6 +109,7 @@ class WorkingResolution:
                 most = min(most, self.most_px)
             least = min(_LEAST_LONG_SIDE_PX, seen.long_side, self.seen.long_side)
             scale = min(max(seen.long_side / finer, least), most) / long_side
+        scale = 1 / _whole(1 / scale)
         size = max(1, round(width * scale)), max(1, round(height * scale))
         return None if size == (width, height) else size
 
@@ -117,7 +120,7 @@ class WorkingResolution:
         not finer; their own pixels are the larger ones.
         """
         finer = photo.over(self.stored)
-        return finer if finer > _ALIKE else 1.0
+        return _whole(finer) if finer > _ALIKE else 1.0
 
 
 def resized(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
@@ -133,6 +136,12 @@ def _finer(photos: Sequence[Resolution]) -> Resolution:
     long_side = _upper_quartile(photo.long_side for photo in photos)
     focal = [photo.focal_length for photo in photos if photo.focal_length is not None]
     return Resolution(long_side, _upper_quartile(focal) if focal else None)
+
+
+def _whole(reduction: float) -> float:
+    """Return the whole number beside a reduction, if there is one: it blurs no pixels."""
+    whole = max(1.0, float(round(min(reduction, 1e6))))
+    return whole if 1 / _NEARLY < reduction / whole < _NEARLY else reduction
 
 
 def _upper_quartile(values: Iterable[float]) -> float:

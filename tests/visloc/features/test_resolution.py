@@ -24,12 +24,20 @@ def test_a_photo_of_the_maps_own_camera_is_left_alone() -> None:
     assert KITCHEN.finer(film(640, 560.0)) == 1.0
 
 
-@pytest.mark.parametrize("times", [2, 4, 6.25])
+@pytest.mark.parametrize("times", [2, 2.5, 4])
 def test_the_same_view_with_more_pixels_has_the_maps_size(times: float) -> None:
     photo = film(640 * times, 525.0 * times)
     size = KITCHEN.feature_size(photo, round(640 * times), round(480 * times))
     assert size == (640, 480)
     assert KITCHEN.finer(photo) == pytest.approx(times)
+
+
+@pytest.mark.parametrize(("times", "whole"), [(2.95, 3), (6.25, 6), (1.04, 1)])
+def test_reductions_near_a_whole_number_are_whole(times: float, whole: int) -> None:
+    width, height = round(640 * times), round(480 * times)
+    expected = None if whole == 1 else (round(width / whole), round(height / whole))
+    assert KITCHEN.feature_size(film(640 * times, 525.0 * times), width, height) == expected
+    assert KITCHEN.finer(film(640 * times, 525.0 * times)) == whole
 
 
 def test_a_photo_on_its_side_is_reduced_as_much() -> None:
