@@ -19,6 +19,8 @@ from visloc.geometry import Camera
 # Resolutions that differ by less count as the same: matches are not lost yet, and a photo that was
 # not resized has the sharper pixels.
 _ALIKE = 1.1
+# A reduction that is so near to a whole number is taken for it.
+_NEARLY = 1.05
 # No photo is reduced to less. A long lens shows little of what a mapping photo shows.
 _LEAST_LONG_SIDE_PX = 320
 # A wide-angle photo is enlarged to at most this many times the longer side of mapping photos.
@@ -58,7 +60,7 @@ class Resolution:
 
 @dataclass(frozen=True, slots=True)
 class WorkingResolution:
-    """How finely the photos of a map see, in the middle of their order.
+    """How finely the photos of a map see: as finely as a quarter of them or more.
 
     Attributes:
         stored: in the pixels of their files.
@@ -83,7 +85,7 @@ class WorkingResolution:
         most = parameters.get("max_long_side_px")
         most_px = float(most) if isinstance(most, int | float) and most > 0 else None
         seen = [photo.shrunk_to(most_px) for photo in photos]
-        return WorkingResolution(_middle(photos), _middle(seen), most_px)
+        return WorkingResolution(_finer(photos), _finer(seen), most_px)
 
     def feature_size(self, photo: Resolution, width: int, height: int) -> tuple[int, int] | None:
         """Return the width and height at which the features of a photo are to be found.
@@ -107,6 +109,7 @@ class WorkingResolution:
                 most = min(most, self.most_px)
             least = min(_LEAST_LONG_SIDE_PX, seen.long_side, self.seen.long_side)
             scale = min(max(seen.long_side / finer, least), most) / long_side
+        scale = 1 / _whole(1 / scale)
         size = max(1, round(width * scale)), max(1, round(height * scale))
         return None if size == (width, height) else size
 
@@ -117,7 +120,7 @@ class WorkingResolution:
         not finer; their own pixels are the larger ones.
         """
         finer = photo.over(self.stored)
-        return finer if finer > _ALIKE else 1.0
+        return _whole(finer) if finer > _ALIKE else 1.0
 
 
 def resized(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
@@ -129,13 +132,20 @@ def resized(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8
     return np.asarray(cv2.resize(rgb, (width, height), interpolation=method), np.uint8)
 
 
-def _middle(photos: Sequence[Resolution]) -> Resolution:
-    long_side = _upper_median(photo.long_side for photo in photos)
+def _finer(photos: Sequence[Resolution]) -> Resolution:
+    long_side = _upper_quartile(photo.long_side for photo in photos)
     focal = [photo.focal_length for photo in photos if photo.focal_length is not None]
-    return Resolution(long_side, _upper_median(focal) if focal else None)
+    return Resolution(long_side, _upper_quartile(focal) if focal else None)
 
 
-def _upper_median(values: Iterable[float]) -> float:
-    # Of two sizes that are equally common, the larger one: reduced photos are placed less exactly.
+def _whole(reduction: float) -> float:
+    """Return the whole number beside a reduction, if there is one: it blurs no pixels."""
+    whole = max(1.0, float(round(min(reduction, 1e6))))
+    return whole if 1 / _NEARLY < reduction / whole < _NEARLY else reduction
+
+
+def _upper_quartile(values: Iterable[float]) -> float:
+    # Of two sizes, the larger one if a quarter of the photos have it: photos that are enlarged
+    # match nearly as well, but those that are reduced are placed less exactly.
     ordered = sorted(values)
-    return ordered[len(ordered) // 2]
+    return ordered[3 * len(ordered) // 4]

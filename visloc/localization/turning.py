@@ -31,13 +31,18 @@ from visloc.types import Evidence, LocalFeatures, Reason
 REASONS_OF_TURNED_PHOTOS = (
     *(Reason.TOO_FEW_MATCHES, Reason.NO_POSE, Reason.TOO_FEW_INLIERS, Reason.LOW_INLIER_RATIO),
 )
+# A symmetric room has a wrong pose for a photo that is upside down.
+_WORTH_TURNING = (*REASONS_OF_TURNED_PHOTOS, Reason.UNCERTAIN_POSE, Reason.UNLIKELY_POSE)
 # Degrees clockwise. Whoever holds a camera upside down does not hold it askew as well.
-_TURNS = (90, 180, 270, 45, 315)
+_QUARTERS, _ASKEW = (90, 180, 270), (45, 315)
+_ALL = (*_QUARTERS, *_ASKEW)
 _STEP_DEG = 45
 _NUM_KEYPOINTS, _NUM_PHOTOS = 1000, 3
 # A turn is worth a try with this many clear matches with one photo, and with so many times as many
 # as come by chance, if the photo as it was has fewer.
-_LEAST_CLEAR, _TIMES_BY_CHANCE = 20, 2
+_LEAST_CLEAR, _TIMES_BY_CHANCE = 20, 2.0
+# A photo that is held askew shows something when it is turned by 45 degrees too little or too much.
+_TIMES_NEXT_TO_IT = 1.5
 # With so many, no other turn is looked at.
 _SURELY_CLEAR = 100
 # Of a unit vector: gravity that lies nearer to the optical axis does not tell the roll.
@@ -85,7 +90,7 @@ class TurnFinder:
             priors: gravity tells the turn, and others exclude mapping photos.
             cache: features of this photo; those of the turns are added.
         """
-        if options.read_as is not ReadAs.ANY or reason not in REASONS_OF_TURNED_PHOTOS:
+        if options.read_as is not ReadAs.ANY or reason not in _WORTH_TURNING:
             return 0
         constraints = Constraints(self._geometry, priors)
         turns = _turns_by(constraints.gravity, photo)
@@ -102,14 +107,13 @@ class TurnFinder:
             return 0
         counts = {0: clear(0)}
         for turned in turns:
+            if turned in _ASKEW and turns is _ALL and not _promises(counts, _TIMES_NEXT_TO_IT):
+                break
             counts[turned] = clear(turned)
             if counts[turned] >= _SURELY_CLEAR:
                 break
-        # Most turns show nothing of the map, so that half of them have what comes by chance.
-        by_chance = sorted(counts.values())[(len(counts) - 1) // 2]
-        best = max(counts, key=lambda turned: counts[turned])
-        promises = counts[best] >= max(_LEAST_CLEAR, _TIMES_BY_CHANCE * by_chance)
-        return best if promises else 0
+        promises = _promises(counts, _TIMES_BY_CHANCE)
+        return max(counts, key=lambda turned: counts[turned]) if promises else 0
 
     def _clear_matches(
         self, local: LocalFeatures, rgb: NDArray[np.uint8], constraints: Constraints
@@ -131,10 +135,17 @@ class TurnFinder:
         return int(np.bincount(pairs.ranks, minlength=1).max())
 
 
+def _promises(counts: Mapping[int, int], times: float) -> bool:
+    """Tell whether the best turn has so many times as many clear matches as come by chance."""
+    # Most turns show nothing of the map, so that half of them have what comes by chance.
+    by_chance = sorted(counts.values())[(len(counts) - 1) // 2]
+    return max(counts.values()) >= max(_LEAST_CLEAR, times * by_chance)
+
+
 def _turns_by(gravity: KnownGravity | None, photo: Photo) -> tuple[int, ...]:
     """Return the turns to look at: the one that gravity tells, else all."""
     if gravity is None or np.linalg.norm(gravity.rig[:2]) < _LEAST_ACROSS:
-        return _TURNS
+        return _ALL
     size = photo.width, photo.height
     ends = np.array([[0.0, 0.0], gravity.rig[:2]])
     start, end = upright_from_stored(ends, turn_of(photo.exif_orientation), *size)

@@ -81,7 +81,8 @@ describe("advice", () => {
       const { stage } = table.find((row) => row.reason === reason)!;
       const camera = { source: "guess" } as LocalizeResponse["camera"];
       const tries = (exif: number, read_as: string): string[] =>
-        advice(refused(stage, reason, { camera, orientation: { exif, read_as, turned: 0 } }), {}).tries;
+        advice(refused(stage, reason, { camera, orientation: { exif, read_as, turned: 0 } }), {})
+          .tries;
       expect(tries(6, "stored")[0]).toContain("upright");
       expect(tries(6, "upright").join()).not.toContain("upright");
       expect(tries(1, "stored").join()).not.toContain("upright");

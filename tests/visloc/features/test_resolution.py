@@ -24,12 +24,20 @@ def test_a_photo_of_the_maps_own_camera_is_left_alone() -> None:
     assert KITCHEN.finer(film(640, 560.0)) == 1.0
 
 
-@pytest.mark.parametrize("times", [2, 4, 6.25])
+@pytest.mark.parametrize("times", [2, 2.5, 4])
 def test_the_same_view_with_more_pixels_has_the_maps_size(times: float) -> None:
     photo = film(640 * times, 525.0 * times)
     size = KITCHEN.feature_size(photo, round(640 * times), round(480 * times))
     assert size == (640, 480)
     assert KITCHEN.finer(photo) == pytest.approx(times)
+
+
+@pytest.mark.parametrize(("times", "whole"), [(2.95, 3), (6.25, 6), (1.04, 1)])
+def test_reductions_near_a_whole_number_are_whole(times: float, whole: int) -> None:
+    width, height = round(640 * times), round(480 * times)
+    expected = None if whole == 1 else (round(width / whole), round(height / whole))
+    assert KITCHEN.feature_size(film(640 * times, 525.0 * times), width, height) == expected
+    assert KITCHEN.finer(film(640 * times, 525.0 * times)) == whole
 
 
 def test_a_photo_on_its_side_is_reduced_as_much() -> None:
@@ -64,12 +72,12 @@ def test_what_a_network_shrinks_alike_is_reduced_to_the_maps_size() -> None:
     assert phone.finer(film(1280, 960.0)) == 1.0
 
 
-def test_the_camera_of_most_photos_counts_and_of_two_the_finer_one() -> None:
+def test_the_finest_camera_of_a_quarter_of_the_photos_counts() -> None:
     small, large = film(640, 500.0), film(4000, 3000.0)
     mixed = of(small, large, small, large)
     assert mixed.feature_size(large, 4000, 3000) is None
     assert mixed.feature_size(small, 640, 480) == (1229, 922)
-    mixed = of(small, large, small)
+    mixed = of(small, large, small, small, small)
     assert mixed.feature_size(large, 4000, 3000) == (667, 500)
     assert mixed.finer(large) == pytest.approx(6.0)
 

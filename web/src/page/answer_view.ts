@@ -296,6 +296,7 @@ const STAGE_NAMES: Readonly<Record<string, string>> = {
   retrieval: "retrieval",
   matching: "matching",
   pose: "pose",
+  turns: "looking at other turns",
 };
 
 function timeBar(answer: LocalizeResponse, whole: number | null): HTMLElement {

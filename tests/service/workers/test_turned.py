@@ -1,0 +1,64 @@
+"""Photos of turned cameras, as a worker localizes them."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import replace
+from pathlib import Path
+from time import time
+from typing import Protocol
+
+from mapping.build.build import build_map
+from mapping.build.settings import BuildSettings
+from service.values import MapFolder, WorkerSettings, photo_job
+from service.workers.vision import Vision
+from tests.turning import png, turned_camera, turned_pixels, turned_pose
+from visloc.archive import MapStore
+from visloc.evaluation import pose_error
+from visloc.geometry import Camera, Pose
+from visloc.images import read_photo
+from visloc.options import Inference, LocalizeOptions, ReadAs
+
+SETTINGS = WorkerSettings(None, 1, 10**9, 8, 8, 10**8, 10**8, Inference.FP32)
+
+
+class Query(Protocol):
+    image: bytes
+    camera: Camera
+    cam_from_world: Pose
+
+
+def test_a_photo_of_a_turned_camera_is_found_and_drawn(
+    sample: Path, query: Query, tmp_path: Path
+) -> None:
+    settings = BuildSettings(
+        dataset=sample / "mapping",
+        map_id="room",
+        maps_dir=tmp_path,
+        method="rgbd",
+        local_features="xfeat",
+        max_keypoints=1500,
+    )
+    build_map(settings, lambda *_: None)
+    store = MapStore(tmp_path)
+    maps = [MapFolder(store.open("room").ref, store.folder("room"))]
+    image = png(turned_pixels(read_photo(query.image).rgb, 3))
+    camera, truth = turned_camera(query.camera, 3), turned_pose(query.cam_from_world, 3)
+    process = Vision(SETTINGS, ctypes.c_bool())
+
+    job = photo_job(("room",), image, camera, LocalizeOptions())
+    found = process.localize(replace(job, debug=True), maps, time())
+    assert found.answer.pose is not None, found.answer.refusal
+    assert pose_error(found.answer.pose.rig_from_world, truth) < (0.02, 0.5)
+    (shown,) = found.answer.images
+    assert shown.evidence is not None
+    assert shown.evidence.turned == 180
+    assert shown.evidence.camera == camera
+    assert found.answer.seconds["turns"] > 0
+    assert found.debug is not None
+    assert len(found.debug.keypoints) == shown.evidence.num_correspondences
+
+    upright = LocalizeOptions(read_as=ReadAs.UPRIGHT)
+    alone = process.localize(photo_job(("room",), image, camera, upright), maps, time())
+    assert alone.answer.refusal is not None
+    assert "turns" not in alone.answer.seconds
