@@ -29,23 +29,29 @@ def extract_features(
     Args:
         photo: pixels as stored.
         extractor: finds the features.
-        max_keypoints: strongest ones kept.
+        max_keypoints: strongest ones kept, before the mask drops some of them.
         read_as: ``STORED`` to find them without turning the photo.
         extraction: how much effort goes into it.
 
     Returns:
         Features with keypoints in the stored pixels, where the photo's mask lets them count, and
-        the picture (H, W, 3) that they were
-        found in, which global descriptors are to describe.
+        the picture (H, W, 3) that they were found in, which global descriptors are to describe.
     """
     turn = turn_of(photo.exif_orientation) if read_as is ReadAs.UPRIGHT else 1
     rgb = photo.rgb if turn == 1 else upright(photo.rgb, turn)
     local = extractor.extract(rgb, max_keypoints=max_keypoints, extraction=extraction)
     keypoints = stored_from_upright(local.keypoints, turn, photo.width, photo.height)
-    local = replace(local, keypoints=keypoints)
-    if photo.mask is not None:
-        counts = photo.counts(keypoints)
-        local = LocalFeatures(
-            keypoints[counts], local.descriptors[counts], local.scores[counts], local.scales[counts]
-        )
-    return local, rgb
+    return where_counting(photo, replace(local, keypoints=keypoints)), rgb
+
+
+def where_counting(photo: Photo, local: LocalFeatures) -> LocalFeatures:
+    """Drop the features, with keypoints in the stored pixels, that the photo's mask hides."""
+    if photo.mask is None:
+        return local
+    counts = photo.counts(local.keypoints)
+    return LocalFeatures(
+        local.keypoints[counts],
+        local.descriptors[counts],
+        local.scores[counts],
+        local.scales[counts],
+    )

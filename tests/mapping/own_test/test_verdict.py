@@ -15,6 +15,8 @@ from mapping.build.build import build_map
 from mapping.build.settings import BuildSettings
 from mapping.cli.acceptance import require_acceptance, use
 from mapping.maps.editing import content_of
+from mapping.maps.merging import merge_maps
+from mapping.maps.splitting import split_map
 from mapping.own_test.publishing import publish_edited
 from mapping.own_test.trials import OwnTestRun, run_own_test
 from mapping.own_test.verdict import doubts_about
@@ -207,3 +209,23 @@ def test_only_a_version_is_put_into_use(maps_dir: Path) -> None:
     assert caught.value.code == "map.use"
     with pytest.raises(NotFound):
         use("room@nothing", maps_dir)
+
+
+def test_nothing_is_made_of_a_version_in_doubt_until_it_is_accepted(
+    broken: Path, maps_dir: Path
+) -> None:
+    store = MapStore(maps_dir)
+    good = store.current_version("room")
+    ref = f"room@{build(broken, maps_dir).manifest.version}"
+
+    with pytest.raises(Conflict) as caught:
+        split_map(store, ref, "tiles", lambda *_: None, tile=100.0, overlap=0.0)
+    assert caught.value.code == "map.doubtful"
+    with pytest.raises(Conflict) as caught:
+        merge_maps(store, f"room@{good}", ref, "both", lambda *_: None)
+    assert caught.value.code == "map.doubtful"
+    assert store.ids() == ["room"]
+
+    use(ref, maps_dir)
+    split_map(store, ref, "tiles", lambda *_: None, tile=100.0, overlap=0.0)
+    assert "tiles" in store.ids()
