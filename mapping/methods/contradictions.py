@@ -47,8 +47,9 @@ _LEAST_COMPARED, _FULL_WEIGHT = 40, 300
 # Photos of one place may be correlated a little the other way round. Measured:
 # docs/decisions/0034-places-that-contradict.md.
 _SLACK = 0.05
-# Groups show two places when so many pairs across them or more are correlated by this or less in
-# the mean, and pairs within them by so much more.
+# Groups of so many photos show two places when so many pairs across them or more are correlated by
+# this or less in the mean, and pairs within them by so much more.
+_LEAST_PHOTOS = 3
 _LEAST_PAIRS, _CONTRADICT, _LEAST_CONTRAST = 4, -0.07, 0.25
 # A pair with such a correlation shows one place, whatever its groups say.
 _AGREE = 0.15
@@ -121,7 +122,7 @@ def find_places(photos: Sequence[ModelPhoto], points: NDArray[np.float64]) -> Pl
     groups = _contracted(len(photos), pairs, weights)
     return Places(
         groups,
-        _contradicting(groups[pairs], correlations, counts),
+        _contradicting(groups, pairs, correlations, counts),
         frozenset(map(tuple, pairs[correlations >= _AGREE].tolist())),
     )
 
@@ -177,7 +178,7 @@ class _Model:
         )
         there = np.isfinite(distances)
         front = np.where(there, own[np.where(there, beside, 0)], np.inf).min(axis=1)
-        return landmarks[front >= _IN_FRONT * depths]
+        return np.asarray(landmarks[front >= _IN_FRONT * depths])
 
     def shown(self, row: int, landmarks: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Tell which of the expected landmarks a photo shows.
@@ -288,12 +289,16 @@ def _contracted(
 
 
 def _contradicting(
-    pairs: NDArray[np.int64], correlations: NDArray[np.float64], counts: NDArray[np.float64]
+    groups: NDArray[np.int64],
+    pairs: NDArray[np.int64],
+    correlations: NDArray[np.float64],
+    counts: NDArray[np.float64],
 ) -> frozenset[tuple[int, int]]:
-    """Return the pairs of groups that show two places; ``pairs`` (m, 2) are of groups."""
+    """Return the pairs of groups that show two places."""
     weights = np.minimum(counts, _FULL_WEIGHT)
+    sizes = np.bincount(groups).tolist()
     of_groups: dict[tuple[int, int], list[int]] = {}
-    for row, (a, b) in enumerate(np.sort(pairs, axis=1).tolist()):
+    for row, (a, b) in enumerate(np.sort(groups[pairs], axis=1).tolist()):
         of_groups.setdefault((a, b), []).append(row)
 
     def mean(rows: list[int]) -> float:
@@ -302,7 +307,9 @@ def _contradicting(
     found = set()
     for (a, b), across in of_groups.items():
         within = [*of_groups.get((a, a), []), *of_groups.get((b, b), [])]
-        if a == b or len(across) < _LEAST_PAIRS or not within:
+        if a == b or min(sizes[a], sizes[b]) < _LEAST_PHOTOS:
+            continue
+        if len(across) < _LEAST_PAIRS or not within:
             continue
         if mean(across) <= _CONTRADICT and mean(within) - mean(across) >= _LEAST_CONTRAST:
             found.add((a, b))

@@ -73,7 +73,7 @@ def _places_of(
     own = dict(rows_by_value(observations.views))
     none = np.empty(0, np.int64)
     number: dict[int, int] = {}
-    placed = []
+    placed: list[ModelPhoto] = []
     for row, (photo, view) in enumerate(zip(photos, model.views, strict=True)):
         if view is None:
             continue
