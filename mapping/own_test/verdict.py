@@ -99,7 +99,8 @@ def _apart(opened: Map) -> Doubt | None:
 
 def _two_places(opened: Map) -> Doubt | None:
     """Doubt a map in which photos of two places seem to have been taken beside each other."""
-    if not opened.images:
+    if not _has_estimated_poses(opened):
+        # A map keeps only keypoints that were matched: where few pairs were, others seem missing.
         return None
     rows = find_places(_model_photos(opened), opened.landmarks.astype(np.float64)).doubted()
     if len(rows) < LEAST_DOUBTED or len(rows) <= MOST_APART * len(opened.images):
