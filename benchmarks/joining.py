@@ -27,6 +27,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
 from mapping.cluster.executors import open_executor
 from mapping.cluster.workers import one_thread_here
@@ -37,7 +38,7 @@ from mapping.methods.matching import Matches, Verification, match_pairs
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto
-from mapping.methods.triangulation import reconstruct
+from mapping.methods.undoing import reconstruct_places
 from mapping.sample import write_sample
 from mapping.stages.context import BuildContext
 from mapping.stages.global_features import describe_photos
@@ -90,6 +91,7 @@ def all_models(root: Path, work: Path) -> tuple[int, list[Model]]:
         pairs = find_pairs(make_scene(dataset, photos, described, SETTINGS), SETTINGS)
         verification = Verification(CONFIG.filter_max_reproj_error, CONFIG.min_num_matches, False)
         matches, _ = match_pairs(context, photos, pairs.rows, verification)
+        found = [source.read(photo) for photo in photos]
         given = [
             SfmPhoto(
                 photo.name,
@@ -98,19 +100,22 @@ def all_models(root: Path, work: Path) -> tuple[int, list[Model]]:
                 photo.camera,
                 photo.camera_known,
                 None,
-                source.read(photo).keypoints,
+                features.keypoints,
             )
-            for photo in photos
+            for photo, features in zip(photos, found, strict=True)
         ]
+        looks = [np.rint(127 * features.descriptors).astype(np.int8) for features in found]
     models = []
     left = list(range(len(given)))
-    while found := _model_of(given, matches, left):
-        models.append({given[row].name: pose for row, pose in found.items()})
-        left = [row for row in left if row not in found]
+    while placed := _model_of(given, looks, matches, left):
+        models.append({given[row].name: pose for row, pose in placed.items()})
+        left = [row for row in left if row not in placed]
     return len(given), models
 
 
-def _model_of(photos: list[SfmPhoto], matches: list[Matches], rows: list[int]) -> dict[int, Pose]:
+def _model_of(
+    photos: list[SfmPhoto], looks: list[NDArray[np.int8]], matches: list[Matches], rows: list[int]
+) -> dict[int, Pose]:
     """Return the poses of the largest model of some photos; nothing without one."""
     number = {row: order for order, row in enumerate(rows)}
     among = [
@@ -121,7 +126,16 @@ def _model_of(photos: list[SfmPhoto], matches: list[Matches], rows: list[int]) -
     some = [photos[row] for row in rows]
     with tempfile.TemporaryDirectory() as folder:
         try:
-            model = reconstruct(some, {}, among, CONFIG, (), Path(folder), lambda *_: None)
+            model = reconstruct_places(
+                some,
+                lambda row: looks[rows[row]],
+                {},
+                among,
+                CONFIG,
+                (),
+                Path(folder),
+                lambda *_: None,
+            )
         except InvalidInput as error:
             typer.echo(f"{len(rows)} photos are in no model: {error.code}")
             return {}

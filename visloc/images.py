@@ -27,6 +27,7 @@ from visloc.photo_formats import (
     Passes,
     PhotoHeader,
     count_passes,
+    mask_hides_unsaid,
     open_header,
 )
 
@@ -164,9 +165,12 @@ def with_mask(
         field: for errors.
 
     Raises:
-        InvalidInput: ``mask.size``, and what ``read_photo`` raises.
+        InvalidInput: ``mask.size``; ``mask.kind`` for 16 bits or transparency; and what
+            ``read_photo`` raises.
     """
     read = _read(data, limits, field)
+    if (unsaid := mask_hides_unsaid(data)) is not None:
+        raise refuse("mask.kind", field=field, got=unsaid)
     shown: NDArray[np.bool_] = np.asarray(read.rgb.any(axis=2))
     width, height = read.file_size or (read.width, read.height)
     stored = photo.file_size or (photo.width, photo.height)

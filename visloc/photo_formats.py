@@ -143,6 +143,28 @@ def open_header(data: bytes, field: str) -> PhotoHeader:
     return _pillow_header(kind.name, opened, data)
 
 
+def mask_hides_unsaid(data: bytes) -> str | None:
+    """Say what of a picture would be lost if its black pixels were taken for a mask.
+
+    In 16 bits, small values such as the numbers of objects would become black; and what is
+    transparent may have any colour.
+
+    Args:
+        data: a picture that ``PhotoHeader.decode`` decodes, of a size within the limits.
+    """
+    if data.startswith(_JPEG):
+        return None
+    # Without a format that has either, OpenCV returns nothing.
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        return None
+    if pixels.dtype != np.uint8:
+        return "16 bits per sample"
+    if pixels.ndim == 3 and pixels.shape[2] == 4 and (pixels[..., 3] < 255).any():
+        return "transparent pixels"
+    return None
+
+
 def _pillow_header(name: str, opened: ImageFile, data: bytes) -> PhotoHeader:
     size, turned = opened.size, 1
     decode = partial(_decode_with_opencv, data)

@@ -7,13 +7,15 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapping.methods.colmap_scene import Rigs
 from mapping.methods.intrinsics import Doubt
 from mapping.methods.matching import Matches, camera_values, pose_values
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
-from mapping.methods.triangulation import MAPPING, TRIANGULATION, reconstruct, triangulate
+from mapping.methods.triangulation import MAPPING, TRIANGULATION, triangulate
+from mapping.methods.undoing import reconstruct_places
 from mapping.progress import Progress
 from mapping.stages.context import BuildContext
 from mapping.stages.landmarks import Observations, View
@@ -23,7 +25,8 @@ from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc.geometry import Camera, Pose
 
 # Raised when the code of the stage changes what comes out.
-_REVISION = 7
+_REVISION = 8
+_LARGEST = 127  # of descriptors in 8 bits
 
 
 def make_model(
@@ -65,10 +68,10 @@ class _ModelTask:
         def compute() -> Item:
             given = [self._given(photo) for photo in self.photos]
             config, refine = MAPPER_CONFIGS[self.settings.mapper], self.settings.refine
-            inputs = given, self.rigs, self.matches, config, refine, self.work.scratch
+            inputs = self.rigs, self.matches, config, refine, self.work.scratch
             if self.settings.estimate_poses:
-                return _to_item(reconstruct(*inputs, progress))
-            return _to_item(triangulate(*inputs, partial(progress, TRIANGULATION)))
+                return _to_item(reconstruct_places(given, self._describe, *inputs, progress))
+            return _to_item(triangulate(given, *inputs, partial(progress, TRIANGULATION)))
 
         stages = (MAPPING, TRIANGULATION) if self.settings.estimate_poses else (TRIANGULATION,)
         if self.work.has(key):
@@ -77,6 +80,11 @@ class _ModelTask:
             return
         progress(stages[0], 0, len(self.photos))
         self.work.get(key, compute)
+
+    def _describe(self, row: int) -> NDArray[np.int8]:
+        descriptors = self.features.read(self.photos[row]).descriptors
+        # One scale for all: they are unit rows.
+        return np.rint(_LARGEST * descriptors).astype(np.int8)
 
     def _given(self, photo: MappingPhoto) -> SfmPhoto:
         return SfmPhoto(
@@ -138,6 +146,7 @@ def _to_item(model: SparseModel) -> Item:
         "doubt_reasons": np.array([doubt.reason for doubt in model.doubts.values()], dtype=np.str_),
         "doubt_px": np.array([doubt.focal_length_px for doubt in model.doubts.values()]),
         "apart": np.array(model.apart, dtype=np.int64),
+        "undone": np.array(model.undone),
         **{f"observed_{name}": array for name, array in asdict(model.observations).items()},
     }
 
@@ -165,4 +174,5 @@ def _from_item(item: Item, photos: Sequence[MappingPhoto]) -> SparseModel:
         bool(item["on_rigs"]),
         {sensor: Doubt(reason, focal) for sensor, reason, focal in doubts},
         tuple(item["apart"].tolist()),
+        int(item["undone"]),
     )

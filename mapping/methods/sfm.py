@@ -156,10 +156,16 @@ def _placed_landmarks(
 
 
 def _notes_on_absent(photos: Sequence[MappingPhoto], model: SparseModel) -> list[str]:
+    notes = []
+    if model.undone:
+        notes.append(
+            f"{model.undone} pairs of photos were not used: they joined places that look alike, "
+            "and photos in the joined model missed what others beside them saw"
+        )
     absent = [photo.name for photo, v in zip(photos, model.views, strict=True) if v is None]
     if not absent:
-        return []
-    notes = [f"{len(absent)} of {len(photos)} photos found no place: {some(absent)}"]
+        return notes
+    notes.append(f"{len(absent)} of {len(photos)} photos found no place: {some(absent)}")
     if model.apart:
         pieces = ", ".join(map(str, model.apart))
         notes.append(

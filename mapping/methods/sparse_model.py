@@ -86,6 +86,8 @@ class SparseModel:
         doubts: by sensor, why refined intrinsics are not believed. Known intrinsics in doubt stayed
             as they were. Photos whose estimated camera is implausible were left out.
         apart: numbers of photos that make other models, which nothing links to this one.
+        undone: pairs of photos whose matches were not used, as models with them showed two places
+            in one.
     """
 
     views: tuple[View | None, ...]
@@ -95,6 +97,7 @@ class SparseModel:
     on_rigs: bool
     doubts: Mapping[str, Doubt]
     apart: tuple[int, ...] = ()
+    undone: int = 0
 
 
 # Stands in for a photo without a pose, which observes nothing.

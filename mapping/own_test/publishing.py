@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from mapping.own_test.trials import run_own_test
@@ -11,6 +12,7 @@ from mapping.stages.publishing import link_photos, new_version
 from visloc.archive import Map, MapContent, MapStore, add_own_test, open_map, write_map
 from visloc.archive.checks import read_manifest
 from visloc.archive.schema import Doubt
+from visloc.errors import NotFound, refuse
 
 Examine = Callable[[Map], Sequence[Doubt]]
 """What else speaks against a map, beside its own test."""
@@ -85,6 +87,24 @@ def publish_tested(
     return store.publish(
         incoming, map_id, version, based_on=based_on, make_current=accept or not is_doubtful
     )
+
+
+def refuse_not_accepted(store: MapStore, opened: Map) -> None:
+    """Refuse to make something of a version in doubt that nobody put into use.
+
+    What is made of it would be put into use: a test of the result does not find all that spoke
+    against the version, as photos that found no place are not in it any more.
+
+    Raises:
+        Conflict: ``map.doubtful``.
+    """
+    map_id, version = opened.manifest.id, opened.manifest.version
+    if not opened.manifest.parts.doubts:
+        return
+    with suppress(NotFound):
+        if store.current_version(map_id) == version:
+            return
+    raise refuse("map.doubtful", field="MAP", ref=opened.ref)
 
 
 def write_content(

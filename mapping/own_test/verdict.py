@@ -9,9 +9,12 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from mapping.methods.contradictions import ModelPhoto, find_places
 from mapping.own_test.trials import OwnTestRun
+from mapping.stages.landmarks import View
 from visloc.archive import Map
 from visloc.archive.schema import Doubt, OwnTest
+from visloc.localization.constraints import MapGeometry
 
 # Shares that no map at hand that localizes well comes near: of 17, those with exact poses have all
 # photos back, and the weakest of look-alike hallways one wrong photo of 12. The painted sample with
@@ -23,6 +26,8 @@ LEAST_TESTED = 8
 # Photos that find no place when poses are estimated, or lie in another piece than the most.
 MOST_LEFT_OUT = 0.4
 MOST_APART = 0.1
+# Fewer photos that contradict a larger group may have rough poses.
+LEAST_DOUBTED = 4
 # A pose needs at least as many landmarks by default (``RegistrationPreset.min_inliers``).
 LINKING_LANDMARKS = 30
 MAX_NAMES = 100
@@ -38,7 +43,12 @@ def doubts_about(opened: Map, run: OwnTestRun, left_out: Sequence[str] = ()) -> 
     """
     return tuple(
         doubt
-        for doubt in (_not_back(opened, run), _without_place(opened, left_out), _apart(opened))
+        for doubt in (
+            _not_back(opened, run),
+            _without_place(opened, left_out),
+            _apart(opened),
+            _two_places(opened),
+        )
         if doubt is not None
     )
 
@@ -95,6 +105,40 @@ def _apart(opened: Map) -> Doubt | None:
         "largest"
     )
     return Doubt(kind="pieces", message=message, photos=tuple(names))
+
+
+def _two_places(opened: Map) -> Doubt | None:
+    """Doubt a map in which photos of two places seem to have been taken beside each other."""
+    if not _has_estimated_poses(opened):
+        # A map keeps only keypoints that were matched: where few pairs were, others seem missing.
+        return None
+    rows = find_places(_model_photos(opened), opened.landmarks.astype(np.float64)).doubted()
+    if len(rows) < LEAST_DOUBTED or len(rows) <= MOST_APART * len(opened.images):
+        return None
+    message = (
+        f"the map seems to show two places that look alike as one: {len(rows)} of "
+        f"{len(opened.images)} photos miss what others beside them see, and see what these miss"
+    )
+    names = [opened.images[row].name for row in rows[:MAX_NAMES]]
+    return Doubt(kind="places", message=message, photos=tuple(names))
+
+
+def _model_photos(opened: Map) -> list[ModelPhoto]:
+    """Return the photos, relative to the map's origin, with the keypoints that the map keeps."""
+    viewpoints = MapGeometry(opened).viewpoints
+    photos = []
+    for row, image in enumerate(opened.images):
+        landmarks, descriptors = opened.observations(row)
+        photos.append(
+            ModelPhoto(
+                View(opened.cameras[image.camera], viewpoints.pose(row)),
+                opened.keypoints(row),
+                descriptors,
+                landmarks.astype(np.int64),
+                np.arange(len(landmarks)),
+            )
+        )
+    return photos
 
 
 def _has_estimated_poses(opened: Map) -> bool:

@@ -615,6 +615,22 @@ def test_a_mask_is_reduced_as_its_photo_is() -> None:
     assert masked.counts(points).tolist() == [False, False, True, True]
 
 
+@pytest.mark.parametrize("file_format", ["PNG", "TIFF"])
+def test_masks_in_16_bits_or_with_transparent_pixels_are_refused_by_name(file_format: str) -> None:
+    photo = read_photo(encode(Image.fromarray(texture(40, 30)), "JPEG"))
+    objects = np.full((30, 40), 7, np.uint16)  # all black in 8 bits
+    cut_out = np.full((30, 40, 4), 255, np.uint8)
+    opaque = encode(Image.fromarray(cut_out), file_format)
+    cut_out[:, :20, 3] = 0
+
+    for pixels, got in ((objects, "16 bits per sample"), (cut_out, "transparent pixels")):
+        with pytest.raises(InvalidInput) as caught:
+            with_mask(photo, encode(Image.fromarray(pixels), file_format), field="masks/a.png")
+        assert (caught.value.code, caught.value.field) == ("mask.kind", "masks/a.png")
+        assert caught.value.got == got
+    assert with_mask(photo, opaque).mask is not None
+
+
 def test_the_focal_length_of_a_reduced_photo_is_in_its_pixels() -> None:
     data = encode(Image.new("RGB", (400, 300)), "JPEG", exif=exif_with(FocalLengthIn35mmFilm=26))
 

@@ -35,7 +35,7 @@ def extract_features(
     Args:
         photo: pixels as stored.
         extractor: finds the features.
-        max_keypoints: strongest ones kept.
+        max_keypoints: strongest ones kept, before the mask drops some of them.
         read_as: ``STORED`` to find them without turning the photo.
         extraction: how much effort goes into it.
         framing: how it is resized before, and turned after that.
@@ -59,10 +59,12 @@ def extract_features(
         ratio = np.array([photo.width / width, photo.height / height], np.float32)
         keypoints = keypoints * ratio
         local = replace(local, scales=local.scales * ratio.max())
-    local = replace(local, keypoints=keypoints)
-    if photo.mask is not None:
-        local = local.of(photo.counts(keypoints))
-    return local, rgb
+    return where_counting(photo, replace(local, keypoints=keypoints)), rgb
+
+
+def where_counting(photo: Photo, local: LocalFeatures) -> LocalFeatures:
+    """Drop the features, with keypoints in the stored pixels, that the photo's mask hides."""
+    return local if photo.mask is None else local.of(photo.counts(local.keypoints))
 
 
 def _unturned(found: LocalFeatures, degrees: int, width: int, height: int) -> LocalFeatures:

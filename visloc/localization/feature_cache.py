@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from visloc.features import LocalFeatureExtractor
 from visloc.features.framing import AS_IT_IS, Framing
-from visloc.features.photo import extract_features
+from visloc.features.photo import extract_features, where_counting
 from visloc.images import Photo
 from visloc.options import Extraction, LocalizeOptions, ReadAs
 from visloc.types import LocalFeatures
@@ -24,7 +24,8 @@ class FoundFeatures:
     """Local features of a photo, kept for the next map that asks for them.
 
     Attributes:
-        local: with keypoints in the stored pixels.
+        local: with keypoints in the stored pixels, of the whole photo. A mask is applied to the
+            strongest that a map asks for, so that the maps before it change nothing.
         max_keypoints: the limit that the extractor was given.
         rgb: (height, width, 3) pixels that it read, upright if that was asked for.
     """
@@ -56,14 +57,15 @@ def find_features(
         framing: how the photo is resized and turned before.
 
     Returns:
-        Features with keypoints in the stored pixels, and the image they were found in.
+        Features with keypoints in the stored pixels, where the photo's mask lets them count, and
+        the image they were found in.
     """
     most = min(most, _MOST_KEYPOINTS.get(options.extraction, most))
     key = extractor, options.orientation, options.extraction, framing
     known = None if found is None else found.get(key)
     if known is None or known.max_keypoints < most:
         local, rgb = extract_features(
-            photo,
+            replace(photo, mask=None),
             extractor,
             max_keypoints=most,
             read_as=options.orientation,
@@ -74,4 +76,4 @@ def find_features(
         if found is not None:
             found[key] = known
     local = known.local if known.max_keypoints == most else known.local.strongest(most)
-    return local, known.rgb
+    return where_counting(photo, local), known.rgb

@@ -11,7 +11,7 @@ import numpy as np
 from mapping.maps.editing import content_of, joined, moved, refuse_other_features, same_model
 from mapping.maps.merging.registration import Registration, register, updates_of
 from mapping.maps.sets import publish_set
-from mapping.own_test.publishing import publish_edited
+from mapping.own_test.publishing import publish_edited, refuse_not_accepted
 from mapping.report.cameras import origins_record
 from mapping.stages.publishing import photo_files
 from mapping.stages.work_folder import exclusive
@@ -64,15 +64,20 @@ def merge_maps(
         map_id: of the new map; there must be none of this name.
         progress: told the stage, how much is done, and how much there is.
         min_overlap: least part of the photos of B that must be tied to A.
-        accept: put it into use even if its own test speaks against it.
+        accept: put it into use even if its own test speaks against it, or spoke against one of
+            the two.
 
     Raises:
-        Conflict: ``merge.overlap``, ``merge.unit``, ``merge.features``, ``merge.photos``;
-            ``map.exists``; ``build.running``.
+        Conflict: ``map.doubtful`` for a version in doubt that is not in use; ``merge.overlap``,
+            ``merge.unit``, ``merge.features``, ``merge.photos``; ``map.exists``;
+            ``build.running``.
         InvalidInput: ``map.id``, ``merge.same``, ``merge.min_overlap``.
     """
     _refuse_name(store, map_id)
     a, b = _opened(store, a_ref, b_ref, min_overlap)
+    if not accept:
+        for opened in (a, b):
+            refuse_not_accepted(store, opened)
     with exclusive(_lock_of(store, map_id)):
         first, second = content_of(a), content_of(b)
         refuse_other_features(first, second)

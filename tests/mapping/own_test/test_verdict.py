@@ -15,6 +15,8 @@ from mapping.build.build import build_map
 from mapping.build.settings import BuildSettings
 from mapping.cli.acceptance import require_acceptance, use
 from mapping.maps.editing import content_of
+from mapping.maps.merging import merge_maps
+from mapping.maps.splitting import split_map
 from mapping.own_test.publishing import publish_edited
 from mapping.own_test.trials import OwnTestRun, run_own_test
 from mapping.own_test.verdict import doubts_about, misses_own_photos
@@ -227,3 +229,54 @@ def test_only_a_version_is_put_into_use(maps_dir: Path) -> None:
     assert caught.value.code == "map.use"
     with pytest.raises(NotFound):
         use("room@nothing", maps_dir)
+
+
+def test_nothing_is_made_of_a_version_in_doubt_until_it_is_accepted(
+    broken: Path, maps_dir: Path
+) -> None:
+    store = MapStore(maps_dir)
+    good = store.current_version("room")
+    ref = f"room@{build(broken, maps_dir).manifest.version}"
+
+    with pytest.raises(Conflict) as caught:
+        split_map(store, ref, "tiles", lambda *_: None, tile=100.0, overlap=0.0)
+    assert caught.value.code == "map.doubtful"
+    with pytest.raises(Conflict) as caught:
+        merge_maps(store, f"room@{good}", ref, "both", lambda *_: None)
+    assert caught.value.code == "map.doubtful"
+    assert store.ids() == ["room"]
+
+    use(ref, maps_dir)
+    split_map(store, ref, "tiles", lambda *_: None, tile=100.0, overlap=0.0)
+    assert "tiles" in store.ids()
+
+
+@pytest.mark.parametrize("poses", ["estimate", "given"])
+def test_two_places_in_one_space_are_a_doubt_if_poses_were_estimated(
+    make_map: Callable[..., Map],
+    room: Callable[..., np.ndarray],
+    looking: Callable[..., Pose],
+    poses: str,
+) -> None:
+    """Of two rooms in one space, photos taken in turn see one and what both have in common."""
+    points = np.concatenate([room(np.random.default_rng(seed), 800) for seed in range(3)])
+    opened = make_map(
+        points, [looking([0.05 * np.sin(i), 0.0, 0.0], 15.0 * (i // 2)) for i in range(48)]
+    )
+    first_row = {tuple(point): row for row, point in enumerate(points.astype(np.float32).tolist())}
+    part = np.array([first_row[tuple(p)] // 800 for p in opened.landmarks.tolist()])
+    photos = np.repeat(np.arange(48), np.diff(opened.observation_offsets))
+    of_landmarks = part[opened.observation_landmarks]
+    keep = np.flatnonzero((of_landmarks == 2) | (of_landmarks == photos % 2))
+    folded = replace(
+        opened,
+        observation_landmarks=opened.observation_landmarks[keep],
+        observation_keypoints=opened.observation_keypoints[keep],
+        observation_descriptors=opened.observation_descriptors[keep],
+        observation_offsets=np.searchsorted(keep, opened.observation_offsets).astype(np.int64),
+    )
+
+    found = doubts_about(estimated(folded, poses), ran(12, 0, 0))
+
+    assert [doubt.kind for doubt in found] == (["places"] if poses == "estimate" else [])
+    assert doubts_about(estimated(opened, poses), ran(12, 0, 0)) == ()

@@ -1,0 +1,91 @@
+"""Incremental mapping whose wrong loop closures are found in the finished model, and undone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapping.methods.colmap_scene import Rigs
+from mapping.methods.contradictions import ModelPhoto, Places, find_places
+from mapping.methods.matching import Matches
+from mapping.methods.sparse_model import MapperConfig, SfmPhoto, SparseModel
+from mapping.methods.triangulation import reconstruct
+from mapping.progress import Progress
+from mapping.stages.landmarks import rows_by_value
+
+# Models that are made: what is wrong after the last stays, and the map's own test tells.
+_MOST_MODELS = 4
+
+
+def reconstruct_places(
+    photos: Sequence[SfmPhoto],
+    describe: Callable[[int], NDArray[np.int8]],
+    rigs: Rigs,
+    matches: Sequence[Matches],
+    config: MapperConfig,
+    refine: Sequence[str],
+    work: Path,
+    progress: Progress,
+) -> SparseModel:
+    """Reconstruct, and again without the pairs of photos that the model shows to be of two places.
+
+    Arguments and errors are those of ``reconstruct``.
+
+    Args:
+        describe: returns the descriptors (k, D) of a photo's keypoints, all with one scale.
+    """
+    undone = 0
+    for _ in range(_MOST_MODELS):
+        model = reconstruct(photos, rigs, matches, config, refine, work, progress)
+        kept = _without_two_places(photos, describe, matches, model)
+        if len(kept) == len(matches):
+            break
+        undone += len(matches) - len(kept)
+        matches = kept
+    return replace(model, undone=undone)
+
+
+def _without_two_places(
+    photos: Sequence[SfmPhoto],
+    describe: Callable[[int], NDArray[np.int8]],
+    matches: Sequence[Matches],
+    model: SparseModel,
+) -> list[Matches]:
+    number, places = _places_of(photos, describe, model)
+    return [
+        pair
+        for pair in matches
+        if pair.first not in number
+        or pair.second not in number
+        or not places.tell_apart(number[pair.first], number[pair.second])
+    ]
+
+
+def _places_of(
+    photos: Sequence[SfmPhoto], describe: Callable[[int], NDArray[np.int8]], model: SparseModel
+) -> tuple[dict[int, int], Places]:
+    """Return the order of the photos in a model, by their rows, and the places that they show."""
+    observations = model.observations
+    own = dict(rows_by_value(observations.views))
+    none = np.empty(0, np.int64)
+    number: dict[int, int] = {}
+    placed: list[ModelPhoto] = []
+    for row, (photo, view) in enumerate(zip(photos, model.views, strict=True)):
+        if view is None:
+            continue
+        number[row] = len(placed)
+        seen = own.get(row, none)
+        placed.append(
+            ModelPhoto(
+                view,
+                photo.keypoints,
+                describe(row),
+                observations.points[seen],
+                observations.rows[seen],
+            )
+        )
+    return number, find_places(placed, model.points)
