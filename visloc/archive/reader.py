@@ -6,7 +6,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from visloc.archive.checks import (
     read_model,
     read_record,
 )
+from visloc.archive.index_files import IndexFiles, check_lists, index_files, open_index
 from visloc.archive.places import GeoCircle, circle_of, down_of
 from visloc.archive.schema import (
     INDEX_FOLDER,
@@ -36,14 +37,6 @@ from visloc.archive.set_schema import SetManifest
 from visloc.errors import InvalidInput, refuse
 from visloc.geometry import Camera, Pose
 from visloc.retrieval.fusion import LateFusion
-from visloc.retrieval.inverted import (
-    InvertedFile,
-    centers_fit,
-    lists_are_good,
-    row_bytes,
-    sizes_fit,
-    width_of,
-)
 from visloc.retrieval.rows import GlobalRows
 
 Model = Mapping[str, NDArray[np.float32]]
@@ -283,8 +276,7 @@ def verify_map(folder: Path) -> Map:
         if rows.scales is not None:
             fine[f"global/{stem}.scales.npy"] = is_finite(rows.scales) and rows.scales.min() >= 0
         if rows.inverted is not None:
-            lists = _index_files(record).lists
-            fine[lists] = lists_are_good(folder / lists, rows.inverted.sizes, record.dim)
+            check_lists(rows.inverted)
     for name, good in fine.items():
         if not good:
             raise refuse("map.range", field=str(folder / name))
@@ -297,47 +289,20 @@ def _map_rows(folder: Path, record: GlobalFeaturesRecord, num_images: int) -> Gl
     scales = None
     if record.bits == 8:
         scales = map_array(folder, _scales_file(record), "<f4", (num_images,))
-    return GlobalRows(values, scales, _open_inverted(folder, record, num_images))
-
-
-def _open_inverted(
-    folder: Path, record: GlobalFeaturesRecord, num_images: int
-) -> InvertedFile | None:
-    """Open the inverted file of a global descriptor after checks of all but the lists' content."""
-    if record.lists is None:
-        return None
-    files, width = _index_files(record), width_of(record.dim)
-    centers = map_array(folder, files.centers, "<f4", (record.lists, width), load=True)
-    sizes = map_array(folder, files.sizes, "<i8", (record.lists,), load=True)
-    for name, good in (
-        (files.centers, centers_fit(centers)),
-        (files.sizes, sizes_fit(sizes, num_images)),
-    ):
-        if not good:
-            raise refuse("map.range", field=str(folder / name))
-    size, expected = (folder / files.lists).stat().st_size, num_images * row_bytes(width)
-    if size != expected:
-        raise refuse(
-            "map.array",
-            "the lists of an index do not fit the map; restore or rebuild the map",
-            field=str(folder / files.lists),
-            expected=f"{expected} bytes",
-            got=f"{size} bytes",
+    inverted = None
+    if record.lists is not None:
+        inverted = open_index(
+            folder,
+            _index_files(record),
+            dim=record.dim,
+            num_lists=record.lists,
+            num_rows=num_images,
         )
-    return InvertedFile(centers, sizes, folder / files.lists)
+    return GlobalRows(values, scales, inverted)
 
 
-class _IndexFiles(NamedTuple):
-    """The files of the inverted file of one global descriptor."""
-
-    centers: str
-    sizes: str
-    lists: str
-
-
-def _index_files(record: GlobalFeaturesRecord) -> _IndexFiles:
-    stem = f"{INDEX_FOLDER}{record.fingerprint.file_stem}"
-    return _IndexFiles(f"{stem}.centers.npy", f"{stem}.sizes.npy", f"{stem}.lists")
+def _index_files(record: GlobalFeaturesRecord) -> IndexFiles:
+    return index_files(INDEX_FOLDER + record.fingerprint.file_stem)
 
 
 def _scales_file(record: GlobalFeaturesRecord) -> str:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import JsonValue
 
 from visloc.archive.checks import SCALES, content_hash, json_text, manifest_hash, sha256_of
+from visloc.archive.index_files import index_files
 from visloc.archive.schema import (
     FORMAT,
     FORMAT_MAJOR,
@@ -413,9 +414,10 @@ def write_index(files: Files, stem: str, rows: Rows) -> int:
     """Write an inverted file of a global descriptor; return its number of lists."""
     centers = make_centers(rows, num_lists(len(rows)))
     lists = make_lists(rows, centers)
-    files.write_array(f"{INDEX_FOLDER}{stem}.centers.npy", "<f4", centers)
-    files.write_array(f"{INDEX_FOLDER}{stem}.sizes.npy", "<i8", lists.sizes)
-    files.write_bytes(f"{INDEX_FOLDER}{stem}.lists", bytes_of([lists]))
+    names = index_files(INDEX_FOLDER + stem)
+    files.write_array(names.centers, "<f4", centers)
+    files.write_array(names.sizes, "<i8", lists.sizes)
+    files.write_bytes(names.lists, bytes_of([lists]))
     return len(centers)
 
 

@@ -3,8 +3,8 @@
 Rows are clustered (Sivic and Zisserman 2003). The list of a cluster holds a code of one bit per
 dimension for each of its rows (RaBitQ, Gao and Long 2024), and the row's number. faiss maps the
 lists from their file and searches them; it never parses a file. Whoever opens an inverted file
-checks its plain arrays first (``sizes_fit``): faiss's own readers, which would parse what strangers
-wrote, are not used (docs/decisions/0034-the-index-is-faiss.md).
+checks its plain arrays first (``visloc.archive.index_files``): faiss's own readers, which would
+parse what strangers wrote, are not used (docs/decisions/0034-the-index-is-faiss.md).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _LEAST_ALIKE = 0.05
 _BLOCK_ROWS = 4096
 # Codes are whole words of so many bits, so that the numbers behind them are aligned.
 _WORD_BITS = 64
-_ID_BYTES, _FACTOR_BYTES = 8, 8
+ID_BYTES, FACTOR_BYTES = 8, 8
 # Bits in which a query is rounded for the comparison with codes.
 _QUERY_BITS = 8
 
@@ -64,12 +64,12 @@ class InvertedFile:
         lists: the file: for each list its codes, then the numbers of its rows as int64.
     """
 
-    __slots__ = ("_coarse", "_index", "_lengths", "centers", "num_rows", "sizes")
+    __slots__ = ("_coarse", "_index", "_lengths", "centers", "num_rows", "path", "sizes")
 
     def __init__(self, centers: NDArray[np.float32], sizes: NDArray[np.int64], lists: Path) -> None:
         faiss = _faiss()
         count, width = centers.shape
-        self.sizes = sizes
+        self.sizes, self.path = sizes, lists
         self.num_rows = int(sizes.sum())
         self._coarse = _coarse(centers)
         self._index = _index(self._coarse, count)
@@ -162,44 +162,7 @@ def width_of(dim: int) -> int:
 
 def row_bytes(width: int) -> int:
     """Bytes of one row in the lists: a bit for each dimension, two float32, and its number."""
-    return width // 8 + _FACTOR_BYTES + _ID_BYTES
-
-
-def centers_fit(centers: NDArray[np.float32]) -> bool:
-    """Tell whether centres are no longer than unit rows, as means of them."""
-    return bool((np.abs(centers) <= 1 + 1e-3).all())  # NaN fails every comparison
-
-
-def sizes_fit(sizes: NDArray[np.int64], num_rows: int) -> bool:
-    """Tell whether sizes of lists can be those of so many rows."""
-    # One by one first: a sum of large numbers overflows.
-    return bool(((sizes >= 0) & (sizes <= num_rows)).all()) and int(sizes.sum()) == num_rows
-
-
-def lists_are_good(lists: Path, sizes: NDArray[np.int64], dim: int) -> bool:
-    """Tell whether the file of all lists numbers every row once and has finite codes.
-
-    Args:
-        lists: the file; its size fits.
-        sizes: (C,) of the lists.
-        dim: of the rows.
-    """
-    num, start = int(sizes.sum()), 0
-    bytes_of_row = row_bytes(width_of(dim))
-    content = np.memmap(lists, np.uint8, "r")
-    seen = np.zeros(num, np.bool_)
-    for size in sizes.tolist():
-        stop = start + size * bytes_of_row
-        codes, ids = np.split(content[start:stop], [stop - start - size * _ID_BYTES])
-        numbers = ids.view("<i8")
-        factors = (
-            codes.reshape(size, bytes_of_row - _ID_BYTES)[:, -_FACTOR_BYTES:].copy().view("<f4")
-        )
-        if not ((numbers >= 0) & (numbers < num)).all() or not np.isfinite(factors).all():
-            return False
-        seen[numbers] = True
-        start = stop
-    return bool(seen.all())
+    return width // 8 + FACTOR_BYTES + ID_BYTES
 
 
 def make_centers(rows: Rows, count: int, seed: int = 0) -> NDArray[np.float32]:
@@ -287,7 +250,7 @@ def _coarse(centers: NDArray[np.float32]) -> Any:
 def _index(coarse: Any, count: int) -> Any:
     faiss = _faiss()
     index = faiss.IndexIVFRaBitQ(coarse, coarse.d, count, faiss.METRIC_INNER_PRODUCT, False)
-    if index.code_size != row_bytes(coarse.d) - _ID_BYTES:
+    if index.code_size != row_bytes(coarse.d) - ID_BYTES:
         raise AssertionError(f"this faiss writes codes of {index.code_size} bytes")
     index.is_trained = True
     return index

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from visloc.archive.index_files import check_lists
 from visloc.retrieval.inverted import (
     InvertedFile,
     bytes_of,
-    lists_are_good,
     make_centers,
     make_lists,
     num_lists,
@@ -22,5 +22,6 @@ def inverted(rows: NDArray[np.float32], path: Path) -> InvertedFile:
     centers = make_centers(rows, num_lists(len(rows)))
     lists = make_lists(rows, centers)
     path.write_bytes(b"".join(bytes_of([lists])))
-    assert lists_are_good(path, lists.sizes, rows.shape[1])
-    return InvertedFile(centers, lists.sizes, path)
+    opened = InvertedFile(centers, lists.sizes, path)
+    check_lists(opened)
+    return opened
