@@ -18,7 +18,7 @@ MAX_EXACT = 10_000
 # In a map with an inverted file: so many photos that priors allow are all compared, and so many
 # where the proposals do not stand out from the others.
 _MAX_ALLOWED_EXACT, _MAX_DOUBTFUL_EXACT = 2000, 50_000
-# Photos that each descriptor proposes, and lists that it searches; measured in docs/scale.md.
+# Photos that each descriptor proposes, and lists that it searches (docs/performance.md).
 _MIN_PROPOSED, _PROPOSED_PER_RESULT = 200, 10
 _LISTS = 50
 
@@ -111,16 +111,20 @@ def _proposed(
     if left <= _MAX_ALLOWED_EXACT:
         return _allowed(photo_weights), {}
     count = max(_MIN_PROPOSED, _PROPOSED_PER_RESULT * top_k)
+    can_compare = left <= _MAX_DOUBTFUL_EXACT
+    # Photos that priors leave may lie in lists further away; if few, doubts about the proposals
+    # cost less than more lists.
+    searched = _LISTS if can_compare else math.ceil(_LISTS * num / left)
     photos, limits = [], {}
     for name, file in files.items():
-        lists = file.nearest_lists(query[name], math.ceil(_LISTS * num / left))
+        lists = file.nearest_lists(query[name], searched)
         found, rough = file.nearest(query[name], count, lists, allowed)
         if len(found) < count and len(lists) < len(file.sizes):
             every = np.arange(len(file.sizes))
             found, rough = file.nearest(query[name], count, every, allowed)
         photos.append(found)
         limits[name] = float(rough.min(initial=1.0)) + file.error
-    return np.unique(np.concatenate(photos)), limits if left <= _MAX_DOUBTFUL_EXACT else {}
+    return np.unique(np.concatenate(photos)), limits if can_compare else {}
 
 
 def _stand_out(
