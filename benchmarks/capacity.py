@@ -28,7 +28,7 @@ from benchmarks.generated_tiles import generated_model
 from visloc.archive import Map, MapStore
 from visloc.features.descriptors.whitening import WHITENING_MAX_DIMS
 from visloc.kapture import read_dataset
-from visloc.sets.coarse import BITS, describe
+from visloc.sets.coarse import describe
 
 _STAGE = re.compile(r"^\s*(\S.*?)\s+(\d+)?\s+([\d.]+)\s+([\d.]+)\s+([\d.]+)\s*$")
 
@@ -243,7 +243,7 @@ def measured(
     dims = max(record.dim for record in opened.manifest.global_features)
     steps = ("matching", "pose")
     word_dim = opened.manifest.local_features.descriptor_dim
-    model = generated_model(dims, BITS, word_dim=word_dim)
+    model = generated_model(dims, word_dim=word_dim)
     started = time.process_time()
     describe(opened, model)
     described_s = time.process_time() - started

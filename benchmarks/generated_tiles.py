@@ -28,9 +28,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.tile_similarities import NAMES, quantiles
+from benchmarks.tile_similarities import NAMES, centroids_of, quantiles
 from visloc.features.descriptors.whitening import unit_rows
-from visloc.sets.coarse import CoarseModel, described, random_planes
+from visloc.sets.coarse import CoarseModel, described, random_rotation
 
 SIMILARITIES = Path(__file__).parent / "tile_similarities.json"
 PASSES = 8
@@ -178,7 +178,7 @@ def similarities(
     """
     made = [city.tile(tile, queries) for tile in tiles]
     neighbourhoods = np.array([city.neighbourhood(tile) for tile in tiles])
-    centroids = [described(tile.rows, model).centroids for tile in made]
+    centroids = [centroids_of(described(tile.rows, model), model) for tile in made]
     found: dict[str, list[Rows]] = {name: [] for name in NAMES}
     for number, tile in enumerate(made):
         own = tile.queries @ tile.rows.T
@@ -196,7 +196,7 @@ def similarities(
     return {name: quantiles([np.concatenate(some)]) for name, some in found.items()}
 
 
-def generated_model(dim: int, bits: int, words: int = 128, word_dim: int = 128) -> CoarseModel:
+def generated_model(dim: int, words: int = 128, word_dim: int = 128) -> CoarseModel:
     """Return a model of the size of a real one, which knows nothing.
 
     Pooling and projecting a query by it takes as long as by a real one.
@@ -208,7 +208,7 @@ def generated_model(dim: int, bits: int, words: int = 128, word_dim: int = 128) 
         "vocabulary": unit_rows(vocabulary),
         "mean": np.zeros(words * word_dim, np.float32),
         "axes": axes / np.float32(word_dim),
-        "planes": random_planes(dim, bits, random),
+        "rotation": random_rotation(dim, random),
     }
 
 

@@ -113,7 +113,7 @@ def compared_with_all(
 ) -> dict[str, float | list[float]]:
     """How many of the best photos of an exact search are found, and how long that takes."""
     index = opened.global_descriptors
-    every = {name: replace(rows, clusters=None) for name, rows in index.items()}
+    every = {name: replace(rows, inverted=None) for name, rows in index.items()}
     seconds, found = [], 0
     for photo in random.integers(0, len(opened.images), queries).tolist():
         query = described(opened, photo, random)

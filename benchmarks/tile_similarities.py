@@ -37,13 +37,13 @@ from numpy.typing import NDArray
 from benchmarks.retrieval import shared_landmarks
 from visloc.archive import Map, MapStore
 from visloc.features import LocalFeatureExtractor, make_local_features
+from visloc.features.descriptors.whitening import unit_rows
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
 from visloc.options import Extraction
 from visloc.sets.coarse import (
-    BITS,
     CoarseModel,
-    codes_of,
+    DescribedTile,
     described,
     descriptor_of,
     descriptors_of,
@@ -103,7 +103,7 @@ def place_of(
             rows.append(descriptor_of(words_of(dataset.path_of(record), extractor), model))
             shared.append(shared_landmarks(opened, camera, pose))
     photos = descriptors_of(opened, model)
-    centroids = described(photos, model).centroids
+    centroids = centroids_of(described(photos, model), model)
     return Place(photos, centroids, np.array(rows), np.array(shared))
 
 
@@ -166,13 +166,9 @@ def table(rows: Sequence[tuple[str, Sequence[float]]]) -> str:
     return "\n".join(lines)
 
 
-def spread_of_codes(rows: Rows, planes: Rows, pairs: int = 100_000) -> float:
-    """Return the standard deviation of what codes say of a cosine, less the cosine."""
-    first, second = np.random.default_rng(0).integers(0, len(rows), (2, pairs))
-    codes = codes_of(rows, planes)
-    differing = np.bitwise_count(codes[first] ^ codes[second]).sum(axis=1)
-    told = np.cos(np.pi * differing / planes.shape[1])
-    return float(np.std(told - (rows[first] * rows[second]).sum(axis=1)))
+def centroids_of(tile: DescribedTile, model: CoarseModel) -> Rows:
+    """Return the unit centres of a tile's lists as descriptors."""
+    return unit_rows(tile.centers) @ model["rotation"].T
 
 
 def main(
@@ -190,19 +186,18 @@ def main(
     words = [words for path in paths if len(words := words_of(path, extractor)) >= MIN_WORDS]
     teach, compare = words[::2], words[1::2]
     random = np.random.default_rng(0)
-    model = learn_of_words(teach.__getitem__, len(teach), BITS, random)
+    model = learn_of_words(teach.__getitem__, len(teach), random)
     places = [
         place_of(opened, queries, extractor, model)
         for opened, (_, queries) in zip(maps, named, strict=True)
     ]
     rest = np.array([descriptor_of(one, model) for one in compare])
     found = {name: quantiles(groups) for name, groups in similarities(places, rest).items()}
-    typer.echo(f"`{kind}`; learned on {len(teach)} photos, {rest.shape[1]} dimensions, {BITS} bits")
+    typer.echo(f"`{kind}`; learned on {len(teach)} photos, {rest.shape[1]} dimensions")
     typer.echo(
         f"{len(compare)} photos of different places; maps {', '.join(m.ref for m in maps)}\n"
     )
     typer.echo(table(list(found.items())))
-    typer.echo(f"\nA code says the cosine to +-{spread_of_codes(rest, model['planes']):.3f}.")
     content = {"levels": LEVELS, "quantiles": found, "spectra": spectra(places, rest)}
     out.write_text(json.dumps(content, indent=1) + "\n")
 

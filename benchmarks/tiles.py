@@ -42,7 +42,8 @@ from visloc.archive import (
 )
 from visloc.archive.schema import Extent
 from visloc.archive.sets import joined_extent
-from visloc.sets.coarse import BITS, CENTROIDS, CoarseModel, DescribedTile, coarse_index, described
+from visloc.retrieval.inverted import MadeLists
+from visloc.sets.coarse import TILE_LISTS, CoarseModel, DescribedTile, coarse_index, described
 
 TILE_M = 25.0
 # How far its photos see: a street, or a large room.
@@ -62,7 +63,7 @@ def main(
 ) -> None:
     """Make, ask, print."""
     city = City(tiles, photos, seed)
-    model = generated_model(len(city.stds["within"]), BITS)
+    model = generated_model(len(city.stds["within"]))
     folder = work / name_of(city)
     started = time.perf_counter()
     made = make_set(folder, city, model)
@@ -80,7 +81,7 @@ def main(
 
 def name_of(city: City) -> str:
     """Name the set after all that it is made of."""
-    content = [asdict(city), BITS, CENTROIDS, hashlib.sha256(SIMILARITIES.read_bytes()).hexdigest()]
+    content = [asdict(city), TILE_LISTS, hashlib.sha256(SIMILARITIES.read_bytes()).hexdigest()]
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]
 
 
@@ -91,7 +92,9 @@ def make_set(folder: Path, city: City, model: CoarseModel) -> Path:
         return made
     blocks = folder / "blocks"
     blocks.mkdir(parents=True, exist_ok=True)
-    coarse = coarse_index(described_tiles(blocks, city, model), model)
+    lists = folder / "lists"
+    lists.unlink(missing_ok=True)
+    coarse = coarse_index(described_tiles(blocks, city, model), model, lists)
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir()
     records = tuple(record_of(city, tile) for tile in range(city.num_tiles))
@@ -105,6 +108,7 @@ def make_set(folder: Path, city: City, model: CoarseModel) -> Path:
     write_set(unfinished, content, set_id="city", version="1", created="2026-01-01T00:00:00+00:00")
     unfinished.rename(made)
     shutil.rmtree(blocks)
+    lists.unlink()
     return made
 
 
@@ -118,12 +122,15 @@ def described_tiles(blocks: Path, city: City, model: CoarseModel) -> Iterator[De
             unfinished = path.with_suffix(".unfinished.npz")
             np.savez(
                 unfinished,
-                codes=np.array([tile.codes for tile in made]),
-                centroids=np.array([tile.centroids for tile in made]),
+                centers=np.array([tile.centers for tile in made]),
+                sizes=np.array([tile.lists.sizes for tile in made]),
+                codes=np.array([tile.lists.codes for tile in made]),
+                ids=np.array([tile.lists.ids for tile in made]),
             )
             unfinished.rename(path)
         with np.load(path) as arrays:
-            yield from map(DescribedTile, arrays["codes"], arrays["centroids"])
+            lists = map(MadeLists, arrays["sizes"], arrays["codes"], arrays["ids"])
+            yield from map(DescribedTile, arrays["centers"], lists)
         typer.echo(f"\r{tiles.stop} of {city.num_tiles} tiles", err=True, nl=False)
     typer.echo(err=True)
 
@@ -177,7 +184,7 @@ def answers(made: Path, asked: Path) -> dict[str, Any]:
 def rows_of(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """Name and value of what was measured."""
     yield "photos", f"{found['photos']:,}".replace(",", " ")
-    yield "MB on disk: codes, centroids, manifest, all", megabytes(found["disk_bytes"])
+    yield "MB on disk: lists, centres, manifest, all", megabytes(found["disk_bytes"])
     yield "opens in s", f"{found['open_s']:.2f}"
     yield "anonymous MB: the set, the process", megabytes(found["anonymous_bytes"])
     yield "resident MB with the pages of files", megabytes(found["resident_bytes"])

@@ -39,7 +39,7 @@ def main(folder: Path, queries: Path) -> None:
     none = [Priors() for _ in rows]
     near = [Priors(position=PositionPrior(position, RADIUS_M)) for position in positions]
     found = {
-        "photos": len(opened.coarse.codes),
+        "photos": opened.manifest.counts.images,
         "open_s": seconds,
         "without a prior": asked(opened, rows, tiles, none),
         "position to 30 m": asked(opened, rows, tiles, near),
@@ -97,9 +97,9 @@ def percentiles_ms(seconds: Sequence[float]) -> list[float]:
 
 
 def disk_bytes(folder: Path) -> list[int]:
-    """Sizes of codes, centroids, manifest, and of all files."""
+    """Sizes of lists, centres, manifest, and of all files."""
     sizes = {path.name: path.stat().st_size for path in folder.rglob("*") if path.is_file()}
-    names = ("codes.npy", "centroids.npy", "manifest.json")
+    names = ("photos.lists", "photos.centers.npy", "manifest.json")
     return [*(sizes[name] for name in names), sum(sizes.values())]
 
 

@@ -56,6 +56,7 @@ def build_content(
         anchor=made.anchor,
         gravity=gravity,
         fusion=settings.late_fusion,
+        index=settings.index,
         **photo_content(dataset, photos, [photo.name for photo in photos], features, made),
     )
 

@@ -39,6 +39,7 @@ from visloc.features import DEFAULT_GLOBAL_FEATURES, DEFAULT_LOCAL_FEATURES
 from visloc.geometry import PixelOrigin
 from visloc.options import Fusion, Inference
 from visloc.retrieval.fusion import LateFusion
+from visloc.retrieval.index import MAX_EXACT, IndexKind
 
 _cluster_option = partial(typer.Option, rich_help_panel=CLUSTER_PANEL)
 
@@ -91,6 +92,13 @@ class BuildSettings:
         ),
         OnCommandLine(_weights_in),
     ] = None
+    index: Annotated[
+        IndexKind,
+        typer.Option(
+            help="How queries search the photos of the map. flat: all are compared. ivf: the most "
+            f"similar by an inverted file. auto: ivf for more than {MAX_EXACT} photos."
+        ),
+    ] = IndexKind.AUTO
     features_dir: FeaturesDirOption = None
     pixel_origin: PixelOriginOption = PixelOrigin.CORNER
     weights_dir: WeightsDirOption = None

@@ -152,14 +152,16 @@ def anchor(
 def upgrade(map_ref: MapArgument, maps_dir: MapsDirOption = Path("maps")) -> None:
     """Add to a map of an older format what needs no photos; publish it as a new version.
 
-    The map is tested with what it stores of its own photos. Answers then state their whole
-    uncertainty.
+    The map is tested with what it stores of its own photos, so that answers state their whole
+    uncertainty. A map of very many photos gets an index.
     """
     opened = open_map(map_folder(map_ref, maps_dir))
-    with _step("own test"):
+    with _step("upgrade"):
         folder = upgrade_map(opened, maps_dir)
     upgraded = open_map(folder)
-    say(f"map {upgraded.ref}: own test added")
+    added = ["own test"] * (opened.manifest.parts.own_test is None)
+    added += ["index"] * (upgraded.has_index and not opened.has_index)
+    say(f"map {upgraded.ref}: {' and '.join(added)} added")
     say_notes(lacking(upgraded))
 
 

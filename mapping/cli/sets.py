@@ -115,7 +115,7 @@ def print_set(opened: MapSet) -> None:
         "tiles": f"{manifest.counts.tiles}, of {manifest.counts.images} photos and "
         f"{manifest.counts.landmarks} landmarks together",
         "local features": manifest.local_features.name,
-        "coarse index": f"{manifest.coarse.bits} bits of a photo, {opened.size_bytes} bytes",
+        "coarse index": f"{manifest.coarse.lists} lists of a tile, {opened.size_bytes} bytes",
         "world": "metric" if world.metric else "not metric",
         "gravity": gravity_text(opened.gravity),
         "place": place_text(opened.place),

@@ -23,6 +23,7 @@ from visloc.archive.schema import CamerasFile
 from visloc.archive.writer import PoseRow
 from visloc.errors import refuse
 from visloc.geometry import Camera, Pose, Similarity
+from visloc.retrieval.index import IndexKind
 
 # Names that an error lists.
 _NAMED = 3
@@ -82,6 +83,7 @@ def content_of(opened: Map) -> MapContent:
         fusion=opened.fusion,
         descriptor_scale=scale,
         own_test=manifest.parts.own_test,
+        index=IndexKind.IVF if opened.has_index else IndexKind.AUTO,
     )
 
 

@@ -125,17 +125,18 @@ def publish_set(
     if model is None:
         with one_step(progress, "coarse model"):
             model = learn(lambda tile: open_published(folders[tile]), len(folders))
-    coarse = coarse_index(_described(folders, model, progress), model)
-    with one_step(progress, "look-alikes"):
-        records = _with_look_alikes(folders, [one.record for one in placed], coarse)
-    content = SetContent(
-        world=world,
-        local_features=placed[0].features,
-        tiles=records,
-        coarse=coarse,
-        notes=(*notes, *_warnings(records), *(note for one in placed for note in one.doubts)),
-    )
-    return _publish_changed(store, set_id, content)
+    with store.incoming() as scratch:
+        coarse = coarse_index(_described(folders, model, progress), model, scratch / "lists")
+        with one_step(progress, "look-alikes"):
+            records = _with_look_alikes(folders, [one.record for one in placed], coarse)
+        content = SetContent(
+            world=world,
+            local_features=placed[0].features,
+            tiles=records,
+            coarse=coarse,
+            notes=(*notes, *_warnings(records), *(note for one in placed for note in one.doubts)),
+        )
+        return _publish_changed(store, set_id, content)
 
 
 def _refuse_number(num_tiles: int) -> None:

@@ -10,12 +10,14 @@ from mapping.stages.work_folder import exclusive
 from visloc.archive import Map, MapStore, write_tested
 from visloc.archive.version_rules import outdated
 from visloc.errors import refuse
+from visloc.retrieval.index import MAX_EXACT
 
 
 def upgrade_map(opened: Map, maps_dir: Path) -> Path:
-    """Publish a map with a test of its own as a new version, and make it current.
+    """Publish a map with its own test, and with an index if it is large, as a new version.
 
-    Landmarks, photos and features stay as they are; both versions share their files.
+    The new version becomes current. Landmarks, photos and features stay as they are; both versions
+    share their files.
 
     Returns:
         The folder of the new version.
@@ -24,7 +26,9 @@ def upgrade_map(opened: Map, maps_dir: Path) -> Path:
         Conflict: ``map.upgraded`` when there is nothing to add; ``map.outdated`` when another
             version is in use; ``build.running``.
     """
-    if opened.manifest.parts.own_test is not None:
+    test = opened.manifest.parts.own_test
+    indexed = len(opened.images) > MAX_EXACT and not opened.has_index
+    if test is not None and not indexed:
         raise refuse("map.upgraded", field="MAP", ref=opened.ref)
     map_id, based_on = opened.manifest.id, opened.manifest.version
     store = MapStore(maps_dir)
@@ -34,9 +38,15 @@ def upgrade_map(opened: Map, maps_dir: Path) -> Path:
     ):
         if (current := store.current_version(map_id)) != based_on:
             raise outdated(map_id, based_on, current)
-        test = own_test(opened)
         version, created = new_version()
-        version = write_tested(opened, incoming, test, version=version, created=created)
+        version = write_tested(
+            opened,
+            incoming,
+            own_test(opened) if test is None else test,
+            version=version,
+            created=created,
+            indexed=indexed,
+        )
         return store.publish(incoming, map_id, version, based_on=based_on)
 
 

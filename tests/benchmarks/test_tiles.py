@@ -13,9 +13,9 @@ from benchmarks.tile_similarities import LEVELS, quantiles
 from benchmarks.tiles import BLOCK_TILES, answers, make_set, write_queries
 from benchmarks.tiles_queries import WARM_UP
 from visloc.archive import verify_set
-from visloc.sets.coarse import BITS, MAX_RANKED
+from visloc.sets.coarse import MAX_RANKED
 
-MODEL = generated_model(len(City(1, PASSES).stds["within"]), BITS, words=2, word_dim=8)
+MODEL = generated_model(len(City(1, PASSES).stds["within"]), words=2, word_dim=8)
 
 
 def test_quantiles_weigh_datasets_the_same_whatever_their_size() -> None:
@@ -55,7 +55,7 @@ def test_queries_find_their_tiles_through_the_index(
 ) -> None:
     city = City(BLOCK_TILES + 14, 40)
     whole = make_set(tmp_path / "whole", city, MODEL)
-    assert verify_set(whole).coarse.codes.shape == (city.num_tiles * 40, BITS // 64)
+    assert verify_set(whole).coarse.inverted.num_rows == city.num_tiles * 40
 
     # Stopped in the second block, and gone on with: the same index, and the first is not made anew.
     made: list[int] = []

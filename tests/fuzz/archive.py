@@ -17,10 +17,11 @@ import numpy as np
 from tests.fuzz.edits import Edit, EditedFolder, decode, encode
 from tests.fuzz.target import holds, refusal
 from tests.fuzz.tiny_map import write_tiny_map
-from visloc.archive import verify_map
+from visloc.archive import open_map, verify_map
 from visloc.archive.checks import SCALES, content_hash, json_text, manifest_hash
 from visloc.errors import MapCorrupt
 from visloc.geometry import Pose
+from visloc.retrieval.index import IndexKind
 
 _MADE_RIGHT = 1
 
@@ -29,7 +30,7 @@ class Archive:
     """Verifies a small map of which some files are altered."""
 
     def __init__(self, folder: Path) -> None:
-        write_tiny_map(folder / "map")
+        write_tiny_map(folder / "map", index=IndexKind.IVF)
         self._map = EditedFolder(folder / "map")
 
     def run(self, data: bytes) -> str:
@@ -39,6 +40,7 @@ class Archive:
             contents = dict(self._map.alter(edits))
             if flags & _MADE_RIGHT and self._has_manifest():
                 self._make_right(contents)
+            self._search()
             try:
                 outcome = self._verify()
             except MapCorrupt as error:
@@ -67,8 +69,31 @@ class Archive:
             yield encode(names, [Edit(names[0], kind, b"\x10\0")])
             yield encode(names, [Edit("manifest.json", kind, b"\x10\0")])
         yield encode(names, [Edit(name, "content", good[name]) for name in names[:3]], _MADE_RIGHT)
+        for lists in _lists(good["index/densevlad.lists"]):
+            yield encode(names, [Edit("index/densevlad.lists", "content", lists)], _MADE_RIGHT)
+        for sizes in ([0, 0, 3], [2, 2, -1], [2**62, 2**62, 2**63 - 1]):
+            file = io.BytesIO()
+            np.save(file, np.array(sizes, np.int64))
+            edit = Edit("index/densevlad.sizes.npy", "content", file.getvalue())
+            yield encode(names, [edit], _MADE_RIGHT)
         for model in _models():
             yield encode(names, [Edit("global/densevlad.model.npz", "content", model)], _MADE_RIGHT)
+
+    def _search(self) -> None:
+        """Search an index as a map is served: opening does not read its lists."""
+        try:
+            opened = open_map(self._map.folder)
+        except MapCorrupt:
+            return
+        for rows in opened.global_descriptors.values():
+            if rows.inverted is None:
+                continue
+            query = np.ones(rows.values.shape[1], np.float32)
+            lists = rows.inverted.nearest_lists(query, 2)
+            for allowed in (None, np.arange(len(rows)) > 0):
+                found, _ = rows.inverted.nearest(query, 3, lists, allowed)
+                assert ((found >= 0) & (found < len(rows))).all()
+                assert allowed is None or allowed[found].all()
 
     def _verify(self) -> str:
         opened = verify_map(self._map.folder)
@@ -103,6 +128,15 @@ class Archive:
         except (ValueError, TypeError, LookupError, RecursionError, AttributeError):
             return  # not such a manifest that could be made right
         self._map.write("manifest.json", text)
+
+
+def _lists(good: bytes) -> Iterator[bytes]:
+    """Yield lists with ids out of range or twice, and codes that no row has."""
+    words = np.frombuffer(good, "<i8").reshape(3, 3)  # of each photo: bits, two float32, its id
+    for column, value in ((2, 2**62), (2, -1), (2, 1), (1, -1), (0, -1)):
+        altered = words.copy()
+        altered[:, column] = value
+        yield altered.tobytes()
 
 
 def _models() -> Iterator[bytes]:

@@ -18,11 +18,14 @@ from visloc.archive import (
     write_map,
 )
 from visloc.geometry import Camera, Pose
+from visloc.retrieval.index import IndexKind
 
 LOCAL_DIM, GLOBAL_DIM = 8, 4
 
 
-def write_tiny_map(folder: Path, local_features: str = "sift") -> None:
+def write_tiny_map(
+    folder: Path, local_features: str = "sift", index: IndexKind = IndexKind.AUTO
+) -> None:
     """Write a map of three photos that see five landmarks seven times, into a new folder."""
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(7, LOCAL_DIM)).astype(np.float32)
@@ -70,6 +73,7 @@ def write_tiny_map(folder: Path, local_features: str = "sift") -> None:
             geodetic=Geodetic(latitude_deg=45.0, longitude_deg=5.8, altitude_m=300.0),
         ),
         gravity=(0.0, 0.0, -1.0),
+        index=index,
     )
     folder.mkdir(parents=True)
     write_map(folder, content, map_id="room", version="v1", created="2026-01-02T03:04:05+00:00")

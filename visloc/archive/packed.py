@@ -27,7 +27,7 @@ from visloc.archive.checks import MAX_MANIFEST_BYTES, check_files, read_any_mani
 from visloc.archive.npz import zip_errors
 from visloc.archive.schema import FILE_NAME
 from visloc.archive.set_rules import AnyManifest
-from visloc.archive.sets import SET_CODES
+from visloc.archive.sets import SET_OFFSETS
 from visloc.errors import VislocError, refuse
 
 MAX_ENTRIES = 100_000
@@ -187,7 +187,7 @@ def _check_sizes(entries: dict[str, zipfile.ZipInfo], max_bytes: int) -> None:
             got=f"{total} bytes",
         )
     limit = _MAX_MAP_MANIFEST_BYTES + _MAX_MANIFEST_BYTES_PER_FILE * len(entries)
-    if SET_CODES in entries:
+    if SET_OFFSETS in entries:
         limit = MAX_MANIFEST_BYTES
     if entries[MANIFEST].file_size > limit:
         raise refuse(

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from visloc.archive.anchoring import link_or_copy
 from visloc.archive.reader import Map
-from visloc.archive.schema import FORMAT_MAJOR, FORMAT_MINOR, Doubt, OwnTest
-from visloc.archive.writer import Files
+from visloc.archive.schema import FORMAT_MAJOR, FORMAT_MINOR, INDEX_FOLDER, Doubt, OwnTest
+from visloc.archive.writer import Files, write_index
 
 
 def add_own_test(folder: Path, test: OwnTest, *, version: str, doubts: Sequence[Doubt] = ()) -> str:
@@ -34,7 +34,9 @@ def add_own_test(folder: Path, test: OwnTest, *, version: str, doubts: Sequence[
     return Files(folder).finish(manifest, version)
 
 
-def write_tested(opened: Map, folder: Path, test: OwnTest, *, version: str, created: str) -> str:
+def write_tested(
+    opened: Map, folder: Path, test: OwnTest, *, version: str, created: str, indexed: bool = False
+) -> str:
     """Write a map with its own test into an empty folder; files are shared by hard links.
 
     Args:
@@ -43,14 +45,29 @@ def write_tested(opened: Map, folder: Path, test: OwnTest, *, version: str, crea
         test: of the map.
         version: as for ``write_map``.
         created: ISO 8601 in UTC.
+        indexed: whether it gets a new index, instead of one that it has.
 
     Returns:
         The version.
     """
-    for name in opened.manifest.files:
+    manifest = json.loads((opened.path / "manifest.json").read_text(encoding="utf-8"))
+    if indexed:
+        old = [name for name in manifest["files"] if name.startswith(INDEX_FOLDER)]
+        for name in old:
+            del manifest["files"][name]
+    for name in manifest["files"]:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         link_or_copy(opened.path / name, folder / name)
-    manifest = json.loads((opened.path / "manifest.json").read_text(encoding="utf-8"))
+    if indexed:
+        files = Files(folder)
+        for record, known in zip(
+            manifest["global_features"], opened.manifest.global_features, strict=True
+        ):
+            name, stem = known.fingerprint.name, known.fingerprint.file_stem
+            record["lists"] = write_index(files, stem, opened.global_descriptors[name])
+            record.pop("clusters", None)
+        manifest["files"] |= files.written()
     manifest["created"] = created
     (folder / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
-    return add_own_test(folder, test, version=version)
+    doubts = opened.manifest.parts.doubts
+    return add_own_test(folder, test, version=version, doubts=doubts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +21,10 @@ from visloc.archive.checks import (
     read_model,
     read_record,
 )
+from visloc.archive.index_files import IndexFiles, check_lists, index_files, open_index
 from visloc.archive.places import GeoCircle, circle_of, down_of
 from visloc.archive.schema import (
+    INDEX_FOLDER,
     MAX_PHOTO_BYTES,
     CamerasFile,
     Geodetic,
@@ -36,9 +39,9 @@ from visloc.errors import InvalidInput, refuse
 from visloc.geometry import Camera, Pose
 from visloc.retrieval.fusion import LateFusion
 from visloc.retrieval.rows import GlobalRows
-from visloc.retrieval.shortlist import Clusters
 
 Model = Mapping[str, NDArray[np.float32]]
+logger = logging.getLogger(__name__)
 ManifestType = TypeVar("ManifestType", Manifest, SetManifest)
 
 
@@ -142,6 +145,11 @@ class Map(MapOutline):
         start, stop = self.observation_offsets[image], self.observation_offsets[image + 1]
         return self.observation_landmarks[start:stop], self.observation_descriptors[start:stop]
 
+    @property
+    def has_index(self) -> bool:
+        """Whether all global descriptors have an inverted file."""
+        return all(rows.inverted is not None for rows in self.global_descriptors.values())
+
     def keypoints(self, image: int) -> NDArray[np.float32]:
         """Keypoints (m, 2) of one photo in pixels, in the order of ``observations``."""
         start, stop = self.observation_offsets[image], self.observation_offsets[image + 1]
@@ -187,6 +195,7 @@ def open_map(folder: Path) -> Map:
     check_files(folder, manifest)
     _check_listed(folder, manifest)
     _check_photos(folder, manifest)
+    _warn_of_old_index(manifest)
     outline = outline_of(folder, manifest)
     images = read_images(folder, outline)
     counts, local = manifest.counts, manifest.local_features
@@ -269,8 +278,8 @@ def verify_map(folder: Path) -> Map:
         fine[_model_file(record)] = models.fits(model, record.dim)
         if rows.scales is not None:
             fine[f"global/{stem}.scales.npy"] = is_finite(rows.scales) and rows.scales.min() >= 0
-        if rows.clusters is not None:
-            fine[f"index/{stem}.members.npy"] = _are_good(rows.clusters, counts.images)
+        if rows.inverted is not None:
+            check_lists(rows.inverted)
     for name, good in fine.items():
         if not good:
             raise refuse("map.range", field=str(folder / name))
@@ -280,26 +289,27 @@ def verify_map(folder: Path) -> Map:
 def _map_rows(folder: Path, record: GlobalFeaturesRecord, num_images: int) -> GlobalRows:
     dtype = "|i1" if record.bits == 8 else "<f4"
     values = map_array(folder, _rows_file(record), dtype, (num_images, record.dim))
-    beside = [map_array(folder, *one) for one in _beside_rows(record, num_images)]
-    scales = beside.pop(0) if record.bits == 8 else None
-    return GlobalRows(values, scales, Clusters(*beside) if beside else None)
-
-
-def _beside_rows(
-    record: GlobalFeaturesRecord, num_images: int
-) -> list[tuple[str, str, tuple[int, ...]]]:
-    """Name, type and shape of a global descriptor's arrays besides its rows."""
-    stem, clusters = record.fingerprint.file_stem, record.clusters
-    beside: list[tuple[str, str, tuple[int, ...]]] = []
+    scales = None
     if record.bits == 8:
-        beside.append((f"global/{stem}.scales.npy", "<f4", (num_images,)))
-    if clusters is not None:
-        beside += [
-            (f"index/{stem}.centers.npy", "<f4", (clusters, record.dim)),
-            (f"index/{stem}.offsets.npy", "<i8", (clusters + 1,)),
-            (f"index/{stem}.members.npy", "<u4", (num_images,)),
-        ]
-    return beside
+        scales = map_array(folder, _scales_file(record), "<f4", (num_images,))
+    inverted = None
+    if record.lists is not None:
+        inverted = open_index(
+            folder,
+            _index_files(record),
+            dim=record.dim,
+            num_lists=record.lists,
+            num_rows=num_images,
+        )
+    return GlobalRows(values, scales, inverted)
+
+
+def _index_files(record: GlobalFeaturesRecord) -> IndexFiles:
+    return index_files(INDEX_FOLDER + record.fingerprint.file_stem)
+
+
+def _scales_file(record: GlobalFeaturesRecord) -> str:
+    return f"global/{record.fingerprint.file_stem}.scales.npy"
 
 
 def _lead_through(offsets: NDArray[np.int64], num_rows: int) -> bool:
@@ -309,15 +319,16 @@ def _lead_through(offsets: NDArray[np.int64], num_rows: int) -> bool:
     return ascend and int(offsets[0]) == 0 and int(offsets[-1]) == num_rows
 
 
-def _are_good(clusters: Clusters, num_images: int) -> bool:
-    """Whether clusters hold every photo exactly once."""
-    offsets, members = clusters.offsets, clusters.members
-    return (
-        is_finite(clusters.centers)
-        and _lead_through(offsets, num_images)
-        and int(members.max()) < num_images
-        and bool((np.bincount(members, minlength=num_images) == 1).all())
-    )
+def _warn_of_old_index(manifest: Manifest) -> None:
+    if any(record.clusters is not None for record in manifest.global_features):
+        logger.warning(
+            "%s@%s has an index of an older format, which is not used: every query is compared "
+            "with all of its %d photos. `mapping upgrade %s` adds an index.",
+            manifest.id,
+            manifest.version,
+            manifest.counts.images,
+            manifest.id,
+        )
 
 
 def _check_listed(folder: Path, manifest: Manifest) -> None:
@@ -331,8 +342,8 @@ def _check_listed(folder: Path, manifest: Manifest) -> None:
             got=", ".join(record.fingerprint.name for record in records),
         )
     files = [*_ARRAYS, *map(_rows_file, records), *map(_model_file, records)]
-    for record in records:
-        files += [name for name, _, _ in _beside_rows(record, manifest.counts.images)]
+    files += [_scales_file(record) for record in records if record.bits == 8]
+    files += [name for r in records if r.lists is not None for name in _index_files(r)]
     for name in files:
         if name not in manifest.files:
             raise refuse(

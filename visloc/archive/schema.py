@@ -24,11 +24,13 @@ from visloc.retrieval.fusion import LateFusion
 from visloc.types import Fingerprint
 
 FORMAT = "visloc-map"
-FORMAT_MAJOR, FORMAT_MINOR = 3, 0
+FORMAT_MAJOR, FORMAT_MINOR = 3, 1
 
 ID_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 # Names of a map's files: a path below the map on every operating system.
 FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}(/[A-Za-z0-9][A-Za-z0-9._-]{0,127}){0,3}")
+
+INDEX_FOLDER = "index/"
 
 # A photo that a map keeps: pixels of its longer side, and bytes.
 MAX_PHOTO_SIDE = 640
@@ -115,12 +117,14 @@ class GlobalFeaturesRecord(Record):
 
     Attributes:
         bits: 8 for int8 with a scale for each row; 32 for float32, as in all maps before 2.0.
-        clusters: number of clusters in maps with too many photos to compare all with a query.
+        lists: number of lists of the inverted file; None where all rows are compared with a query.
+        clusters: of another index, which maps before 3.1 may have; it is not read.
     """
 
     fingerprint: FingerprintRecord
     dim: Annotated[int, Field(ge=1)]
     bits: Literal[8, 32] = 32
+    lists: Annotated[int, Field(ge=1)] | None = None
     clusters: Annotated[int, Field(ge=1)] | None = None
 
 

@@ -23,11 +23,9 @@ from visloc.geometry import Pose, Similarity
 from visloc.priors import MAX_TILES
 
 SET_FORMAT = "visloc-set"
-SET_MAJOR, SET_MINOR = 1, 2
+SET_MAJOR, SET_MINOR = 2, 0
 # Scale of a tile. Beyond these, squares and inverses overflow.
 MIN_SCALE, MAX_SCALE = 1e-9, 1e9
-# The time of a query is proportional to it.
-MAX_BITS = 1024
 
 
 class SimilarityRecord(Record):
@@ -90,13 +88,13 @@ class TileRecord(Record):
 class CoarseRecord(Record):
     """The coarse index over all photos of all tiles.
 
-    ``bits`` is the length of a photo's code; ``centroids`` is the number of rows for each tile.
+    ``lists`` is the number of lists of each tile. Sets of formats before 2.0 have none, but another
+    index, which is not read.
     """
 
     fingerprint: FingerprintRecord
     dim: Annotated[int, Field(ge=1)]
-    bits: Annotated[int, Field(ge=64, le=MAX_BITS, multiple_of=64)]
-    centroids: Annotated[int, Field(ge=1, le=64)]
+    lists: Annotated[int, Field(ge=1, le=64)] | None = None
 
 
 class SetWorld(Record):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,11 @@ from visloc.archive import models
 from visloc.archive.checks import (
     check_checksums,
     check_files,
-    is_finite,
     map_array,
     read_any_manifest,
     read_model,
 )
+from visloc.archive.index_files import check_lists, index_files, open_index
 from visloc.archive.reader import MapOutline, Outline, outline_of, verify_map
 from visloc.archive.schema import Extent, FingerprintRecord
 from visloc.archive.set_schema import (
@@ -31,14 +32,15 @@ from visloc.archive.set_schema import (
 )
 from visloc.archive.writer import Files
 from visloc.errors import refuse
-from visloc.retrieval.rows import GlobalRows
+from visloc.retrieval.inverted import InvertedFile, width_of
 
-SET_CODES = "coarse/codes.npy"
-_OFFSETS, _MODEL = "coarse/offsets.npy", "coarse/model.npz"
-_CENTROIDS, _SCALES = "coarse/centroids.npy", "coarse/centroids.scales.npy"
-_FILES = (SET_CODES, _OFFSETS, _MODEL, _CENTROIDS, _SCALES)
-# The arrays that localvlad learns, and the planes of the codes.
-_MODEL_ARRAYS = ("vocabulary", "mean", "axes", "planes")
+# Sets of all formats have it, and maps have not.
+SET_OFFSETS = "coarse/offsets.npy"
+_MODEL, _INDEX = "coarse/model.npz", index_files("coarse/photos")
+_FILES = (SET_OFFSETS, _MODEL, *_INDEX)
+# The arrays that localvlad learns, and what turns its descriptors.
+_MODEL_ARRAYS = ("vocabulary", "mean", "axes", "rotation")
+_BLOCK_BYTES = 2**24
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,31 +71,28 @@ class SetOutline(Outline[SetManifest]):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoarseIndex:
-    """A code of a few bytes for every photo, and a few rows for every tile.
+    """An inverted file of all photos, with a few lists for each tile.
 
     Attributes:
-        model: its arrays, and ``planes`` (D, bits): bit b of a photo's code says on which side of
-            plane b its descriptor lies.
-        codes: (N, bits / 64) uint64, the codes of all photos, tile by tile.
-        offsets: (T + 1,) int64; rows offsets[t]:offsets[t + 1] of ``codes`` belong to tile t.
-        centroids: (T * C, D), C rows that summarize the photos of each tile.
+        model: its arrays, and ``rotation`` (D, W): descriptors times it are the rows of the file.
+        offsets: (T + 1,) int64; rows offsets[t]:offsets[t + 1] are the photos of tile t.
+        inverted: lists K t to K (t + 1) hold the photos of tile t.
     """
 
     fingerprint: FingerprintRecord
     model: Mapping[str, NDArray[np.float32]]
-    codes: NDArray[np.uint64]
     offsets: NDArray[np.int64]
-    centroids: GlobalRows
+    inverted: InvertedFile
 
     @property
-    def bits(self) -> int:
-        """Length of a code."""
-        return 64 * int(self.codes.shape[1])
+    def tile_lists(self) -> int:
+        """Lists of each tile."""
+        return len(self.inverted.sizes) // (len(self.offsets) - 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapSet(SetOutline):
-    """One version of a set, open for reading; its tiles are not. Codes are mapped from disk."""
+    """One version of a set, open for reading; its tiles are not. Lists are mapped from disk."""
 
     path: Path
     coarse: CoarseIndex
@@ -116,13 +115,11 @@ def write_set(folder: Path, content: SetContent, *, set_id: str, version: str, c
     Arguments and result are as for ``write_map``.
     """
     files, coarse, tiles = Files(folder), content.coarse, content.tiles
-    scales = coarse.centroids.scales
-    if scales is None:
-        raise AssertionError("centroids are stored in 8 bits")
-    files.write_array(SET_CODES, "<u8", coarse.codes)
-    files.write_array(_OFFSETS, "<i8", coarse.offsets)
-    files.write_array(_CENTROIDS, "|i1", coarse.centroids.values)
-    files.write_array(_SCALES, "<f4", scales)
+    files.write_array(SET_OFFSETS, "<i8", coarse.offsets)
+    files.write_array(_INDEX.centers, "<f4", coarse.inverted.centers)
+    files.write_array(_INDEX.sizes, "<i8", coarse.inverted.sizes)
+    with coarse.inverted.path.open("rb") as lists:
+        files.write_bytes(_INDEX.lists, iter(partial(lists.read, _BLOCK_BYTES), b""))
     files.write_model(_MODEL, coarse.model)
     manifest = {
         "format": SET_FORMAT,
@@ -134,9 +131,8 @@ def write_set(folder: Path, content: SetContent, *, set_id: str, version: str, c
         "tiles": [tile.model_dump(mode="json") for tile in tiles],
         "coarse": {
             "fingerprint": coarse.fingerprint.model_dump(mode="json"),
-            "dim": coarse.centroids.values.shape[1],
-            "bits": coarse.bits,
-            "centroids": len(coarse.centroids) // len(tiles),
+            "dim": coarse.model["rotation"].shape[0],
+            "lists": coarse.tile_lists,
         },
         "counts": {
             "tiles": len(tiles),
@@ -178,10 +174,14 @@ def open_set(folder: Path) -> MapSet:
     Raises:
         MapCorrupt: with the file that is wrong.
         InvalidInput: ``set.is_map``.
+        Conflict: ``set.index`` for a set of a format before 2.0.
     """
     outline = read_set_outline(folder)
     manifest = outline.manifest
     check_files(folder, manifest)
+    record, num_tiles = manifest.coarse, manifest.counts.tiles
+    if record.lists is None:
+        raise refuse("set.index", field=str(folder), ref=outline.ref)
     for name in _FILES:
         if name not in manifest.files:
             raise refuse(
@@ -189,26 +189,28 @@ def open_set(folder: Path) -> MapSet:
                 "the manifest does not list a file that every set has",
                 field=name,
             )
-    record, num_tiles = manifest.coarse, manifest.counts.tiles
-    num_rows = num_tiles * record.centroids
-    offsets = map_array(folder, _OFFSETS, "<i8", (num_tiles + 1,), load=True)
+    offsets = map_array(folder, SET_OFFSETS, "<i8", (num_tiles + 1,), load=True)
     expected = np.cumsum([0, *(tile.images for tile in manifest.tiles)])
     if not np.array_equal(offsets, expected):
         raise refuse(
             "map.range",
             "the offsets of the tiles do not match the manifest",
-            field=str(folder / _OFFSETS),
+            field=str(folder / SET_OFFSETS),
         )
+    inverted = open_index(
+        folder,
+        _INDEX,
+        dim=record.dim,
+        num_lists=num_tiles * record.lists,
+        num_rows=manifest.counts.images,
+    )
+    if not np.array_equal(inverted.sizes.reshape(num_tiles, -1).sum(axis=1), np.diff(offsets)):
+        raise refuse("map.range", field=str(folder / _INDEX.sizes))
     coarse = CoarseIndex(
         fingerprint=record.fingerprint,
         model=_read_coarse_model(folder, manifest),
-        codes=map_array(folder, SET_CODES, "<u8", (manifest.counts.images, record.bits // 64)),
         offsets=offsets,
-        # Read with every query: held in memory.
-        centroids=GlobalRows(
-            map_array(folder, _CENTROIDS, "|i1", (num_rows, record.dim), load=True),
-            map_array(folder, _SCALES, "<f4", (num_rows,), load=True),
-        ),
+        inverted=inverted,
     )
     return MapSet(manifest, outline.photo_boxes, outline.reaches, folder, coarse)
 
@@ -223,9 +225,7 @@ def verify_set(folder: Path) -> MapSet:
     """
     opened = open_set(folder)
     check_checksums(folder, opened.manifest)
-    scales = opened.coarse.centroids.scales
-    if scales is None or not is_finite(scales) or scales.min() < 0:
-        raise refuse("map.range", field=str(folder / _SCALES))
+    check_lists(opened.coarse.inverted)
     if not models.fits(opened.coarse.model, opened.manifest.coarse.dim):
         raise refuse("map.range", field=str(folder / _MODEL))
     return opened
@@ -265,15 +265,15 @@ def _read_coarse_model(folder: Path, manifest: SetManifest) -> dict[str, NDArray
         "vocabulary": shapes["vocabulary"],
         "mean": (size,),
         "axes": (size, record.dim),
-        "planes": (record.dim, record.bits),
+        "rotation": (record.dim, width_of(record.dim)),
     }
     if len(shapes["vocabulary"]) != 2 or shapes != expected or model.keys() != expected.keys():
         raise refuse(
             "map.array",
             "the arrays of the coarse model do not fit each other or the manifest",
             field=str(folder / _MODEL),
-            expected=f"vocabulary (K, d), mean (K d), axes (K d, {record.dim}), planes "
-            f"({record.dim}, {record.bits})",
+            expected=f"vocabulary (K, d), mean (K d), axes (K d, {record.dim}), rotation "
+            f"({record.dim}, {width_of(record.dim)})",
             got=str(shapes),
         )
     return model

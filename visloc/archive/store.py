@@ -20,7 +20,7 @@ from visloc.archive.set_rules import (
     refuse_other_kind,
     unreadable_set,
 )
-from visloc.archive.sets import SET_CODES, MapSet, SetOutline, open_set, verify_any
+from visloc.archive.sets import SET_OFFSETS, MapSet, SetOutline, open_set, verify_any
 from visloc.archive.version_rules import (
     checked_name,
     none_in_use,
@@ -256,13 +256,13 @@ class MapStore:
         (manifest,) = self.backend.manifests([(map_id, version)])
         if manifest is None or isinstance(manifest, MapCorrupt):
             has_poses = self.backend.has_file(map_id, version, _IMAGE_POSES)
-            return has_poses or not self.backend.has_file(map_id, version, SET_CODES)
+            return has_poses or not self.backend.has_file(map_id, version, SET_OFFSETS)
         return isinstance(manifest, Manifest)
 
     def _looks_like_map(self, map_id: str, version: str) -> bool:
         """Whether a version's files show that it is a map; a damaged map may lack them."""
         has_poses = self.backend.has_file(map_id, version, _IMAGE_POSES)
-        return has_poses and not self.backend.has_file(map_id, version, SET_CODES)
+        return has_poses and not self.backend.has_file(map_id, version, SET_OFFSETS)
 
     def _sets_in_use(self, leaving: tuple[str, str]) -> Iterator[tuple[str, AnyManifest]]:
         """The current sets except ``leaving``; every version of an id whose ``current`` is damaged.

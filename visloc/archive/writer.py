@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 from pydantic import JsonValue
 
 from visloc.archive.checks import SCALES, content_hash, json_text, manifest_hash, sha256_of
+from visloc.archive.index_files import index_files
 from visloc.archive.schema import (
     FORMAT,
     FORMAT_MAJOR,
     FORMAT_MINOR,
+    INDEX_FOLDER,
     Anchor,
     FingerprintRecord,
     ImageRecord,
@@ -31,9 +33,9 @@ from visloc.archive.schema import (
 )
 from visloc.geometry import Camera, Pose
 from visloc.retrieval.fusion import EQUAL_GHARM, LateFusion
-from visloc.retrieval.index import MAX_EXACT
+from visloc.retrieval.index import MAX_EXACT, IndexKind
+from visloc.retrieval.inverted import Rows, bytes_of, make_centers, make_lists, num_lists
 from visloc.retrieval.rows import in_8_bits
-from visloc.retrieval.shortlist import make_clusters
 
 # Rows of an array that are converted and written at once.
 _BLOCK_ROWS = 8192
@@ -107,6 +109,7 @@ class MapContent:
         descriptor_scale: the step in which descriptors are stored. The step of the map that they
             were read from stores them unchanged; None chooses one that fits the largest value.
         own_test: of a map that this is or is a part of; None when it took none.
+        index: whether an inverted file of the global descriptors is written.
     """
 
     metric: bool
@@ -129,6 +132,7 @@ class MapContent:
     fusion: LateFusion = EQUAL_GHARM
     descriptor_scale: float | None = None
     own_test: OwnTest | None = None
+    index: IndexKind = IndexKind.AUTO
 
 
 def pose_row(pose: Pose) -> PoseRow:
@@ -163,7 +167,16 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
         (len(landmarks.observed), content.descriptor_dim),
         content.descriptor_scale,
     )
-    clusters = [_write_global(files, features) for features in content.global_features]
+    for features in content.global_features:
+        _write_global(files, features)
+    indexed = {
+        features.fingerprint.file_stem: write_index(
+            files, features.fingerprint.file_stem, features.descriptors
+        )
+        for features in content.global_features
+        if content.index is IndexKind.IVF
+        or (content.index is IndexKind.AUTO and len(content.images) > MAX_EXACT)
+    }
     manifest: dict[str, Any] = {
         "format": FORMAT,
         "format_version": f"{FORMAT_MAJOR}.{FORMAT_MINOR}",
@@ -184,9 +197,9 @@ def write_map(folder: Path, content: MapContent, *, map_id: str, version: str, c
                 "fingerprint": features.fingerprint.model_dump(),
                 "dim": features.descriptors.shape[1],
                 "bits": 8,
-                "clusters": count,
+                "lists": indexed.get(features.fingerprint.file_stem),
             }
-            for features, count in zip(content.global_features, clusters, strict=True)
+            for features in content.global_features
         ],
         "retrieval": RetrievalRecord.of(content.fusion).model_dump(mode="json"),
         "counts": {
@@ -209,7 +222,7 @@ class Files:
         self._written: dict[str, str] = {}
 
     def write_json(self, name: str, value: object) -> None:
-        self._write(name, [json_text(value).encode()])
+        self.write_bytes(name, [json_text(value).encode()])
 
     def write_array(
         self,
@@ -233,7 +246,7 @@ class Files:
             header, {"descr": dtype, "fortran_order": False, "shape": shape}
         )
         rows = (np.ascontiguousarray(block, dtype).data for block in blocks if block.size)
-        self._write(name, itertools.chain([header.getvalue()], rows))
+        self.write_bytes(name, itertools.chain([header.getvalue()], rows))
 
     def write_model(self, name: str, model: Mapping[str, NDArray[Any]]) -> None:
         """Write the arrays of a model, with large matrices in 8 bits."""
@@ -252,6 +265,13 @@ class Files:
                 sha256 = self._written.get(name) or sha256_of(path)
                 entries[name] = {"size": path.stat().st_size, "sha256": sha256}
         return entries
+
+    def written(self) -> dict[str, dict[str, int | str]]:
+        """Size and checksum of the files that this wrote."""
+        return {
+            name: {"size": (self.folder / name).stat().st_size, "sha256": sha256}
+            for name, sha256 in self._written.items()
+        }
 
     def finish(self, manifest: dict[str, Any], version: str) -> str:
         """Add version and hashes to a manifest, write it, and sync all files to disk.
@@ -274,7 +294,7 @@ class Files:
                     os.fsync(file.fileno())
         return str(manifest["version"])
 
-    def _write(self, name: str, parts: Iterable[bytes | memoryview]) -> None:
+    def write_bytes(self, name: str, parts: Iterable[bytes | memoryview]) -> None:
         digest = hashlib.sha256()
         with self._path(name).open("wb") as file:
             for part in parts:
@@ -390,8 +410,19 @@ def _write_descriptors(
     return scale
 
 
-def _write_global(files: Files, features: GlobalFeatures) -> int | None:
-    """Store a global descriptor's rows and model in 8 bits; return its number of clusters."""
+def write_index(files: Files, stem: str, rows: Rows) -> int:
+    """Write an inverted file of a global descriptor; return its number of lists."""
+    centers = make_centers(rows, num_lists(len(rows)))
+    lists = make_lists(rows, centers)
+    names = index_files(INDEX_FOLDER + stem)
+    files.write_array(names.centers, "<f4", centers)
+    files.write_array(names.sizes, "<i8", lists.sizes)
+    files.write_bytes(names.lists, bytes_of([lists]))
+    return len(centers)
+
+
+def _write_global(files: Files, features: GlobalFeatures) -> None:
+    """Store a global descriptor's rows and model in 8 bits."""
     stem, rows = features.fingerprint.file_stem, features.descriptors
     scales = np.empty(len(rows), np.float32)
 
@@ -404,13 +435,6 @@ def _write_global(files: Files, features: GlobalFeatures) -> int | None:
     files.write_blocks(f"global/{stem}.npy", "|i1", rows.shape, stored())
     files.write_array(f"global/{stem}.scales.npy", "<f4", scales)
     files.write_model(f"global/{stem}.model.npz", features.model)
-    if len(rows) <= MAX_EXACT:
-        return None
-    clusters = make_clusters(rows)
-    files.write_array(f"index/{stem}.centers.npy", "<f4", clusters.centers)
-    files.write_array(f"index/{stem}.offsets.npy", "<i8", clusters.offsets)
-    files.write_array(f"index/{stem}.members.npy", "<u4", clusters.members)
-    return len(clusters.centers)
 
 
 def _stored_model(model: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:

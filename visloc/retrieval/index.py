@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from visloc.retrieval.fusion import EQUAL_GHARM, LateFusion
 from visloc.retrieval.rows import GlobalRows
-from visloc.retrieval.shortlist import united
 
-# Maps with more photos have clusters.
-MAX_EXACT = 50_000
-# Photos that each descriptor proposes in such maps; measured in docs/decisions/0016.
-_NUM_PROPOSED = 4000
-_PROPOSED_PER_RESULT = 20
+# Larger maps are written with an inverted file unless a build asks for something else.
+MAX_EXACT = 10_000
+# In a map with an inverted file: so many photos that priors allow are all compared, and so many
+# where the proposals do not stand out from the others.
+_MAX_ALLOWED_EXACT, _MAX_DOUBTFUL_EXACT = 2000, 50_000
+# Photos that each descriptor proposes, and lists that it searches (docs/performance.md).
+_MIN_PROPOSED, _PROPOSED_PER_RESULT = 200, 10
+_LISTS = 50
+
+
+class IndexKind(StrEnum):
+    """How the photos of a map are searched: ``auto`` is ``ivf`` beyond ``MAX_EXACT`` photos."""
+
+    AUTO = "auto"
+    FLAT = "flat"
+    IVF = "ivf"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,8 +55,9 @@ def retrieve(
 ) -> Retrieved:
     """Rank the photos of a map by fused similarity to a query.
 
-    Up to ``MAX_EXACT`` photos are all compared. In larger maps each descriptor proposes the photos
-    of the clusters nearest to the query, and all proposals are compared under all descriptors.
+    In maps with an inverted file each descriptor proposes the photos that are most like the query
+    by their codes, and all proposals are compared under all descriptors. In other maps, where
+    priors leave few photos, and where they leave none that stands out, all are compared.
 
     Args:
         query: unit vector (D,) by global descriptor; a zero vector is similar to nothing.
@@ -55,8 +68,11 @@ def retrieve(
         fusion: fuses similarities into scores; it must use at least one of the descriptors.
     """
     index = {name: index[name] for name in fusion.counted(index)}
-    compared = _compared(query, index, top_k, photo_weights)
-    cosines = {name: rows.cosines(query[name], compared) for name, rows in index.items()}
+    compared, limits = _proposed(query, index, top_k, photo_weights)
+    cosines = _cosines(query, index, compared)
+    if limits and not _stand_out(cosines, limits, top_k, fusion):
+        compared = _allowed(photo_weights)
+        cosines = _cosines(query, index, compared)
     scores = fusion.scores(cosines)
     photos = np.arange(len(scores)) if compared is None else compared
     candidates = np.arange(len(scores))
@@ -74,18 +90,61 @@ def retrieve(
     )
 
 
-def _compared(
+def _proposed(
     query: Mapping[str, NDArray[np.float32]],
     index: Mapping[str, GlobalRows],
     top_k: int,
     photo_weights: NDArray[np.float64] | None,
-) -> NDArray[np.int64] | None:
-    """The photos to compare with the query, in the order of the map; None for all."""
-    clusters = {name: rows.clusters for name, rows in index.items() if rows.clusters is not None}
-    if len(clusters) < len(index):
-        return None
+) -> tuple[NDArray[np.int64] | None, Mapping[str, float]]:
+    """The photos to compare with the query, in the order of the map; None for all.
+
+    Also returns, by descriptor, the cosine that photos which were not proposed have at most, as
+    far as codes can tell. Empty where more photos shall not be compared.
+    """
+    files = {name: rows.inverted for name, rows in index.items() if rows.inverted is not None}
+    if len(files) < len(index):
+        return None, {}
+    num = left = len(next(iter(index.values())))
     allowed = None if photo_weights is None else photo_weights > 0
-    if allowed is not None and np.count_nonzero(allowed) <= MAX_EXACT:
-        return np.flatnonzero(allowed)
-    count = max(_NUM_PROPOSED, _PROPOSED_PER_RESULT * top_k)
-    return united([c.nearest(query[name], count, allowed) for name, c in clusters.items()])
+    if allowed is not None:
+        left = int(np.count_nonzero(allowed))
+    if left <= _MAX_ALLOWED_EXACT:
+        return _allowed(photo_weights), {}
+    count = max(_MIN_PROPOSED, _PROPOSED_PER_RESULT * top_k)
+    can_compare = left <= _MAX_DOUBTFUL_EXACT
+    # Photos that priors leave may lie in lists further away; if few, doubts about the proposals
+    # cost less than more lists.
+    searched = _LISTS if can_compare else math.ceil(_LISTS * num / left)
+    photos, limits = [], {}
+    for name, file in files.items():
+        lists = file.nearest_lists(query[name], searched)
+        found, rough = file.nearest(query[name], count, lists, allowed)
+        if len(found) < count and len(lists) < len(file.sizes):
+            every = np.arange(len(file.sizes))
+            found, rough = file.nearest(query[name], count, every, allowed)
+        photos.append(found)
+        limits[name] = float(rough.min(initial=1.0)) + file.error
+    return np.unique(np.concatenate(photos)), limits if can_compare else {}
+
+
+def _stand_out(
+    cosines: Mapping[str, NDArray[np.float64]],
+    limits: Mapping[str, float],
+    top_k: int,
+    fusion: LateFusion,
+) -> bool:
+    """Tell whether the best proposals are better than any other photo can be."""
+    scores = fusion.scores({name: np.append(row, limits[name]) for name, row in cosines.items()})
+    return int(np.count_nonzero(scores[:-1] >= scores[-1])) >= top_k
+
+
+def _cosines(
+    query: Mapping[str, NDArray[np.float32]],
+    index: Mapping[str, GlobalRows],
+    photos: NDArray[np.int64] | None,
+) -> dict[str, NDArray[np.float64]]:
+    return {name: rows.cosines(query[name], photos) for name, rows in index.items()}
+
+
+def _allowed(photo_weights: NDArray[np.float64] | None) -> NDArray[np.int64] | None:
+    return None if photo_weights is None else np.flatnonzero(photo_weights)

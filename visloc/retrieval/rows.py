@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from visloc.retrieval.inverted import InvertedFile
 from visloc.retrieval.products import dot_products
-from visloc.retrieval.shortlist import Clusters
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,12 +18,12 @@ class GlobalRows:
     Attributes:
         values: (n, D) int8 or float32.
         scales: (n,) float32 factors of the rows of ``values``; None for 1.
-        clusters: None in maps whose rows are all compared with every query.
+        inverted: None in maps whose rows are all compared with every query.
     """
 
     values: NDArray[np.int8] | NDArray[np.float32]
     scales: NDArray[np.float32] | None = None
-    clusters: Clusters | None = None
+    inverted: InvertedFile | None = None
 
     def __len__(self) -> int:
         return len(self.values)

@@ -17,7 +17,7 @@ def room(built_maps: Path) -> Map:
     return MapStore(built_maps).open("room")
 
 
-def index_with(room: Map, *, first: bool, second: bool) -> CoarseIndex:
+def index_with(room: Map, folder: Path, *, first: bool, second: bool) -> CoarseIndex:
     """Index two tiles, each with the photos of the room or with as many that show nothing of it."""
     random = np.random.default_rng(0)
     model = dict(learn(lambda _: room, 1))
@@ -27,18 +27,18 @@ def index_with(room: Map, *, first: bool, second: bool) -> CoarseIndex:
     rows = descriptors_of(room, model)
     foreign = random.normal(size=rows.shape).astype(np.float32)
     tiles = [described(rows if has_room else foreign, model) for has_room in (first, second)]
-    return coarse_index(iter(tiles), model)
+    return coarse_index(iter(tiles), model, folder / "lists")
 
 
-def test_a_tile_is_mistaken_for_one_that_shows_its_photos_better(room: Map) -> None:
+def test_a_tile_is_mistaken_for_one_that_shows_its_photos_better(room: Map, tmp_path: Path) -> None:
     """The first tile's index forgot what its photos look like; the second one's did not."""
-    index = index_with(room, first=False, second=True)
+    index = index_with(room, tmp_path, first=False, second=True)
 
     assert mistaken_for(lambda _: room, APART, index)[0] == (1,)
 
 
-def test_tiles_of_the_same_place_are_not_compared(room: Map) -> None:
-    index = index_with(room, first=False, second=True)
+def test_tiles_of_the_same_place_are_not_compared(room: Map, tmp_path: Path) -> None:
+    index = index_with(room, tmp_path, first=False, second=True)
     together = np.array([APART[0], APART[0] + 1.0])
 
     assert mistaken_for(lambda _: room, together, index) == [(), ()]

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from mapping.cli.main import app
 from mapping.maps.upgrading import lacking, upgrade_map
 from mapping.own_test.trials import own_test
-from visloc.archive import Map, MapStore, verify_map
+from visloc.archive import Map, MapStore, sha256_of, verify_map
 from visloc.archive.checks import content_hash, json_text, manifest_hash
 from visloc.errors import Conflict
 
@@ -38,7 +38,7 @@ def test_an_upgraded_map_has_its_own_test_over_the_same_files(old: MapStore) -> 
     folder = upgrade_map(before, old.root)
     after = verify_map(folder)
     assert old.current_version("room") == after.manifest.version != before.manifest.version
-    assert after.manifest.format_version == "3.0"
+    assert after.manifest.format_version == "3.1"
     assert after.manifest.files == before.manifest.files
     assert after.manifest.parts.own_test == own_test(before)
     assert before.manifest.parts.own_test is None
@@ -96,3 +96,31 @@ def test_what_only_a_new_build_can_add_is_said(old: MapStore) -> None:
         "keypoints and global descriptors stay in 32 bits",
         "what computed the features stays unknown",
     ]
+
+
+def test_a_large_map_gets_an_index_and_keeps_its_old_one_as_it_was(
+    old: MapStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Formats 2.0 to 3.0 had another index, of which one file has the same name."""
+    monkeypatch.setattr("mapping.maps.upgrading.MAX_EXACT", 2)
+    before = old.folder("room")
+    name = "index/densevlad.centers.npy"
+    (before / "index").mkdir()
+    (before / name).write_bytes(b"centers")
+    manifest = json.loads((before / "manifest.json").read_text())
+    manifest["files"][name] = {"size": 7, "sha256": sha256_of(before / name)}
+    for record in manifest["global_features"]:
+        record["clusters"] = 4
+        record.pop("lists", None)
+    manifest["content_hash"] = content_hash(manifest)
+    manifest["manifest_hash"] = manifest_hash(manifest)
+    (before / "manifest.json").write_text(json_text(manifest))
+
+    after = verify_map(upgrade_map(verify_map(before), old.root))
+
+    assert after.has_index
+    assert not verify_map(before).has_index
+    assert (before / name).read_bytes() == b"centers"
+    assert all(record.clusters is None for record in after.manifest.global_features)
+    with pytest.raises(Conflict):
+        upgrade_map(after, old.root)

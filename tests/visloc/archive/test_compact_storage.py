@@ -30,6 +30,7 @@ from visloc.archive.checks import SCALES, content_hash, json_text, manifest_hash
 from visloc.archive.packed import pack_map, unpack_map
 from visloc.errors import MapCorrupt
 from visloc.geometry import Camera
+from visloc.retrieval.index import IndexKind
 
 
 @pytest.fixture
@@ -113,7 +114,7 @@ def as_before_2_0(opened: Map, folder: Path, version: str) -> None:
     for name in ("keypoint_step_px", "computed_with"):
         del manifest["local_features"][name]
     for record in manifest["global_features"]:
-        del record["bits"], record["clusters"]
+        del record["bits"], record["lists"]
     make_right(folder, manifest)
 
 
@@ -165,7 +166,7 @@ def test_another_anchor_leaves_a_map_to_the_programs_that_could_read_it(
     assert found.manifest.files == opened.manifest.files
 
 
-@pytest.mark.parametrize("version", ["1.3", "3.0"])
+@pytest.mark.parametrize("version", ["1.3", "3.1"])
 def test_packed_maps_of_both_formats_come_back_as_they_were(
     folder: Path, tmp_path: Path, version: str
 ) -> None:
@@ -289,44 +290,107 @@ def test_what_computed_the_features_is_told(folder: Path, tmp_path: Path) -> Non
 
 
 @pytest.fixture
-def clustered(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def indexed(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A map of three photos, written as one of too many to compare all."""
-    monkeypatch.setattr(visloc.archive.writer, "MAX_EXACT", 2)
-    rewritten(open_map(folder), tmp_path / "clustered")
-    return tmp_path / "clustered"
+    monkeypatch.setattr("visloc.archive.writer.MAX_EXACT", 2)
+    rewritten(open_map(folder), tmp_path / "indexed")
+    return tmp_path / "indexed"
 
 
-def test_a_map_of_very_many_photos_is_written_with_clusters(clustered: Path) -> None:
-    opened = verify_map(clustered)
-    rows = opened.global_descriptors["densevlad"]
-    assert rows.clusters is not None
-    assert sorted(rows.clusters.members.tolist()) == [0, 1, 2]
-    assert len(rows.clusters.centers) == opened.manifest.global_features[0].clusters
+def test_a_map_of_very_many_photos_is_written_with_an_inverted_file(indexed: Path) -> None:
+    opened = verify_map(indexed)
+    inverted = opened.global_descriptors["densevlad"].inverted
+    assert inverted is not None
+    assert opened.has_index
+    assert len(inverted.centers) == opened.manifest.global_features[0].lists == 3
+    query = opened.global_descriptors["densevlad"][1]
+    assert inverted.nearest(query, 3, np.arange(3))[0][0] == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "has_index"),
+    [(IndexKind.AUTO, False), (IndexKind.FLAT, False), (IndexKind.IVF, True)],
+)
+def test_an_inverted_file_is_written_as_asked_for(
+    folder: Path, tmp_path: Path, kind: IndexKind, has_index: bool
+) -> None:
+    written = rewritten(open_map(folder), tmp_path / "new", index=kind)
+    assert written.has_index is has_index
+    assert (tmp_path / "new" / "index").exists() is has_index
 
 
 @pytest.mark.parametrize(
     ("name", "array", "code"),
     [
-        ("members", np.array([0, 1, 1], np.uint32), "map.range"),
-        ("members", np.array([0, 1, 3], np.uint32), "map.range"),
-        ("members", np.array([0, 1, 2**32 - 1], np.uint32), "map.range"),
-        ("members", np.array([0, 1, 2], np.int64), "map.array"),
-        ("members", np.array([0, 1], np.uint32), "map.array"),
-        ("offsets", np.array([0, 2, 1, 3]), "map.range"),
-        ("offsets", np.array([0, 1, 2, 2]), "map.range"),
-        ("offsets", np.array([0, 2**63 - 1, -(2**63), 3]), "map.range"),
-        ("offsets", np.array([-1, 1, 2, 3]), "map.range"),
-        ("centers", np.full((3, 4), np.nan, np.float32), "map.range"),
+        ("sizes", np.array([0, 1, 1]), "map.range"),
+        ("sizes", np.array([4, 0, -1]), "map.range"),
+        ("sizes", np.array([2**63 - 1, 2**63 - 1, 5]), "map.range"),
+        ("sizes", np.array([1, 1, 1], np.int32), "map.array"),
+        ("sizes", np.array([1, 2]), "map.array"),
+        ("centers", np.full((3, 64), np.nan, np.float32), "map.range"),
+        ("centers", np.zeros((3, 4), np.float32), "map.array"),
     ],
 )
-def test_clusters_that_cannot_be_are_refused(
-    clustered: Path, name: str, array: NDArray[np.generic], code: str
+def test_an_inverted_file_that_cannot_be_is_not_opened(
+    indexed: Path, name: str, array: NDArray[np.generic], code: str
 ) -> None:
-    np.save(clustered / "index" / f"densevlad.{name}.npy", array)
-    make_right(clustered, json.loads((clustered / "manifest.json").read_text()))
+    np.save(indexed / "index" / f"densevlad.{name}.npy", array)
+    make_right(indexed, json.loads((indexed / "manifest.json").read_text()))
     with pytest.raises(MapCorrupt) as caught:
-        verify_map(clustered)
+        open_map(indexed)
     assert caught.value.code == code
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "code"),
+    [
+        (slice(16, 24), np.array([1], "<i8"), "map.range"),  # another row's number
+        (slice(16, 24), np.array([3], "<i8"), "map.range"),
+        (slice(16, 24), np.array([-1], "<i8"), "map.range"),
+        (slice(16, 24), np.array([2**63 - 1], "<i8"), "map.range"),
+        (slice(8, 16), np.array([np.nan, 1], "<f4"), "map.range"),
+        (slice(24, 96), np.empty(0, "<i8"), "map.array"),
+        (slice(0, 0), np.array([0], "<i8"), "map.array"),
+    ],
+)
+def test_lists_that_cannot_be_are_refused(
+    indexed: Path, place: slice, value: NDArray[np.generic], code: str
+) -> None:
+    path = indexed / "index" / "densevlad.lists"
+    content = bytearray(path.read_bytes())
+    first = int.from_bytes(content[16:24], "little")
+    if value.dtype == np.int64 and first == 1 and value.tolist() == [1]:
+        value = np.array([0], "<i8")
+    content[place] = value.tobytes()
+    path.write_bytes(content)
+    make_right(indexed, json.loads((indexed / "manifest.json").read_text()))
+    with pytest.raises(MapCorrupt) as caught:
+        verify_map(indexed)
+    assert caught.value.code == code
+
+
+def test_an_index_of_an_older_format_is_not_used_and_a_warning_says_what_to_do(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Maps of more than 50 000 photos had one in formats 2.0 to 3.0."""
+    (folder / "index").mkdir()
+    arrays = {
+        "centers": np.eye(2, 4, dtype=np.float32),
+        "offsets": np.array([0, 1, 3]),
+        "members": np.array([2, 0, 1], np.uint32),
+    }
+    manifest = json.loads((folder / "manifest.json").read_text())
+    for name, array in arrays.items():
+        np.save(folder / "index" / f"densevlad.{name}.npy", array)
+        manifest["files"][f"index/densevlad.{name}.npy"] = {}
+    manifest["format_version"] = "2.2"
+    manifest["global_features"][0]["clusters"] = 2
+    del manifest["global_features"][0]["lists"]
+    make_right(folder, manifest)
+    opened = verify_map(folder)
+    assert not opened.has_index
+    assert "compared with all of its 3 photos" in caplog.text
+    assert f"mapping upgrade {manifest['id']}" in caplog.text
 
 
 @pytest.mark.parametrize("scale", [np.nan, -1.0, np.inf])

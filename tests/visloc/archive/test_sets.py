@@ -27,7 +27,7 @@ from visloc.archive.packed import pack_map, unpack_map
 from visloc.archive.remote_store import RemoteMapStore
 from visloc.errors import Conflict, InvalidInput, MapCorrupt, NotFound
 from visloc.geometry import Similarity
-from visloc.sets.coarse import BITS
+from visloc.sets.coarse import TILE_LISTS
 
 LARGE = 2**30
 SECOND = Similarity(1.0, np.eye(3), np.array([100.0, 0.0, 3.0]))
@@ -113,10 +113,11 @@ def test_a_set_is_open_with_its_index(store: MapStore) -> None:
     assert isinstance(opened, MapSet)
     photos = len(store.open("hall").images)
     assert opened.coarse.offsets.tolist() == [0, photos, 2 * photos]
-    assert isinstance(opened.coarse.codes, np.memmap)
-    assert opened.coarse.bits == BITS
+    assert opened.coarse.tile_lists == TILE_LISTS
+    inverted = opened.coarse.inverted
     # Both tiles are the same map.
-    np.testing.assert_array_equal(opened.coarse.codes[:photos], opened.coarse.codes[photos:])
+    np.testing.assert_array_equal(inverted.sizes[:TILE_LISTS], inverted.sizes[TILE_LISTS:])
+    np.testing.assert_array_equal(inverted.centers[:TILE_LISTS], inverted.centers[TILE_LISTS:])
     assert verify_set(opened.path).ref == opened.ref
 
 
@@ -314,11 +315,11 @@ def test_what_is_a_set_its_manifest_says(store: MapStore, tmp_path: Path) -> Non
     # A map with a file of a set, and a set that lost it.
     hall, house = store.folder("hall"), store.folder("house")
     (hall / "coarse").mkdir()
-    shutil.copy(house / "coarse/codes.npy", hall / "coarse/codes.npy")
+    shutil.copy(house / "coarse/offsets.npy", hall / "coarse/offsets.npy")
     manifest = json.loads((hall / "manifest.json").read_text())
-    manifest["files"]["coarse/codes.npy"] = json.loads((house / "manifest.json").read_text())[
+    manifest["files"]["coarse/offsets.npy"] = json.loads((house / "manifest.json").read_text())[
         "files"
-    ]["coarse/codes.npy"]
+    ]["coarse/offsets.npy"]
     renamed(hall, "hall", "v1", files=manifest["files"])
     hashed = json.loads((hall / "manifest.json").read_text())["content_hash"]
     tiles = json.loads((house / "manifest.json").read_text())["tiles"]
@@ -330,7 +331,7 @@ def test_what_is_a_set_its_manifest_says(store: MapStore, tmp_path: Path) -> Non
     for one, folder in ((store, house), (server, tmp_path / "bucket" / "house" / house.name)):
         for lost in (False, True):
             if lost:
-                (folder / "coarse/codes.npy").unlink()
+                (folder / "coarse/offsets.npy").unlink()
             for tile in ("hall", "attic"):
                 with pytest.raises(Conflict, match="tile of a current set"):
                     one.remove(tile, "v1")
@@ -362,18 +363,18 @@ def keep(_manifest: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("change", "code"),
     [
-        (lambda m: m.update(format_version="2.0"), "map.format_version"),
+        (lambda m: m.update(format_version="3.0"), "map.format_version"),
         (lambda m: m.update(format="visloc-town"), "map.manifest"),
         (lambda m: m.update(tiles=[]), "map.manifest"),
         (lambda m: m["counts"].update(images=3), "map.manifest"),
-        (lambda m: m["coarse"].update(bits=100), "map.manifest"),
-        (lambda m: m["coarse"].update(bits=64_000), "map.manifest"),
+        (lambda m: m["coarse"].update(lists=0), "map.manifest"),
+        (lambda m: m["coarse"].update(lists=64_000), "map.manifest"),
         (lambda m: m["tiles"][0]["set_from_tile"].update(scale=1e-320), "map.manifest"),
         (lambda m: m["tiles"][0]["set_from_tile"].update(scale=1e200), "map.manifest"),
         (lambda m: m["world"]["extent"].update(min=[5] * 3, max=[-5] * 3), "map.manifest"),
         (lambda m: m["tiles"][1]["extent"].update(max=[1e6] * 3), "map.manifest"),
         (lambda m: m["tiles"][1].update(map="hall"), "map.manifest"),
-        (lambda m: m["coarse"].update(bits=BITS // 2), "map.array"),
+        (lambda m: m["coarse"].update(lists=TILE_LISTS // 2), "map.array"),
         (lambda m: m["coarse"].update(dim=5), "map.array"),
         (lambda m: m["tiles"][0]["set_from_tile"].update(scale=0), "map.manifest"),
         (
@@ -381,7 +382,7 @@ def keep(_manifest: dict[str, Any]) -> None:
             "map.manifest",
         ),
         (lambda m: m["tiles"][0]["photo_extent"].update(max=[-1e6] * 3), "map.manifest"),
-        (lambda m: m["files"].pop("coarse/codes.npy"), "map.file_missing"),
+        (lambda m: m["files"].pop("coarse/offsets.npy"), "map.file_missing"),
         (lambda m: m["tiles"].reverse(), None),
     ],
 )
@@ -424,13 +425,40 @@ def test_offsets_are_those_of_the_tiles(store: MapStore) -> None:
     assert caught.value.code == "map.range"
 
 
-def test_scales_are_numbers(store: MapStore) -> None:
+def test_lists_are_those_of_the_tiles(store: MapStore) -> None:
     folder = store.folder("house")
-    np.save(folder / "coarse" / "centroids.scales.npy", np.full(8, np.nan, np.float32))
+    sizes = np.load(folder / "coarse" / "photos.sizes.npy")
+    sizes[TILE_LISTS - 1] += 1
+    sizes[TILE_LISTS] -= 1
+    np.save(folder / "coarse" / "photos.sizes.npy", sizes)
+
+    with pytest.raises(MapCorrupt) as caught:
+        open_set(rewritten(folder, keep))
+    assert caught.value.code == "map.range"
+
+
+def test_lists_hold_every_photo_once(store: MapStore) -> None:
+    folder = store.folder("house")
+    lists = folder / "coarse" / "photos.lists"
+    content = lists.read_bytes()
+    lists.write_bytes(content[:-8] + bytes(8))  # the last photo is now the first
 
     with pytest.raises(MapCorrupt) as caught:
         verify_set(rewritten(folder, keep))
     assert caught.value.code == "map.range"
+
+
+def test_a_set_of_a_format_before_2_0_is_to_be_published_again(store: MapStore) -> None:
+    def as_before(manifest: dict[str, Any]) -> None:
+        manifest["format_version"] = "1.1"
+        del manifest["coarse"]["lists"]
+        manifest["coarse"].update(bits=512, centroids=4)
+
+    folder = rewritten(store.folder("house"), as_before)
+    with pytest.raises(Conflict, match="mapping set") as caught:
+        open_set(folder)
+    assert caught.value.code == "set.index"
+    assert read_any_outline(folder).manifest.tiles
 
 
 def test_an_outline_needs_no_arrays(store: MapStore) -> None:

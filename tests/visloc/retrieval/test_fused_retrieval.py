@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 import visloc.retrieval.index as retrieval
+from tests.visloc.retrieval.made_lists import inverted
 from visloc.options import Fusion
 from visloc.retrieval.fusion import LateFusion
 from visloc.retrieval.index import retrieve
 from visloc.retrieval.rows import GlobalRows
-from visloc.retrieval.shortlist import make_clusters
 
 EVERY = pytest.mark.parametrize("fusion", Fusion)
 NUM, DIM = 400, 16
@@ -100,13 +102,15 @@ def test_large_maps_rank_what_is_proposed_as_if_that_were_all(
     index: dict[str, GlobalRows],
     query: dict[str, NDArray[np.float32]],
     fusion: Fusion,
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(retrieval, "MAX_EXACT", 50)
-    monkeypatch.setattr(retrieval, "_NUM_PROPOSED", 60)
+    monkeypatch.setattr(retrieval, "_MAX_ALLOWED_EXACT", 50)
+    monkeypatch.setattr(retrieval, "_MAX_DOUBTFUL_EXACT", 0)
+    monkeypatch.setattr(retrieval, "_MIN_PROPOSED", 60)
     monkeypatch.setattr(retrieval, "_PROPOSED_PER_RESULT", 1)
     large = {
-        name: GlobalRows(rows.values, clusters=make_clusters(rows[:]))
+        name: GlobalRows(rows.values, inverted=inverted(rows[:], tmp_path / name))
         for name, rows in index.items()
     }
     late = LateFusion(fusion, {"a": 1.0, "c": 2.0})

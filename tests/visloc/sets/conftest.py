@@ -41,14 +41,14 @@ def _outline(
     manifest = SetManifest.model_validate(
         {
             "format": "visloc-set",
-            "format_version": "1.0",
+            "format_version": "2.0",
             "id": "town",
             "version": "v1",
             "created": "2026-01-02T03:04:05+00:00",
             "world": {"metric": True, "extent": whole, "gravity": gravity},
             "local_features": fingerprint,
             "tiles": tiles,
-            "coarse": {"fingerprint": fingerprint, "dim": 8, "bits": 64, "centroids": 4},
+            "coarse": {"fingerprint": fingerprint, "dim": 8, "lists": 4},
             "counts": {"tiles": count, "images": 10 * count, "landmarks": 20 * count},
             "content_hash": HASH,
             "manifest_hash": HASH,

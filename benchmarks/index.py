@@ -1,0 +1,208 @@
+"""The index of one map, from generated rows: time, memory and recall, with and without priors.
+
+    OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 python -m benchmarks.index --work DIR
+        [--photos 100000] [--dim 1024] [--descriptors 2] [--queries 60]
+
+Places have 40 photos each. A photo's descriptor is the unit vector along a sum of what its place
+has in common (35 % of the squared length), what one of the three directions shows that photos of
+the place look in (40 %), and noise (25 %). A query is as far from a photo (cosine 0.735) as another
+photo of its place and direction. So the best 20 of a query are photos of its place.
+
+Milliseconds are those of a core, since other programs may run; one thread computes. Rows and index
+are kept in DIR and found there again. Prints a table in Markdown; the truth is the
+comparison of all allowed photos. "near" allows a stretch of the map that holds the query's place,
+"random" any photos, "elsewhere" a stretch without the query's place.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from benchmarks.large_map_queries import anonymous_mb, percentiles_ms
+from visloc.retrieval.index import retrieve
+from visloc.retrieval.inverted import InvertedFile, bytes_of, make_centers, make_lists, num_lists
+from visloc.retrieval.rows import GlobalRows, in_8_bits
+
+Query = Mapping[str, NDArray[np.float32]]
+Index = Mapping[str, GlobalRows]
+
+PLACE, DIRECTIONS = 40, 3
+SHARES = {"place": 0.35, "direction": 0.4, "noise": 0.25}
+COSINE = 0.735
+TOP_K = 20
+PRIORS = [("none", 1.0)] + [
+    (kind, share) for share in (0.5, 0.1, 0.01) for kind in ("near", "random", "elsewhere")
+]
+_BLOCK = 100 * PLACE
+
+
+def main(
+    work: Annotated[Path, typer.Option(help="Where to make rows and index; kept.")],
+    photos: Annotated[int, typer.Option(help="A multiple of 4000.")] = 100_000,
+    dim: int = 1024,
+    descriptors: int = 2,
+    queries: int = 60,
+) -> None:
+    """Make, ask, print."""
+    work.mkdir(parents=True, exist_ok=True)
+    directions = np.random.default_rng(0).integers(DIRECTIONS, size=photos)
+    names = [f"{photos}-{dim}-{number}" for number in range(descriptors)]
+    for number, name in enumerate(names):
+        if not (work / f"{name}.lists").exists():
+            write_rows(work, name, directions, dim, number + 1)
+            write_lists(work, name)
+    # Loads faiss, which a process does once, whatever it opens.
+    InvertedFile(np.eye(1, 64, dtype=np.float32), np.zeros(1, np.int64), work)
+    before, started = anonymous_mb(), time.process_time()
+    index = {name: opened(work, name) for name in names}
+    typer.echo(
+        f"{photos} photos, {descriptors} descriptors of {dim} dimensions; opened in "
+        f"{time.process_time() - started:.3f} s with {anonymous_mb() - before:.1f} MB\n"
+    )
+    asked = queries_of(index, queries)
+    typer.echo("| allowed | ms p50 / p95 | all compared, ms p50 | recall |\n|---|---|---|---|")
+    for kind, share in PRIORS:
+        typer.echo(row_of(kind, share, index, asked))
+    typer.echo(f"\n{anonymous_mb() - before:.1f} MB after all queries")
+
+
+def write_rows(work: Path, name: str, directions: NDArray[np.int64], dim: int, seed: int) -> None:
+    """Write the rows of one descriptor as a map stores them, block by block."""
+    random = np.random.default_rng(seed)
+    values = np.lib.format.open_memmap(
+        work / f"{name}.npy", "w+", np.dtype(np.int8), (len(directions), dim)
+    )
+    scales = np.empty(len(directions), np.float32)
+    for start in range(0, len(directions), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        count = len(directions[block])
+        place = np.arange(count) // PLACE
+        parts = {
+            "place": _units(random, -(-count // PLACE), dim)[place],
+            "direction": _units(random, DIRECTIONS * -(-count // PLACE), dim)[
+                DIRECTIONS * place + directions[block]
+            ],
+            "noise": _units(random, count, dim),
+        }
+        rows = sum(np.float32(np.sqrt(SHARES[part])) * parts[part] for part in parts)
+        values[block], scales[block] = in_8_bits(_unit(np.asarray(rows)))
+    np.save(work / f"{name}.scales.npy", scales)
+
+
+def write_lists(work: Path, name: str) -> None:
+    """Make the inverted file of one descriptor, and say what it took."""
+    rows, started = stored(work, name), time.process_time()
+    centers = make_centers(rows, num_lists(len(rows)))
+    clustered = time.process_time()
+    lists = make_lists(rows, centers)
+    typer.echo(
+        f"{name}: {len(centers)} lists, k-means {clustered - started:.0f} s, assigned and coded in "
+        f"{time.process_time() - clustered:.0f} s of one core\n"
+    )
+    np.save(work / f"{name}.centers.npy", centers)
+    np.save(work / f"{name}.sizes.npy", lists.sizes)
+    with (work / f"{name}.lists").open("wb") as file:
+        file.writelines(bytes_of([lists]))
+
+
+def stored(work: Path, name: str) -> GlobalRows:
+    """Return the rows of one descriptor, mapped from their files."""
+    return GlobalRows(
+        np.load(work / f"{name}.npy", mmap_mode="r"),
+        np.load(work / f"{name}.scales.npy", mmap_mode="r"),
+    )
+
+
+def opened(work: Path, name: str) -> GlobalRows:
+    """Open the rows of one descriptor with their inverted file."""
+    rows = stored(work, name)
+    centers, sizes = (np.load(work / f"{name}.{part}.npy") for part in ("centers", "sizes"))
+    inverted = InvertedFile(centers, sizes, work / f"{name}.lists")
+    return GlobalRows(rows.values, rows.scales, inverted)
+
+
+def queries_of(index: Index, count: int) -> list[tuple[int, Query]]:
+    """Return photos of the map, and queries that see what they see."""
+    random = np.random.default_rng(7)
+    num = len(next(iter(index.values())))
+    made: list[tuple[int, Query]] = []
+    for photo in random.integers(num, size=count).tolist():
+        query = {}
+        for name, rows in index.items():
+            noise = _units(random, 1, rows.values.shape[1])[0]
+            other = COSINE * rows[photo] + np.sqrt(1 - COSINE**2) * noise
+            query[name] = _unit(other[None])[0]
+        made.append((photo, query))
+    return made
+
+
+def row_of(kind: str, share: float, index: Index, asked: list[tuple[int, Query]]) -> str:
+    """Ask with the index and without it; one line of the table."""
+    num = len(next(iter(index.values())))
+    every = {name: GlobalRows(rows.values, rows.scales) for name, rows in index.items()}
+    weights = [
+        None if kind == "none" else prior(kind, share, photo, num, seed)
+        for seed, (photo, _) in enumerate(asked)
+    ]
+
+    def answers(rows: Index) -> tuple[list[NDArray[np.int64]], list[float]]:
+        def ask(number: int) -> NDArray[np.int64]:
+            return retrieve(asked[number][1], rows, TOP_K, weights[number]).images
+
+        ask(0)
+        return _timed(ask, len(asked))
+
+    found, seconds = answers(index)
+    truth, exact = answers(every)
+    same = [len(np.intersect1d(a, b)) / TOP_K for a, b in zip(found, truth, strict=True)]
+    p50, p95 = percentiles_ms(seconds)
+    allowed = "all" if kind == "none" else f"{100 * share:g} %, {kind}"
+    return (
+        f"| {allowed} | {p50:.2f} / {p95:.2f} | {percentiles_ms(exact)[0]:.1f} "
+        f"| {np.mean(same):.4f} |"
+    )
+
+
+def prior(kind: str, share: float, photo: int, num: int, seed: int) -> NDArray[np.float64]:
+    """Return weights (num,) that allow a share of the photos."""
+    random = np.random.default_rng(seed)
+    count, weights = int(share * num), np.zeros(num)
+    if kind == "random":
+        weights[random.choice(num, count, replace=False)] = 1
+        return weights
+    if kind == "near":
+        start = photo - int(random.integers(count))
+    else:
+        start = photo + PLACE + int(random.integers(num - count - 2 * PLACE))
+    weights[np.arange(start, start + count) % num] = 1
+    return weights
+
+
+def _timed(
+    ask: Callable[[int], NDArray[np.int64]], count: int
+) -> tuple[list[NDArray[np.int64]], list[float]]:
+    found, seconds = [], []
+    for number in range(count):
+        started = time.process_time()
+        found.append(ask(number))
+        seconds.append(time.process_time() - started)
+    return found, seconds
+
+
+def _units(random: np.random.Generator, count: int, dim: int) -> NDArray[np.float32]:
+    return _unit(random.standard_normal((count, dim), dtype=np.float32))
+
+
+def _unit(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), np.float32)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,69 @@
+"""Nothing lets faiss or pickle parse an index: maps come from strangers (decision 0034)."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = (
+    *("visloc", "mapping", "service", "clients", "samples", "training", "visloc_api"),
+    *("visloc_web", "benchmarks"),
+)
+# Names of faiss's functions and classes that parse what they are given.
+FORBIDDEN_STARTS = ("read_index", "deserialize_", "read_VectorTransform", "read_ProductQuantizer")
+FORBIDDEN = frozenset(
+    ("read_InvertedLists", "clone_index", "VectorIOReader", "FileIOReader", "BufferedIOReader")
+)
+# The only file that may load it.
+HOME = ROOT / "visloc" / "retrieval" / "inverted.py"
+
+
+def words(tree: ast.AST) -> Iterator[str]:
+    """Every name, attribute, imported name, and short text in a file: getattr needs a text."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.Name(id=word) | ast.Attribute(attr=word) | ast.alias(name=word):
+                yield word
+            case ast.Constant(value=str(word)):
+                yield word
+
+
+def forbidden(source: str) -> list[str]:
+    tree = ast.parse(source)
+    found = [w for w in words(tree) if w.startswith(FORBIDDEN_STARTS) or w in FORBIDDEN]
+    if any(word == "faiss" for word in words(tree)):
+        found += [w for w in words(tree) if w in ("pickle", "cPickle", "dill", "cloudpickle")]
+    return found
+
+
+def files() -> list[Path]:
+    return [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
+
+
+def test_no_file_lets_faiss_or_pickle_parse_an_index() -> None:
+    assert HOME in files()
+    assert {str(p): found for p in files() if (found := forbidden(p.read_text()))} == {}
+
+
+def test_one_file_loads_faiss() -> None:
+    loading = [path for path in files() if "faiss" in set(words(ast.parse(path.read_text())))]
+    assert loading == [HOME]
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import faiss\nfaiss.read_index('x')",
+        "from faiss import read_index_binary as r",
+        "import faiss\ngetattr(faiss, 'deserialize_index')(b'')",
+        "import faiss as f\nf.read_VectorTransform('x')",
+        "import faiss\nimport pickle\npickle.loads(b'')",
+        "import faiss\nfaiss.FileIOReader('x')",
+    ],
+)
+def test_every_way_to_parse_one_is_found(source: str) -> None:
+    assert forbidden(source)

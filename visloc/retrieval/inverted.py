@@ -1,0 +1,264 @@
+"""An inverted file of very many rows, searched by faiss: which rows may be most like a query.
+
+Rows are clustered (Sivic and Zisserman 2003). The list of a cluster holds a code of one bit per
+dimension for each of its rows (RaBitQ, Gao and Long 2024), and the row's number. faiss maps the
+lists from their file and searches them; it never parses a file. Whoever opens an inverted file
+checks its plain arrays first (``visloc.archive.index_files``): faiss's own readers, which would
+parse what strangers wrote, are not used (docs/decisions/0034-the-index-is-faiss.md).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visloc.retrieval.products import dot_products
+
+_ITERATIONS = 10
+_SAMPLES_PER_LIST = 50
+# Of a centre's length, also where all of its rows went elsewhere.
+_LEAST_ALIKE = 0.05
+_BLOCK_ROWS = 4096
+# Codes are whole words of so many bits, so that the numbers behind them are aligned.
+_WORD_BITS = 64
+ID_BYTES, FACTOR_BYTES = 8, 8
+# Bits in which a query is rounded for the comparison with codes.
+_QUERY_BITS = 8
+
+
+class Rows(Protocol):
+    """Unit rows (n, D) that are read in parts: an array, or the stored rows of a map."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, rows: Any, /) -> NDArray[np.float32]: ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MadeLists:
+    """The lists of an inverted file, to be written.
+
+    Attributes:
+        sizes: (C,) int64 rows of each list.
+        codes: (n, B) uint8, list by list.
+        ids: (n,) int64 numbers of the rows, list by list.
+    """
+
+    sizes: NDArray[np.int64]
+    codes: NDArray[np.uint8]
+    ids: NDArray[np.int64]
+
+
+class InvertedFile:
+    """An inverted file that is open for queries; its lists stay mapped from their file.
+
+    Args:
+        centers: (C, D') float32, one row for each list; D' is ``width_of(D)``.
+        sizes: (C,) int64, rows of each list.
+        lists: the file: for each list its codes, then the numbers of its rows as int64.
+    """
+
+    __slots__ = ("_coarse", "_index", "_lengths", "centers", "num_rows", "path", "sizes")
+
+    def __init__(self, centers: NDArray[np.float32], sizes: NDArray[np.int64], lists: Path) -> None:
+        faiss = _faiss()
+        count, width = centers.shape
+        self.sizes, self.path = sizes, lists
+        self.num_rows = int(sizes.sum())
+        self._coarse = _coarse(centers)
+        self._index = _index(self._coarse, count)
+        # The copy that faiss has.
+        self.centers = faiss.rev_swig_ptr(self._coarse.get_xb(), count * width).reshape(-1, width)
+        self._lengths = _lengths(self.centers)
+        mapped = faiss.OnDiskInvertedLists()
+        mapped.nlist, mapped.code_size = count, self._index.code_size
+        mapped.totsize = self.num_rows * row_bytes(width)
+        mapped.filename, mapped.read_only = str(lists), True
+        mapped.prefetch_nthread = 0  # it would start threads
+        mapped.lists.resize(count)
+        counts = sizes.astype(np.uint64)  # kept until faiss has copied it
+        mapped.set_all_lists_sizes(faiss.swig_ptr(counts))
+        if self.num_rows:
+            mapped.do_mmap()
+        self._index.replace_invlists(mapped, False)
+        self._index.referenced_objects = (self._coarse, mapped)
+        self._index.ntotal = self.num_rows
+
+    @property
+    def error(self) -> float:
+        """Three standard deviations of a rough cosine; theorem 3.2 of Gao and Long 2024."""
+        return 3.0 * math.sqrt((math.pi / 2 - 1) / self.centers.shape[1])
+
+    def nearest_lists(
+        self, query: NDArray[np.float32], count: int, among: NDArray[np.int64] | None = None
+    ) -> NDArray[np.int64]:
+        """The lists (k,) whose centres have the largest cosines to a query, at most ``count``.
+
+        Args:
+            query: unit vector (D,).
+            count: at least 1.
+            among: (m,) the lists that are considered; None for all.
+        """
+        cosines = dot_products(self.centers, self._widened(query[None])[0], among)
+        cosines /= self._lengths if among is None else self._lengths[among]
+        best = np.arange(len(cosines))
+        if count < len(cosines):
+            best = np.argpartition(-cosines, count)[:count]
+        return best if among is None else among[best]
+
+    def nearest(
+        self,
+        query: NDArray[np.float32],
+        count: int,
+        lists: NDArray[np.int64],
+        allowed: NDArray[np.bool_] | None = None,
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Rows that are most like a query by their codes, best first, and their rough cosines.
+
+        Numbers of rows are in range whatever the file holds, but one may come twice where the file
+        says so.
+
+        Args:
+            query: unit vector (D,).
+            count: number of rows; fewer come if the lists have fewer.
+            lists: the lists that are searched.
+            allowed: (n,) the rows that may come; None for all.
+        """
+        faiss = _faiss()
+        wide = self._widened(query[None])
+        found = np.empty(min(count, self.num_rows), np.int64)
+        cosines = np.empty(len(found), np.float32)
+        if not len(found) or not len(lists):
+            return found[:0], cosines[:0]
+        chosen = faiss.IVFRaBitQSearchParameters()
+        chosen.nprobe, chosen.qb = len(lists), _QUERY_BITS
+        if allowed is not None:
+            bits = np.packbits(allowed, bitorder="little")
+            selector = faiss.IDSelectorBitmap(len(bits), faiss.swig_ptr(bits))
+            chosen.sel = selector
+        probed = np.ascontiguousarray(lists, np.int64)
+        distances = np.zeros(len(probed), np.float32)  # RaBitQ reads the centres instead
+        arrays = (probed, distances, cosines, found)
+        self._index.search_preassigned_c(
+            1, faiss.swig_ptr(wide), len(found), *map(faiss.swig_ptr, arrays), False, chosen
+        )
+        good = (found >= 0) & (found < self.num_rows)
+        return found[good], cosines[good]
+
+    def _widened(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        return _widened(rows, self.centers.shape[1])
+
+
+def width_of(dim: int) -> int:
+    """Dimensions of centres and codes of rows of ``dim`` dimensions; those added are zero."""
+    return -(-dim // _WORD_BITS) * _WORD_BITS
+
+
+def row_bytes(width: int) -> int:
+    """Bytes of one row in the lists: a bit for each dimension, two float32, and its number."""
+    return width // 8 + FACTOR_BYTES + ID_BYTES
+
+
+def make_centers(rows: Rows, count: int, seed: int = 0) -> NDArray[np.float32]:
+    """Cluster unit rows (n, D) by spherical k-means on a sample; return (C, D') centres.
+
+    A centre is as long as its rows are like it on average, as their mean is. Codes describe what
+    rows differ by from it, which is then as little as possible.
+    """
+    faiss = _faiss()
+    num = len(rows)
+    random = np.random.default_rng(seed)
+    chosen = np.sort(random.choice(num, min(num, _SAMPLES_PER_LIST * count), replace=False))
+    sample = np.asarray(rows[chosen], np.float32)
+    sample = _widened(sample, width_of(sample.shape[1]))
+    means = faiss.Kmeans(
+        sample.shape[1],
+        min(num, count),
+        niter=_ITERATIONS,
+        seed=seed,
+        spherical=True,
+        min_points_per_centroid=1,
+        max_points_per_centroid=_SAMPLES_PER_LIST,
+    )
+    means.train(sample)
+    cosines, nearest = means.assign(sample)
+    counts = np.bincount(nearest, minlength=means.k)
+    alike = np.bincount(nearest, cosines, means.k) / np.maximum(counts, 1)
+    return np.asarray(means.centroids * np.clip(alike, _LEAST_ALIKE, 1)[:, None], np.float32)
+
+
+def make_lists(rows: Rows, centers: NDArray[np.float32]) -> MadeLists:
+    """Put unit rows (n, D) into the lists of the centres (C, D') that they are most like."""
+    coarse = _coarse(centers / _lengths(centers)[:, None])
+    described = _coarse(centers)
+    index = _index(described, len(centers))
+    num, width = len(rows), centers.shape[1]
+    nearest = np.empty(num, np.int64)
+    codes = np.empty((num, index.code_size), np.uint8)
+    faiss = _faiss()
+    for start in range(0, num, _BLOCK_ROWS):
+        block = slice(start, start + _BLOCK_ROWS)
+        some = _widened(np.asarray(rows[block], np.float32), width)
+        found = np.ascontiguousarray(coarse.assign(some, 1).ravel())
+        index.encode_vectors(
+            len(some), faiss.swig_ptr(some), faiss.swig_ptr(found), faiss.swig_ptr(codes[block])
+        )
+        nearest[block] = found
+    order = np.argsort(nearest, kind="stable")
+    sizes = np.bincount(nearest, minlength=len(centers)).astype(np.int64)
+    return MadeLists(sizes, codes[order], order.astype(np.int64))
+
+
+def bytes_of(lists: Iterable[MadeLists]) -> Iterator[bytes]:
+    """The content of the file of the lists; ids are numbered on from one part to the next."""
+    before = 0
+    for made in lists:
+        ends = np.cumsum(made.sizes)
+        for start, stop in zip((ends - made.sizes).tolist(), ends.tolist(), strict=True):
+            yield made.codes[start:stop].tobytes()
+            yield (made.ids[start:stop] + before).astype("<i8").tobytes()
+        before += len(made.ids)
+
+
+def num_lists(num_rows: int) -> int:
+    """So many that the comparison of the centres takes as long as that of a few lists."""
+    return min(num_rows, round(2.0 * math.sqrt(num_rows)))
+
+
+def _widened(rows: NDArray[np.float32], width: int) -> NDArray[np.float32]:
+    wide = np.zeros((len(rows), width), np.float32)
+    wide[:, : rows.shape[1]] = rows
+    return wide
+
+
+def _lengths(centers: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(np.maximum(np.linalg.norm(centers, axis=1), _LEAST_ALIKE))
+
+
+def _coarse(centers: NDArray[np.float32]) -> Any:
+    coarse = _faiss().IndexFlatIP(centers.shape[1])
+    coarse.add(np.ascontiguousarray(centers, np.float32))
+    return coarse
+
+
+def _index(coarse: Any, count: int) -> Any:
+    faiss = _faiss()
+    index = faiss.IndexIVFRaBitQ(coarse, coarse.d, count, faiss.METRIC_INNER_PRODUCT, False)
+    if index.code_size != row_bytes(coarse.d) - ID_BYTES:
+        raise AssertionError(f"this faiss writes codes of {index.code_size} bytes")
+    index.is_trained = True
+    return index
+
+
+def _faiss() -> Any:
+    """Load faiss, with one thread: builds must not depend on the number of processors."""
+    import faiss  # maps without an inverted file do not need it
+
+    faiss.omp_set_num_threads(1)
+    return faiss
