@@ -60,10 +60,9 @@ class TileRecord(Record):
         photo_extent: bounding box of the photos' centres, along the set's axes.
         reach: median distance from its photos to the landmarks that they see.
         mistaken_for: refs of the tiles that the set would search, without this one, for more than
-            a few of this tile's own photos. Sets of format 1.0 do not say.
+            a few of this tile's own photos.
         misses_own_photos: whether more than a few of its own photos were not found where they are
-            by its own test: doubtful answers are usual there. False where no test says, as in sets
-            before format 1.2.
+            by its own test: doubtful answers are usual there. False where no test says.
     """
 
     map: Annotated[str, Field(pattern=rf"^{ID_PATTERN.pattern}$")]
