@@ -61,7 +61,12 @@ _NOTABLE_FACTOR = 1.15
 
 
 def camera_contradiction(
-    view: MatchedView, source: CameraSource, rig_from_world: Pose, max_error_px: float
+    view: MatchedView,
+    source: CameraSource,
+    rig_from_world: Pose,
+    max_error_px: float,
+    *,
+    reduced: float = 1.0,
 ) -> str | None:
     """Say how the matches of a view contradict its camera, and what may be the cause.
 
@@ -70,12 +75,13 @@ def camera_contradiction(
         source: of the camera.
         rig_from_world: the best pose with it.
         max_error_px: largest reprojection error of an inlier.
+        reduced: how many pixels of the photo, as it was sent, a side of the view's pixel spans.
 
     Returns:
         None where they do not, or are too few to tell.
     """
     found = _contradicting(view, source, rig_from_world, max_error_px)
-    return None if found is None else _described(view.camera, source, found)
+    return None if found is None else _described(view.camera.reduced(1 / reduced), source, found)
 
 
 def only_focal_length_contradicts(

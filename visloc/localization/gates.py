@@ -56,6 +56,7 @@ class Problem:
         views: of the images, relative to the map's origin.
         sources: where the camera of each view came from.
         shown: all that each image shows; () or None where a pose shall not be compared with it.
+        reduced: how many pixels of each image, as it was sent, a side of a view's pixel spans.
     """
 
     views: tuple[MatchedView, ...]
@@ -63,6 +64,7 @@ class Problem:
     options: LocalizeOptions
     constraints: Constraints
     shown: tuple[Shown | None, ...] = ()
+    reduced: tuple[float, ...] = ()
 
     @property
     def registration(self) -> RegistrationPreset:
@@ -237,10 +239,13 @@ def cameras_agree(problem: Problem, pose: GeneralizedPose) -> Refusal | None:
     Each camera is looked at on its own, so that wrong ``cam_from_rig`` accuse no camera.
     """
     max_error_px = problem.registration.max_error_px
-    for view, source in zip(problem.views, problem.sources, strict=True):
+    sizes = problem.reduced or (1.0,) * len(problem.views)
+    for view, source, reduced in zip(problem.views, problem.sources, sizes, strict=True):
         if pose.camera is not None:
             view, source = replace(view, camera=pose.camera), CameraSource.ESTIMATED
-        contradiction = camera_contradiction(view, source, pose.rig_from_world, max_error_px)
+        contradiction = camera_contradiction(
+            view, source, pose.rig_from_world, max_error_px, reduced=reduced
+        )
         if contradiction is not None:
             return _refused(Reason.CAMERA_CONTRADICTED, contradiction)
     return None

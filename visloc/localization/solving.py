@@ -169,7 +169,14 @@ def solve_instant(
     with timed(seconds, "pose"):
         problem, found, refusal = _find_pose(
             images,
-            Problem(views, _sources_of(images), options, constraints, _shown_in(images, options)),
+            Problem(
+                views,
+                _sources_of(images),
+                options,
+                constraints,
+                _shown_in(images, options),
+                tuple(look.reduced for look in looks),
+            ),
         )
         if refusal is None or refusal.reason is not Reason.CONTRADICTS_PRIOR:
             elsewhere = _views_of(images, [look.elsewhere for look in looks], options)
