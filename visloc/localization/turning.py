@@ -112,8 +112,7 @@ class TurnFinder:
             counts[turned] = clear(turned)
             if counts[turned] >= _SURELY_CLEAR:
                 break
-        promises = _promises(counts, _TIMES_BY_CHANCE)
-        return max(counts, key=lambda turned: counts[turned]) if promises else 0
+        return turn_that_promises(counts)
 
     def _clear_matches(
         self, local: LocalFeatures, rgb: NDArray[np.uint8], constraints: Constraints
@@ -135,10 +134,21 @@ class TurnFinder:
         return int(np.bincount(pairs.ranks, minlength=1).max())
 
 
+def turn_that_promises(counts: Mapping[int, int]) -> int:
+    """Return the turn that is worth a second try; 0 when none is.
+
+    Args:
+        counts: clear matches by turn, also of the photo as it was (0).
+    """
+    promises = _promises(counts, _TIMES_BY_CHANCE)
+    return max(counts, key=lambda turned: counts[turned]) if promises else 0
+
+
 def _promises(counts: Mapping[int, int], times: float) -> bool:
     """Tell whether the best turn has so many times as many clear matches as come by chance."""
-    # Most turns show nothing of the map, so that half of them have what comes by chance.
-    by_chance = sorted(counts.values())[(len(counts) - 1) // 2]
+    # Most turns show nothing of the map, so that half of them have what comes by chance. Fewer than
+    # all were looked at when one was surely clear: that one is not part of the half.
+    by_chance = sorted(counts.values())[max(0, len(counts) // 2 - 1)]
     return max(counts.values()) >= max(_LEAST_CLEAR, times * by_chance)
 
 
