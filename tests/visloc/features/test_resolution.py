@@ -66,6 +66,8 @@ def test_what_a_network_shrinks_alike_is_reduced_to_the_maps_size() -> None:
     phone = of(film(4000, 3000.0))
     assert phone.feature_size(film(4000, 3000.0), 4000, 3000) is None
     assert phone.feature_size(film(8000, 6000.0), 8000, 6000) == (4000, 3000)
+    # A turned picture is made beside the photo, and askew a long one has many times its pixels.
+    assert phone.feature_size(film(4000, 3000.0), 4000, 3000, turned=45) == (1333, 1000)
     assert phone.finer(film(8000, 6000.0)) == pytest.approx(2.0)
     # What the network saw of the map's photos is as fine as this photo.
     assert phone.feature_size(film(1280, 960.0), 1280, 960) is None
