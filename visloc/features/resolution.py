@@ -123,9 +123,11 @@ class WorkingResolution:
         """Return by how much a photo is to be reduced to have pixels like those of mapping photos.
 
         Thresholds in pixels mean the same in the reduced photo as in them. 1 for photos that are
-        not finer; their own pixels are the larger ones.
+        not finer; their own pixels are the larger ones. In a photo of a few pixels, all matches
+        would agree with any pose.
         """
-        finer = photo.over(self.stored)
+        least = min(_LEAST_LONG_SIDE_PX, photo.long_side, self.stored.long_side)
+        finer = min(photo.over(self.stored), photo.long_side / least)
         return _whole(finer) if finer > _ALIKE else 1.0
 
 
