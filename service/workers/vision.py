@@ -45,6 +45,7 @@ from visloc.images import ImageLimits, Photo
 from visloc.localization.constraints import MapGeometry
 from visloc.localization.localizer import Localizer
 from visloc.localization.solving import Look, SeenImage, Solved
+from visloc.localization.turning import is_worth_turning
 from visloc.options import LocalizeOptions
 from visloc.priors import Priors
 from visloc.types import InstantAnswer
@@ -122,11 +123,14 @@ class Vision:
             if seen[-1].error is not None:
                 raise seen[-1].error
         row, best, solved = self._solve(job, targets, [(one,) for one in seen])
+        began = perf_counter()
         turned = self._turned(job, targets, decoded, seen, best.answer)
         if turned is not None:
-            again = self._solve(job, targets, [(one,) for one in turned])
-            if again[1].answer.pose is not None:
+            again = self._solve(job, targets, [(one,) for one in turned]) if turned else None
+            if again is not None and again[1].answer.pose is not None:
                 seen, (row, best, solved) = turned, again
+            else:
+                best = _with_seconds(best, {"turns": perf_counter() - began})
         look = seen[row].look
         if not job.debug or look is None or not isinstance(decoded.query, Photo):
             return best
@@ -142,26 +146,39 @@ class Vision:
         seen: Sequence[SeenImage],
         answer: InstantAnswer,
     ) -> list[SeenImage] | None:
-        """Look at a refused photo again, turned as each map seems to know it; None if none does."""
+        """Look at a refused photo again, turned as each map seems to know it.
+
+        Returns:
+            What each map shows of it, empty when no turn promises more; None when other turns were
+            not looked at.
+        """
         photo, refusal = decoded.query, answer.refusal
         if refusal is None or not isinstance(photo, Photo):
             return None
+        if not is_worth_turning(refusal.reason, job.options):
+            return None
         (image,), again, any_turned = job.images, list[SeenImage](), False
-        began = perf_counter()
         for target, one in zip(targets, seen, strict=True):
-            self._step()
+            began = perf_counter()
             turns, look = target.localizer.turns, one.look
             assert turns is not None  # the photo was looked at
             assert look is not None
             turned = turns.find(
-                photo, look.evidence, refusal.reason, job.options, job.priors, decoded.found
+                photo,
+                look.evidence,
+                refusal.reason,
+                job.options,
+                job.priors,
+                decoded.found,
+                self._step,
             )
             seconds = {**look.evidence.seconds, "turns": perf_counter() - began}
             if turned:
+                self._step()
                 any_turned = True
                 one = target.look(image, decoded, job.options, job.priors, seconds, turned)
             again.append(one)
-        return again if any_turned else None
+        return again if any_turned else []
 
     def check_rig(self, job: RigJob, maps: Sequence[MapFolder]) -> None:
         """Refuse a rig's images, which come without their photos, or options that do not fit."""
@@ -338,6 +355,11 @@ def _by_map(looks: Sequence[PackedLooks], num_maps: int) -> list[tuple[SeenImage
     """Return the looks of an instant's images by map; only ``look_at_image`` pickled them."""
     images: list[list[SeenImage]] = [pickle.loads(each) for each in looks]
     return [tuple(image[i] for image in images) for i in range(num_maps)]
+
+
+def _with_seconds(found: Localization, more: Mapping[str, float]) -> Localization:
+    answer = found.answer
+    return replace(found, answer=replace(answer, seconds=summed(answer.seconds, more)))
 
 
 def _picture(

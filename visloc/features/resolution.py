@@ -87,13 +87,16 @@ class WorkingResolution:
         seen = [photo.shrunk_to(most_px) for photo in photos]
         return WorkingResolution(_finer(photos), _finer(seen), most_px)
 
-    def feature_size(self, photo: Resolution, width: int, height: int) -> tuple[int, int] | None:
+    def feature_size(
+        self, photo: Resolution, width: int, height: int, turned: int = 0
+    ) -> tuple[int, int] | None:
         """Return the width and height at which the features of a photo are to be found.
 
         Args:
             photo: how finely it sees.
             width: of the photo as stored, pixels.
             height: of the photo as stored, pixels.
+            turned: degrees by which it is turned then.
 
         Returns:
             None for its own size.
@@ -109,6 +112,9 @@ class WorkingResolution:
                 most = min(most, self.most_px)
             least = min(_LEAST_LONG_SIDE_PX, seen.long_side, self.seen.long_side)
             scale = min(max(seen.long_side / finer, least), most) / long_side
+        if turned != 0 and self.most_px is not None:
+            # Askew, a long narrow photo fills a picture of many times its pixels.
+            scale = min(scale, self.most_px / long_side)
         scale = 1 / _whole(1 / scale)
         size = max(1, round(width * scale)), max(1, round(height * scale))
         return None if size == (width, height) else size
@@ -117,9 +123,11 @@ class WorkingResolution:
         """Return by how much a photo is to be reduced to have pixels like those of mapping photos.
 
         Thresholds in pixels mean the same in the reduced photo as in them. 1 for photos that are
-        not finer; their own pixels are the larger ones.
+        not finer; their own pixels are the larger ones. In a photo of a few pixels, all matches
+        would agree with any pose.
         """
-        finer = photo.over(self.stored)
+        least = min(_LEAST_LONG_SIDE_PX, photo.long_side, self.stored.long_side)
+        finer = min(photo.over(self.stored), photo.long_side / least)
         return _whole(finer) if finer > _ALIKE else 1.0
 
 

@@ -260,7 +260,7 @@ class Localizer:
         resolution, mapped = query_resolution(used, source), self.geometry.resolution
         with timed(seconds, "local_features"):
             most = self.map.manifest.local_features.max_keypoints
-            size = mapped.feature_size(resolution, photo.width, photo.height)
+            size = mapped.feature_size(resolution, photo.width, photo.height, turned)
             framing = Framing(size, turned)
             local, rgb = find_features(photo, self._extractor, most, options, cache, framing)
         reduced = mapped.finer(resolution)

@@ -8,7 +8,8 @@ clear (docs/decisions/0036-turned-cameras.md).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +80,7 @@ class TurnFinder:
         options: LocalizeOptions,
         priors: Priors,
         cache: FeatureCache,
+        step: Callable[[], None] = lambda: None,
     ) -> int:
         """Return the degrees clockwise by which to turn a refused photo; 0 when nothing promises.
 
@@ -89,16 +91,21 @@ class TurnFinder:
             options: those of the query.
             priors: gravity tells the turn, and others exclude mapping photos.
             cache: features of this photo; those of the turns are added.
+            step: called before each look, it may raise to end the search.
         """
-        if options.read_as is not ReadAs.ANY or reason not in _WORTH_TURNING:
+        if not is_worth_turning(reason, options):
             return 0
         constraints = Constraints(self._geometry, priors)
         turns = _turns_by(constraints.gravity, photo)
         resolution = query_resolution(evidence.camera, evidence.camera_source)
-        size = self._geometry.resolution.feature_size(resolution, photo.width, photo.height)
+        seen_as = partial(
+            self._geometry.resolution.feature_size, resolution, photo.width, photo.height
+        )
 
         def clear(turned: int) -> int:
+            step()
             most = self._geometry.opened.manifest.local_features.max_keypoints
+            size = seen_as(turned)
             framing = Framing(size, turned)
             local, rgb = find_features(photo, self._extractor, most, options, cache, framing)
             return self._clear_matches(local.strongest(_NUM_KEYPOINTS), rgb, constraints)
@@ -112,8 +119,7 @@ class TurnFinder:
             counts[turned] = clear(turned)
             if counts[turned] >= _SURELY_CLEAR:
                 break
-        promises = _promises(counts, _TIMES_BY_CHANCE)
-        return max(counts, key=lambda turned: counts[turned]) if promises else 0
+        return turn_that_promises(counts)
 
     def _clear_matches(
         self, local: LocalFeatures, rgb: NDArray[np.uint8], constraints: Constraints
@@ -135,10 +141,26 @@ class TurnFinder:
         return int(np.bincount(pairs.ranks, minlength=1).max())
 
 
+def is_worth_turning(reason: Reason, options: LocalizeOptions) -> bool:
+    """Tell whether a photo that was refused for this reason is to be looked at in other turns."""
+    return options.read_as is ReadAs.ANY and reason in _WORTH_TURNING
+
+
+def turn_that_promises(counts: Mapping[int, int]) -> int:
+    """Return the turn that is worth a second try; 0 when none is.
+
+    Args:
+        counts: clear matches by turn, also of the photo as it was (0).
+    """
+    promises = _promises(counts, _TIMES_BY_CHANCE)
+    return max(counts, key=lambda turned: counts[turned]) if promises else 0
+
+
 def _promises(counts: Mapping[int, int], times: float) -> bool:
     """Tell whether the best turn has so many times as many clear matches as come by chance."""
-    # Most turns show nothing of the map, so that half of them have what comes by chance.
-    by_chance = sorted(counts.values())[(len(counts) - 1) // 2]
+    # Most turns show nothing of the map, so that half of them have what comes by chance. Fewer than
+    # all were looked at when one was surely clear: that one is not part of the half.
+    by_chance = sorted(counts.values())[max(0, len(counts) // 2 - 1)]
     return max(counts.values()) >= max(_LEAST_CLEAR, times * by_chance)
 
 

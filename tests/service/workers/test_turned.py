@@ -8,15 +8,18 @@ from pathlib import Path
 from time import time
 from typing import Protocol
 
+import pytest
+
 from mapping.build.build import build_map
 from mapping.build.settings import BuildSettings
 from service.values import MapFolder, WorkerSettings, photo_job
-from service.workers.vision import Vision
+from service.workers.vision import Abandoned, Vision
 from tests.turning import png, turned_camera, turned_pixels, turned_pose
 from visloc.archive import MapStore
 from visloc.evaluation import pose_error
 from visloc.geometry import Camera, Pose
 from visloc.images import read_photo
+from visloc.localization.turning import TurnFinder
 from visloc.options import Inference, LocalizeOptions, ReadAs
 
 SETTINGS = WorkerSettings(None, 1, 10**9, 8, 8, 10**8, 10**8, Inference.FP32)
@@ -29,7 +32,7 @@ class Query(Protocol):
 
 
 def test_a_photo_of_a_turned_camera_is_found_and_drawn(
-    sample: Path, query: Query, tmp_path: Path
+    sample: Path, query: Query, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = BuildSettings(
         dataset=sample / "mapping",
@@ -62,3 +65,21 @@ def test_a_photo_of_a_turned_camera_is_found_and_drawn(
     alone = process.localize(photo_job(("room",), image, camera, upright), maps, time())
     assert alone.answer.refusal is not None
     assert "turns" not in alone.answer.seconds
+
+    # Where no turn helps, the time they took is stated too; and a caller who leaves ends it.
+    rgb = read_photo(query.image).rgb[:, ::-1]  # a mirrored room is another one
+    mirrored = photo_job(("room",), png(rgb), camera, LocalizeOptions())
+    elsewhere = process.localize(mirrored, maps, time())
+    assert elsewhere.answer.refusal is not None
+    assert elsewhere.answer.seconds["turns"] > 0
+    abandoned = ctypes.c_bool()
+    leaving = Vision(SETTINGS, abandoned)
+    leaving.load(maps[0])
+
+    def leave(*_: object) -> int:
+        abandoned.value = True
+        return 0
+
+    monkeypatch.setattr(TurnFinder, "_clear_matches", leave)
+    with pytest.raises(Abandoned):
+        leaving.localize(mirrored, maps, time())

@@ -18,7 +18,7 @@ from visloc.features import make_local_features
 from visloc.geometry import Camera, Pose
 from visloc.images import Photo, read_photo
 from visloc.localization.localizer import Localizer
-from visloc.localization.turning import TurnFinder
+from visloc.localization.turning import TurnFinder, turn_that_promises
 from visloc.options import LocalizeOptions, ReadAs
 from visloc.priors import GravityPrior, Priors
 from visloc.types import Answer, Localized, NotLocalized
@@ -139,6 +139,15 @@ def test_gravity_tells_the_turn(
     )
     refused(localizer.localize(Photo(rgb), query.camera, OPTIONS, Priors(gravity=upright)))
     assert not asked
+
+
+def test_a_clear_turn_counts_when_the_photo_as_it_was_shows_something_too() -> None:
+    # An upside-down photo of a symmetric room; the last turn is not looked at, as 110 is clear.
+    assert turn_that_promises({0: 60, 90: 3, 180: 110}) == 180
+    assert turn_that_promises({0: 60, 90: 3, 180: 110, 270: 3}) == 180
+    assert turn_that_promises({0: 60, 90: 58, 180: 110, 270: 57}) == 0
+    assert turn_that_promises({0: 110, 90: 3, 180: 60, 270: 3}) == 0
+    assert turn_that_promises({0: 2, 90: 19, 180: 1, 270: 2}) == 0
 
 
 def _must_not(*_: object) -> int:
