@@ -41,7 +41,7 @@ class Licensed:
         version: of constraints.txt; empty for what it does not pin, such as pip itself.
         licence: an SPDX expression, or what the package says where the policy does not know it.
         images: that hold it.
-        bundled: libraries within its wheel that have another licence.
+        bundled: libraries within its wheel that have another licence, as files or linked.
     """
 
     name: str
@@ -92,7 +92,7 @@ def dependencies(rules: Mapping[str, Any]) -> list[Licensed]:
             pins.get(name, ""),
             licence_of(name, rules),
             tuple(image for image, names in images.items() if name in names),
-            bundled_in(name, rules["bundled"]),
+            (*bundled_in(name, rules["bundled"]), *rules["linked"].get(name, ())),
         )
         for name in of_extras(_EXTRAS)
     ]
@@ -115,7 +115,7 @@ def refusals(found: Sequence[Licensed], rules: Mapping[str, Any]) -> list[str]:
         if one.bundled and one.name not in rules["holders"]:
             told.append(f"{one.name} {one.version} holds {', '.join(one.bundled)}")
     names = {one.name for one in found}
-    for table in ("known", "tools", "holders"):
+    for table in ("known", "tools", "linked", "holders"):
         told += [
             f"{name}: the policy knows it, and nothing needs it"
             for name in rules[table].keys() - names

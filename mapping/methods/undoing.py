@@ -39,8 +39,10 @@ def reconstruct_places(
         describe: returns the descriptors (k, D) of a photo's keypoints, all with one scale.
     """
     undone = 0
-    for _ in range(_MOST_MODELS):
+    for left in reversed(range(_MOST_MODELS)):
         model = reconstruct(photos, rigs, matches, config, refine, work, progress)
+        if not left:
+            break
         kept = _without_two_places(photos, describe, matches, model)
         if len(kept) == len(matches):
             break

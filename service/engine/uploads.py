@@ -118,14 +118,15 @@ class Uploads:
         self, folder: Path, map_id: str, version: str, loop: asyncio.AbstractEventLoop
     ) -> None:
         """Unpack, verify, try and publish; in a thread."""
-        packed, target = folder / "packed", folder / map_id / version
+        # Below a folder of their own: a map may be named as the file beside it.
+        packed, target = folder / "packed", folder / "maps" / map_id / version
 
         def accept(manifest: AnyManifest) -> None:
             tried = MapFolder(f"{map_id}@{version}", target, isinstance(manifest, SetManifest))
             asyncio.run_coroutine_threadsafe(self._tried(tried), loop).result()
 
         try:
-            target.parent.mkdir()
+            target.parent.mkdir(parents=True)
             manifest = unpack_map(packed, target, self._max_bytes)
             packed.unlink()
             if (manifest.id, manifest.version) != (map_id, version):

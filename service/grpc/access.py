@@ -83,7 +83,8 @@ class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
                     return await behaviour(messages, context)
             except TimeoutError:
                 over = refuse("request.deadline", "watching ends after a while; call again")
-                await self._refuse(method, over, context)
+                # Every watcher meets it all the time: alerts would take it for missed deadlines.
+                await self._refuse(method, over, context, counted=False)
             finally:
                 self._keyless -= 1
 
@@ -110,14 +111,16 @@ class AccessInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         made: Handler = grpc.stream_stream_rpc_method_handler(refuse)
         return made
 
-    async def _refuse(self, method: str, error: VislocError, context: Context) -> None:
+    async def _refuse(
+        self, method: str, error: VislocError, context: Context, *, counted: bool = True
+    ) -> None:
         forwarded = [
             value
             for name, value in context.invocation_metadata() or ()
             if name == FORWARDED_HEADER and isinstance(value, str)
         ]
         caller = self._access.caller(address_of_grpc(context.peer()), forwarded)
-        await self._envelope.refuse(_name(method), error, context, caller=caller)
+        await self._envelope.refuse(_name(method), error, context, caller=caller, counted=counted)
 
 
 def _name(method: str) -> str:

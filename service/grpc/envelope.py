@@ -76,22 +76,36 @@ class Envelope:
                 await self._refuse(internal_error(), id_, context, record)
 
     async def refuse(
-        self, method: str, error: VislocError, context: Context, *, caller: str | None = None
+        self,
+        method: str,
+        error: VislocError,
+        context: Context,
+        *,
+        caller: str | None = None,
+        counted: bool = True,
     ) -> None:
-        """Answer a call with an error before its method runs.
+        """Answer a call with an error outside of its method.
 
         Args:
             caller: its address, for the log.
+            counted: whether it is one of the errors that metrics count.
         """
         id_ = request_id(None)
         with self._observer.request("grpc", id_, route=method) as record:
             record.peer = caller
-            await self._refuse(error, id_, context, record)
+            await self._refuse(error, id_, context, record, counted=counted)
 
     async def _refuse(
-        self, error: VislocError, id_: str, context: Context, record: RequestRecord
+        self,
+        error: VislocError,
+        id_: str,
+        context: Context,
+        record: RequestRecord,
+        *,
+        counted: bool = True,
     ) -> None:
-        self._observer.error(error)
+        if counted:
+            self._observer.error(error)
         record.status = statuses_of(error)[1].name
         await _abort(error, id_, context)
 

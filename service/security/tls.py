@@ -124,7 +124,7 @@ def _read(files: tuple[Path, Path]) -> _Pair:
         context.load_cert_chain(*files, lambda: b"")
         certificates = [ssl.PEM_cert_to_DER_cert(pem.decode()) for pem in _PEM.findall(contents[0])]
         ends = min(_end_of(certificate) for certificate in certificates)
-    except (ssl.SSLError, ValueError, IndexError) as error:
+    except (OSError, ValueError, IndexError) as error:  # a file may be gone again, too
         raise SettingsError(
             f"tls_cert, tls_key: {files[0]} and {files[1]} are not a certificate chain and its "
             f"private key, both PEM and not encrypted: {error}"

@@ -82,6 +82,7 @@ class Workers:
         self._queue: deque[_Queued] = deque()
         self._changed = asyncio.Condition()
         self._serving: list[asyncio.Task[None]] = []
+        self._closed = False
 
     @property
     def count(self) -> int:
@@ -130,9 +131,11 @@ class Workers:
         A task that has not begun is then dropped; a running one ends at its next step.
 
         Raises:
-            Unavailable: ``server.worker_died``.
+            Unavailable: ``server.worker_died``; ``server.stopping`` after ``close``.
             TimedOut: ``server.deadline`` when it exceeded the limit.
         """
+        if self._closed:  # nobody would ever take it: uploads are verified until then
+            raise stopping_error()
         task: Task[T] = methodcaller(str(method), *args, **kwargs)
         queued = _Queued(task, asyncio.get_running_loop().create_future())
         async with self._changed:
@@ -166,6 +169,7 @@ class Workers:
 
     async def close(self) -> None:
         """End all processes at once; queued and running tasks raise ``server.stopping``."""
+        self._closed = True
         for serving in self._serving:
             serving.cancel()
         if self._serving:

@@ -1,8 +1,11 @@
 from __future__ import annotations
 
 import copy
+from pathlib import Path
 from typing import Any
 
+import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
+import pycolmap
 import pytest
 
 from supply_chain.licences import (
@@ -32,7 +35,17 @@ def test_no_image_holds_more_of_the_gpl_than_the_policy_says() -> None:
     shipped = [one for one in FOUND if one.images]
 
     assert not [one.name for one in shipped if "GPL" in one.licence.replace("LGPL", "")]
-    assert {one.name: one.images for one in shipped if one.bundled} == {"av": ("mapping",)}
+    assert {one.name: one.images for one in shipped if one.bundled} == {
+        "av": ("mapping",),
+        "pycolmap": ("service", "mapping"),
+    }
+
+
+def test_what_is_linked_into_a_wheel_is_there() -> None:
+    (code,) = (Path(pycolmap.__file__).parent).glob("_core*.so")
+    content = code.read_bytes()
+    for module in (b"Supernodal", b"MatrixOps"):
+        assert b"/CHOLMOD/%s/" % module in content
 
 
 def dependency(

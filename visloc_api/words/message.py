@@ -140,10 +140,11 @@ def check_names_once(fields: list[tuple[str, object]]) -> None:
     Raises:
         InvalidInput: ``request.duplicate_field``.
     """
-    names = [name for name, _ in fields]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise refuse("request.duplicate_field", field=twice[:100])
+    seen: set[str] = set()
+    for name, _ in fields:
+        if name in seen:
+            raise refuse("request.duplicate_field", field=name[:_MAX_NAME])
+        seen.add(name)
 
 
 def check_json_values(text: str | bytes, max_values: int, field: str = "") -> None:

@@ -87,3 +87,14 @@ def test_a_hallway_walked_twice_stays_whole(tmp_path: Path) -> None:
     )
     assert all(model.views)
     assert model.undone == 0
+
+
+def test_only_pairs_that_the_model_lacks_count_as_undone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos, descriptors, matches = film(0.25)
+    inputs = {}, matches, CONFIG, (), tmp_path, lambda *_: None
+    monkeypatch.setattr("mapping.methods.undoing._MOST_MODELS", 1)
+    model = reconstruct_places(photos, descriptors.__getitem__, *inputs)
+    assert places_in(model) == {0, 1}
+    assert model.undone == 0

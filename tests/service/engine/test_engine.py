@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from service.engine.engine import Engine
+from service.workers.tasks import Vision
 from tests.service.engine.engines import Query, WithEngine, held_back, job_for, make, run, until
 from visloc.archive import MapStore
 from visloc.errors import InvalidInput, NotFound, Overloaded, TimedOut, Unavailable
@@ -175,3 +176,18 @@ def test_a_worker_that_hangs_is_replaced_and_its_request_is_told(
         assert pid not in engine.workers.pids
 
     with_engine(play)
+
+
+def test_nothing_waits_for_workers_that_have_ended(tmp_path: Path) -> None:
+    """An upload may be verified until then, and would wait for ever."""
+
+    async def play() -> None:
+        engine = make(tmp_path)
+        await engine.start()
+        await engine.close()
+        async with asyncio.timeout(20):
+            await engine.workers.run(Vision.ping)
+
+    with pytest.raises(Unavailable) as caught:
+        asyncio.run(play())
+    assert caught.value.code == "server.stopping"

@@ -32,10 +32,13 @@ from visloc.errors import (
 @pytest.fixture(scope="module")
 def packed(built_maps: Path, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The map ``room`` as its version ``v1``."""
-    folder = tmp_path_factory.mktemp("packed")
+    return packed_as("room", built_maps, tmp_path_factory.mktemp("packed"))
+
+
+def packed_as(map_id: str, built_maps: Path, folder: Path) -> bytes:
     copied = Path(shutil.copytree(MapStore(built_maps).folder("room"), folder / "map"))
     manifest = json.loads((copied / "manifest.json").read_text())
-    manifest.update(version="v1")
+    manifest.update(id=map_id, version="v1")
     manifest["manifest_hash"] = manifest_hash(manifest)
     (copied / "manifest.json").write_text(json_text(manifest))
     pack_map(copied, folder / "map.zip")
@@ -74,6 +77,15 @@ def test_a_version_is_there_in_the_end_and_not_in_use(store: MapStore, packed: b
     assert store.ids() == []
     assert store.open("room@v1").manifest.version == "v1"
     assert all(name.startswith("room/v1/") for name in files_in(store))
+
+
+@pytest.mark.parametrize("name", ["packed", "map", "maps"])
+def test_no_name_is_in_the_way_of_the_upload(
+    name: str, store: MapStore, built_maps: Path, tmp_path: Path
+) -> None:
+    content = packed_as(name, built_maps, tmp_path)
+    asyncio.run(Uploads(store, 10**9, usable).publish(name, "v1", chunks_of(content)))
+    assert store.versions(name) == ["v1"]
 
 
 def test_nothing_is_taken_of_a_version_that_exists(store: MapStore, packed: bytes) -> None:

@@ -304,6 +304,19 @@ def test_who_watches_health_leaves_room_for_others(serve: Any, tmp_path: Any) ->
             watch.cancel()
 
 
+def test_the_end_of_watching_health_is_told_and_no_failure(
+    serve: Any, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.grpc.access._KEYLESS_S", 0.1)
+    with serve(tmp_path, load=False) as doors:
+        watch = health_pb2_grpc.HealthStub(doors.channel).Watch(health_pb2.HealthCheckRequest())
+        with pytest.raises(grpc.RpcError) as caught:
+            list(watch)
+        info_of(caught.value, grpc.StatusCode.DEADLINE_EXCEEDED, "request.deadline")
+        metrics = doors.server.observer.metrics
+        assert value_of(metrics, 'visloc_errors_total{code="request.deadline"') == 0
+
+
 def test_what_breaks_inside_is_internal_without_its_insides(
     doors: Any, query: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -410,3 +410,22 @@ def test_readiness_names_maps_only_to_a_key_that_may_read(
 def test_a_service_that_would_be_open_to_others_does_not_start(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"^keys_file: needed"):
         Server(ServiceSettings(maps_dir=str(tmp_path), host="0.0.0.0", http_port=0, grpc_port=0))
+
+
+def test_a_file_that_vanishes_while_it_is_read_leaves_the_certificate_in_use(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chain, key = make_certificate(tmp_path)
+    certificate = Certificate(chain, key)
+    before = certificate.context
+    make_certificate(tmp_path)
+    read = Path.read_bytes
+
+    def read_then_removed(path: Path) -> bytes:
+        content = read(path)
+        if path == key:
+            path.unlink()
+        return content
+
+    monkeypatch.setattr(Path, "read_bytes", read_then_removed)
+    assert certificate.context is before

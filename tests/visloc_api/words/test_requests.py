@@ -28,7 +28,7 @@ from visloc.options import LocalizeOptions as CoreOptions
 from visloc.priors import GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
 from visloc.sequences.filling import TimeUnit
 from visloc_api.v1 import localization_pb2 as pb2
-from visloc_api.words.message import IncomingMessage
+from visloc_api.words.message import IncomingMessage, check_names_once
 from visloc_api.words.options import LocalizeOptions
 from visloc_api.words.photo import LocalizeRequest
 from visloc_api.words.rigs import BatchLimits, LocalizeRigRequest
@@ -158,6 +158,27 @@ def test_a_part_made_in_python_is_refused_with_its_place_in_the_whole() -> None:
     with pytest.raises(InvalidInput) as caught:
         LocalizeRigRequest(**raw)  # type: ignore[arg-type]
     assert caught.value.field == "images[1].camera.model"
+
+
+def test_a_name_is_found_twice_without_comparing_all_with_all() -> None:
+    """A request may have 100 000 names."""
+    compared = 0
+
+    class Name(str):
+        __slots__ = ()
+        __hash__ = str.__hash__
+
+        def __eq__(self, other: object) -> bool:
+            nonlocal compared
+            compared += 1
+            return str.__eq__(self, other)
+
+    fields: list[tuple[str, object]] = [(Name(f"n{i}"), i) for i in range(300)]
+    check_names_once(fields)
+    with pytest.raises(InvalidInput) as caught:
+        check_names_once([*fields, (Name("n299"), 0)])
+    assert (caught.value.code, caught.value.field) == ("request.duplicate_field", "n299")
+    assert compared <= 2 * len(fields)
 
 
 @pytest.mark.parametrize(
