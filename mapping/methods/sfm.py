@@ -7,6 +7,7 @@ also for photos without poses.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -31,6 +32,7 @@ from mapping.stages.context import BuildContext
 from mapping.stages.landmarks import MadeLandmarks, View, assemble_landmarks
 from mapping.stages.photos import MappingPhoto, some
 from visloc.archive import Anchor, GlobalFeatures
+from visloc.errors import InvalidInput
 from visloc.geometry import Pose, Similarity
 from visloc.kapture import Dataset
 
@@ -73,8 +75,9 @@ def landmarks_from_matches(
     if (found := with_found_cameras(photos, model)) is not None:
         matches, matches_key = match_pairs(context, found, pairs.rows, verification)
         begun = [replace(p, camera=new.camera) for p, new in zip(photos, found, strict=True)]
-        again = make_model(context, begun, rigs, matches, matches_key, settings)
-        model = min(again, model, key=lambda each: each.views.count(None))
+        with suppress(InvalidInput):  # a second look that finds nothing takes nothing away
+            again = make_model(context, begun, rigs, matches, matches_key, settings)
+            model = min(again, model, key=lambda each: each.views.count(None))
     names = names_by_sensor((photo.record.sensor_id, photo.name) for photo in photos)
     origins = {
         sensor: origin_of(dataset.sensors[sensor], model.doubts.get(sensor)) for sensor in names
@@ -98,7 +101,8 @@ def with_found_cameras(
     find one.
 
     Returns:
-        None when all photos have a place, or nothing was learnt of any camera.
+        None when all photos have a place, or lack one because they show another place that looks
+        alike, or nothing was learnt of any camera.
     """
     learnt = {
         photo.record.sensor_id: view.camera
@@ -106,7 +110,7 @@ def with_found_cameras(
         if view is not None and not photo.camera_known
     }
     usable = learnt.keys() - model.doubts.keys()
-    if not usable or None not in model.views:
+    if not usable or model.undone or None not in model.views:
         return None
     return [
         replace(photo, camera=learnt[sensor], camera_known=True)

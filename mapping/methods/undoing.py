@@ -16,6 +16,7 @@ from mapping.methods.sparse_model import MapperConfig, SfmPhoto, SparseModel
 from mapping.methods.triangulation import reconstruct
 from mapping.progress import Progress
 from mapping.stages.landmarks import rows_by_value
+from visloc.errors import InvalidInput
 
 # Models that are made: what is wrong after the last stays, and the map's own test tells.
 _MOST_MODELS = 4
@@ -38,14 +39,16 @@ def reconstruct_places(
     Args:
         describe: returns the descriptors (k, D) of a photo's keypoints, all with one scale.
     """
+    model = reconstruct(photos, rigs, matches, config, refine, work, progress)
     undone = 0
-    for left in reversed(range(_MOST_MODELS)):
-        model = reconstruct(photos, rigs, matches, config, refine, work, progress)
-        if not left:
-            break
+    for _ in range(_MOST_MODELS - 1):
         kept = _without_two_places(photos, describe, matches, model)
         if len(kept) == len(matches):
             break
+        try:
+            model = reconstruct(photos, rigs, kept, config, refine, work, progress)
+        except InvalidInput:
+            break  # too little is left; the map's own test tells that it shows two places
         undone += len(matches) - len(kept)
         matches = kept
     return replace(model, undone=undone)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mapping.methods import undoing
 from mapping.methods.matching import Matches
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
 from mapping.methods.triangulation import reconstruct
 from mapping.methods.undoing import reconstruct_places
+from visloc.errors import refuse
 from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import project
 
@@ -97,4 +100,25 @@ def test_only_pairs_that_the_model_lacks_count_as_undone(
     monkeypatch.setattr("mapping.methods.undoing._MOST_MODELS", 1)
     model = reconstruct_places(photos, descriptors.__getitem__, *inputs)
     assert places_in(model) == {0, 1}
+    assert model.undone == 0
+
+
+def test_a_model_that_cannot_be_parted_stays(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Its own test tells that it shows two places; nothing at all would tell less."""
+    photos, descriptors, matches = film(0.25)
+    made: list[SparseModel] = []
+
+    def once(*arguments: Any) -> SparseModel:
+        if made:
+            raise refuse("sfm.no_model")
+        made.append(reconstruct(*arguments))
+        return made[0]
+
+    monkeypatch.setattr(undoing, "reconstruct", once)
+    model = reconstruct_places(
+        photos, descriptors.__getitem__, {}, matches, CONFIG, (), tmp_path, lambda *_: None
+    )
+    assert model.views == made[0].views
     assert model.undone == 0
