@@ -21,7 +21,10 @@ _MAX_ALLOWED_EXACT = 2000
 # Photos that each descriptor proposes, and lists that it searches (docs/performance.md).
 _MIN_PROPOSED, _PROPOSED_PER_RESULT = 200, 10
 _LISTS = 50
-# Where proposals do not stand out, all codes of so many photos are compared, and these rows.
+# No cosine, and no limit of one that codes tell, is so large.
+_ABOVE_ALL = 2.0
+# Where proposals do not stand out among at most so many photos, the codes of all are compared; of
+# the best by these, so many rows and this share.
 _MAX_DOUBTFUL, _DOUBTFUL_ROWS, _DOUBTFUL_SHARE = 50_000, 2000, 0.1
 
 
@@ -123,9 +126,10 @@ def _proposed(
         )
         best = largest(rough, count)
         photos.append(found[best])
-        limits[name] = 1.0 if len(best) < count else float(rough[best].min()) + file.error
-    enough = left > _MAX_DOUBTFUL and max(limits.values()) < 1.0
-    return np.unique(np.concatenate(photos)), {} if enough else limits
+        enough = len(best) == count
+        limits[name] = float(rough[best].min()) + file.error if enough else _ABOVE_ALL
+    sure = left > _MAX_DOUBTFUL and _ABOVE_ALL not in limits.values()
+    return np.unique(np.concatenate(photos)), {} if sure else limits
 
 
 def _stand_out(
@@ -153,7 +157,7 @@ def _best_by_codes(
     for name, file in _inverted(index).items():
         photos, cosines = file.rough_cosines(query[name], np.arange(len(file.sizes)), allowed)
         rough[name] = np.full(len(allowed), -1.0)
-        rough[name][photos] = np.clip(cosines, -1, 1)
+        rough[name][photos] = cosines
     left = np.flatnonzero(allowed)
     scores = fusion.scores({name: row[left] for name, row in rough.items()})
     count = _DOUBTFUL_ROWS + math.ceil(_DOUBTFUL_SHARE * len(left))

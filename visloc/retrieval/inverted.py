@@ -119,7 +119,7 @@ class InvertedFile:
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Compare a query with the codes of some lists; return rows (m,) and cosines (m,).
 
-        They come in no order. Numbers of rows are in range whatever the file holds, but one may
+        They come in no order. Rows and cosines are in range whatever the file holds, but a row may
         come twice where the file says so.
 
         Args:
@@ -144,7 +144,7 @@ class InvertedFile:
         num = int(faiss.rev_swig_ptr(found.lims, 2)[1])
         rows, cosines = (faiss.rev_swig_ptr(a, num) for a in (found.labels, found.distances))
         good = (rows >= 0) & (rows < self.num_rows)
-        return rows[good], cosines[good]  # copies: faiss frees what it found
+        return rows[good], np.clip(cosines[good], -1, 1)  # copies: faiss frees what it found
 
 
 def largest(values: NDArray[np.floating], count: int) -> NDArray[np.int64]:

@@ -196,7 +196,7 @@ def _score(
         allowed[coarse.offsets[tile] + left_out] = False
     _, cosines = inverted.rough_cosines(query, _lists_of(coarse, np.array([tile])), allowed)
     best = cosines[largest(cosines, _NUM_BEST)]
-    return float(np.clip(best, -1, 1).mean()) if len(best) else -1.0
+    return float(best.mean()) if len(best) else -1.0
 
 
 def _lists_of(coarse: CoarseIndex, tiles: NDArray[np.int64]) -> NDArray[np.int64]:
