@@ -28,7 +28,7 @@ from benchmarks.generated_tiles import generated_model
 from visloc.archive import Map, MapStore
 from visloc.features.descriptors.whitening import WHITENING_MAX_DIMS
 from visloc.kapture import read_dataset
-from visloc.sets.coarse import describe
+from visloc.sets.coarse import described, descriptors_of
 
 _STAGE = re.compile(r"^\s*(\S.*?)\s+(\d+)?\s+([\d.]+)\s+([\d.]+)\s+([\d.]+)\s*$")
 
@@ -245,7 +245,7 @@ def measured(
     word_dim = opened.manifest.local_features.descriptor_dim
     model = generated_model(dims, word_dim=word_dim)
     started = time.process_time()
-    describe(opened, model)
+    described(descriptors_of(opened, model), model)
     described_s = time.process_time() - started
     searched = tiles["without a prior"]
     large = "Maps at scale"

@@ -29,8 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.tile_similarities import NAMES, centroids_of, quantiles
+from mapping.maps.coarse_model import random_rotation
 from visloc.features.descriptors.whitening import unit_rows
-from visloc.sets.coarse import CoarseModel, described, random_rotation
+from visloc.sets.coarse import CoarseModel, described
 
 SIMILARITIES = Path(__file__).parent / "tile_similarities.json"
 PASSES = 8

@@ -35,6 +35,7 @@ import typer
 from numpy.typing import NDArray
 
 from benchmarks.retrieval import shared_landmarks
+from mapping.maps.coarse_model import learn_of_words
 from visloc.archive import Map, MapStore
 from visloc.features import LocalFeatureExtractor, make_local_features
 from visloc.features.descriptors.whitening import unit_rows
@@ -47,7 +48,6 @@ from visloc.sets.coarse import (
     described,
     descriptor_of,
     descriptors_of,
-    learn_of_words,
 )
 
 LEVELS = (0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 0.9999)

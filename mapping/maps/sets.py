@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mapping.maps.coarse_model import learn
 from mapping.maps.editing import moved_anchor
 from mapping.maps.mistaken import mistaken_for
 from mapping.own_test.verdict import misses_own_photos
@@ -43,7 +44,13 @@ from visloc.geodesy import ecef_from_geodetic, geodetic_from_enu
 from visloc.geometry import Similarity
 from visloc.localization.constraints import MapGeometry
 from visloc.priors import MAX_TILES
-from visloc.sets.coarse import CoarseModel, DescribedTile, coarse_index, describe, learn
+from visloc.sets.coarse import (
+    CoarseModel,
+    DescribedTile,
+    coarse_index,
+    described,
+    descriptors_of,
+)
 
 # Metric maps of one set have one unit, as far as a fit to positions can tell.
 _MAX_SCALE_DIFFERENCE = 0.02
@@ -196,7 +203,7 @@ def _described(
 ) -> Iterator[DescribedTile]:
     progress("coarse index", 0, len(folders))
     for number, folder in enumerate(folders, 1):
-        yield describe(open_published(folder), model)
+        yield described(descriptors_of(open_published(folder), model), model)
         progress("coarse index", number, len(folders))
 
 

@@ -91,7 +91,7 @@ class Archive:
             query = np.ones(rows.values.shape[1], np.float32)
             lists = rows.inverted.nearest_lists(query, 2)
             for allowed in (None, np.arange(len(rows)) > 0):
-                found, _ = rows.inverted.nearest(query, 3, lists, allowed)
+                found, _ = rows.inverted.rough_cosines(query, lists, allowed)
                 assert ((found >= 0) & (found < len(rows))).all()
                 assert allowed is None or allowed[found].all()
 

@@ -11,16 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visloc.retrieval.fusion import EQUAL_GHARM, LateFusion
+from visloc.retrieval.inverted import InvertedFile, largest
 from visloc.retrieval.rows import GlobalRows
 
 # Larger maps are written with an inverted file unless a build asks for something else.
 MAX_EXACT = 10_000
-# In a map with an inverted file: so many photos that priors allow are all compared, and so many
-# where the proposals do not stand out from the others.
-_MAX_ALLOWED_EXACT, _MAX_DOUBTFUL_EXACT = 2000, 50_000
+# In a map with an inverted file: so many photos that priors allow are all compared.
+_MAX_ALLOWED_EXACT = 2000
 # Photos that each descriptor proposes, and lists that it searches (docs/performance.md).
 _MIN_PROPOSED, _PROPOSED_PER_RESULT = 200, 10
 _LISTS = 50
+# No cosine, and no limit of one that codes tell, is so large.
+_ABOVE_ALL = 2.0
+# Where proposals do not stand out among at most so many photos, the codes of all are compared; of
+# the best by these, so many rows and this share.
+_MAX_DOUBTFUL, _DOUBTFUL_ROWS, _DOUBTFUL_SHARE = 50_000, 2000, 0.1
 
 
 class IndexKind(StrEnum):
@@ -56,8 +61,8 @@ def retrieve(
     """Rank the photos of a map by fused similarity to a query.
 
     In maps with an inverted file each descriptor proposes the photos that are most like the query
-    by their codes, and all proposals are compared under all descriptors. In other maps, where
-    priors leave few photos, and where they leave none that stands out, all are compared.
+    by their codes, and all proposals are compared under all descriptors. Where they do not stand
+    out, all codes propose. In other maps, and where priors leave few photos, all are compared.
 
     Args:
         query: unit vector (D,) by global descriptor; a zero vector is similar to nothing.
@@ -71,7 +76,7 @@ def retrieve(
     compared, limits = _proposed(query, index, top_k, photo_weights)
     cosines = _cosines(query, index, compared)
     if limits and not _stand_out(cosines, limits, top_k, fusion):
-        compared = _allowed(photo_weights)
+        compared = _best_by_codes(query, index, photo_weights, fusion)
         cosines = _cosines(query, index, compared)
     scores = fusion.scores(cosines)
     photos = np.arange(len(scores)) if compared is None else compared
@@ -99,32 +104,32 @@ def _proposed(
     """The photos to compare with the query, in the order of the map; None for all.
 
     Also returns, by descriptor, the cosine that photos which were not proposed have at most, as
-    far as codes can tell. Empty where more photos shall not be compared.
+    far as codes can tell. Empty where no other photos shall be compared.
     """
-    files = {name: rows.inverted for name, rows in index.items() if rows.inverted is not None}
+    files = _inverted(index)
     if len(files) < len(index):
         return None, {}
     num = left = len(next(iter(index.values())))
     allowed = None if photo_weights is None else photo_weights > 0
     if allowed is not None:
         left = int(np.count_nonzero(allowed))
-    if left <= _MAX_ALLOWED_EXACT:
-        return _allowed(photo_weights), {}
-    count = max(_MIN_PROPOSED, _PROPOSED_PER_RESULT * top_k)
-    can_compare = left <= _MAX_DOUBTFUL_EXACT
+        if left <= _MAX_ALLOWED_EXACT:
+            return np.flatnonzero(allowed), {}
+    count = min(left, max(_MIN_PROPOSED, _PROPOSED_PER_RESULT * top_k))
     # Photos that priors leave may lie in lists further away; if few, doubts about the proposals
     # cost less than more lists.
-    searched = _LISTS if can_compare else math.ceil(_LISTS * num / left)
+    searched = math.ceil(_LISTS * num / left) if left > _MAX_DOUBTFUL else _LISTS
     photos, limits = [], {}
     for name, file in files.items():
-        lists = file.nearest_lists(query[name], searched)
-        found, rough = file.nearest(query[name], count, lists, allowed)
-        if len(found) < count and len(lists) < len(file.sizes):
-            every = np.arange(len(file.sizes))
-            found, rough = file.nearest(query[name], count, every, allowed)
-        photos.append(found)
-        limits[name] = float(rough.min(initial=1.0)) + file.error
-    return np.unique(np.concatenate(photos)), limits if can_compare else {}
+        found, rough = file.rough_cosines(
+            query[name], file.nearest_lists(query[name], searched), allowed
+        )
+        best = largest(rough, count)
+        photos.append(found[best])
+        enough = len(best) == count
+        limits[name] = float(rough[best].min()) + file.error if enough else _ABOVE_ALL
+    sure = left > _MAX_DOUBTFUL and _ABOVE_ALL not in limits.values()
+    return np.unique(np.concatenate(photos)), {} if sure else limits
 
 
 def _stand_out(
@@ -138,13 +143,34 @@ def _stand_out(
     return int(np.count_nonzero(scores[:-1] >= scores[-1])) >= top_k
 
 
+def _best_by_codes(
+    query: Mapping[str, NDArray[np.float32]],
+    index: Mapping[str, GlobalRows],
+    photo_weights: NDArray[np.float64] | None,
+    fusion: LateFusion,
+) -> NDArray[np.int64]:
+    """The allowed photos with the best fused scores by their codes, in the order of the map."""
+    allowed = np.ones(len(next(iter(index.values()))), np.bool_)
+    if photo_weights is not None:
+        allowed = photo_weights > 0
+    rough = {}
+    for name, file in _inverted(index).items():
+        photos, cosines = file.rough_cosines(query[name], np.arange(len(file.sizes)), allowed)
+        rough[name] = np.full(len(allowed), -1.0)
+        rough[name][photos] = cosines
+    left = np.flatnonzero(allowed)
+    scores = fusion.scores({name: row[left] for name, row in rough.items()})
+    count = _DOUBTFUL_ROWS + math.ceil(_DOUBTFUL_SHARE * len(left))
+    return np.sort(left[largest(scores, count)])
+
+
+def _inverted(index: Mapping[str, GlobalRows]) -> dict[str, InvertedFile]:
+    return {name: rows.inverted for name, rows in index.items() if rows.inverted is not None}
+
+
 def _cosines(
     query: Mapping[str, NDArray[np.float32]],
     index: Mapping[str, GlobalRows],
     photos: NDArray[np.int64] | None,
 ) -> dict[str, NDArray[np.float64]]:
     return {name: rows.cosines(query[name], photos) for name, rows in index.items()}
-
-
-def _allowed(photo_weights: NDArray[np.float64] | None) -> NDArray[np.int64] | None:
-    return None if photo_weights is None else np.flatnonzero(photo_weights)

@@ -105,37 +105,29 @@ class InvertedFile:
             count: at least 1.
             among: (m,) the lists that are considered; None for all.
         """
-        cosines = dot_products(self.centers, self._widened(query[None])[0], among)
+        wide = _widened(query[None], self.centers.shape[1])[0]
+        cosines = dot_products(self.centers, wide, among)
         cosines /= self._lengths if among is None else self._lengths[among]
-        best = np.arange(len(cosines))
-        if count < len(cosines):
-            best = np.argpartition(-cosines, count)[:count]
+        best = largest(cosines, count)
         return best if among is None else among[best]
 
-    def nearest(
+    def rough_cosines(
         self,
         query: NDArray[np.float32],
-        count: int,
         lists: NDArray[np.int64],
         allowed: NDArray[np.bool_] | None = None,
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Rows that are most like a query by their codes, best first, and their rough cosines.
+        """Compare a query with the codes of some lists; return rows (m,) and cosines (m,).
 
-        Numbers of rows are in range whatever the file holds, but one may come twice where the file
-        says so.
+        They come in no order. Rows and cosines are in range whatever the file holds, but a row may
+        come twice where the file says so.
 
         Args:
             query: unit vector (D,).
-            count: number of rows; fewer come if the lists have fewer.
             lists: the lists that are searched.
             allowed: (n,) the rows that may come; None for all.
         """
         faiss = _faiss()
-        wide = self._widened(query[None])
-        found = np.empty(min(count, self.num_rows), np.int64)
-        cosines = np.empty(len(found), np.float32)
-        if not len(found) or not len(lists):
-            return found[:0], cosines[:0]
         chosen = faiss.IVFRaBitQSearchParameters()
         chosen.nprobe, chosen.qb = len(lists), _QUERY_BITS
         if allowed is not None:
@@ -144,15 +136,22 @@ class InvertedFile:
             chosen.sel = selector
         probed = np.ascontiguousarray(lists, np.int64)
         distances = np.zeros(len(probed), np.float32)  # RaBitQ reads the centres instead
-        arrays = (probed, distances, cosines, found)
-        self._index.search_preassigned_c(
-            1, faiss.swig_ptr(wide), len(found), *map(faiss.swig_ptr, arrays), False, chosen
+        wide, found = _widened(query[None], self.centers.shape[1]), faiss.RangeSearchResult(1)
+        arrays = map(faiss.swig_ptr, (probed, distances))
+        self._index.range_search_preassigned_c(
+            1, faiss.swig_ptr(wide), -np.inf, *arrays, found, False, chosen
         )
-        good = (found >= 0) & (found < self.num_rows)
-        return found[good], cosines[good]
+        num = int(faiss.rev_swig_ptr(found.lims, 2)[1])
+        rows, cosines = (faiss.rev_swig_ptr(a, num) for a in (found.labels, found.distances))
+        good = (rows >= 0) & (rows < self.num_rows)
+        return rows[good], np.clip(cosines[good], -1, 1)  # copies: faiss frees what it found
 
-    def _widened(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
-        return _widened(rows, self.centers.shape[1])
+
+def largest(values: NDArray[np.floating], count: int) -> NDArray[np.int64]:
+    """Return the positions of the largest values (n,), in no order, at most ``count``."""
+    if count >= len(values):
+        return np.arange(len(values))
+    return np.argpartition(-values, count)[:count]
 
 
 def width_of(dim: int) -> int:

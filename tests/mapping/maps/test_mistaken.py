@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapping.maps.coarse_model import learn
 from mapping.maps.mistaken import mistaken_for
 from visloc.archive import CoarseIndex, Map, MapStore
-from visloc.sets.coarse import coarse_index, described, descriptors_of, learn
+from visloc.sets.coarse import coarse_index, described, descriptors_of
 
 APART = np.array([((0, 0, 0), (5, 5, 2)), ((100, 0, 0), (105, 5, 2))], dtype=np.float64)
 

@@ -106,7 +106,7 @@ def test_large_maps_rank_what_is_proposed_as_if_that_were_all(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(retrieval, "_MAX_ALLOWED_EXACT", 50)
-    monkeypatch.setattr(retrieval, "_MAX_DOUBTFUL_EXACT", 0)
+    monkeypatch.setattr(retrieval, "_MAX_DOUBTFUL", 0)
     monkeypatch.setattr(retrieval, "_MIN_PROPOSED", 60)
     monkeypatch.setattr(retrieval, "_PROPOSED_PER_RESULT", 1)
     large = {

@@ -55,7 +55,7 @@ def index(tmp_path_factory: pytest.TempPathFactory) -> dict[str, GlobalRows]:
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Look at a tenth of the photos."""
     monkeypatch.setattr(retrieval, "_MAX_ALLOWED_EXACT", 50)
-    monkeypatch.setattr(retrieval, "_MAX_DOUBTFUL_EXACT", 0)
+    monkeypatch.setattr(retrieval, "_MAX_DOUBTFUL", 0)
     monkeypatch.setattr(retrieval, "_MIN_PROPOSED", 60)
     monkeypatch.setattr(retrieval, "_LISTS", 12)
     monkeypatch.setattr(retrieval, "_PROPOSED_PER_RESULT", 1)
@@ -108,9 +108,8 @@ def test_rough_cosines_are_within_their_error(tmp_path: Path, dim: int) -> None:
     rng = np.random.default_rng(dim)
     rows, query = unit(rng.normal(size=(500, dim))), unit(rng.normal(size=dim))
     opened = inverted(rows, tmp_path / "lists")
-    found, rough = opened.nearest(query, 500, np.arange(len(opened.sizes)))
+    found, rough = opened.rough_cosines(query, np.arange(len(opened.sizes)))
     assert np.array_equal(np.sort(found), np.arange(500))
-    assert (np.diff(rough) <= 0).all()
     wide = np.abs(rough - rows[found] @ query)
     assert np.percentile(wide, 99) <= opened.error * np.sqrt(width_of(dim) / dim) + 1e-3
 
@@ -179,6 +178,23 @@ def test_allowed_photos_that_look_like_nothing_are_all_compared(
         np.testing.assert_allclose(some.scores, best.scores)
 
 
+def test_codes_of_all_allowed_photos_propose_where_nothing_stands_out(
+    index: dict[str, GlobalRows], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retrieval, "_MAX_ALLOWED_EXACT", 50)
+    monkeypatch.setattr(retrieval, "_MIN_PROPOSED", 30)
+    monkeypatch.setattr(retrieval, "_LISTS", 3)
+    monkeypatch.setattr(retrieval, "_DOUBTFUL_ROWS", 150)
+    found = []
+    for seed in range(20):
+        query, allowed = unlike(index, seed), (np.arange(NUM) % 2).astype(np.float64)
+        best = retrieve(query, all_compared(index), 10, allowed)
+        some = retrieve(query, index, 10, allowed)
+        assert allowed[some.images].all()
+        found.append(len(np.intersect1d(best.images, some.images)) / 10)
+    assert np.mean(found) > 0.9
+
+
 def test_a_query_that_looks_like_nothing_is_compared_with_all(
     index: dict[str, GlobalRows], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -241,7 +257,7 @@ def test_hostile_lists_are_told_and_searched_without_harm(tmp_path: Path, kind: 
             check_lists(opened)
     index = {"a": GlobalRows(*in_8_bits(rows), opened)}
     for allowed in (None, np.arange(NUM) % 2 == 0):
-        found, _ = opened.nearest(rows[5], 300, np.arange(20), allowed)
+        found, _ = opened.rough_cosines(rows[5], np.arange(20), allowed)
         assert ((found >= 0) & (found < NUM)).all()
         assert allowed is None or allowed[found].all()
     weights = (np.arange(NUM) < 900).astype(np.float64)

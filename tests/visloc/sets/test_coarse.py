@@ -8,23 +8,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from visloc.archive import CoarseIndex, Map, MapStore, SetOutline, open_map
+from mapping.maps.coarse_model import learn, random_rotation
+from visloc.archive import CoarseIndex, Map, MapStore, SetOutline
 from visloc.archive.index_files import check_lists
 from visloc.archive.sets import MapSet
 from visloc.errors import Conflict, MapCorrupt
 from visloc.features import make_local_features
 from visloc.images import read_photo_file
 from visloc.kapture import read_dataset
-from visloc.retrieval.inverted import width_of
 from visloc.sets.coarse import (
     CoarseModel,
     DescribedTile,
     check_descriptor,
     coarse_index,
-    describe,
     described,
-    learn,
-    random_rotation,
+    descriptors_of,
     rank_tiles,
     ranked,
     score_without,
@@ -55,13 +53,6 @@ def index_of(
     middles = unit(random.normal(size=(num_tiles, 1, DIM)))
     rows = unit(middles + 0.08 * random.normal(size=(num_tiles, photos, DIM)))
     return joined([tile_of(some) for some in rows], folder, MODEL), rows
-
-
-def test_a_rotation_keeps_cosines() -> None:
-    for dim in (1, 63, 64, 65):
-        rotation = random_rotation(dim, np.random.default_rng(0))
-        assert rotation.shape == (dim, width_of(dim))
-        np.testing.assert_allclose(rotation @ rotation.T, np.eye(dim), atol=1e-6)
 
 
 @pytest.mark.parametrize("num_tiles", [7, 60, 1000])  # of the last, a tenth of the lists
@@ -147,8 +138,8 @@ def test_tiles_join_in_their_order(tmp_path: Path) -> None:
     check_lists(index.inverted)
     for tile, some in enumerate(rows):
         assert score_without(index, some[0], tile, np.empty(0, np.int64)) > 0.2
-    photo = index.inverted.nearest(rows[1][0] @ MODEL["rotation"], 1, np.arange(12))[0]
-    assert photo.tolist() == [3]
+    photos, cosines = index.inverted.rough_cosines(rows[1][0] @ MODEL["rotation"], np.arange(12))
+    assert photos[cosines.argmax()] == 3
 
 
 # With the map of the sample
@@ -166,12 +157,17 @@ def rooms(
     """The room as one tile, and as another one of photos that see what nobody has seen."""
     model, random = dict(learn(lambda _: room, 1)), np.random.default_rng(3)
     # Without whitening, which takes away what the photos of the only room have in common.
-    model["axes"] = random.normal(size=(len(model["mean"]), DIM)).astype(np.float32)
+    # As many dimensions as sets have: codes of fewer tell less.
+    model["axes"] = random.normal(size=(len(model["mean"]), 256)).astype(np.float32)
     model["mean"] = np.zeros_like(model["mean"])
-    model["rotation"] = MODEL["rotation"]
-    other = described(unit(random.normal(size=(9, DIM))), model)
+    model["rotation"] = random_rotation(256, random)
+    other = described(unit(random.normal(size=(9, 256))), model)
     said = outline([((0, 0, 0), (1, 1, 1))] * 2)
-    index = joined([other, describe(room, model)], tmp_path_factory.mktemp("rooms"), model)
+    index = joined(
+        [other, described(descriptors_of(room, model), model)],
+        tmp_path_factory.mktemp("rooms"),
+        model,
+    )
     return MapSet(said.manifest, said.photo_boxes, said.reaches, Path(), index)
 
 
@@ -194,34 +190,6 @@ def test_a_photo_of_nothing_is_like_no_tile(rooms: MapSet) -> None:
     )
 
     assert all(abs(s.score) < 0.5 for s in rank_tiles(rooms, nothing))
-
-
-def test_many_tiles_teach_with_one_open_at_a_time(room: Map) -> None:
-    files = Path("/proc/self/fd")
-    before, most = len(list(files.iterdir())), 0
-
-    def open_tile(_: int) -> Map:
-        nonlocal most
-        opened = open_map(room.path)
-        most = max(most, len(list(files.iterdir())) - before)
-        return opened
-
-    alone = open_tile(0)
-    assert most > 0
-    of_one = 2 * most  # the one that is opened, and the one before it
-    del alone
-    learn(open_tile, 30)
-    assert most <= of_one
-
-
-def test_equal_seeds_learn_the_same(room: Map) -> None:
-    once, again = (learn(lambda _: room, 1) for _ in range(2))
-
-    assert once.keys() == {"vocabulary", "mean", "axes", "rotation"}
-    for name, array in once.items():
-        np.testing.assert_array_equal(array, again[name])
-    dim = once["axes"].shape[1]
-    assert once["rotation"].shape == (dim, width_of(dim))
 
 
 def test_a_vocabulary_of_other_features_is_named(rooms: MapSet) -> None:
