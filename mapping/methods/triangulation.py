@@ -13,7 +13,7 @@ import numpy as np
 import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
 
-from mapping.methods.adjustment import error_rises, refine_model, with_principal_points
+from mapping.methods.adjustment import adjusted_robustly, error_rises, refine_model
 from mapping.methods.colmap_calls import interruptible
 from mapping.methods.colmap_scene import ColmapScene, Rigs, colmap_database
 from mapping.methods.intrinsics import (
@@ -132,9 +132,8 @@ def reconstruct(
 
         refined = scene.cameras.keys() - constant
         result, doubts = solve_with_priors(solve, scene, photos, refined, poses=True)
-        if not scene.on_rigs:  # the adjustment would take their unit away
-            sure = {scene.camera_ids[sensor] for sensor in refined - doubts.keys()}
-            result = with_principal_points(result, sure)
+        sure = {scene.camera_ids[sensor] for sensor in refined - doubts.keys()}
+        result = adjusted_robustly(result, sure)
         found = scene.read(result, photos, ("poses", "intrinsics"), doubts)
         found = replace(found, apart=tuple(apart))
     progress(MAPPING, len(photos), len(photos))
