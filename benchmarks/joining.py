@@ -2,12 +2,15 @@
 
     python -m benchmarks.joining hallways DATA/ie_tower --floor floor11
     python -m benchmarks.joining walk DATA/gardenspoint/mapping
+    python -m benchmarks.joining small
     python -m benchmarks.joining speed --images 500 [--code OTHER_VERSION]
 
 ``hallways`` puts the photos of both hallways of a floor into one folder. ``walk`` takes a dataset
 whose photos were taken in order, and whose poses lie in pieces 1000 units apart. Both make all
-models that there are: one of all photos, then one of those that are left, and so on. ``speed``
-builds a map of photos of the sample in a process of its own, without its poses, rigs and positions.
+models that there are: one of all photos, then one of those that are left, and so on. ``small``
+compares the poses of few photos of the sample with the true ones, over settings that should not
+matter. ``speed`` builds a map of photos of the sample in a process of its own, without its poses,
+rigs and positions.
 """
 
 from __future__ import annotations
@@ -21,7 +24,8 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -39,6 +43,7 @@ from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto
 from mapping.methods.undoing import reconstruct_places
+from mapping.pairing import PairSettings
 from mapping.sample import write_sample
 from mapping.stages.context import BuildContext
 from mapping.stages.global_features import describe_photos
@@ -57,6 +62,23 @@ CONFIG = MAPPER_CONFIGS["config1"]
 # Of the poses of one dataset.
 PIECES_APART = 1000.0
 SETTINGS = SfmSettings(pairs=("retrieval", "sequence"), poses="estimate")
+# Photos of the sample, their size, the seed, local features, keypoints, pairs of a photo.
+SMALL = (
+    (16, (256, 192), 0, "sift", 500, 4),
+    (16, (256, 192), 0, "sift", 1000, 4),
+    (16, (256, 192), 0, "sift", 1000, 8),
+    (16, (256, 192), 1, "sift", 500, 4),
+    (16, (256, 192), 1, "sift", 1000, 4),
+    (24, (320, 240), 0, "sift", 500, 4),
+    (24, (320, 240), 0, "sift", 1000, 4),
+    (24, (320, 240), 0, "sift", 1000, 8),
+    (24, (320, 240), 1, "sift", 1000, 4),
+    (16, (512, 384), 0, "sift", 1000, 4),
+    (16, (512, 384), 0, "sift", 2000, 4),
+    (16, (512, 384), 0, "sift", 1000, 8),
+    (16, (512, 384), 0, "xfeat", 1000, 4),
+    (24, (320, 240), 0, "xfeat", 1000, 8),
+)
 # The command was in another file in versions before its rooms.
 COMMAND = """
 try:
@@ -69,8 +91,25 @@ WorkOption = Annotated[Path, typer.Option(help="Features and matches, kept for t
 app = typer.Typer(add_completion=False, help=__doc__)
 
 
-def all_models(root: Path, work: Path) -> tuple[int, list[Model]]:
-    """Return how many photos a dataset has, and cam_from_world by name in each of its models."""
+@dataclass(frozen=True, slots=True)
+class Matched:
+    """Photos with keypoints, their descriptors in 8 bits, and verified matches."""
+
+    photos: list[SfmPhoto]
+    looks: list[NDArray[np.int8]]
+    matches: list[Matches]
+
+
+def matched(
+    root: Path,
+    work: Path,
+    settings: SfmSettings,
+    *,
+    local_features: str = DEFAULT_LOCAL_FEATURES,
+    global_features: Sequence[str] = DEFAULT_GLOBAL_FEATURES,
+    max_keypoints: int = 5000,
+) -> Matched:
+    """Return the inputs of incremental mapping of a dataset's photos."""
     networks = Networks(None, Inference.AUTO)
     dataset = read_dataset(root)
     with open_executor("local", 2, "") as workers, one_thread_here():
@@ -78,17 +117,17 @@ def all_models(root: Path, work: Path) -> tuple[int, list[Model]]:
         source = local_features_source(
             folder,
             root,
-            DEFAULT_LOCAL_FEATURES,
+            local_features,
             networks=networks,
-            max_keypoints=5000,
+            max_keypoints=max_keypoints,
             features_dir=None,
             pixel_origin=PixelOrigin.CORNER,
         )
         context = BuildContext(folder, source, networks, workers, lambda *_: None)
         photos, _ = collect_photos(dataset, posed=False, with_files=True, progress=lambda *_: None)
         context.run("local features", source.prepare, photos)
-        described = [describe_photos(context, photos, name) for name in DEFAULT_GLOBAL_FEATURES]
-        pairs = find_pairs(make_scene(dataset, photos, described, SETTINGS), SETTINGS)
+        described = [describe_photos(context, photos, name) for name in global_features]
+        pairs = find_pairs(make_scene(dataset, photos, described, settings), settings)
         verification = Verification(CONFIG.filter_max_reproj_error, CONFIG.min_num_matches, False)
         matches, _ = match_pairs(context, photos, pairs.rows, verification)
         found = [source.read(photo) for photo in photos]
@@ -105,30 +144,34 @@ def all_models(root: Path, work: Path) -> tuple[int, list[Model]]:
             for photo, features in zip(photos, found, strict=True)
         ]
         looks = [np.rint(127 * features.descriptors).astype(np.int8) for features in found]
+    return Matched(given, looks, matches)
+
+
+def all_models(root: Path, work: Path) -> tuple[int, list[Model]]:
+    """Return how many photos a dataset has, and cam_from_world by name in each of its models."""
+    scene = matched(root, work, SETTINGS)
     models = []
-    left = list(range(len(given)))
-    while placed := _model_of(given, looks, matches, left):
-        models.append({given[row].name: pose for row, pose in placed.items()})
+    left = list(range(len(scene.photos)))
+    while placed := _model_of(scene, left):
+        models.append({scene.photos[row].name: pose for row, pose in placed.items()})
         left = [row for row in left if row not in placed]
-    return len(given), models
+    return len(scene.photos), models
 
 
-def _model_of(
-    photos: list[SfmPhoto], looks: list[NDArray[np.int8]], matches: list[Matches], rows: list[int]
-) -> dict[int, Pose]:
+def _model_of(scene: Matched, rows: list[int]) -> dict[int, Pose]:
     """Return the poses of the largest model of some photos; nothing without one."""
     number = {row: order for order, row in enumerate(rows)}
     among = [
         Matches(number[pair.first], number[pair.second], pair.rows)
-        for pair in matches
+        for pair in scene.matches
         if pair.first in number and pair.second in number
     ]
-    some = [photos[row] for row in rows]
+    some = [scene.photos[row] for row in rows]
     with tempfile.TemporaryDirectory() as folder:
         try:
             model = reconstruct_places(
                 some,
-                lambda row: looks[rows[row]],
+                lambda row: scene.looks[rows[row]],
                 {},
                 among,
                 CONFIG,
@@ -184,19 +227,49 @@ def walk(root: Path, work: WorkOption = Path("work/joining/walk")) -> None:
     for model in models:
         for which in sorted({piece[name] for name in model}):
             names = [name for name in model if piece[name] == which]
-            if len(names) < 3:
-                continue
-            given = [truth[name] for name in names]
-            moved = align_poses([model[name] for name in names], given)
-            errors += [
-                float(np.linalg.norm(moved.apply(model[name].center[None])[0] - pose.center))
-                for name, pose in zip(names, given, strict=True)
-            ]
+            if len(names) >= 3:
+                errors += _distances({name: model[name] for name in names}, truth)
     near = np.array(errors)
     typer.echo(
         f"after alignment {(near <= 1).sum()} of {len(near)} are within 1 unit, the median "
         f"within {np.median(near):.2f}"
     )
+
+
+def _distances(model: Model, truth: Mapping[str, Pose]) -> list[float]:
+    """Return how far the photos of a model are from the true places, after alignment to them."""
+    given = [truth[name] for name in model]
+    moved = align_poses(list(model.values()), given)
+    return [
+        float(np.linalg.norm(moved.apply(pose.center[None])[0] - true.center))
+        for pose, true in zip(model.values(), given, strict=True)
+    ]
+
+
+@app.command()
+def small(work: WorkOption = Path("work/joining/small")) -> None:
+    """Compare the poses of few photos of the sample with the true ones, of known cameras."""
+    for images, size, seed, features, max_keypoints, top_k in SMALL:
+        folder = work / f"{images} of {size[0]}x{size[1]}, seed {seed}"
+        if not folder.exists():
+            write_sample(folder, images=images, size=size, seed=seed)
+        dataset = read_dataset(folder / "mapping")
+        truth = {r.path: pose for r in dataset.images if (pose := dataset.pose(r)) is not None}
+        scene = matched(
+            folder / "mapping",
+            work / f"kept {folder.name}",
+            replace(SETTINGS, pairs=("retrieval",), pairing=PairSettings(top_k=top_k)),
+            local_features=features,
+            global_features=("localvlad",),
+            max_keypoints=max_keypoints,
+        )
+        placed = _model_of(scene, list(range(len(scene.photos))))
+        model = {scene.photos[row].name: pose for row, pose in placed.items()}
+        errors = 100 * np.array(_distances(model, truth) if len(model) >= 3 else [np.nan])
+        typer.echo(
+            f"{folder.name}, {features} {max_keypoints}, {top_k} a photo: {len(model)} placed, "
+            f"rms {np.sqrt(np.mean(errors**2)):.2f} cm, largest {errors.max():.2f} cm"
+        )
 
 
 @app.command()

@@ -13,7 +13,7 @@ import numpy as np
 import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
 
-from mapping.methods.adjustment import error_rises, refine_model, with_principal_points
+from mapping.methods.adjustment import adjusted_robustly, error_rises, refine_model
 from mapping.methods.colmap_calls import interruptible
 from mapping.methods.colmap_scene import ColmapScene, Rigs, colmap_database
 from mapping.methods.intrinsics import (
@@ -25,11 +25,12 @@ from mapping.methods.intrinsics import (
 )
 from mapping.methods.look_alikes import without_look_alikes
 from mapping.methods.matching import Matches
+from mapping.methods.misplaced import misplaced
 from mapping.methods.points import triangulate_points
 from mapping.methods.sparse_model import MapperConfig, SfmPhoto, SparseModel, without_bad_points
 from mapping.methods.thinning import thin
 from mapping.progress import ItemProgress, Progress
-from visloc.errors import refuse
+from visloc.errors import VislocError, refuse
 
 # Stages of a build.
 MAPPING, TRIANGULATION = "incremental mapping", "triangulation"
@@ -99,48 +100,100 @@ def reconstruct(
         InvalidInput: ``sfm.no_matches``, ``sfm.no_model``, ``sfm.camera``, ``sfm.no_points``.
     """
     matches = without_look_alikes(photos, matches)
-    with colmap_database(photos, rigs, thin(photos, matches), work) as (path, scene):
+    thinned = thin(photos, matches)
+    with colmap_database(photos, rigs, thinned, work) as (path, scene):
         known = {photo.sensor for photo in photos if photo.camera_known}
         constant = set() if "intrinsics" in refine else known
         placed = _Placed(len(photos), partial(progress, MAPPING))
         apart: list[int] = []
 
-        def solve(doubts: Mapping[str, Doubt]) -> pycolmap.Reconstruction:
-            left_out = doubts.keys() - known
+        def options_with(doubts: Mapping[str, Doubt]) -> pycolmap.IncrementalPipelineOptions:
             options = _pipeline_options(config)
             options.constant_cameras = {
                 scene.camera_ids[sensor] for sensor in constant | (doubts.keys() & known)
             }
+            left_out = doubts.keys() - known
             options.image_names = [p.name for p in photos if p.sensor not in left_out]
-            models = _map_incrementally(path, options, placed)
+            return options
+
+        def solve(doubts: Mapping[str, Doubt]) -> pycolmap.Reconstruction:
+            left_out = doubts.keys() - known
+            models = _map_incrementally(path, options_with(doubts), placed)
             if models:
                 largest = max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()))
                 apart[:] = _photos_apart(models.values(), largest)
                 return largest
-            if left_out:
-                names = names_by_sensor((photo.sensor, photo.name) for photo in photos)
-                raise no_lens({sensor: doubts[sensor] for sensor in left_out}, names)
-            raise refuse(
-                "sfm.no_model",
-                "no two photos could be placed relative to each other with their known focal length"
-                if doubts
-                else None,
-                field="dataset",
-                expected="photos that overlap; see --pairs and --mapper",
-                got=f"{len(photos)} photos, {len(matches)} pairs with verified matches",
-            )
+            raise _no_model(photos, matches, doubts, left_out)
 
         refined = scene.cameras.keys() - constant
         result, doubts = solve_with_priors(solve, scene, photos, refined, poses=True)
-        if not scene.on_rigs:  # the adjustment would take their unit away
-            sure = {scene.camera_ids[sensor] for sensor in refined - doubts.keys()}
-            result = with_principal_points(result, sure)
+        sure = {scene.camera_ids[sensor] for sensor in refined - doubts.keys()}
+        result = adjusted_robustly(result, sure)
+
+        def go_on(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction | None:
+            models = _map_incrementally(path, options_with(doubts), placed, model)
+            largest = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
+            return None if largest is None else adjusted_robustly(largest, sure)
+
+        result = _with_misplaced_again(result, go_on, scene, photos, thinned, config)
         found = scene.read(result, photos, ("poses", "intrinsics"), doubts)
         found = replace(found, apart=tuple(apart))
     progress(MAPPING, len(photos), len(photos))
     return _with_all_points(
         found, photos, rigs, matches, config, work, partial(progress, TRIANGULATION)
     )
+
+
+def _no_model(
+    photos: Sequence[SfmPhoto],
+    matches: Sequence[Matches],
+    doubts: Mapping[str, Doubt],
+    left_out: Collection[str],
+) -> VislocError:
+    """Return why there is no model, without the photos of the sensors left out."""
+    if left_out:
+        names = names_by_sensor((photo.sensor, photo.name) for photo in photos)
+        return no_lens({sensor: doubts[sensor] for sensor in left_out}, names)
+    return refuse(
+        "sfm.no_model",
+        "no two photos could be placed relative to each other with their known focal length"
+        if doubts
+        else None,
+        field="dataset",
+        expected="photos that overlap; see --pairs and --mapper",
+        got=f"{len(photos)} photos, {len(matches)} pairs with verified matches",
+    )
+
+
+def _with_misplaced_again(
+    model: pycolmap.Reconstruction,
+    go_on: Callable[[pycolmap.Reconstruction], pycolmap.Reconstruction | None],
+    scene: ColmapScene,
+    photos: Sequence[SfmPhoto],
+    matches: Sequence[Matches],
+    config: MapperConfig,
+) -> pycolmap.Reconstruction:
+    """Place the photos that a model contradicts once more, if it becomes better by that.
+
+    Args:
+        go_on: maps incrementally from a model on; None without success.
+    """
+
+    def judge(judged: pycolmap.Reconstruction) -> tuple[list[int], float]:
+        views = scene.read(judged, photos, ("poses", "intrinsics"), {}).views
+        return misplaced(photos, views, matches, config.filter_max_reproj_error)
+
+    rows, share = judge(model)
+    if not rows:
+        return model
+    rest = pycolmap.Reconstruction(model)
+    frames = {rest.image(scene.images[row].image_id).frame_id for row in rows}
+    for frame in frames:
+        rest.deregister_frame(frame)
+    again = go_on(rest)
+    if again is None or again.num_reg_images() < model.num_reg_images():
+        return model
+    return again if judge(again)[1] > share else model
 
 
 def _with_all_points(
@@ -213,16 +266,25 @@ class _Placed:
 
 
 def _map_incrementally(
-    path: Path, options: pycolmap.IncrementalPipelineOptions, placed: _Placed
+    path: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+    placed: _Placed,
+    begun: pycolmap.Reconstruction | None = None,
 ) -> dict[int, pycolmap.Reconstruction]:
     if not options.image_names:  # pycolmap would take all photos
         return {}
+    folder = path.parent / "begun"
+    if begun is not None:
+        folder.mkdir(exist_ok=True)
+        begun.write(folder)
+        placed.count = begun.num_reg_images()
     return interruptible(
         lambda token: pycolmap.incremental_mapping(
             path,
             path.parent,
             path.parent,
             options=options,
+            input_path="" if begun is None else folder,
             initial_image_pair_callback=placed.first_pair,
             next_image_callback=placed.one_more,
             cancellation_token=token,
