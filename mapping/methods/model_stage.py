@@ -25,7 +25,7 @@ from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc.geometry import Camera, Pose
 
 # Raised when the code of the stage changes what comes out.
-_REVISION = 10
+_REVISION = 11
 _LARGEST = 127  # of descriptors in 8 bits
 
 

@@ -18,7 +18,8 @@ from visloc.geometry import Camera
 # Keypoints that take part: of all photos together, and of each at least. Adjusting few photos takes
 # little time with all that they have, and each of their links counts.
 ALL, MOST = 100_000, 1000
-# Every pair keeps so many matches, if it has them: they may be all that places a photo.
+# Pairs with so few matches keep all: they may be all that places a photo. A pair that is left with
+# few of many gets none back: what its photos share with no third is more often wrong.
 FEW = 200
 # The longer side of a photo is divided into so many cells, which have equal parts of them.
 _CELLS = 8
@@ -27,8 +28,8 @@ _CELLS = 8
 def thin(photos: Sequence[SfmPhoto], matches: Sequence[Matches]) -> list[Matches]:
     """Return the pairs with the matches between the best keypoints of both photos.
 
-    The best of a cell are those matched in most pairs, which make the longest tracks. A pair that
-    is left with fewer than ``FEW`` matches gets the best of its others back.
+    Pairs with ``FEW`` matches or fewer stay as they are. The best of a cell are those matched in
+    most pairs, which make the longest tracks.
     """
     counts = [np.zeros(len(photo.keypoints), dtype=np.int64) for photo in photos]
     for pair in matches:
@@ -41,11 +42,11 @@ def thin(photos: Sequence[SfmPhoto], matches: Sequence[Matches]) -> list[Matches
     ]
     thinned = []
     for pair in matches:
-        first, second = pair.rows.T
-        both = kept[pair.first][first] & kept[pair.second][second]
-        often = np.minimum(counts[pair.first][first], counts[pair.second][second])
-        best = np.lexsort((-often, ~both))[: max(FEW, int(both.sum()))]
-        thinned.append(Matches(pair.first, pair.second, pair.rows[np.sort(best)]))
+        if len(pair.rows) <= FEW:
+            thinned.append(pair)
+            continue
+        both = kept[pair.first][pair.rows[:, 0]] & kept[pair.second][pair.rows[:, 1]]
+        thinned.append(Matches(pair.first, pair.second, pair.rows[both]))
     return thinned
 
 

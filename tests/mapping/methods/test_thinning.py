@@ -63,16 +63,6 @@ def test_they_are_spread_over_the_photo() -> None:
     assert set(range(COUNT - 200, COUNT)) <= set(kept.rows[:, 0].tolist())
 
 
-def test_a_pair_that_shares_few_of_the_best_keeps_enough_to_place_a_photo() -> None:
-    # The best keypoints of photo 0 are in photos 1 and 2, and none of them in photo 3.
-    keypoints = np.random.default_rng(0).uniform(1, 70, (COUNT, 2)).astype(np.float32)
-    often, others = np.arange(thinning.MOST), np.arange(thinning.MOST, COUNT)
-    matches = [all_of(0, 1, often), all_of(0, 2, often), all_of(0, 3, others)]
-    kept = thin([photo_of(number, keypoints) for number in range(4)], matches)
-    assert [len(pair.rows) for pair in kept] == [thinning.MOST, thinning.MOST, thinning.FEW]
-    assert set(kept[2].rows[:, 0].tolist()) <= set(others.tolist())
-
-
 def test_a_photo_without_matches_is_no_harm() -> None:
     empty = np.empty((0, 2), np.float32)
     assert thin([photo_of(0, empty)], []) == []

@@ -72,7 +72,7 @@ def places_in(model: SparseModel) -> set[int]:
 @pytest.mark.parametrize("share", [0.25, 0.5])
 def test_a_film_through_two_hallways_makes_a_model_of_one(share: float, tmp_path: Path) -> None:
     photos, descriptors, matches = film(share)
-    inputs = {}, matches, CONFIG, (), tmp_path, lambda *_: None
+    inputs: tuple[Any, ...] = ({}, matches, CONFIG, (), tmp_path, lambda *_: None)
     # There is something to undo.
     assert places_in(reconstruct(photos, *inputs)) == {0, 1}
 
@@ -96,7 +96,7 @@ def test_only_pairs_that_the_model_lacks_count_as_undone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photos, descriptors, matches = film(0.25)
-    inputs = {}, matches, CONFIG, (), tmp_path, lambda *_: None
+    inputs: tuple[Any, ...] = ({}, matches, CONFIG, (), tmp_path, lambda *_: None)
     monkeypatch.setattr("mapping.methods.undoing._MOST_MODELS", 1)
     model = reconstruct_places(photos, descriptors.__getitem__, *inputs)
     assert places_in(model) == {0, 1}
