@@ -226,7 +226,6 @@ def _placed(opened: Map, set_from_tile: Similarity) -> _Placed:
         landmarks=manifest.counts.landmarks,
         size_bytes=opened.size_bytes,
         misses_own_photos=misses_own_photos(manifest.parts.own_test),
-        left_out_photos=any(each.kind == "left_out" for each in manifest.parts.doubts),
     )
     anchor = manifest.world.anchor
     return _Placed(

@@ -63,8 +63,6 @@ class TileRecord(Record):
             a few of this tile's own photos.
         misses_own_photos: whether more than a few of its own photos were not found where they are
             by its own test: doubtful answers are usual there. False where no test says.
-        left_out_photos: whether many of the photos that it was to be built from found no place in
-            it: photos may show what it has no landmarks of.
     """
 
     map: Annotated[str, Field(pattern=rf"^{ID_PATTERN.pattern}$")]
@@ -79,7 +77,6 @@ class TileRecord(Record):
     size_bytes: Annotated[int, Field(ge=0)]
     mistaken_for: Annotated[tuple[str, ...], Field(max_length=MAX_TILES)] = ()
     misses_own_photos: bool = False
-    left_out_photos: bool = False
 
     @property
     def ref(self) -> str:

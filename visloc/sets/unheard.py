@@ -56,8 +56,8 @@ def left_open(
     that answers, even if it has a pose that explains much less: it is poor. But where the tile that
     answers misses photos of its own, doubtful answers to these are usual, and no sign of another
     place: there a tile stays open only if the answer is more likely wrong than right. Then, so does
-    one that looks about as much like the photo; one that left out many of its own photos always
-    does. Tiles of the same place, whose photos lie among each other, are no contradiction.
+    one that looks about as much like the photo. Tiles of the same place, whose photos lie among
+    each other, are no contradiction.
 
     Args:
         outline: the set.
@@ -79,7 +79,7 @@ def left_open(
     for other in np.flatnonzero(elsewhere & apart(outline.photo_boxes, row)).tolist():
         if telling and tiles[row].ref in tiles[other].mistaken_for:
             why = f"whose own photos look like those of {place.ref}"
-        elif other in close and (more_likely_wrong or tiles[other].left_out_photos):
+        elif more_likely_wrong and other in close:
             why = "which looks about as much like it"
         else:
             continue

@@ -85,21 +85,6 @@ def test_a_doubtful_answer_of_a_tile_that_misses_its_own_photos_is_nothing_unusu
             assert "whose own photos look like those of good@v1" in refusal.message
 
 
-def test_a_tile_that_left_out_photos_stays_open_where_it_looks_alike(floors: SetOutline) -> None:
-    tiles = list(floors.tiles)
-    tiles[GOOD] = tiles[GOOD].model_copy(update={"left_out_photos": True})
-    lacking = replace(floors, manifest=floors.manifest.model_copy(update={"tiles": tuple(tiles)}))
-
-    for probability, close, is_refused in (
-        (0.89, (OTHER, GOOD), True),
-        (0.89, (OTHER,), False),
-        (0.9, (OTHER, GOOD), False),
-    ):
-        answer = place(lacking, OTHER, probability)
-        refusal = left_open(lacking, OTHER, answer, elsewhere(GOOD, POOR), close)
-        assert (refusal is not None) == is_refused
-
-
 def test_a_tile_that_agrees_or_is_excluded_is_not_left_open(floors: SetOutline) -> None:
     assert left_open(floors, GOOD, place(floors, GOOD, 0.3), elsewhere(OTHER), (GOOD,)) is None
 
