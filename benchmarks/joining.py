@@ -200,7 +200,7 @@ def _print(total: int, models: list[Model], place: Callable[[str], str]) -> None
 
 @app.command()
 def hallways(
-    data: Path, floor: str = "floor11", work: WorkOption = Path("work/joining/hallways")
+    data: Path, floor: str = "floor11", work: WorkOption = Path(".bench/joining/hallways")
 ) -> None:
     """Put the photos of both hallways of a floor into one folder."""
     photos, dataset = work / "photos", work / "dataset"
@@ -215,7 +215,7 @@ def hallways(
 
 
 @app.command()
-def walk(root: Path, work: WorkOption = Path("work/joining/walk")) -> None:
+def walk(root: Path, work: WorkOption = Path(".bench/joining/walk")) -> None:
     """Take the photos of a walk in order, and compare with its poses, in pieces far apart."""
     dataset = read_dataset(root)
     posed, _ = collect_photos(dataset, posed=True, with_files=False, progress=lambda *_: None)
@@ -247,7 +247,7 @@ def _distances(model: Model, truth: Mapping[str, Pose]) -> list[float]:
 
 
 @app.command()
-def small(work: WorkOption = Path("work/joining/small")) -> None:
+def small(work: WorkOption = Path(".bench/joining/small")) -> None:
     """Compare the poses of few photos of the sample with the true ones, of known cameras."""
     for images, size, seed, features, max_keypoints, top_k in SMALL:
         folder = work / f"{images} of {size[0]}x{size[1]}, seed {seed}"
@@ -278,7 +278,7 @@ def speed(
     code: Annotated[
         Path | None, typer.Option(help="Folder of another version's code, which builds the map.")
     ] = None,
-    work: WorkOption = Path("work/joining/speed"),
+    work: WorkOption = Path(".bench/joining/speed"),
 ) -> None:
     """Build a map of photos of the sample without poses; print seconds, GiB, silence."""
     work = work.resolve()
