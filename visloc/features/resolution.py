@@ -23,8 +23,6 @@ _ALIKE = 1.1
 _NEARLY = 1.05
 # No photo is reduced to less. A long lens shows little of what a mapping photo shows.
 _LEAST_LONG_SIDE_PX = 320
-# A wide-angle photo is enlarged to at most this many times the longer side of mapping photos.
-_MOST_ENLARGED = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,11 +105,10 @@ class WorkingResolution:
             # Local features would see as much in the photo itself, but not as fast.
             scale = 1 / self.finer(photo)
         else:
-            most = max(_MOST_ENLARGED * self.seen.long_side, seen.long_side)
-            if self.most_px is not None:
-                most = min(most, self.most_px)
             least = min(_LEAST_LONG_SIDE_PX, seen.long_side, self.seen.long_side)
-            scale = min(max(seen.long_side / finer, least), most) / long_side
+            # Never enlarged: more keypoints of the same pixels have errors alike, so that stated
+            # uncertainties are too small, and wrong poses have more inliers.
+            scale = min(max(seen.long_side / finer, least), seen.long_side) / long_side
         if turned != 0 and self.most_px is not None:
             # Askew, a long narrow photo fills a picture of many times its pixels.
             scale = min(scale, self.most_px / long_side)
@@ -132,12 +129,10 @@ class WorkingResolution:
 
 
 def resized(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """Resize pixels (H, W, 3), averaging where they are reduced."""
+    """Reduce pixels (H, W, 3), averaging them."""
     if (width, height) == (rgb.shape[1], rgb.shape[0]):
         return rgb
-    shrinks = width < rgb.shape[1]
-    method = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
-    return np.asarray(cv2.resize(rgb, (width, height), interpolation=method), np.uint8)
+    return np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _finer(photos: Sequence[Resolution]) -> Resolution:
@@ -153,7 +148,7 @@ def _whole(reduction: float) -> float:
 
 
 def _upper_quartile(values: Iterable[float]) -> float:
-    # Of two sizes, the larger one if a quarter of the photos have it: photos that are enlarged
-    # match nearly as well, but those that are reduced are placed less exactly.
+    # Of two sizes, the larger one if a quarter of the photos have it: photos that are reduced are
+    # placed less exactly.
     ordered = sorted(values)
     return ordered[3 * len(ordered) // 4]

@@ -262,7 +262,7 @@ def checkerboard(height: int, width: int) -> NDArray[np.uint8]:
     [
         (np.full((192, 256, 3), 128, np.uint8), "features", Reason.NO_KEYPOINTS),
         (np.zeros((1, 1, 3), np.uint8), "features", Reason.NO_KEYPOINTS),
-        (noise(16, 16), "gate", Reason.TOO_FEW_INLIERS),
+        (noise(16, 16), "features", Reason.NO_KEYPOINTS),
         (noise(192, 256), "gate", Reason.TOO_FEW_INLIERS),
         (checkerboard(192, 256), "matching", Reason.TOO_FEW_MATCHES),
     ],
