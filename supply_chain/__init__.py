@@ -1,1 +1,1 @@
-"""What the images are made of: locked versions with hashes, licences, parts lists."""
+"""Locks the packages of the images, checks their licences and lists their parts."""

@@ -89,6 +89,7 @@ class Certificate:
             try:
                 self._pair = _read(self._files)
             except SettingsError as error:
+                # The message says all; a stack trace would fill the log of whoever renews slowly.
                 logger.error("the certificate was not reloaded: %s", error)  # noqa: TRY400
             else:
                 ends = datetime.fromtimestamp(self._pair.ends, UTC)
