@@ -16,7 +16,8 @@ from mapping.methods.matching import Matches, fits_poses
 from mapping.methods.sparse_model import SfmPhoto
 from mapping.stages.landmarks import View
 
-# Least share of a photo's verified matches that fit the poses. Of photos in their place, 0.92 or more do.
+# Least share of a photo's verified matches that fit the poses. Of photos in their place, 0.92 or
+# more do.
 _LEAST_FITTING = 0.9
 # With more of the photos in doubt, what is left is not known to be right.
 _MOST_IN_DOUBT = 0.5
