@@ -1,4 +1,4 @@
-"""The size at which the features of each mapping photo are found, so that all see as finely."""
+"""The size at which the features of each mapping photo are found: the finest are reduced."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def at_one_resolution(
 ) -> list[MappingPhoto]:
     """Say at which size features are found in the photos of a new map.
 
-    A phone's photos of 12 megapixels then match frames of a film. Ready-made features are as they
-    are.
+    A few photos of 12 megapixels then match the frames of a film. Coarser photos stay as they are,
+    and so do ready-made features.
     """
     if not isinstance(features, ExtractedFeatures) or not photos:
         return list(photos)
