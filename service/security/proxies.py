@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable
 from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
 from urllib.parse import unquote
@@ -11,6 +12,7 @@ from service.settings import SettingsError
 Networks = Collection[IPv4Network | IPv6Network]
 # Each proxy appends the address that it was called from.
 FORWARDED_HEADER = "x-forwarded-for"
+_WITH_PORT = re.compile(r"(\[(?P<v6>[^][]*)\]|(?P<v4>[^][:]*))(:[0-9]{1,5})?", re.ASCII)
 
 
 def networks_of(names: Iterable[str]) -> Networks:
@@ -46,7 +48,7 @@ def caller_of(peer: str | None, forwarded: Iterable[str], proxies: Networks) -> 
     entries = [entry.strip() for header in forwarded for entry in header.split(",")]
     caller = peer
     while entries and _is_in(caller, proxies):
-        address = _address_of(entries.pop())
+        address = _address_of(_without_port(entries.pop()))
         if address is None:
             break
         caller = str(address)
@@ -56,6 +58,15 @@ def caller_of(peer: str | None, forwarded: Iterable[str], proxies: Networks) -> 
 def address_of_grpc(peer: str) -> str:
     """Return the address in gRPC's name of a peer, such as ``ipv6:%5B::1%5D:5000``."""
     return unquote(peer.partition(":")[2]).rpartition(":")[0].strip("[]")
+
+
+def _without_port(entry: str) -> str:
+    """Return the address of an entry; some proxies write ``1.2.3.4:5000`` and ``[2001:db8::1]:5000``.
+
+    What has neither form is returned as it is: an IPv6 address without brackets has no port.
+    """
+    found = _WITH_PORT.fullmatch(entry)
+    return entry if found is None else found["v6"] or found["v4"]
 
 
 def _is_in(address: str, networks: Networks) -> bool:

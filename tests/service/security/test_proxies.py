@@ -38,7 +38,27 @@ def test_behind_proxies_the_last_address_that_is_none_of_them_is_the_callers(
 
 
 @pytest.mark.parametrize(
-    "entry", ["", "unknown", "a\nkey=admin", f"{CALLER}:4711", "300.1.1.1", "x" * 10_000]
+    ("entry", "address"),
+    [
+        (f"{CALLER}:4711", CALLER),
+        (f"[::ffff:{CALLER}]:4711", CALLER),
+        ("[2001:db8::1]:4711", "2001:db8::1"),
+        ("[2001:db8::1]", "2001:db8::1"),
+        ("2001:db8::1:4711", "2001:db8::1:4711"),  # without brackets, all of it is the address
+    ],
+)
+def test_an_entry_may_have_a_port(entry: str, address: str) -> None:
+    assert caller_of(PROXY, [f"{FORGED}, {entry}"], TRUSTED) == address
+    assert caller_of(PROXY, [f"{entry}, 10.0.0.8:80, [fd00::1]:80"], TRUSTED) == address
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        *("", "unknown", "a\nkey=admin", "300.1.1.1", "x" * 10_000, "[", "[]", "[]:80"),
+        *(f"{CALLER}:", f"{CALLER}:http", f"{CALLER}:4711:4712", f"{CALLER}:123456"),
+        *("[2001:db8::1]4711", "[2001:db8::1", "[[2001:db8::1]]:4711"),
+    ],
 )
 def test_what_is_no_address_is_not_logged(entry: str) -> None:
     assert caller_of(PROXY, [entry], TRUSTED) == PROXY
