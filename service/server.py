@@ -199,7 +199,7 @@ class _HttpServer(uvicorn.Server):
             uvicorn.Config(
                 app,
                 log_config=None,
-                log_level="warning",
+                log_level="error",  # its warnings are of callers' mistakes, one line for each
                 access_log=False,
                 ws="none",
                 proxy_headers=False,  # any local process could forge them

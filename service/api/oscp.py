@@ -6,13 +6,13 @@ absent, the version is told by the shape of ``sensorReadings``. Writing is stric
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import from_json
 
 from service.api.oscp_images import image_bytes
 from service.values import ImageJob, RigJob, photo_job
@@ -21,12 +21,8 @@ from visloc.geometry import Camera, Pose
 from visloc.options import LocalizeOptions
 from visloc.types import MAX_RADIUS_M, Near, RigSensor
 from visloc_api.words.geopose import GeoPose
-from visloc_api.words.message import (
-    MAX_INSTANT_VALUES,
-    check_json_values,
-    check_names_once,
-    refusal_of,
-)
+from visloc_api.words.json_text import check_json_values, check_names
+from visloc_api.words.message import MAX_INSTANT_VALUES, refusal_of
 
 # A device is searched for so far around a position at least: cities make fixes worse than they say.
 _MIN_RADIUS_M = 100.0
@@ -150,11 +146,10 @@ class GeoPoseRequest(_Read):
         """
         check_json_values(text, MAX_INSTANT_VALUES)
         try:
-            body = json.loads(
-                text, parse_constant=_refuse_constant, object_pairs_hook=_object_of_fields
-            )
-        except (ValueError, RecursionError):
+            body = from_json(text, allow_inf_nan=False)
+        except ValueError:
             raise refuse("request.malformed", expected="JSON") from None
+        check_names(text)
         body = _object(body, "")
         readings = body.get("sensorReadings")
         sensors = _list(body.get("sensors"), "sensors")
@@ -427,12 +422,3 @@ def _finite(value: object) -> int | float | None:
         return None
     # Infinite, or a whole number that no clock shows.
     return value if abs(value) < 2**63 and np.isfinite(float(value)) else None
-
-
-def _object_of_fields(fields: list[tuple[str, Any]]) -> dict[str, Any]:
-    check_names_once(fields)
-    return dict(fields)
-
-
-def _refuse_constant(name: str) -> None:
-    raise ValueError(name)

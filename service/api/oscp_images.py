@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import base64
-import binascii
 import struct
 import zlib
 
 import numpy as np
 
 from visloc.errors import refuse
+from visloc_api.words.json_text import bytes_of_base64
 
 # JPEG, PNG, TIFF; RIFF is followed by the name WEBP. Two letters of BMP say too little.
 _FILE_BEGINNINGS = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"RIFF")
@@ -48,8 +47,8 @@ def image_bytes(
         )
     text = text.translate(_FROM_URL_SAFE)
     try:
-        data = base64.b64decode(text + "=" * (-len(text) % 4), validate=True)
-    except (binascii.Error, ValueError) as error:  # ValueError: letters outside ASCII
+        data = bytes_of_base64(text + "=" * (-len(text) % 4))
+    except ValueError as error:
         raise refuse(
             "image.base64", field="imageBytes", expected="the photo in base64", got=str(error)
         ) from None

@@ -13,7 +13,8 @@ from visloc.errors import VislocError, inside, refuse
 from visloc.types import Near
 from visloc_api.v1 import localization_pb2 as pb2
 from visloc_api.words import near, sequences
-from visloc_api.words.message import MAX_INSTANT_VALUES, check_num_values
+from visloc_api.words.json_text import check_num_values
+from visloc_api.words.message import MAX_INSTANT_VALUES
 from visloc_api.words.photo import LocalizeRequest
 from visloc_api.words.rigs import BatchLimits, LocalizeRigRequest
 

@@ -13,8 +13,11 @@ from service.errors import too_slow
 from service.grpc.calls import Handler, behaviour_of, handler_like
 from service.grpc.connections import GrpcConnections
 from service.grpc.envelope import Context, Envelope
+from service.grpc.wire_format import num_fields
 from service.settings import SLOWEST_BYTES_PER_S
-from visloc.errors import InvalidInput, TimedOut, refuse
+from visloc.errors import InvalidInput, TimedOut, TooLarge, VislocError, refuse
+from visloc_api.words.json_text import check_num_values
+from visloc_api.words.message import MAX_INSTANT_VALUES
 
 # Calls whose only message may be large.
 _LARGE_MESSAGES = ("Localize", "LocalizeRig")
@@ -68,19 +71,38 @@ class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
 
 
 class _Unreadable(NamedTuple):
-    """Stands for a message that could not be parsed; gRPC would end the call with its own error."""
+    """Stands for a message that is not parsed; gRPC would end the call with its own error."""
 
-    reason: str
+    error: VislocError
 
 
 def _readable_or_not(parse: Callable[[bytes], Any] | None) -> Callable[[bytes], Any]:
+    # Generated code gives the parser of a message's class.
+    kind = getattr(parse, "__self__", None)
+
     def parsed(message: bytes) -> Any:
+        if parse is None:
+            return message
         try:
-            return message if parse is None else parse(message)
+            if kind is not None:
+                fields = num_fields(message, kind.DESCRIPTOR, MAX_INSTANT_VALUES + 1)
+                check_num_values(fields, MAX_INSTANT_VALUES)
+            return parse(message)
         except DecodeError as error:
-            return _Unreadable(str(error))
+            return _Unreadable(_malformed(str(error)))
+        except TooLarge as error:
+            return _Unreadable(error)
 
     return parsed
+
+
+def _malformed(got: str) -> VislocError:
+    return refuse(
+        "request.malformed",
+        "the message does not fit the method",
+        expected="a protobuf message as in localization.proto",
+        got=got,
+    )
 
 
 async def _timely(messages: AsyncIterator[Any], patience_s: float) -> AsyncGenerator[Any]:
@@ -93,10 +115,5 @@ async def _timely(messages: AsyncIterator[Any], patience_s: float) -> AsyncGener
         if message is None:
             return
         if isinstance(message, _Unreadable):
-            raise refuse(
-                "request.malformed",
-                "the message does not fit the method",
-                expected="a protobuf message as in localization.proto",
-                got=message.reason,
-            )
+            raise message.error
         yield message

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from time import monotonic, sleep
 from typing import TypeVar
 
@@ -25,6 +26,8 @@ from visloc_api.words.sequences import LocalizeSequenceRequest
 # The parts of the form of one photo that are files, and the file names in curl's examples.
 _FILES_PER_IMAGE = 2  # a photo and its mask
 _FILES = {"image": "photo.jpg", "features": "photo.json", "mask": "mask.png"}
+# JSON of one photo from which on it is parsed on its own.
+_LARGE_BYTES = 2**20
 _FORM, _JSON = "multipart/form-data", "application/json"
 # Values in a sequence: each takes about a microsecond and 100 bytes to parse. A photo needs 16 for
 # its pinhole camera and its share of the instant's. An instant of few photos needs more: odometry
@@ -35,38 +38,42 @@ JobT = TypeVar("JobT")
 ToJob = Callable[[str | bytes, Mapping[str, bytes]], JobT]
 
 
-class _BatchParser:
-    """Parses the JSON of batches in one thread, one after the other.
+class _OneByOne:
+    """Parses JSON that takes long in one thread, one text after the other.
 
-    Parsing holds Python's lock, for some tenths of a second for the largest sequence. Answering any
-    other request takes several turns of the event loop, and each turn would wait for one batch. So
-    the thread rests after each batch for as long as it took.
+    Parsing holds Python's lock for some hundredths of a second at a time. Answering any other
+    request takes several turns of the event loop, and each turn would wait for every thread that
+    parses. So there is one, and it rests after each text for as long as it took.
     """
 
     def __init__(self) -> None:
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="batches")
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="json")
         self._rests_until = 0.0
 
-    async def parse(
-        self, to_job: ToJob[JobT], text: str | bytes, files: Mapping[str, bytes]
-    ) -> JobT:
-        """Make the job of a batch; raises what ``to_job`` raises."""
-        loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(self._thread, self._parsed, to_job, text, files)
+    async def run(self, parse: Callable[[], JobT]) -> JobT:
+        """Return what ``parse`` returns; raises what it raises."""
+        return await asyncio.get_running_loop().run_in_executor(self._thread, self._parsed, parse)
 
-    def _parsed(self, to_job: ToJob[JobT], text: str | bytes, files: Mapping[str, bytes]) -> JobT:
+    def _parsed(self, parse: Callable[[], JobT]) -> JobT:
         started = monotonic()
         if started < self._rests_until:
             sleep(self._rests_until - started)
             started = monotonic()
         try:
-            return to_job(text, files)
+            return parse()
         finally:
             ended = monotonic()
             self._rests_until = ended + (ended - started)
 
 
-_BATCHES = _BatchParser()
+_ONE_BY_ONE = _OneByOne()
+
+
+async def parsed(body: bytes, parse: Callable[[bytes], JobT]) -> JobT:
+    """Parse the JSON of one photo, not on the event loop; raises what ``parse`` raises."""
+    if len(body) > _LARGE_BYTES:
+        return await _ONE_BY_ONE.run(partial(parse, body))
+    return await asyncio.to_thread(parse, body)
 
 
 async def read_localize_job(request: Request) -> RigJob:
@@ -92,12 +99,12 @@ async def read_localize_job(request: Request) -> RigJob:
     def from_json(body: bytes) -> RigJob:
         return jobs.photo_job_of(LocalizeRequest.read_json(body))
 
-    parse, limit = from_json, backend.settings.max_json_bytes
     if checked_media_type(request, (_FORM, _JSON)) == _FORM:
-        parse, limit = from_form, backend.settings.max_request_bytes
-    async with backend.arrivals.body(request, limit) as body:
-        # Parsing and decoding take milliseconds: not on the event loop.
-        return await asyncio.to_thread(parse, body)
+        async with backend.arrivals.body(request, backend.settings.max_request_bytes) as body:
+            # Parsing takes milliseconds: not on the event loop.
+            return await asyncio.to_thread(from_form, body)
+    async with backend.arrivals.body(request, backend.settings.max_json_bytes) as body:
+        return await parsed(body, from_json)
 
 
 async def read_rig_job(request: Request) -> RigJob:
@@ -196,7 +203,7 @@ async def _read_batch(request: Request, to_job: ToJob[JobT], *, max_files: int) 
     is_form = checked_media_type(request, (_FORM, _JSON)) == _FORM
     async with backend.arrivals.body(request, max_bytes) as body:
         text, files = await asyncio.to_thread(from_form, body) if is_form else (body, {})
-        return await _BATCHES.parse(to_job, text, files)
+        return await _ONE_BY_ONE.run(partial(to_job, text, files))
 
 
 def _no_request_text(form: Form) -> VislocError:

@@ -61,7 +61,7 @@ def address_of_grpc(peer: str) -> str:
 
 
 def _without_port(entry: str) -> str:
-    """Return the address of an entry; some proxies write ``1.2.3.4:5000`` and ``[2001:db8::1]:5000``.
+    """Return the address of an entry such as ``1.2.3.4:5000`` or ``[2001:db8::1]:5000``.
 
     What has neither form is returned as it is: an IPv6 address without brackets has no port.
     """

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import binascii
 import math
 from functools import partial
 from typing import Annotated, ClassVar
@@ -17,6 +15,7 @@ from pydantic_core import PydanticCustomError
 import visloc.types
 from visloc.errors import refuse
 from visloc_api.words.base import AS_BASE64
+from visloc_api.words.json_text import bytes_of_base64
 from visloc_api.words.message import IncomingMessage, converted
 from visloc_api.words.wire import ARRAY_DTYPES
 
@@ -29,8 +28,8 @@ def _bytes_from_base64(value: object, field: str) -> object:
     if not isinstance(value, str):
         return value
     try:
-        return base64.b64decode(value, validate=True)
-    except (binascii.Error, ValueError) as error:  # ValueError: letters outside ASCII
+        return bytes_of_base64(value)
+    except ValueError as error:
         raise refuse(
             "image.base64",
             field=field,
@@ -53,8 +52,8 @@ def _array_bytes_from_base64(value: object) -> object:
     if not isinstance(value, str):
         return value
     try:
-        return base64.b64decode(value, validate=True)
-    except (binascii.Error, ValueError):
+        return bytes_of_base64(value)
+    except ValueError:
         raise PydanticCustomError("base64", "the array's bytes in standard base64") from None
 
 

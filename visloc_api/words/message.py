@@ -5,7 +5,6 @@ Names and types are checked; errors have the codes of this API.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
@@ -20,11 +19,11 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from visloc.errors import InvalidInput, VislocError, placed, refuse
+from visloc_api.words.json_text import MAX_NAME, check_json_values, check_names
 
 T = TypeVar("T")
 
 _NOT_AN_OBJECT, _UNKNOWN_FIELD, _REFUSED = "not_an_object", "unknown_field", "refused"
-_MAX_NAME = 100  # characters of a name from outside
 # A message of many small values takes many times its size, and its time, when it is parsed: so they
 # are counted before. One photo needs a few dozen, and the names of all tiles of a set: 10 000.
 MAX_JSON_VALUES = 11_000
@@ -103,10 +102,7 @@ class IncomingMessage(_Made):
         """
         check_json_values(text, max_values, cls.path.rstrip("."))
         checked = cls._checked(lambda: cls.model_validate_json(text, context=limits))
-        try:
-            json.loads(text, object_pairs_hook=check_names_once)  # pydantic takes the last one
-        except (ValueError, RecursionError):
-            raise refuse("request.malformed", expected="JSON") from None
+        check_names(text)  # pydantic takes the last one
         return checked
 
     def given(self) -> dict[str, Any]:
@@ -129,53 +125,6 @@ class IncomingMessage(_Made):
             raise refusal
         finally:
             del refusal
-
-
-def check_names_once(fields: list[tuple[str, object]]) -> None:
-    """Refuse an object of JSON that has a field twice, of which readers take one or the other.
-
-    Args:
-        fields: names and values, as ``json`` gives them to its ``object_pairs_hook``.
-
-    Raises:
-        InvalidInput: ``request.duplicate_field``.
-    """
-    seen: set[str] = set()
-    for name, _ in fields:
-        if name in seen:
-            raise refuse("request.duplicate_field", field=name[:_MAX_NAME])
-        seen.add(name)
-
-
-def check_json_values(text: str | bytes, max_values: int, field: str = "") -> None:
-    """Refuse JSON with too many values before parsing it, which would block all other threads.
-
-    Raises:
-        TooLarge: ``request.too_large``.
-    """
-    # Brackets as well: a list within a list within a list has no comma.
-    values = (
-        sum(map(text.count, ",[{"))
-        if isinstance(text, str)
-        else sum(map(text.count, (b",", b"[", b"{")))
-    )
-    check_num_values(values, max_values, field)
-
-
-def check_num_values(values: int, max_values: int, field: str = "") -> None:
-    """Refuse a message of too many values.
-
-    Raises:
-        TooLarge: ``request.too_large``.
-    """
-    if values > max_values:
-        raise refuse(
-            "request.too_large",
-            "the request has too many values; send numbers of features in base64",
-            field=field or None,
-            expected=f"at most {max_values}",
-            got=values,
-        )
 
 
 def converted(convert: Callable[[Any], Any]) -> BeforeValidator:
@@ -237,5 +186,5 @@ def _joined(location: Sequence[str | int]) -> str:
     """Write a place in a message as ``instants[3].images[0].camera``."""
     text = ""
     for part in location:
-        text += f"[{part}]" if isinstance(part, int) else f".{part[:_MAX_NAME]}"
+        text += f"[{part}]" if isinstance(part, int) else f".{part[:MAX_NAME]}"
     return text.removeprefix(".")

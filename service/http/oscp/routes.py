@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
+from functools import partial
 from http import HTTPStatus
 from time import time
 
@@ -15,7 +15,7 @@ from service.api.answers import geoposes_to_words
 from service.api.deadlines import within
 from service.api.oscp import GeoPoseAccuracy, GeoPoseRequest, GeoPoseResponse, GeoPoseStatus
 from service.http.backend import Backend, backend_of, limit_of
-from service.http.bodies import checked_media_type
+from service.http.bodies import checked_media_type, parsed
 from service.http.openapi.app import problems
 from service.http.oscp.examples import GEOPOSE_BODY, GEOPOSE_RESPONSES
 from service.http.responses import json_response, problem_response, while_connected
@@ -71,7 +71,7 @@ async def geopose(request: Request) -> Response:
     limit = limit_of(request)
     backend.engine.check_room()
     async with backend.arrivals.body(request, backend.settings.max_batch_bytes) as body:
-        asked, job = await asyncio.to_thread(_read, body, backend.settings)
+        asked, job = await parsed(body, partial(_read, settings=backend.settings))
     async with within(limit):
         work = _answer(backend, asked, job, request.state.request_id)
         answer = await while_connected(request.receive, work)

@@ -275,6 +275,17 @@ def test_a_message_that_is_no_protobuf_is_refused_counted_and_logged_in_a_line(
     assert value_of(metrics, errors) == counted[1] + 1
 
 
+def test_a_message_of_very_many_fields_is_refused_before_it_is_parsed(doors: Any) -> None:
+    call = doors.channel.unary_unary(f"/{SERVICE_NAMES[0]}/LocalizeRig")
+    image = pb2.LocalizeRigRequest()
+    image.images.add()
+    with pytest.raises(grpc.RpcError) as caught:
+        call(image.SerializeToString() * 100_001)
+
+    info = info_of(caught.value, grpc.StatusCode.RESOURCE_EXHAUSTED, "request.too_large")
+    assert info.metadata["expected"] == "at most 100000"
+
+
 def lines_of(caplog: pytest.LogCaptureFixture, code: str) -> list[dict[str, Any]]:
     """What the access log has of requests that were refused with a code."""
     every = [getattr(record, "facts", {}) for record in caplog.records]

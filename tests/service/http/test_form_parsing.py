@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import AsyncGenerator, Mapping
+from collections.abc import AsyncGenerator
+from functools import partial
 
 import pytest
 from hypothesis import given
@@ -30,28 +31,28 @@ class Clock:
         self.now += seconds
 
 
-def test_parsing_rests_between_batches_for_as_long_as_it_took(
+def test_parsing_rests_between_texts_for_as_long_as_it_took(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clock = Clock()
     monkeypatch.setattr(bodies, "monotonic", lambda: clock.now)
     monkeypatch.setattr(bodies, "sleep", clock.rest)
-    parser = bodies._BatchParser()
+    parser = bodies._OneByOne()
 
-    def job(text: str | bytes, _files: Mapping[str, bytes]) -> str:
+    def job(text: str) -> str:
         clock.now += 0.25
         if text == "wrong":
             raise InvalidInput("request.malformed", "not JSON")
-        return str(text)
+        return text
 
     async def play() -> None:
-        assert await parser.parse(job, "first", {}) == "first"
+        assert await parser.run(partial(job, "first")) == "first"
         with pytest.raises(InvalidInput):
-            await parser.parse(job, "wrong", {})
-        assert await parser.parse(job, "third", {}) == "third"
+            await parser.run(partial(job, "wrong"))
+        assert await parser.run(partial(job, "third")) == "third"
         assert clock.rests == [0.25, 0.25]
         clock.now += 10.0
-        assert await parser.parse(job, "after a while", {}) == "after a while"
+        assert await parser.run(partial(job, "after a while")) == "after a while"
         assert clock.rests == [0.25, 0.25]
 
     asyncio.run(play())

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import httpx
@@ -236,6 +236,46 @@ def test_however_large_a_length_is_it_is_refused_before_any_of_it_comes(
     with connected(server[0]) as connection:
         connection.sendall(head("/read", size))
         assert b'"code":"request.too_large"' in one_answer(connection)
+
+
+CHUNKED = b"POST /%b HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
+
+
+@pytest.mark.parametrize("path", [b"read", b"refuse"])
+def test_a_body_in_very_many_tiny_chunks_is_not_read(
+    server: tuple[int, Arrivals], path: bytes
+) -> None:
+    with connected(server[0]) as connection:
+        connection.sendall(CHUNKED % path)
+        if path == b"refuse":  # the answer comes before the body
+            assert one_answer(connection).startswith(b"HTTP/1.1 403")
+        dribble(connection, b"1\r\nx\r\n" * 50, 0.0)  # which is nothing special
+        with suppress(ConnectionError):
+            connection.sendall(b"1\r\nx\r\n" * 20_000)
+        answer = answer_of(connection)
+    assert answer.startswith(b"HTTP/1.1 400") == (path == b"read" and bool(answer))
+    wait_until_idle(server[1])
+
+
+@pytest.mark.parametrize(("number", "size"), [(2000, 1), (2900, 64), (500, 200)])
+def test_a_body_in_many_chunks_is_read(
+    server: tuple[int, Arrivals], number: int, size: int
+) -> None:
+    with connected(server[0]) as connection:
+        chunk = b"%x\r\n%b\r\n" % (size, b"x" * size)
+        connection.sendall(CHUNKED % b"read" + chunk * number + b"0\r\n\r\n")
+        assert one_answer(connection).endswith(f"{number * size} {number * size}".encode())
+
+
+def test_what_is_no_http_after_an_answer_leaves_no_traceback(
+    server: tuple[int, Arrivals], caplog: pytest.LogCaptureFixture
+) -> None:
+    with connected(server[0]) as connection:
+        connection.sendall(CHUNKED % b"refuse")
+        assert one_answer(connection).startswith(b"HTTP/1.1 403")
+        connection.sendall(b"this is no chunk\r\n\r\n")
+        assert not answer_of(connection)
+    assert not caplog.records
 
 
 def test_together_bodies_take_no_more_than_there_is_room_for(

@@ -28,7 +28,8 @@ from visloc.options import LocalizeOptions as CoreOptions
 from visloc.priors import GravityPrior, HeightBand, PosePrior, PositionPrior, Priors
 from visloc.sequences.filling import TimeUnit
 from visloc_api.v1 import localization_pb2 as pb2
-from visloc_api.words.message import IncomingMessage, check_names_once
+from visloc_api.words.json_text import check_names_once
+from visloc_api.words.message import IncomingMessage
 from visloc_api.words.options import LocalizeOptions
 from visloc_api.words.photo import LocalizeRequest
 from visloc_api.words.rigs import BatchLimits, LocalizeRigRequest

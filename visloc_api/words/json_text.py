@@ -1,0 +1,121 @@
+"""JSON from outside as text: what is checked of it beside what a model says.
+
+Parsing holds Python's lock, and so stops every other thread. A text may have 64 MB, nearly all of
+it base64. What is done here takes milliseconds at a time.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+
+from visloc.errors import refuse
+
+MAX_NAME = 100  # characters of a name from outside that a refusal repeats
+# Characters that are looked at while Python's lock is held: about a millisecond.
+_PIECE = 2**20
+# Texts of at least so many characters are replaced before names are compared.
+_LONG = 1000
+
+
+def check_json_values(text: str | bytes, max_values: int, field: str = "") -> None:
+    """Refuse JSON with too many values before parsing it, which would block all other threads.
+
+    Raises:
+        TooLarge: ``request.too_large``.
+    """
+    # Brackets as well: a list within a list within a list has no comma. And quotes, of which a
+    # value and its name have four.
+    values = sum(_count(text, mark) for mark in ",[{")
+    check_num_values(max(values, _count(text, '"') // 4), max_values, field)
+
+
+def check_num_values(values: int, max_values: int, field: str = "") -> None:
+    """Refuse a message of too many values.
+
+    Raises:
+        TooLarge: ``request.too_large``.
+    """
+    if values > max_values:
+        raise refuse(
+            "request.too_large",
+            "the request has too many values; send numbers of features in base64",
+            field=field or None,
+            expected=f"at most {max_values}",
+            got=values,
+        )
+
+
+def check_names(text: str | bytes) -> None:
+    """Refuse JSON with an object that has a field twice, of which readers take one or the other.
+
+    Args:
+        text: JSON that another reader accepted.
+
+    Raises:
+        InvalidInput: ``request.duplicate_field``; ``request.malformed``.
+    """
+    try:
+        json.loads(_shortened(text), object_pairs_hook=check_names_once)
+    except (ValueError, RecursionError):
+        raise refuse("request.malformed", expected="JSON") from None
+
+
+def check_names_once(fields: list[tuple[str, object]]) -> None:
+    """Refuse an object of JSON that has a field twice.
+
+    Args:
+        fields: names and values, as ``json`` gives them to its ``object_pairs_hook``.
+
+    Raises:
+        InvalidInput: ``request.duplicate_field``.
+    """
+    seen: set[str] = set()
+    for name, _ in fields:
+        if name in seen:
+            raise refuse("request.duplicate_field", field=name[:MAX_NAME])
+        seen.add(name)
+
+
+def bytes_of_base64(text: str) -> bytes:
+    """Decode standard base64, padded and without anything else in it.
+
+    Raises:
+        ValueError: when it is none; ``binascii.Error`` is one.
+    """
+    parts = []
+    for start in range(0, len(text), _PIECE):
+        piece = text[start : start + _PIECE]
+        if start + _PIECE < len(text) and piece.endswith("="):
+            raise binascii.Error("Excess data after padding")
+        parts.append(base64.b64decode(piece, validate=True))
+    return b"".join(parts)
+
+
+def _count(text: str | bytes, mark: str) -> int:
+    starts = range(0, len(text), _PIECE)
+    if isinstance(text, str):
+        return sum(text.count(mark, start, start + _PIECE) for start in starts)
+    return sum(text.count(mark.encode(), start, start + _PIECE) for start in starts)
+
+
+def _shortened(text: str | bytes) -> str | bytes:
+    """Return JSON with numbers in the place of long texts: equal ones for equal texts.
+
+    Between two quotes without a backslash, a comma, and a colon lies the inside of a text, for
+    what separates two texts has one of the latter. So nothing but texts is replaced.
+    """
+    if isinstance(text, str):
+        return '"'.join(
+            str(hash(part))
+            if len(part) >= _LONG and not any(mark in part for mark in "\\,:")
+            else part
+            for part in text.split('"')
+        )
+    return b'"'.join(
+        b"%d" % hash(part)
+        if len(part) >= _LONG and not any(mark in part for mark in (b"\\", b",", b":"))
+        else part
+        for part in text.split(b'"')
+    )
