@@ -18,12 +18,11 @@ from typing import Annotated
 import typer
 
 from benchmarks.reliability.checks import print_checks
+from benchmarks.reliability.connections import connections
 from benchmarks.reliability.heavy_requests import heavy_photos, many_values
-from benchmarks.reliability.idle_connections import idle_connections
 from benchmarks.reliability.kills import kill_service, kill_workers
 from benchmarks.reliability.maps import SampleMaps, make_maps
 from benchmarks.reliability.refusals import refusals
-from benchmarks.reliability.slow_clients import slow_clients
 from benchmarks.reliability.soak import soak
 from benchmarks.reliability.storage import s3_away
 from benchmarks.reliability.uploads import full_disk, truncated_upload
@@ -73,27 +72,14 @@ def s3_away_command(
         print_checks("S3 away", asyncio.run(s3_away(maps, work, seconds)))
 
 
-@app.command("slow-clients")
-def slow_clients_command(
-    connections: Annotated[int, typer.Option(help="Slow ones, at once.")] = 200,
-    seconds: Annotated[float, typer.Option(help="Of each turn.")] = 25.0,
-    rounds: Annotated[int, typer.Option(help="Of turns.")] = 3,
+@app.command("connections")
+def connections_command(
+    count: Annotated[int, typer.Option(help="Connections of each attack, at once.")] = 2500,
+    seconds: Annotated[float, typer.Option(help="Of each attack.")] = 8.0,
 ) -> None:
-    """Clients that send one byte per second."""
+    """Idle, slow and flooding connections, with 1024 and 65536 open files, without and with TLS."""
     with _prepared() as (maps, work):
-        print_checks(
-            "slow clients", asyncio.run(slow_clients(maps, work, connections, seconds, rounds))
-        )
-
-
-@app.command("idle-connections")
-def idle_connections_command(
-    connections: Annotated[int, typer.Option(help="Idle ones, at once.")] = 2500,
-) -> None:
-    """Connections that say nothing, with 1024 open files allowed."""
-    with _prepared() as (maps, work):
-        checks = asyncio.run(idle_connections(maps.folder, work, connections))
-        print_checks("idle connections", checks)
+        print_checks("connections", asyncio.run(connections(maps, work, count, seconds)))
 
 
 @app.command("heavy-photos")

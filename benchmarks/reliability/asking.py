@@ -70,13 +70,13 @@ class Doors:
     def __init__(self, service: ServiceProcess) -> None:
         # No limits: the requests that wait are the test.
         limits = httpx.Limits(max_connections=None, max_keepalive_connections=64)
-        self.http = httpx.AsyncClient(base_url=service.url, timeout=_ANSWER_WITHIN_S, limits=limits)
-        self._channel = grpc.aio.insecure_channel(
-            service.grpc,
-            options=(
-                ("grpc.initial_reconnect_backoff_ms", 200),
-                ("grpc.max_reconnect_backoff_ms", 500),
-            ),
+        self.http = httpx.AsyncClient(
+            base_url=service.url, timeout=_ANSWER_WITHIN_S, limits=limits, verify=service.tls()
+        )
+        self._channel = channel_to(
+            service,
+            ("grpc.initial_reconnect_backoff_ms", 200),
+            ("grpc.max_reconnect_backoff_ms", 500),
         )
         self.stub = LocalizationStub(self._channel)
 
@@ -91,6 +91,14 @@ class Doors:
     ) -> None:
         await self.http.aclose()
         await self._channel.close(None)
+
+
+def channel_to(service: ServiceProcess, *options: tuple[str, int]) -> grpc.aio.Channel:
+    """Open a channel, with TLS where the service has it."""
+    if service.trust is None:
+        return grpc.aio.insecure_channel(service.grpc, options=options)
+    credentials = grpc.ssl_channel_credentials(service.trust)
+    return grpc.aio.secure_channel(service.grpc, credentials, options=options)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import time
@@ -29,7 +30,11 @@ class ServiceProcess:
         ports: of HTTP and gRPC; free ones when None.
         before: words before the command, such as ``unshare``'s.
         environment: variables besides this process's own.
+        certificate: PEM files of a certificate and its key, for TLS.
         settings: further settings, by name.
+
+    Attributes:
+        trust: its certificate, where it speaks TLS.
     """
 
     def __init__(
@@ -41,10 +46,15 @@ class ServiceProcess:
         ports: tuple[int, int] | None = None,
         before: Sequence[str] = (),
         environment: Mapping[str, str] | None = None,
+        certificate: tuple[Path, Path] | None = None,
         **settings: object,
     ) -> None:
         self.http_port, self.grpc_port = ports or (free_port(), free_port())
-        self.url = f"http://{host}:{self.http_port}"
+        self.trust: bytes | None = None
+        if certificate is not None:
+            self.trust = certificate[0].read_bytes()
+            settings |= {"tls_cert": certificate[0], "tls_key": certificate[1]}
+        self.url = f"{'http' if certificate is None else 'https'}://{host}:{self.http_port}"
         self.grpc = f"{host}:{self.grpc_port}"
         self.log = log
         given = {
@@ -95,9 +105,15 @@ class ServiceProcess:
     def is_ready(self) -> bool:
         """Whether /readyz says so."""
         try:
-            return httpx.get(f"{self.url}/readyz", timeout=5).status_code == 200
+            return httpx.get(f"{self.url}/readyz", timeout=5, verify=self.tls()).is_success
         except httpx.TransportError:
             return False
+
+    def tls(self) -> ssl.SSLContext | bool:
+        """What a client needs to trust the service: its certificate, if it has one."""
+        if self.trust is None:
+            return False
+        return ssl.create_default_context(cadata=self.trust.decode())
 
     def kill(self) -> None:
         """Kill the main process, as the kernel does when memory is short."""

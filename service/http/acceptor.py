@@ -10,6 +10,7 @@ import socket
 import ssl
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from itertools import chain
 from time import monotonic
 from typing import Any
 
@@ -51,15 +52,19 @@ class Connection(asyncio.Protocol, ABC):
 class OpenConnections:
     """The open connections of a port, at most ``limit``.
 
-    A connection is in use from the end of a request's head to the end of its answer, else idle. At
-    the limit, the longest idle connection is closed for a new one.
+    A connection is in use from the end of a request's arrival to the end of its answer. Before, its
+    request arrives, from the end of the head on; else it is idle. At the limit, one is closed for a
+    new one: the longest idle, and where none is, the one whose request has come no further for the
+    longest time, because a body may come very slowly.
     """
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self._reserve = min(max(1, limit // 10), limit - 1)
         self._open: set[Connection] = set()
-        self._idle: dict[Connection, float] = {}  # the time it became idle; longest idle first
+        # Since when; the longest first.
+        self._idle: dict[Connection, float] = {}
+        self._arriving: dict[Connection, float] = {}
 
     def __len__(self) -> int:
         return len(self._open)
@@ -67,7 +72,8 @@ class OpenConnections:
     @property
     def is_busy(self) -> bool:
         """Whether all connections are in use except the tenth reserved for health and metrics."""
-        return len(self._open) - len(self._idle) > self.limit - self._reserve
+        in_use = len(self._open) - len(self._idle) - len(self._arriving)
+        return in_use > self.limit - self._reserve
 
     def add(self, connection: Connection) -> None:
         """Count a new connection, idle at first."""
@@ -77,16 +83,30 @@ class OpenConnections:
     def remove(self, connection: Connection) -> None:
         self._open.discard(connection)
         self._idle.pop(connection, None)
+        self._arriving.pop(connection, None)
 
-    def note(self, connection: Connection, *, in_use: bool) -> None:
-        """Record whether a connection is in use. One that stays idle keeps its rank."""
-        if in_use:
+    def note(self, connection: Connection, *, in_use: bool, arriving: bool = False) -> None:
+        """Record what a connection does. One that goes on doing it keeps its rank.
+
+        Args:
+            connection: one that may have been removed.
+            in_use: whether a request has arrived and is not answered.
+            arriving: whether the body of one that is not answered has not arrived.
+        """
+        if in_use or arriving:
             self._idle.pop(connection, None)
-        elif connection in self._open:
-            self._idle.setdefault(connection, monotonic())
+        if in_use or not arriving:
+            self._arriving.pop(connection, None)
+        if connection in self._open and not in_use:
+            (self._arriving if arriving else self._idle).setdefault(connection, monotonic())
+
+    def renew(self, connection: Connection) -> None:
+        """Record that the request of a connection comes on well."""
+        if self._arriving.pop(connection, None) is not None:
+            self._arriving[connection] = monotonic()
 
     def make_room(self) -> float:
-        """At the limit, close the longest idle connection.
+        """At the limit, close the longest idle connection, or one whose request does not come.
 
         Returns:
             Seconds until a connection can be accepted: 0 if one can be now, infinity if all are
@@ -97,7 +117,8 @@ class OpenConnections:
         idlest = self._idlest()
         if idlest is None:
             return math.inf
-        wait_s = self._idle[idlest] + _LEAST_IDLE_S - monotonic()
+        since = self._idle.get(idlest) or self._arriving[idlest]
+        wait_s = since + _LEAST_IDLE_S - monotonic()
         if wait_s > 0:
             return wait_s
         self._close(idlest)
@@ -118,7 +139,8 @@ class OpenConnections:
                 self._close(each)
 
     def _idlest(self) -> Connection | None:
-        return next((each for each in self._idle if not each.is_sending), None)
+        waiting = chain(self._idle, self._arriving)
+        return next((each for each in waiting if not each.is_sending), None)
 
     def _close(self, connection: Connection) -> None:
         self.remove(connection)

@@ -90,9 +90,8 @@ class RequestEnvelope:
                 raise
             await refuse(stopping_error())
         except ClientDisconnect:
-            logger.info(
-                "the client of request %s disconnected before the answer", record.request_id
-            )
+            if record.status:  # else it is in the log as cancelled
+                logger.info("the client of request %s left within the answer", record.request_id)
         except Exception:  # the last line of defence: every caller gets an answer
             logger.exception("request %s failed unexpectedly", record.request_id)
             if record.status:

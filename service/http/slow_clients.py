@@ -56,6 +56,7 @@ class TimelyProtocol(H11Protocol, Connection):
     open_connections: OpenConnections
     _arriving: asyncio.TimerHandle | None = None
     _leaving: asyncio.TimerHandle | None = None
+    _received = 0  # bytes since the connection was renewed
 
     def __init__(self, config: uvicorn.Config, *args: Any, **kwargs: Any) -> None:
         super().__init__(config, *args, **kwargs)
@@ -74,8 +75,12 @@ class TimelyProtocol(H11Protocol, Connection):
         self._watch(first=True)
 
     def data_received(self, data: bytes) -> None:
+        self._received += len(data)
         super().data_received(data)
         self._watch()
+        if self._received >= SLOWEST_BYTES_PER_S:
+            self._received = 0
+            self.open_connections.renew(self)
 
     def on_response_complete(self) -> None:
         super().on_response_complete()
@@ -113,9 +118,10 @@ class TimelyProtocol(H11Protocol, Connection):
 
     def _watch(self, *, first: bool = False) -> None:
         """Start the clock when it is the client's turn. More data does not reset the clock."""
-        in_use = self.cycle is not None and not self.cycle.response_complete
-        self.open_connections.note(self, in_use=in_use)
         state = self.conn.their_state
+        arriving = state is h11.SEND_BODY and self.conn.our_state is h11.SEND_RESPONSE
+        in_use = self.cycle is not None and not self.cycle.response_complete and not arriving
+        self.open_connections.note(self, in_use=in_use, arriving=arriving)
         has_part_of_head = state is h11.IDLE and (first or bool(self.conn.trailing_data[0]))
         is_unwanted = state is h11.SEND_BODY and self.conn.our_state is h11.DONE
         if has_part_of_head or is_unwanted:

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from time import perf_counter, time_ns
 
 from service.errors import statuses_of
+from service.telemetry.floods import Floods
 from service.telemetry.logs import (
     UNMATCHED,
     RequestRecord,
@@ -31,6 +32,7 @@ access_log = logging.getLogger("service.access")
 
 # The status of a request whose caller left before the answer.
 CANCELLED = "CANCELLED"
+_TOO_SLOW = "request.too_slow"
 # Probes come every few seconds: they are logged at level debug and have no spans.
 _PROBES = ("GET /healthz", "GET /readyz", "GET /metrics")
 
@@ -46,6 +48,7 @@ class Observer:
     def __init__(self, metrics: Metrics, spans: Spans | None = None) -> None:
         self.metrics = metrics
         self._spans = spans
+        self._floods = Floods()
 
     @contextmanager
     def request(
@@ -77,7 +80,7 @@ class Observer:
             seconds = perf_counter() - started
             record.status = record.status or CANCELLED
             self.metrics.observe_request(door, record.route, record.status, seconds)
-            _log(record, seconds)
+            self._log(record, seconds)
             if self._spans is not None and trace is not None and record.route not in _PROBES:
                 self._spans.send(
                     RequestSpan(
@@ -124,24 +127,31 @@ class Observer:
         if record is not None:
             record.map, record.outcome = found.map_id, reason or LOCALIZED
 
-
-def _log(record: RequestRecord, seconds: float) -> None:
-    facts: dict[str, object] = {
-        "door": record.door,
-        "route": record.route,
-        "status": record.status,
-        "ms": round(seconds * 1000, 1),
-    }
-    if record.instants > 1:
-        facts |= {"map": record.map, "instants": record.instants, "localized": record.localized}
-    elif record.map is not None:
-        facts |= {"map": record.map, "outcome": record.outcome}
-    if record.code is not None:
-        facts["code"] = record.code
-        if record.code.startswith("access."):
-            facts["peer"] = record.peer
-    level = logging.DEBUG if record.route in _PROBES else logging.INFO
-    access_log.log(level, "request", extra={"facts": facts})
+    def _log(self, record: RequestRecord, seconds: float) -> None:
+        facts: dict[str, object] = {
+            "door": record.door,
+            "route": record.route,
+            "status": record.status,
+            "ms": round(seconds * 1000, 1),
+        }
+        if record.instants > 1:
+            facts |= {"map": record.map}
+            facts |= {"instants": record.instants, "localized": record.localized}
+        elif record.map is not None:
+            facts |= {"map": record.map, "outcome": record.outcome}
+        if record.code is not None:
+            facts["code"] = record.code
+            if record.code.startswith("access."):
+                facts["peer"] = record.peer
+        # What a client did not send or wait for: nothing was worked on, so it costs nobody much to
+        # do it a thousand times a second.
+        if record.status == CANCELLED or record.code == _TOO_SLOW:
+            written, more = self._floods.passes(record.code or CANCELLED)
+            if not written:
+                return
+            facts |= {"unlogged_before": more} if more else {}
+        level = logging.DEBUG if record.route in _PROBES else logging.INFO
+        access_log.log(level, "request", extra={"facts": facts})
 
 
 def _attributes_of(record: RequestRecord) -> dict[str, str | int | float]:

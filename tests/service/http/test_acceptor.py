@@ -117,26 +117,17 @@ def test_silence_within_the_handshake_of_tls_is_idle_too(serve: Any, tmp_path: P
         assert doors.server.state().connections <= LIMIT
 
 
-def test_when_all_are_in_use_only_health_and_metrics_are_answered(
-    serve: Any, tmp_path: Path
-) -> None:
+def test_requests_that_do_not_arrive_leave_room_for_others(serve: Any, tmp_path: Path) -> None:
     with serve(tmp_path, load=False, max_connections=LIMIT) as doors, ExitStack() as stack:
-        port = doors.server.http_port
-        under_way = [stack.enter_context(begun(port)) for _ in range(LIMIT - 2)]
-        wait_until(lambda: doors.server.state().connections == LIMIT - 2)
-
-        refused = httpx.get(f"{doors.url}/maps")
-        assert (refused.status_code, refused.json()["code"]) == (429, "server.busy")
-        assert refused.headers["retry-after"] == "1"
-        for path in ("/healthz", "/metrics"):
-            assert httpx.get(f"{doors.url}{path}").status_code == 200
-        under_way += [stack.enter_context(begun(port)) for _ in range(LIMIT)]
-        # Those that were refused do not hold their places: their bodies are not waited for.
-        for path in ("/healthz", "/metrics"):
-            assert httpx.get(f"{doors.url}{path}").status_code == 200
-        for each in under_way[: LIMIT - 2]:
-            each.sendall(b"]")
-            assert status(each) == 422
+        under_way = [stack.enter_context(begun(doors.server.http_port)) for _ in range(3 * LIMIT)]
+        for path in ("/healthz", "/metrics", "/maps"):
+            assert httpx.get(f"{doors.url}{path}").is_success
+        assert doors.server.state().connections <= LIMIT
+        assert all(gone(each) for each in under_way[:LIMIT])
+        last = under_way[-1]
+        last.setblocking(True)
+        last.sendall(b"]")
+        assert status(last) == 422
 
 
 def answers(stub: Any) -> bool:
@@ -215,6 +206,29 @@ def test_who_is_closed_for_another(monkeypatch: pytest.MonkeyPatch) -> None:
     for talk in talks:
         connections.remove(talk)
     assert len(connections) == 1
+
+
+def test_a_request_that_does_not_come_on_is_closed_when_none_is_idle(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("service.http.acceptor._LEAST_IDLE_S", 0.0)
+    fast, slow, using, silent = talks = [Talk() for _ in range(4)]
+    connections = OpenConnections(4)
+    for talk in talks:
+        connections.add(talk)
+    for talk in (fast, slow, using):
+        connections.note(talk, in_use=False, arriving=True)
+    connections.note(using, in_use=True)
+    connections.renew(fast)
+    connections.renew(silent)  # which brings nothing new
+
+    for closed in ([silent], [silent, slow], [silent, slow, fast]):
+        assert connections.make_room() == 0
+        assert [talk for talk in talks if talk.was_closed] == sorted(closed, key=talks.index)
+        another = Talk()
+        connections.add(another)
+        connections.note(another, in_use=True)
+    assert connections.make_room() == float("inf")
 
 
 def test_a_new_connection_has_time_to_send_a_request() -> None:

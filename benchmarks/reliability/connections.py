@@ -1,0 +1,212 @@
+"""Attacks on connections, one kind after the other, beside probes and one client."""
+
+from __future__ import annotations
+
+import asyncio
+import resource
+import ssl
+import subprocess
+import time
+from collections import Counter
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from math import inf
+from pathlib import Path
+
+import grpc
+import httpx
+from grpc_health.v1 import health_pb2
+from grpc_health.v1.health_pb2_grpc import HealthStub
+
+from benchmarks.reliability.asking import Case, Doors, channel_to, good_cases
+from benchmarks.reliability.attackers import ATTACKS, Attack, Target, attacked
+from benchmarks.reliability.checks import Check, counts_text
+from benchmarks.reliability.load import Asked, ask_in_turn, percentile
+from benchmarks.reliability.maps import SampleMaps
+from benchmarks.reliability.service_process import ServiceProcess, free_port
+from benchmarks.reliability.soak import Expected, unloaded_answers
+
+FLOODING = 10  # connections of a flood
+PROBE_LIMIT_S = 1.0
+MOST_LOG_LINES = 50
+MOST_P90 = 2.0
+_PROBE_EVERY_S = 0.5
+# gRPC itself refuses what comes in the moment in which all its places are taken.
+_REFUSED_BY_GRPC = 1
+_WARM_S = 3.0
+
+
+@dataclass(frozen=True)
+class Besieged:
+    """A service, and what is asked of it meanwhile."""
+
+    service: ServiceProcess
+    doors: Doors
+    cases: Sequence[Case]
+    expected: Expected
+    metrics_port: int
+
+
+async def connections(
+    maps: SampleMaps,
+    work: Path,
+    count: int,
+    seconds: float,
+    limits: Sequence[int] = (1024, 65536),
+    *,
+    tls: Sequence[bool] = (False, True),
+) -> list[Check]:
+    """Attack a service in every way, alone in its process for each limit of open files.
+
+    Args:
+        maps: to serve.
+        work: folder for logs and a certificate.
+        count: connections of every attack that is no flood.
+        seconds: of each attack.
+        limits: of open files; what the hard limit of this process does not allow is left out.
+        tls: whether the service speaks it.
+    """
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    checks = []
+    for limit in (limit for limit in limits if limit <= most):
+        for with_tls in tls:
+            checks += await _withstood(maps, work, limit, with_tls, count, seconds)
+    return checks
+
+
+async def _withstood(
+    maps: SampleMaps, work: Path, limit: int, with_tls: bool, count: int, seconds: float
+) -> list[Check]:
+    where = f"{limit} files, {'TLS' if with_tls else 'no TLS'}"
+    log = work / f"service-{limit}-{with_tls}.log"
+    metrics_port = free_port()
+    own = certificate(work) if with_tls else None
+    before = ["bash", "-c", f'ulimit -n {limit}\nexec "$@"', "-"]
+    cases = [case for case in good_cases(maps) if " photo " in case.name and "two" not in case.name]
+    checks = []
+    with ServiceProcess(
+        maps.folder, log, before=before, certificate=own, metrics_port=metrics_port
+    ) as service:
+        async with Doors(service) as doors:
+            expected = await unloaded_answers(doors, maps, cases)
+            besieged = Besieged(service, doors, cases, expected, metrics_port)
+            await ask_in_turn(doors, cases, 1, _WARM_S)
+            for attack in ATTACKS:
+                if with_tls or not attack.hides_tls:
+                    check = await _attack(besieged, attack, count, seconds)
+                    checks.append(Check(f"{where}: {check[0]}", *check[1:]))
+    return checks
+
+
+async def _attack(
+    besieged: Besieged, attack: Attack, count: int, seconds: float
+) -> tuple[str, str, bool]:
+    """Ask alone, and then beside an attack."""
+    service, doors, cases = besieged.service, besieged.doors, besieged.cases
+    seed = hash(attack.name) % 1000
+    alone = await ask_in_turn(doors, cases, 1, seconds, seed)
+    lines = _lines(service.log)
+    port = service.http_port if attack.api == "HTTP" else service.grpc_port
+    number = FLOODING if attack.is_flood else count
+    async with attacked(Target(port, attacking_tls(service, attack)), attack, number) as seen:
+        await asyncio.sleep(1)
+        probes = asyncio.create_task(probed(besieged, seconds))
+        beside = await ask_in_turn(doors, cases, 1, seconds, seed)
+        found = await probes
+        open_files = len(list(Path(f"/proc/{service.pid}/fd").iterdir()))
+    lines = max(0, _lines(service.log) - lines - len(beside))
+    late = {name: sum(each > PROBE_LIMIT_S for each in took) for name, took in found.items()}
+    if attack.api == "gRPC":
+        late["gRPC health"] = max(0, late["gRPC health"] - _REFUSED_BY_GRPC)
+    slowest = max(each for took in found.values() for each in took)
+    # A connection that was idle for a moment may be closed for another: clients ask again.
+    lost = [one for one in beside if one.outcome.is_lost]
+    wrong = [one for one in beside if one not in lost and _is_wrong(one, besieged.expected)]
+    ratio = p90(beside) / p90(alone)
+    return (
+        f"{number} connections to {attack.api} that {attack.name}",
+        f"probes later than {PROBE_LIMIT_S:g} s: {counts_text(Counter(late))}, slowest "
+        f"{slowest:.2f} s; p90 {p90(beside) * 1e3:.0f} ms, alone {p90(alone) * 1e3:.0f} ms: "
+        f"{ratio:.2f} times, {len(beside)} answers, {len(wrong)} wrong, {len(lost)} to ask again; "
+        f"{lines} log lines; "
+        f"{open_files} files; {counts_text(seen)}",
+        not any(late.values()) and ratio <= MOST_P90 and lines <= MOST_LOG_LINES and not wrong,
+    )
+
+
+def attacking_tls(service: ServiceProcess, attack: Attack) -> ssl.SSLContext | None:
+    """The TLS of an attack's connections; strangers do not look at certificates."""
+    if service.trust is None:
+        return None
+    context = ssl.create_default_context()
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    if attack.api == "gRPC":
+        context.set_alpn_protocols(["h2"])
+    return context
+
+
+def certificate(work: Path) -> tuple[Path, Path]:
+    """Make a certificate for this machine; the files of it and of its key."""
+    cert, key = work / "cert.pem", work / "key.pem"
+    subprocess.run(
+        [
+            *("openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "30"),
+            *("-keyout", key, "-out", cert, "-subj", "/CN=localhost"),
+            *("-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1"),
+        ],
+        check=True,
+        capture_output=True,
+    )
+    return cert, key
+
+
+async def probed(besieged: Besieged, seconds: float) -> Mapping[str, list[float]]:
+    """Ask for health and metrics over new connections; the seconds of each, infinity for failed."""
+    service = besieged.service
+    asked: dict[str, Callable[[], Awaitable[None]]] = {
+        "/healthz": lambda: _get(f"{service.url}/healthz", service),
+        "/readyz": lambda: _get(f"{service.url}/readyz", service),
+        "metrics": lambda: _get(f"http://127.0.0.1:{besieged.metrics_port}/metrics", service),
+        "gRPC health": lambda: _check(service),
+    }
+    found = await asyncio.gather(*(_probed(probe, seconds) for probe in asked.values()))
+    return dict(zip(asked, found, strict=True))
+
+
+async def _probed(probe: Callable[[], Awaitable[None]], seconds: float) -> list[float]:
+    found, end = [], time.monotonic() + seconds
+    while (started := time.monotonic()) < end:
+        took = inf
+        with suppress(httpx.HTTPError, grpc.RpcError):
+            await probe()
+            took = time.monotonic() - started
+        found.append(took)
+        await asyncio.sleep(max(0.0, started + _PROBE_EVERY_S - time.monotonic()))
+    return found
+
+
+async def _get(url: str, service: ServiceProcess) -> None:
+    async with httpx.AsyncClient(timeout=5, verify=service.tls()) as http:
+        (await http.get(url)).raise_for_status()
+
+
+async def _check(service: ServiceProcess) -> None:
+    # A channel of its own, which would otherwise share the connection of the last one.
+    async with channel_to(service, ("grpc.use_local_subchannel_pool", 1)) as channel:
+        await HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=5)
+
+
+def p90(asked: Sequence[Asked]) -> float:
+    """The time within which nine of ten answers came; seconds."""
+    return percentile([one.outcome.seconds for one in asked], 0.9)
+
+
+def _is_wrong(asked: Asked, expected: Expected) -> bool:
+    return (asked.outcome.status, asked.outcome.body) not in expected[asked.case.name]
+
+
+def _lines(log: Path) -> int:
+    return log.read_bytes().count(b"\n")
