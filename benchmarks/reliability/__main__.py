@@ -23,6 +23,7 @@ from benchmarks.reliability.heavy_requests import heavy_photos, many_values
 from benchmarks.reliability.kills import kill_service, kill_workers
 from benchmarks.reliability.maps import SampleMaps, make_maps
 from benchmarks.reliability.refusals import refusals
+from benchmarks.reliability.siege import siege
 from benchmarks.reliability.soak import soak
 from benchmarks.reliability.storage import s3_away
 from benchmarks.reliability.uploads import full_disk, truncated_upload
@@ -98,6 +99,15 @@ def many_values_command(
     """Messages of many small values, which take long to parse."""
     with _prepared() as (maps, work):
         print_checks("many values", many_values(maps, work, clients))
+
+
+@app.command("siege")
+def siege_command(
+    minutes: Annotated[float, typer.Option(help="How long.")] = 15.0,
+) -> None:
+    """All attacks at once on two replicas, with swaps, kills, and a replica replaced."""
+    with _prepared() as (maps, work):
+        print_checks("siege", asyncio.run(siege(maps, work, 60 * minutes)))
 
 
 @app.command("refusals")

@@ -39,6 +39,7 @@ class Attack:
         play: one connection, until it has had enough or is closed.
         is_flood: whether few connections send much, rather than many next to nothing.
         hides_tls: whether it speaks no TLS where it should.
+        one_in: where each connection costs a request, there are so many times fewer of them.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Attack:
     play: Play
     is_flood: bool = False
     hides_tls: bool = False
+    one_in: int = 1
 
 
 @dataclass(frozen=True)
@@ -137,11 +139,11 @@ def _flood(at_once: bytes, next_bytes: Callable[[int], bytes]) -> Play:
         closed, number = asyncio.create_task(_until_closed(reader)), 0
         try:
             while not closed.done():
-                sent = 0
-                while sent < _FLOOD_BYTES:
-                    part = next_bytes(number)
-                    writer.write(part)
-                    number, sent = number + 1, sent + len(part)
+                sent = bytearray()
+                while len(sent) < _FLOOD_BYTES:
+                    sent += next_bytes(number)
+                    number += 1
+                writer.write(sent)
                 await writer.drain()
                 await asyncio.sleep(_FLOOD_PAUSE_S)
         finally:
@@ -231,7 +233,8 @@ ATTACKS = (
     Attack(
         "do not read large answers",
         "HTTP",
-        _unread(b"GET /openapi.json HTTP/1.1\r\nHost: localhost\r\n\r\n" * 20),
+        _unread(b"GET /openapi.json HTTP/1.1\r\nHost: localhost\r\n\r\n" * 4),
+        one_in=5,
     ),
     Attack("end their half within a head", "HTTP", _half_closed),
     Attack("send no HTTP", "HTTP", _no_http),
@@ -254,7 +257,7 @@ ATTACKS = (
             _frame(_DATA, 0, 1, b"\n") * 100,
         ),
     ),
-    Attack("do not read answers", "gRPC", _unread(_unread_call())),
+    Attack("do not read answers", "gRPC", _unread(_unread_call()), one_in=5),
     Attack("flood with calls that they reset", "gRPC", _flood(_HELLO, _reset), is_flood=True),
     Attack(
         "flood with settings",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import resource
 import ssl
 import subprocess
@@ -109,14 +110,14 @@ async def _attack(
     alone = await ask_in_turn(doors, cases, 1, seconds, seed)
     lines = _lines(service.log)
     port = service.http_port if attack.api == "HTTP" else service.grpc_port
-    number = FLOODING if attack.is_flood else count
+    number = FLOODING if attack.is_flood else count // attack.one_in
     async with attacked(Target(port, attacking_tls(service, attack)), attack, number) as seen:
         await asyncio.sleep(1)
         probes = asyncio.create_task(probed(besieged, seconds))
         beside = await ask_in_turn(doors, cases, 1, seconds, seed)
         found = await probes
         open_files = len(list(Path(f"/proc/{service.pid}/fd").iterdir()))
-    lines = max(0, _lines(service.log) - lines - len(beside))
+    lines = _lines(service.log) - lines
     late = {name: sum(each > PROBE_LIMIT_S for each in took) for name, took in found.items()}
     if attack.api == "gRPC":
         late["gRPC health"] = max(0, late["gRPC health"] - _REFUSED_BY_GRPC)
@@ -209,4 +210,6 @@ def _is_wrong(asked: Asked, expected: Expected) -> bool:
 
 
 def _lines(log: Path) -> int:
-    return log.read_bytes().count(b"\n")
+    """Count the lines, but for those of requests that were served."""
+    served = re.compile(rb'"status": ?"(200|OK)"')
+    return sum(served.search(line) is None for line in log.read_bytes().splitlines())

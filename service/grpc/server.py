@@ -48,7 +48,13 @@ class GrpcServer:
         self._server = grpc.aio.server(
             interceptors=[
                 AccessInterceptor(access, envelope, max(1, settings.max_connections // 2)),
-                TimelyCalls(envelope, self._connections, patience_s, settings.max_message_bytes),
+                TimelyCalls(
+                    envelope,
+                    self._connections,
+                    patience_s,
+                    settings.max_message_bytes,
+                    max_waiting=max(1, settings.max_connections // 4),
+                ),
             ],
             options=[
                 ("grpc.max_receive_message_length", settings.max_message_bytes),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from typing import Any, NamedTuple
 
 import grpc
@@ -33,6 +34,7 @@ class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         max_message_bytes: of one message. gRPC does not tell how much of a message has arrived,
             so every large one gets the time of the largest: ``grace_s`` plus a second for every
             100 kB.
+        max_waiting: calls that wait for a message at once.
     """
 
     def __init__(
@@ -41,8 +43,10 @@ class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         connections: GrpcConnections,
         grace_s: float,
         max_message_bytes: int,
+        max_waiting: int,
     ) -> None:
         self._envelope = envelope
+        self._waiting = _Waiting(max_waiting)
         self._connections = connections
         self._patience_s = grace_s + max_message_bytes / SLOWEST_BYTES_PER_S
         self._silence_s = grace_s
@@ -63,11 +67,41 @@ class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         async def serve(messages: AsyncIterator[Any], context: Context) -> Any:
             with self._connections.in_use(context.peer()):
                 try:
-                    return await behaviour(_timely(messages, patience_s), context)
+                    return await behaviour(_timely(messages, patience_s, self._waiting), context)
                 except (TimedOut, InvalidInput) as error:  # before the method's own envelope
                     await self._envelope.refuse(name, error, context)
 
         return handler_like(handler, serve, _readable_or_not(handler.request_deserializer))
+
+
+class _Waiting:
+    """The calls that wait for a message, at most ``most``: for more, the longest is given up.
+
+    A message may take minutes, if it is as large as any may be. Without this, calls whose messages
+    never come would take all places.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._calls: dict[asyncio.Timeout, None] = {}  # the longest waiting first
+
+    @asynccontextmanager
+    async def place(self, patience_s: float) -> AsyncIterator[None]:
+        """Wait in the block for one message.
+
+        Raises:
+            TimeoutError: when it takes longer than ``patience_s``, or others need the place.
+        """
+        async with asyncio.timeout(patience_s) as call:
+            if len(self._calls) >= self._most:
+                longest = next(iter(self._calls))
+                del self._calls[longest]
+                longest.reschedule(asyncio.get_running_loop().time())
+            self._calls[call] = None
+            try:
+                yield
+            finally:
+                self._calls.pop(call, None)
 
 
 class _Unreadable(NamedTuple):
@@ -105,10 +139,12 @@ def _malformed(got: str) -> VislocError:
     )
 
 
-async def _timely(messages: AsyncIterator[Any], patience_s: float) -> AsyncGenerator[Any]:
+async def _timely(
+    messages: AsyncIterator[Any], patience_s: float, waiting: _Waiting
+) -> AsyncGenerator[Any]:
     while True:
         try:
-            async with asyncio.timeout(patience_s):
+            async with waiting.place(patience_s):
                 message = await anext(messages, None)
         except TimeoutError:
             raise too_slow(patience_s, "no message in that time") from None

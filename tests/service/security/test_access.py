@@ -518,7 +518,7 @@ def grpc_door(access: Access, grace_s: float = 20.0) -> Iterator[GrpcDoor]:
         server = grpc.aio.server(
             interceptors=(
                 AccessInterceptor(access, envelope, 10),
-                TimelyCalls(envelope, GrpcConnections(100), grace_s, 0),
+                TimelyCalls(envelope, GrpcConnections(100), grace_s, 0, max_waiting=100),
             )
         )
         pb2_grpc.add_LocalizationServicer_to_server(servicer, server)

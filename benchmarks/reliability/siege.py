@@ -1,0 +1,287 @@
+"""Everything at once: attacks, swaps, killed workers and a replaced replica, and honest clients."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import signal
+import threading
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import AsyncExitStack, ExitStack, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import monotonic
+
+import httpx
+
+from benchmarks.reliability.asking import Case, Doors, Outcome, good_cases
+from benchmarks.reliability.attackers import ATTACKS, Attack, Target, attacked
+from benchmarks.reliability.checks import Check, counts_text
+from benchmarks.reliability.heavy_requests import heavy_photo_requests, many_value_messages
+from benchmarks.reliability.load import RETRY_PAUSE_S, ask_in_turn, percentile
+from benchmarks.reliability.maps import SampleMaps, leftovers, verify_store
+from benchmarks.reliability.service_process import ServiceProcess
+from benchmarks.reliability.soak import Expected, unloaded_answers
+
+SHARE = 0.7  # of the capacity
+EVERY_S = 20.0  # swaps, kills, publications
+MAX_GROWTH = 0.10
+_CAPACITY_S = 10.0
+_HOLDING, _FLOODING = 40, 1  # connections of each attack, to each replica
+_HEAVY_PAUSE_S = 2.0
+_WARM_SHARE = 1 / 3
+_MIB = 2**20
+# What a client asks again after: nothing was worked on, or the other replica may answer.
+_AGAIN = ("429", "503", "UNAVAILABLE", "RESOURCE_EXHAUSTED", "no answer")
+
+
+@dataclass(frozen=True)
+class Honest:
+    """One honest request: its answer, the tries before it, and the seconds of all."""
+
+    case: Case
+    outcome: Outcome
+    tries: tuple[str, ...]
+    seconds: float
+
+
+@dataclass
+class Happened:
+    """What was done to the replicas, and what they said to it."""
+
+    swaps: Counter[str] = field(default_factory=Counter)
+    published: Counter[str] = field(default_factory=Counter)
+    attacks: Counter[str] = field(default_factory=Counter)
+    kills: int = 0
+    replaced: int = 0
+    memory: list[tuple[float, int]] = field(default_factory=list)
+
+
+async def siege(maps: SampleMaps, work: Path, seconds: float) -> list[Check]:
+    """Ask two replicas at 70 % of their capacity while all attacks run.
+
+    An honest client takes the replicas in turn, and asks the other one again when the first is
+    away or has no room.
+    """
+    cases = good_cases(maps)
+    happened = Happened()
+    with ExitStack() as services:
+        replicas = [
+            services.enter_context(ServiceProcess(maps.folder, work / f"replica-{n}.log"))
+            for n in range(2)
+        ]
+        async with AsyncExitStack() as opened:
+            doors = [await opened.enter_async_context(Doors(each)) for each in replicas]
+            expected = await unloaded_answers(doors[0], maps, cases)
+            alone = await asyncio.gather(
+                *(ask_in_turn(each, cases, 1, _CAPACITY_S) for each in doors)
+            )
+            capacity = sum(map(len, alone)) / _CAPACITY_S
+            stop = asyncio.Event()
+            harm = asyncio.create_task(_harm(maps, replicas, doors, happened, stop, seconds))
+            honest = await _ask(doors, cases, SHARE * capacity, seconds)
+            stop.set()
+            await harm
+    quiet = [one.outcome.seconds for asked in alone for one in asked]
+    versions = await asyncio.to_thread(verify_store, maps.folder)
+    return _checks(honest, expected, capacity, quiet, happened, versions, leftovers(maps.folder))
+
+
+async def _ask(
+    doors: Sequence[Doors], cases: Sequence[Case], rate: float, seconds: float
+) -> list[Honest]:
+    draw, started = random.Random(0), monotonic()
+    asking: list[asyncio.Task[Honest]] = []
+    while (now := monotonic() - started) < seconds:
+        due = len(asking) / rate
+        if now < due:
+            await asyncio.sleep(due - now)
+        order = [doors[(len(asking) + n) % len(doors)] for n in range(len(doors))]
+        asking.append(asyncio.create_task(_persist(order, draw.choice(cases))))
+    return list(await asyncio.gather(*asking))
+
+
+async def _persist(doors: Sequence[Doors], case: Case) -> Honest:
+    started, tries = monotonic(), list[str]()
+    while True:
+        outcome = await case.ask(doors[len(tries) % len(doors)])
+        seconds = monotonic() - started
+        # As long as the clients of the service do by default, and a little longer.
+        if not outcome.status.startswith(_AGAIN) or seconds > 60:
+            return Honest(case, outcome, tuple(tries), seconds)
+        tries.append(outcome.status)
+        await asyncio.sleep(min(RETRY_PAUSE_S * len(tries), 4.0))
+
+
+async def _harm(
+    maps: SampleMaps,
+    replicas: Sequence[ServiceProcess],
+    doors: Sequence[Doors],
+    happened: Happened,
+    stop: asyncio.Event,
+    seconds: float,
+) -> None:
+    """Do everything at once until told to stop."""
+    heavy = threading.Event()
+    threads = [
+        asyncio.create_task(asyncio.to_thread(_send_heavy, maps, each, heavy, happened, number))
+        for number, each in enumerate(replicas)
+    ]
+    async with AsyncExitStack() as attacks:
+        for replica in replicas:
+            for attack in (each for each in ATTACKS if not each.hides_tls):
+                number = _FLOODING if attack.is_flood else _HOLDING
+                target = Target(_port(replica, attack))
+                await attacks.enter_async_context(attacked(target, attack, number))
+        await asyncio.gather(
+            _change(maps, doors, happened, stop),
+            _kill_workers(replicas, happened, stop),
+            _replace(replicas[1], happened, stop, seconds / 2),
+            _sample(replicas[0], happened, stop),
+        )
+    heavy.set()
+    await asyncio.gather(*threads)
+
+
+def _port(replica: ServiceProcess, attack: Attack) -> int:
+    return replica.http_port if attack.api == "HTTP" else replica.grpc_port
+
+
+def _send_heavy(
+    maps: SampleMaps,
+    replica: ServiceProcess,
+    stop: threading.Event,
+    happened: Happened,
+    number: int,
+) -> None:
+    """Send photos and messages that cost much, one after the other."""
+    messages = [*heavy_photo_requests(maps), *many_value_messages().values()]
+    while not stop.wait(_HEAVY_PAUSE_S):
+        with suppress(OSError, httpx.HTTPError):
+            happened.attacks[messages[number % len(messages)](replica)] += 1
+        number += 1
+
+
+async def _change(
+    maps: SampleMaps, doors: Sequence[Doors], happened: Happened, stop: asyncio.Event
+) -> None:
+    """Swap the versions of all maps, and publish a new map, every 20 s; each until it is done."""
+    packed, number = maps.packed.read_bytes(), 0
+    headers = {"Content-Type": "application/zip"}
+    while not await _stopped_within(stop, EVERY_S):
+        number += 1
+        for place, (map_id, versions) in enumerate(maps.versions.items()):
+            version = versions[(number >> place) % len(versions)]
+            happened.swaps[
+                await _until_done(
+                    doors, "POST", f"/maps/{map_id}/current", json={"version": version}
+                )
+            ] += 1
+        path = f"/maps/new{number}/versions/v1"
+        happened.published[
+            await _until_done(doors, "PUT", path, content=packed, headers=headers)
+        ] += 1
+
+
+async def _until_done(doors: Sequence[Doors], method: str, path: str, **body: object) -> str:
+    tries = 0
+    while True:
+        with suppress(httpx.TransportError):
+            each = doors[tries % len(doors)]
+            response = await each.http.request(method, path, **body)  # type: ignore[arg-type]
+            if response.status_code not in (429, 503):
+                return str(response.status_code)
+        tries += 1
+        await asyncio.sleep(RETRY_PAUSE_S)
+
+
+async def _kill_workers(
+    replicas: Sequence[ServiceProcess], happened: Happened, stop: asyncio.Event
+) -> None:
+    while not await _stopped_within(stop, EVERY_S):
+        pids = replicas[happened.kills % len(replicas)].worker_pids
+        if pids:
+            with suppress(ProcessLookupError):
+                os.kill(pids[0], signal.SIGKILL)
+                happened.kills += 1
+
+
+async def _replace(
+    replica: ServiceProcess, happened: Happened, stop: asyncio.Event, after_s: float
+) -> None:
+    if not await _stopped_within(stop, after_s):
+        await asyncio.to_thread(replica.stop)
+        replica.start()
+        await asyncio.to_thread(replica.wait_until_ready)
+        happened.replaced += 1
+
+
+async def _sample(replica: ServiceProcess, happened: Happened, stop: asyncio.Event) -> None:
+    started = monotonic()
+    while not await _stopped_within(stop, 2.0):
+        happened.memory.append((monotonic() - started, replica.resident_bytes()[0]))
+
+
+async def _stopped_within(stop: asyncio.Event, seconds: float) -> bool:
+    with suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            await stop.wait()
+    return stop.is_set()
+
+
+def _checks(
+    honest: Sequence[Honest],
+    expected: Expected,
+    capacity: float,
+    quiet: Sequence[float],
+    happened: Happened,
+    versions: int,
+    left: Sequence[str],
+) -> list[Check]:
+    unanswered = [one for one in honest if one.outcome.status.startswith(_AGAIN)]
+    answered = [one for one in honest if not one.outcome.status.startswith(_AGAIN)]
+    wrong = [
+        one
+        for one in answered
+        if (one.outcome.status, one.outcome.body) not in expected[one.case.name]
+    ]
+    tries = Counter(status for one in honest for status in one.tries)
+    took = [one.seconds for one in answered]
+    warm = [size for at, size in happened.memory if at >= happened.memory[-1][0] * _WARM_SHARE]
+    tenth = max(1, len(warm) // 10)
+    before, after = sum(warm[:tenth]) / tenth, sum(warm[-tenth:]) / tenth
+    return [
+        Check(
+            "every honest request is answered in the end",
+            f"{len(answered)} of {len(honest)}, at {SHARE:.0%} of {capacity:.1f}/s; "
+            f"{sum(bool(one.tries) for one in honest)} asked again ({counts_text(tries)}); p50 "
+            f"{percentile(took, 0.5):.2f} s, p90 {percentile(took, 0.9):.2f} s, longest "
+            f"{max(took, default=0):.1f} s; alone p90 {percentile(quiet, 0.9):.2f} s",
+            not unanswered,
+        ),
+        Check(
+            "answers are those of the quiet run, bit for bit",
+            f"{len(answered) - len(wrong)} of {len(answered)}"
+            + "".join(f"; {one.case.name}: {one.outcome.status}" for one in wrong[:3]),
+            not wrong,
+        ),
+        Check(
+            f"memory of the replica that stays grows by at most {MAX_GROWTH:.0%} after a third",
+            f"{before / _MIB:.0f} MiB, then {after / _MIB:.0f} MiB",
+            after <= (1 + MAX_GROWTH) * before,
+        ),
+        Check(
+            "no publication is lost or torn",
+            f"published {counts_text(happened.published)}, swapped {counts_text(happened.swaps)}; "
+            f"{versions} versions read byte by byte; {len(left)} files left over",
+            set(happened.published) <= {"201", "409"} and set(happened.swaps) == {"200"},
+        ),
+        Check(
+            "all of it happened",
+            f"{happened.kills} workers killed, {happened.replaced} replica replaced; heavy "
+            f"requests: {counts_text(happened.attacks)}",
+            happened.kills > 0 and happened.replaced == 1,
+        ),
+    ]
