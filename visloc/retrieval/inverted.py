@@ -91,8 +91,12 @@ class InvertedFile:
 
     @property
     def error(self) -> float:
-        """Three standard deviations of a rough cosine; theorem 3.2 of Gao and Long 2024."""
-        return 3.0 * math.sqrt((math.pi / 2 - 1) / self.centers.shape[1])
+        """Two standard deviations of a rough cosine; theorem 3.2 of Gao and Long 2024.
+
+        Codes describe what is left of unit rows without their centres.
+        """
+        left = 1 - np.average(self._lengths**2, weights=self.sizes) if self.num_rows else 1.0
+        return 2.0 * math.sqrt((math.pi / 2 - 1) / self.centers.shape[1] * max(float(left), 0.0))
 
     def nearest_lists(
         self, query: NDArray[np.float32], count: int, among: NDArray[np.int64] | None = None
