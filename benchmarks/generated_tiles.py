@@ -119,7 +119,8 @@ class City:
         passes = np.repeat(np.arange(PASSES), self.num_photos // PASSES)
         rows = look.photos(common, seen, passes, _normal(random, len(seen), stds["nearest"]))
         random = self._random(3, tile)
-        beside = random.integers(self.num_photos, size=num_queries)
+        # The same places for each seed: cities of two seeds are two descriptors of one city.
+        beside = np.random.default_rng(tile).integers(self.num_photos, size=num_queries)
         kept = np.exp(-_BESIDE_M / look.metres)
         new = _normal(random, num_queries, stds["within"])
         seen = kept * seen[beside] + np.sqrt(1 - kept**2) * new

@@ -27,7 +27,8 @@ def upgrade_map(opened: Map, maps_dir: Path) -> Path:
             version is in use; ``build.running``.
     """
     test = opened.manifest.parts.own_test
-    indexed = len(opened.images) > MAX_EXACT and not opened.has_index
+    had_one = any(record.clusters is not None for record in opened.manifest.global_features)
+    indexed = not opened.has_index and (had_one or len(opened.images) > MAX_EXACT)
     if test is not None and not indexed:
         raise refuse("map.upgraded", field="MAP", ref=opened.ref)
     map_id, based_on = opened.manifest.id, opened.manifest.version

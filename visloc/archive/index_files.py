@@ -18,6 +18,9 @@ from visloc.retrieval.inverted import (
     width_of,
 )
 
+# Of a unit row's component, except for rounding.
+_MOST = 1 + 1e-3
+
 
 class IndexFiles(NamedTuple):
     """Names of the files of one inverted file below the folder of a map or a set."""
@@ -41,7 +44,7 @@ def open_index(
         MapCorrupt: ``map.array``, ``map.range``.
     """
     width = width_of(dim)
-    centers = map_array(folder, files.centers, "<f4", (num_lists, width), load=True)
+    centers = map_array(folder, files.centers, "<f4", (num_lists, width))
     sizes = map_array(folder, files.sizes, "<i8", (num_lists,), load=True)
     for name, good in (
         (files.centers, centers_fit(centers)),
@@ -63,7 +66,8 @@ def open_index(
 
 def centers_fit(centers: NDArray[np.float32]) -> bool:
     """Tell whether centres are no longer than unit rows, as means of them."""
-    return bool((np.abs(centers) <= 1 + 1e-3).all())  # NaN fails every comparison
+    # NaN fails both comparisons.
+    return bool(centers.min(initial=0) >= -_MOST and centers.max(initial=0) <= _MOST)
 
 
 def sizes_fit(sizes: NDArray[np.int64], num_rows: int) -> bool:

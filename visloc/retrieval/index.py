@@ -19,13 +19,15 @@ MAX_EXACT = 10_000
 # In a map with an inverted file: so many photos that priors allow are all compared.
 _MAX_ALLOWED_EXACT = 2000
 # Photos that each descriptor proposes, and lists that it searches (docs/performance.md).
-_MIN_PROPOSED, _PROPOSED_PER_RESULT = 200, 10
+_MIN_PROPOSED, _PROPOSED_PER_RESULT = 300, 10
 _LISTS = 50
 # No cosine, and no limit of one that codes tell, is so large.
 _ABOVE_ALL = 2.0
 # Where proposals do not stand out among at most so many photos, the codes of all are compared; of
-# the best by these, so many rows and this share.
-_MAX_DOUBTFUL, _DOUBTFUL_ROWS, _DOUBTFUL_SHARE = 50_000, 2000, 0.1
+# the best by these, so many rows and this share under the first descriptor, and of these the best
+# half under the next.
+_MAX_DOUBTFUL, _DOUBTFUL_ROWS, _DOUBTFUL_SHARE = 50_000, 1500, 0.09
+_KEPT_BY_EACH = 0.5
 
 
 class IndexKind(StrEnum):
@@ -76,8 +78,7 @@ def retrieve(
     compared, limits = _proposed(query, index, top_k, photo_weights)
     cosines = _cosines(query, index, compared)
     if limits and not _stand_out(cosines, limits, top_k, fusion):
-        compared = _best_by_codes(query, index, photo_weights, fusion)
-        cosines = _cosines(query, index, compared)
+        compared, cosines = _best_by_codes(query, index, top_k, photo_weights, fusion)
     scores = fusion.scores(cosines)
     photos = np.arange(len(scores)) if compared is None else compared
     candidates = np.arange(len(scores))
@@ -146,22 +147,30 @@ def _stand_out(
 def _best_by_codes(
     query: Mapping[str, NDArray[np.float32]],
     index: Mapping[str, GlobalRows],
+    top_k: int,
     photo_weights: NDArray[np.float64] | None,
     fusion: LateFusion,
-) -> NDArray[np.int64]:
-    """The allowed photos with the best fused scores by their codes, in the order of the map."""
+) -> tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]:
+    """The allowed photos with the best fused scores by their codes, in the order of the map.
+
+    Also returns their cosines by descriptor.
+    """
     allowed = np.ones(len(next(iter(index.values()))), np.bool_)
     if photo_weights is not None:
         allowed = photo_weights > 0
-    rough = {}
+    photos, cosines = np.flatnonzero(allowed), {}
     for name, file in _inverted(index).items():
-        photos, cosines = file.rough_cosines(query[name], np.arange(len(file.sizes)), allowed)
-        rough[name] = np.full(len(allowed), -1.0)
-        rough[name][photos] = cosines
-    left = np.flatnonzero(allowed)
-    scores = fusion.scores({name: row[left] for name, row in rough.items()})
-    count = _DOUBTFUL_ROWS + math.ceil(_DOUBTFUL_SHARE * len(left))
-    return np.sort(left[largest(scores, count)])
+        found, rough = file.rough_cosines(query[name], np.arange(len(file.sizes)), allowed)
+        every = np.full(len(allowed), -1.0)
+        every[found] = rough
+        cosines[name] = every[photos]
+    count = _DOUBTFUL_ROWS + math.ceil(_DOUBTFUL_SHARE * len(photos))
+    for name, rows in index.items():
+        kept = np.sort(largest(fusion.scores(cosines), max(count, top_k)))
+        photos, cosines = photos[kept], {other: row[kept] for other, row in cosines.items()}
+        cosines[name] = rows.cosines(query[name], photos)
+        count = math.ceil(_KEPT_BY_EACH * count)
+    return photos, cosines
 
 
 def _inverted(index: Mapping[str, GlobalRows]) -> dict[str, InvertedFile]:

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.retrieval.products import dot_products
+from visloc.retrieval.rows import dot_products
 
 _ITERATIONS = 10
 _SAMPLES_PER_LIST = 50
@@ -29,7 +29,7 @@ _BLOCK_ROWS = 4096
 _WORD_BITS = 64
 ID_BYTES, FACTOR_BYTES = 8, 8
 # Bits in which a query is rounded for the comparison with codes.
-_QUERY_BITS = 8
+_QUERY_BITS = 6
 
 
 class Rows(Protocol):
@@ -64,17 +64,16 @@ class InvertedFile:
         lists: the file: for each list its codes, then the numbers of its rows as int64.
     """
 
-    __slots__ = ("_coarse", "_index", "_lengths", "centers", "num_rows", "path", "sizes")
+    __slots__ = ("_index", "_lengths", "centers", "num_rows", "path", "sizes")
 
     def __init__(self, centers: NDArray[np.float32], sizes: NDArray[np.int64], lists: Path) -> None:
         faiss = _faiss()
         count, width = centers.shape
         self.sizes, self.path = sizes, lists
         self.num_rows = int(sizes.sum())
-        self._coarse = _coarse(centers)
-        self._index = _index(self._coarse, count)
-        # The copy that faiss has.
-        self.centers = faiss.rev_swig_ptr(self._coarse.get_xb(), count * width).reshape(-1, width)
+        # faiss reads them where they are, which may be a file that processes share.
+        self.centers = np.require(centers, np.float32, ["C", "A"])
+        self._index = _index(self.centers)
         self._lengths = _lengths(self.centers)
         mapped = faiss.OnDiskInvertedLists()
         mapped.nlist, mapped.code_size = count, self._index.code_size
@@ -87,13 +86,17 @@ class InvertedFile:
         if self.num_rows:
             mapped.do_mmap()
         self._index.replace_invlists(mapped, False)
-        self._index.referenced_objects = (self._coarse, mapped)
+        self._index.referenced_objects += (mapped,)
         self._index.ntotal = self.num_rows
 
     @property
     def error(self) -> float:
-        """Three standard deviations of a rough cosine; theorem 3.2 of Gao and Long 2024."""
-        return 3.0 * math.sqrt((math.pi / 2 - 1) / self.centers.shape[1])
+        """Two standard deviations of a rough cosine; theorem 3.2 of Gao and Long 2024.
+
+        Codes describe what is left of unit rows without their centres.
+        """
+        left = 1 - np.average(self._lengths**2, weights=self.sizes) if self.num_rows else 1.0
+        return 2.0 * math.sqrt((math.pi / 2 - 1) / self.centers.shape[1] * max(float(left), 0.0))
 
     def nearest_lists(
         self, query: NDArray[np.float32], count: int, among: NDArray[np.int64] | None = None
@@ -144,7 +147,9 @@ class InvertedFile:
         num = int(faiss.rev_swig_ptr(found.lims, 2)[1])
         rows, cosines = (faiss.rev_swig_ptr(a, num) for a in (found.labels, found.distances))
         good = (rows >= 0) & (rows < self.num_rows)
-        return rows[good], np.clip(cosines[good], -1, 1)  # copies: faiss frees what it found
+        kept = slice(None) if good.all() else good
+        # Copies, since faiss frees what it found.
+        return rows[kept].copy(), np.clip(cosines[kept], -1, 1)
 
 
 def largest(values: NDArray[np.floating], count: int) -> NDArray[np.int64]:
@@ -195,8 +200,7 @@ def make_centers(rows: Rows, count: int, seed: int = 0) -> NDArray[np.float32]:
 def make_lists(rows: Rows, centers: NDArray[np.float32]) -> MadeLists:
     """Put unit rows (n, D) into the lists of the centres (C, D') that they are most like."""
     coarse = _coarse(centers / _lengths(centers)[:, None])
-    described = _coarse(centers)
-    index = _index(described, len(centers))
+    index = _index(centers)
     num, width = len(rows), centers.shape[1]
     nearest = np.empty(num, np.int64)
     codes = np.empty((num, index.code_size), np.uint8)
@@ -241,17 +245,23 @@ def _lengths(centers: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _coarse(centers: NDArray[np.float32]) -> Any:
-    coarse = _faiss().IndexFlatIP(centers.shape[1])
-    coarse.add(np.ascontiguousarray(centers, np.float32))
+    """A flat index that reads the centres where they are."""
+    faiss = _faiss()
+    coarse = faiss.IndexFlatIP(centers.shape[1])
+    flat = centers.reshape(-1).view(np.uint8)
+    # Owned by none: the array is.
+    coarse.codes = coarse.codes.create_view(faiss.swig_ptr(flat), flat.size, coarse.codes.owner)
+    coarse.ntotal, coarse.referenced_objects = len(centers), flat
     return coarse
 
 
-def _index(coarse: Any, count: int) -> Any:
-    faiss = _faiss()
-    index = faiss.IndexIVFRaBitQ(coarse, coarse.d, count, faiss.METRIC_INNER_PRODUCT, False)
+def _index(centers: NDArray[np.float32]) -> Any:
+    faiss, coarse = _faiss(), _coarse(centers)
+    index = faiss.IndexIVFRaBitQ(coarse, coarse.d, coarse.ntotal, faiss.METRIC_INNER_PRODUCT, False)
     if index.code_size != row_bytes(coarse.d) - ID_BYTES:
         raise AssertionError(f"this faiss writes codes of {index.code_size} bytes")
     index.is_trained = True
+    index.referenced_objects = (coarse,)
     return index
 
 

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -15,6 +17,7 @@ from mapping.own_test.trials import own_test
 from visloc.archive import Map, MapStore, sha256_of, verify_map
 from visloc.archive.checks import content_hash, json_text, manifest_hash
 from visloc.errors import Conflict
+from visloc.retrieval.index import retrieve
 
 
 @pytest.fixture
@@ -98,29 +101,51 @@ def test_what_only_a_new_build_can_add_is_said(old: MapStore) -> None:
     ]
 
 
-def test_a_large_map_gets_an_index_and_keeps_its_old_one_as_it_was(
-    old: MapStore, monkeypatch: pytest.MonkeyPatch
+def test_the_command_that_a_warning_names_ends_the_warning(
+    old: MapStore, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Formats 2.0 to 3.0 had another index, of which one file has the same name."""
+    before = with_old_index(old.folder("room"))
+    opened = verify_map(before)
+    assert not opened.has_index
+    (command,) = re.findall(r"`mapping (upgrade \S+)`", caplog.text)
+
+    result = CliRunner().invoke(app, [*command.split(), "--maps-dir", str(old.root)])
+
+    assert result.exit_code == 0, result.output
+    assert "own test and index added" in result.output
+    caplog.clear()
+    after = verify_map(old.folder("room"))
+    assert not caplog.records
+    assert after.has_index
+    assert all(record.clusters is None for record in after.manifest.global_features)
+    query = {name: rows[1] for name, rows in after.global_descriptors.items()}
+    best = retrieve(query, opened.global_descriptors, 3)
+    assert np.array_equal(retrieve(query, after.global_descriptors, 3).images, best.images)
+    assert not verify_map(before).has_index
+    again = CliRunner().invoke(app, [*command.split(), "--maps-dir", str(old.root)])
+    assert again.exit_code != 0
+
+
+def test_a_large_map_gets_an_index(old: MapStore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mapping.maps.upgrading.MAX_EXACT", 2)
-    before = old.folder("room")
+    after = verify_map(upgrade_map(old.open("room"), old.root))
+    assert after.has_index
+    with pytest.raises(Conflict):
+        upgrade_map(after, old.root)
+
+
+def with_old_index(folder: Path) -> Path:
+    """Give a map the index of formats 2.0 to 3.0, as far as it is still looked at."""
     name = "index/densevlad.centers.npy"
-    (before / "index").mkdir()
-    (before / name).write_bytes(b"centers")
-    manifest = json.loads((before / "manifest.json").read_text())
-    manifest["files"][name] = {"size": 7, "sha256": sha256_of(before / name)}
+    (folder / "index").mkdir()
+    (folder / name).write_bytes(b"centers")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["files"][name] = {"size": 7, "sha256": sha256_of(folder / name)}
     for record in manifest["global_features"]:
         record["clusters"] = 4
         record.pop("lists", None)
     manifest["content_hash"] = content_hash(manifest)
     manifest["manifest_hash"] = manifest_hash(manifest)
-    (before / "manifest.json").write_text(json_text(manifest))
-
-    after = verify_map(upgrade_map(verify_map(before), old.root))
-
-    assert after.has_index
-    assert not verify_map(before).has_index
-    assert (before / name).read_bytes() == b"centers"
-    assert all(record.clusters is None for record in after.manifest.global_features)
-    with pytest.raises(Conflict):
-        upgrade_map(after, old.root)
+    (folder / "manifest.json").write_text(json_text(manifest))
+    return folder
