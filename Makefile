@@ -10,7 +10,7 @@ PAGE_SOURCES := $(shell find web/src web/index.html web/*.json web/*.ts -type f)
 .DEFAULT_GOAL := help
 # Vite needs this much; without it the service has no page, and says so.
 NODE_IS_THERE = command -v npm >/dev/null && node -e 'const [a, b] = process.versions.node.split(".").map(Number); process.exit(a > 22 || (a === 22 && b >= 12) || (a === 20 && b >= 19) ? 0 : 1)'
-.PHONY: help install licences-check page check-page browser balancer promtool demo test test-all docs-check docs-errors docs-options licences lock sbom audit fuzz fuzz-api train-smoke bench bench-gpu bench-scale trust fmt lint types contracts proto proto-check check serve clean
+.PHONY: help install licences-check page check-page browser balancer promtool demo test test-all docs-check docs-errors docs-options licences lock sbom audit fuzz fuzz-api train-smoke bench bench-gpu bench-scale bench-change trust fmt lint types contracts proto proto-check check serve clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "%-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -129,6 +129,9 @@ bench-gpu: install ## networks, queries and a service on a CUDA GPU, of DATASET
 bench-scale: install ## maps of 100 to 100 000 images: opening, memory, retrieval
 	$(BIN)/python -m benchmarks.scale $(ARGS)
 
+bench-change: install ## other light, weather and cameras: where photos are lost, as in docs/change.md
+	$(BIN)/python -m benchmarks.change $(ARGS)
+
 trust: install ## how far an answer can be trusted: every figure of docs/trust.md
 	$(BIN)/python -m benchmarks.trust $(ARGS)
 
@@ -167,4 +170,4 @@ serve: install ## serve the maps in maps/ on 127.0.0.1:8000 (HTTP) and :50051 (g
 	$(BIN)/python -m service --maps-dir maps
 
 clean: ## remove what make made
-	rm -rf $(VENV) .sbom .demo .bench .trust web/node_modules visloc_web/built
+	rm -rf $(VENV) .sbom .demo .bench .change .trust web/node_modules visloc_web/built

@@ -42,7 +42,7 @@ def enlarged_half(photo: Photo, camera: Camera) -> tuple[Photo, Camera]:
     """
     left, top = photo.width // 4, photo.height // 4
     middle = photo.rgb[top : top + photo.height // 2, left : left + photo.width // 2]
-    return _resized(middle, photo.width, photo.height), camera
+    return resized_to(middle, photo.width, photo.height), camera
 
 
 def corner(photo: Photo, camera: Camera) -> tuple[Photo, Camera]:
@@ -58,7 +58,7 @@ def stretched(photo: Photo, camera: Camera) -> tuple[Photo, Camera]:
     """Squeeze the photo to three quarters of its height; the camera keeps its focal length."""
     height = photo.height * 3 // 4
     centred = _with_centre(camera, lambda x, y: (x, y * height / photo.height))
-    return _resized(photo.rgb, photo.width, height), replace(centred, height=height)
+    return resized_to(photo.rgb, photo.width, height), replace(centred, height=height)
 
 
 def cut_to(photo: Photo, camera: Camera, width: int, height: int) -> tuple[Photo, Camera]:
@@ -78,7 +78,7 @@ def cut_to(photo: Photo, camera: Camera, width: int, height: int) -> tuple[Photo
     cut = photo.rgb[top : top + cut_height, left : left + cut_width]
     centred = _with_centre(camera, lambda x, y: (x - left, y - top))
     whole = replace(centred, width=cut_width, height=cut_height)
-    return _resized(cut, width, height), whole.scaled(width, height)
+    return resized_to(cut, width, height), whole.scaled(width, height)
 
 
 def print_corners(
@@ -123,7 +123,7 @@ def with_print(
     width = max(1, round(float(np.ptp(corners[:, 0]))))
     small = printed.rgb
     if width < printed.width:  # a smaller print has fewer details, not aliased ones
-        small = _resized(small, width, round(width * printed.height / printed.width)).rgb
+        small = resized_to(small, width, round(width * printed.height / printed.width)).rgb
     height, width = small.shape[:2]
     # Pixel positions of OpenCV are 0 at the middle of the first pixel, ours at its corner.
     source = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
@@ -144,7 +144,8 @@ def _with_centre(camera: Camera, moved: Callable[[float, float], tuple[float, fl
     return replace(camera, params=tuple(params))
 
 
-def _resized(rgb: Pixels, width: int, height: int) -> Photo:
+def resized_to(rgb: Pixels, width: int, height: int) -> Photo:
+    """Return pixels resized, without aliases."""
     smaller = width * height < rgb.shape[0] * rgb.shape[1]
     method = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
     return Photo(np.asarray(cv2.resize(rgb, (width, height), interpolation=method), np.uint8))

@@ -81,15 +81,17 @@ class SeenView:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Expected:
+class Expected:
     """Landmarks that a camera at a pose sees.
 
     Attributes:
         pixels: (e, 2) float64.
+        points: (e, 3) float64, relative to the map's origin.
         descriptors: (e, D) int8, of the observation from the most similar viewpoint.
     """
 
     pixels: NDArray[np.float64]
+    points: NDArray[np.float64]
     descriptors: NDArray[np.int8]
 
 
@@ -250,7 +252,8 @@ def _compare(
 ) -> _Compared:
     """Look for the landmarks that a camera at the pose sees."""
     camera, shown = seen.view.camera, seen.shown
-    apart, expected = _expected(geometry, camera, seen.view.cam_from_rig @ rig_from_world)
+    cam_from_world = seen.view.cam_from_rig @ rig_from_world
+    apart, expected = expected_landmarks(geometry, camera, cam_from_world, _MAX_EXPECTED)
     keypoints = shown.keypoints.astype(np.float64)
     num, grid = len(expected.pixels), _Grid.of(camera)
     comparable, explained = np.zeros(num, dtype=np.bool_), np.zeros(num, dtype=np.bool_)
@@ -268,9 +271,9 @@ def _compare(
         theirs = shown.descriptors.rows[near].astype(np.float32)
         ours = expected.descriptors[comparable].astype(np.float32)
         if len(ours):
-            similarity = _best(theirs, ours, there)
+            similarity = best_products(theirs, ours, there)
             # As similar would be any other landmark in its place.
-            chance = _best(theirs, np.roll(ours, len(ours) // 2, axis=0), there)
+            chance = best_products(theirs, np.roll(ours, len(ours) // 2, axis=0), there)
             deviation = max(
                 float(chance.std()), _LEAST_DEVIATION * float(np.abs(chance).max()), 1.0
             )
@@ -313,7 +316,7 @@ class _Grid:
         return np.asarray(np.clip(down, 0, rows) * self.columns + np.clip(across, 0, columns))
 
 
-def _best(
+def best_products(
     theirs: NDArray[np.float32], ours: NDArray[np.float32], there: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """Return the largest product of each landmark (n, D) with keypoints (n, k, D) near it.
@@ -325,10 +328,10 @@ def _best(
     return np.asarray(np.where(there, products, -np.inf).max(axis=1), dtype=np.float64)
 
 
-def _expected(
-    geometry: MapGeometry, camera: Camera, cam_from_world: Pose
-) -> tuple[float, _Expected]:
-    """Return how far the nearest mapping photo is, and the landmarks that a camera sees.
+def expected_landmarks(
+    geometry: MapGeometry, camera: Camera, cam_from_world: Pose, most: int
+) -> tuple[float, Expected]:
+    """Return how far the nearest mapping photo is, and ``most`` landmarks that a camera sees.
 
     A landmark counts if a photo near the pose sees it from about the same side and distance.
     """
@@ -351,9 +354,9 @@ def _expected(
     kept = np.flatnonzero(np.isfinite(unlike))
     order = kept[np.argsort(unlike[kept], kind="stable")]
     _, first = np.unique(landmarks[order], return_index=True)  # of each, the most alike
-    rows = order[first][:: max(1, -(-len(first) // _MAX_EXPECTED))]
+    rows = order[first][:: max(1, -(-len(first) // most))]
     descriptors = np.asarray(opened.observation_descriptors)[observations[rows]]
-    return float(apart[nearest[0]]), _Expected(pixels[rows], descriptors)
+    return float(apart[nearest[0]]), Expected(pixels[rows], points[rows], descriptors)
 
 
 def _unlike(
