@@ -22,7 +22,7 @@ from training.plots import draw
 from training.ranges import paint_pictures, record_ranges
 from training.run import Trainer, resume, train
 from training.settings import PRESETS, Settings
-from training.validation import Score, features_of, validate, validation_pairs
+from training.validation import CHANGES, Score, features_of, validate, validation_pairs
 from visloc.errors import VislocError, refuse
 from visloc.features import make_local_features
 from visloc.features.backends.calibration import PICTURES, RECORDED
@@ -85,6 +85,8 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--weights-dir", type=Path)
     check.add_argument("--validation", type=Path, default=DATA / "validation.safetensors")
     check.add_argument("--per-photo", type=int, default=1, help="pairs of each photo")
+    check.add_argument("--change", choices=CHANGES, default="mixed", help="what alters photos")
+    check.add_argument("--of-first", help="name of local features for the first photos")
     check.add_argument("--output", type=Path, help="append a line of JSON for each")
     check.set_defaults(run=_validate)
 
@@ -202,7 +204,10 @@ def _validation(options: argparse.Namespace) -> Callable[[State], Score] | None:
 
 def _validate(options: argparse.Namespace) -> int:
     photos = read_pack(options.validation).photos
-    pairs = validation_pairs(photos, options.per_photo)
+    pairs = validation_pairs(photos, options.per_photo, CHANGES[options.change])
+    of_first = None
+    if options.of_first is not None:
+        of_first = make_local_features(options.of_first, options.weights_dir)
     sys.stdout.write(
         f"{len(pairs)} pairs\n\n| features | right within 1 px | 3 px | 5 px | right matches"
         " | keypoints | repeatable |\n|---|---|---|---|---|---|---|\n"
@@ -212,7 +217,7 @@ def _validate(options: argparse.Namespace) -> int:
             extractor = features_of(load_state(name, _CPU))
         else:
             extractor = make_local_features(name, options.weights_dir)
-        score = validate(extractor, pairs)
+        score = validate(extractor, pairs, of_first=of_first)
         accuracy = " | ".join(f"{100 * each:.1f} %" for each in score.matching_accuracy)
         sys.stdout.write(
             f"| {name} | {accuracy} | {score.right_matches:.0f} | {score.keypoints:.0f}"

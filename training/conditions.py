@@ -163,7 +163,7 @@ def draw_conditions(
     colour = amount(_COLOUR_SHARE)[:, None] * rng.uniform(-1, 1, (photos, 8))
     tone = amount(_TONE_SHARE)[:, None] * rng.uniform(-1, 1, (photos, 2))
     noisy = amount(_NOISE_SHARE, 0.3) > 0
-    electrons = np.where(at_night, around(30, 2000), around(300, 20_000))
+    electrons = np.where(at_night, around(100, 4000), around(300, 20_000))
     lamp_tints = np.where(at_night, 0.3, 0.12)[:, None]
     return Conditions(
         leaves=weather(_LEAVES_SHARE, 0.3)[:, None]
@@ -193,7 +193,7 @@ def draw_conditions(
         motion=amount(_MOTION_SHARE, 2.0, 2.0 * REACH_PX - 2),
         direction=rng.uniform(0, np.pi, photos),
         exposure=0.6 * colour[:, 0],
-        target=around(0.015, 0.2),
+        target=around(0.03, 0.35),
         balance=colour[:, 1:4] * lamp_tints,
         shot=noisy * strength / electrons,
         read=noisy * strength * rng.uniform(1, 4, photos) / electrons,

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 from training.checkpoint import State
 from training.files import write_tensors
 from training.network import ARCHITECTURES, TrainableR2D2
 from visloc.errors import refuse
-from visloc.features.networks.r2d2.model import pack
+from visloc.features.networks.r2d2 import model as r2d2
+from visloc.features.networks.xfeat import model as xfeat
 
-LICENCE = "BSD-3-Clause"
+Arrays = Mapping[str, NDArray[Any]]
+
 _LARGEST_HALF = 65504.0
 
 
@@ -23,26 +29,47 @@ def export(state: State, output: Path) -> int:
     Raises:
         InvalidInput: ``training.range`` if a weight does not fit 16 bits.
     """
-    trained = TrainableR2D2(ARCHITECTURES[state.settings.architecture])
-    trained.load_state_dict(state.network)
-    network = trained.folded()
-    for number, convolution in enumerate(network.convolutions()):
-        largest = float(convolution.weight.abs().max())
-        if not largest < _LARGEST_HALF:
-            raise refuse(
-                "training.range",
-                field=f"convolutions.{number}",
-                expected=f"less than {_LARGEST_HALF}",
-                got=largest,
-            )
+    architecture = state.settings.architecture
+    arrays, words = _distilled(state) if architecture == "xfeat" else _from_scratch(state)
     about = {
-        "format": "visloc folded R2D2, version 1",
-        "architecture": state.settings.architecture,
-        "licence": LICENCE,
+        **words,
+        "architecture": architecture,
         "step": str(state.step),
         "seconds": f"{state.seconds:.0f}",
         "settings": dataclasses.asdict(state.settings),
         "torch": torch.__version__,
         **state.sources,
     }
-    return write_tensors(output, pack(network), about)
+    return write_tensors(output, arrays, about)
+
+
+def _from_scratch(state: State) -> tuple[Arrays, dict[str, str]]:
+    trained = TrainableR2D2(ARCHITECTURES[state.settings.architecture])
+    trained.load_state_dict(state.network)
+    network = trained.folded()
+    _check_range({f"convolutions.{n}": c.weight for n, c in enumerate(network.convolutions())})
+    words = {"format": "visloc folded R2D2, version 1", "licence": "BSD-3-Clause"}
+    return r2d2.pack(network), words
+
+
+def _distilled(state: State) -> tuple[Arrays, dict[str, str]]:
+    with torch.device("meta"):
+        network = xfeat.XFeatNetwork().fuse()
+    network.load_state_dict(state.network, assign=True)
+    _check_range({name: value for name, value in state.network.items() if "weight" in name})
+    _, teacher_sha256 = xfeat.read_published(None)
+    return xfeat.pack(network.requires_grad_(False)), {
+        "format": "visloc fused XFeat, version 1",
+        "licence": "Apache-2.0",
+        "changed": "fine-tuned by visloc from the weights of XFeat (Potje et al. 2024)",
+        "changed_from_sha256": teacher_sha256,
+    }
+
+
+def _check_range(weights: Mapping[str, Tensor]) -> None:
+    for name, weight in weights.items():
+        largest = float(weight.abs().max())
+        if not largest < _LARGEST_HALF:
+            raise refuse(
+                "training.range", field=name, expected=f"less than {_LARGEST_HALF}", got=largest
+            )

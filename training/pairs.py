@@ -143,6 +143,12 @@ def draw(sources: Sources, settings: Settings, step: int) -> tuple[Drawn, Condit
 
 def make(sources: Sources, settings: Settings, drawn: Drawn, conditions: Conditions) -> Pairs:
     """Make pairs of what was drawn, tensors of float64 on the device."""
+    clean = photograph(sources, settings, drawn)
+    return clean._replace(images=augment(clean.images, conditions))
+
+
+def photograph(sources: Sources, settings: Settings, drawn: Drawn) -> Pairs:
+    """Make pairs of what was drawn before light, weather and cameras change them."""
     crop = settings.crop_px
     seen = look(
         sources.atlas.pixels,
@@ -165,7 +171,7 @@ def make(sources: Sources, settings: Settings, drawn: Drawn, conditions: Conditi
     # A comparison with NaN is false.
     inside = ((flow >= 0) & (flow < crop)).all(dim=-1, keepdim=True)
     return Pairs(
-        augment(seen, conditions),
+        seen,
         torch.where(inside, flow, torch.nan).float(),
         drawn.queries.long(),
         drawn.distractors.long(),

@@ -6,21 +6,19 @@ import dataclasses
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
-import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from training.checkpoint import FILE_NAME, State, load_state, save_state
-from training.losses import peakiness_loss, reliability_loss, similarity_loss
-from training.network import ARCHITECTURES, Maps, TrainableR2D2
-from training.pairs import Pairs, Sources, as_numbers, draw, from_numbers, make
+from training.distillation import Distillation
+from training.from_scratch import FromScratch
+from training.pairs import Sources
 from training.recorded import RecordedStep
-from training.sampler import sample
 from training.settings import Settings
 from training.validation import Score
 from visloc.errors import VislocError, refuse
@@ -37,29 +35,6 @@ class LossIsNaN(VislocError):
     """Training has diverged; what the last checkpoint holds is from before."""
 
 
-LOSSES = ("reliability", "similarity", "peakiness")
-
-
-def losses_of(maps: Maps, pairs: Pairs, settings: Settings) -> Tensor:
-    """Compare what the network says about the images of pairs: (3,), ``LOSSES``."""
-    first, second = maps.halves()
-    sampled = sample(first, second, pairs.flow, pairs.queries, pairs.distractors)
-    valid = ~pairs.flow[..., 0].isnan()
-    # Beyond the border, and not NaN, which would spread.
-    grid = torch.where(valid[..., None], pairs.flow / settings.crop_px * 2 - 1, 2.0)
-    seen = F.grid_sample(
-        second.repeatability[:, None], grid, padding_mode="border", align_corners=False
-    )
-    peakiness = [peakiness_loss(each.repeatability, settings.patch_px) for each in (first, second)]
-    return torch.stack(
-        [
-            reliability_loss(*sampled, settings.good_precision),
-            similarity_loss(first.repeatability, seen[:, 0], valid, settings.patch_px),
-            (peakiness[0] + peakiness[1]) / 2,
-        ]
-    )
-
-
 def learning_rate(settings: Settings, step: int) -> float:
     """Return Adam's learning rate for a step: up in a line, level, down half a cosine."""
     highest, lowest = settings.learning_rate, settings.final_learning_rate
@@ -72,6 +47,34 @@ def learning_rate(settings: Settings, step: int) -> float:
     return lowest + (highest - lowest) * 0.5 * (1 + math.cos(math.pi * share))
 
 
+class Task(Protocol):
+    """What a network learns in each step.
+
+    Attributes:
+        network: what learns, on the device.
+        names: of the losses.
+    """
+
+    @property
+    def network(self) -> nn.Module: ...
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    def numbers(self, step: int) -> Tensor:
+        """Draw what decides the step, a vector of float64 on the processor."""
+
+    def losses(self, numbers: Tensor) -> Tensor:
+        """Return the losses of a step, one for each name, from its numbers on the device."""
+
+
+def make_task(settings: Settings, sources: Sources) -> Task:
+    """Return what the settings' architecture learns from: a teacher, or nothing but photos."""
+    if settings.architecture == "xfeat":
+        return Distillation(settings, sources)
+    return FromScratch(settings, sources)
+
+
 class Trainer:
     """A network, its optimizer, and how far they are."""
 
@@ -82,15 +85,13 @@ class Trainer:
         self.described = described
         self.step = 0
         self.seconds = 0.0
-        self.network = TrainableR2D2(ARCHITECTURES[settings.architecture]).to(sources.device)
+        self.task = make_task(settings, sources)
+        self.network = self.task.network
         on_gpu = sources.device.type == "cuda"
         if on_gpu:
             for weight in self.network.parameters():
                 if weight.dim() == 4:
                     weight.data = weight.data.contiguous(memory_format=torch.channels_last)
-        self._compiled: Callable[..., Maps] = self.network
-        if settings.compiled:
-            self._compiled = torch.compile(self.network)
         # A recorded step reads the learning rate from the device.
         self._rate = torch.tensor(settings.learning_rate, device=sources.device)
         self.optimizer = torch.optim.Adam(
@@ -100,7 +101,6 @@ class Trainer:
             fused=on_gpu,
             capturable=on_gpu,
         )
-        self._like = draw(sources, settings, 0)
         self._learn: Callable[[Tensor], Tensor] = self._learned
         if on_gpu:
             torch.backends.cudnn.benchmark = True
@@ -147,23 +147,21 @@ class Trainer:
         )
 
     def advance(self) -> Tensor:
-        """Do one step, and return its losses (3,), ``LOSSES``, before it."""
+        """Do one step, and return the task's losses before it."""
         rate = learning_rate(self.settings, self.step)
         if self._rate.is_cuda:
             self._rate.fill_(rate)
         else:
             for group in self.optimizer.param_groups:
                 group["lr"] = rate
-        losses = self._learn(as_numbers(*draw(self.sources, self.settings, self.step)))
+        losses = self._learn(self.task.numbers(self.step))
         self.step += 1
         return losses
 
     def _learned(self, numbers: Tensor) -> Tensor:
-        """Learn from the pairs that numbers on the device decide: the same operations always."""
+        """Learn what numbers on the device decide: the same operations always."""
         self.optimizer.zero_grad(set_to_none=True)
-        pairs = make(self.sources, self.settings, *from_numbers(numbers, self._like))
-        maps = self._compiled(pairs.images, bf16=self.settings.bf16)
-        losses = losses_of(maps, pairs, self.settings)
+        losses = self.task.losses(numbers)
         torch.autograd.backward(losses.sum())
         self.optimizer.step()
         return losses.detach()
@@ -207,7 +205,7 @@ def train(
         LossIsNaN: ``training.diverged``.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    log = _Log(folder / LOG_NAME, trainer.step)
+    log = _Log(folder / LOG_NAME, trainer.step, trainer.task.names)
     scores = _Scores(folder / VALIDATION_NAME, trainer.step)
     started = saved = time.monotonic()
     stopped = False
@@ -267,8 +265,8 @@ class _Clock:
 class _Log:
     """Lines of JSON, one per step; those after the checkpoint that a run goes on from are cut."""
 
-    def __init__(self, path: Path, step: int) -> None:
-        self._path = path
+    def __init__(self, path: Path, step: int, names: Sequence[str]) -> None:
+        self._path, self._names = path, names
         self._waiting: list[tuple[dict[str, Any], Tensor]] = []
         kept = path.read_text(encoding="utf-8").splitlines()[:step] if path.exists() else []
         path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
@@ -286,7 +284,7 @@ class _Log:
         lines = []
         read = torch.stack([losses for _, losses in self._waiting]).tolist()
         for (line, _), losses in zip(self._waiting, read, strict=True):
-            line.update({n: round(v, 5) for n, v in zip(LOSSES, losses, strict=True)})
+            line.update({n: round(v, 5) for n, v in zip(self._names, losses, strict=True)})
             line["total"] = round(sum(losses), 5)
             lines.append(json.dumps(line) + "\n")
             if not math.isfinite(line["total"]):

@@ -8,6 +8,8 @@ from typing import Any
 from visloc.errors import refuse
 
 _BLOCK_PX = 8
+ARCHITECTURES = ("faster2d2", "r2d2", "xfeat")
+_XFEAT_MULTIPLE_PX = 32  # its coarsest layers have a 32nd of the resolution
 
 
 def _setting(default: Any, meaning: str) -> Any:
@@ -22,7 +24,7 @@ class Settings:
     steps; losses of patches of 16 px. The metadata of each field says what it means.
     """
 
-    architecture: str = _setting("faster2d2", "faster2d2 or r2d2")
+    architecture: str = _setting("faster2d2", "r2d2, faster2d2, or xfeat with a teacher")
     seed: int = _setting(0, "of the first weights, the pairs and the sampler")
     steps: int = _setting(40_000, "of the optimizer")
     crop_px: int = _setting(192, "side of the square crops, a multiple of 8")
@@ -40,12 +42,14 @@ class Settings:
     parallax_share: float = _setting(0.0, "of the pairs, from synthetic rooms instead of photos")
     night_share: float = _setting(0.0, "of the photos, taken as at night")
     weather_share: float = _setting(0.0, "of the photos that may have weather, season, shadows")
+    unaltered_share: float = _setting(0.0, "of the photos that a student sees as its teacher does")
+    closeness: float = _setting(1.0, "weight of likeness to the teacher on unaltered photos")
     bf16: bool = _setting(False, "convolutions in bfloat16, everything else in float32")
     compiled: bool = _setting(False, "compile the network: no gain on processors")
 
     def __post_init__(self) -> None:
         for name, is_right, expected in (
-            ("architecture", self.architecture in ("faster2d2", "r2d2"), "faster2d2 or r2d2"),
+            ("architecture", self.architecture in ARCHITECTURES, " or ".join(ARCHITECTURES)),
             ("seed", self.seed >= 0, "0 or more"),
             ("steps", self.steps >= 1, "1 or more"),
             (
@@ -53,6 +57,13 @@ class Settings:
                 self.crop_px % _BLOCK_PX == 0 and self.crop_px > 2 * self.border_px,
                 f"a multiple of {_BLOCK_PX}, more than twice the border of {self.border_px}",
             ),
+            (
+                "crop_px",
+                self.architecture != "xfeat" or self.crop_px % _XFEAT_MULTIPLE_PX == 0,
+                f"a multiple of {_XFEAT_MULTIPLE_PX} for xfeat",
+            ),
+            ("unaltered_share", 0 <= self.unaltered_share <= 0.9, "0 to 0.9"),
+            ("closeness", self.closeness >= 0, "0 or more"),
             ("batch", self.batch >= 1, "1 or more"),
             ("learning_rate", 0 < self.learning_rate < 1, "between 0 and 1"),
             ("final_learning_rate", 0 < self.final_learning_rate < 1, "between 0 and 1"),
@@ -116,6 +127,24 @@ PRESETS = {
         night_share=0.35,
         weather_share=0.7,
         bf16=True,
+    ),
+    # Measured on two processor cores, see docs/models/xfeat.md.
+    "distillation": Settings(
+        architecture="xfeat",
+        steps=1_500,
+        batch=8,
+        learning_rate=3e-4,
+        final_learning_rate=1e-6,
+        warm_up_steps=50,
+        decay_from=0.0,
+        weight_decay=0.0,
+        query_step_px=8,
+        mild_steps=150,
+        parallax_share=0.15,
+        night_share=0.5,
+        weather_share=0.5,
+        unaltered_share=0.375,
+        closeness=2.0,
     ),
     # For tests: seconds, and the loss falls.
     "smoke": Settings(

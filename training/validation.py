@@ -27,8 +27,33 @@ THRESHOLDS_PX = (1.0, 3.0, 5.0)
 SIDE_PX = 320
 SEED = 17
 _STRENGTH = 1.0  # looks as different as the hardest in training
-_SHARES = (0.35, 0.7)  # of photos at night, and of those that may have weather
 _CPU = torch.device("cpu")
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What happens to the photos of pairs.
+
+    Attributes:
+        night_share: of the photos, at night.
+        weather_share: of those that may have weather.
+        first_too: whether it happens to first photos; if not, they are unaltered, as in a map.
+        second_too: whether it happens to second photos.
+    """
+
+    night_share: float
+    weather_share: float
+    first_too: bool
+    second_too: bool = True
+
+
+CHANGES = {
+    "mixed": Change(0.35, 0.7, first_too=True),
+    "none": Change(0.0, 0.0, first_too=False, second_too=False),
+    "day": Change(0.0, 0.0, first_too=False),
+    "night": Change(1.0, 0.0, first_too=False),
+    "weather": Change(0.0, 1.0, first_too=False),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +90,9 @@ class Pair:
     second_from_first: Matrices
 
 
-def validation_pairs(photos: Sequence[Photo], per_photo: int = 1) -> list[Pair]:
+def validation_pairs(
+    photos: Sequence[Photo], per_photo: int = 1, change: Change = CHANGES["mixed"]
+) -> list[Pair]:
     """Make pairs of 320 px that depend on nothing but the photos and their order."""
     pairs = []
     for number, photo in enumerate(photos):
@@ -76,7 +103,10 @@ def validation_pairs(photos: Sequence[Photo], per_photo: int = 1) -> list[Pair]:
             levels = levels_to_look_at(atlas, np.zeros(2, np.int64), looks, SIDE_PX)
             begins, sizes, matrices = (torch.from_numpy(each) for each in levels)
             seen = look(atlas.pixels, begins, sizes, matrices, SIDE_PX)
-            first, second = augment(seen, draw_conditions(rng, 2, _STRENGTH, *_SHARES))
+            shares = change.night_share, change.weather_share
+            changed = augment(seen, draw_conditions(rng, 2, _STRENGTH, *shares))
+            first = changed[0] if change.first_too else seen[0]
+            second = changed[1] if change.second_too else seen[1]
             pairs.append(Pair(_pixels(first), _pixels(second), np.linalg.inv(looks[1]) @ looks[0]))
     return pairs
 
@@ -87,19 +117,32 @@ def _pixels(image: torch.Tensor) -> NDArray[np.uint8]:
 
 
 def validate(
-    extractor: LocalFeatureExtractor, pairs: Sequence[Pair], *, max_keypoints: int = 1000
+    extractor: LocalFeatureExtractor,
+    pairs: Sequence[Pair],
+    *,
+    of_first: LocalFeatureExtractor | None = None,
+    max_keypoints: int = 1000,
 ) -> Score:
-    """Match each pair by mutual nearest neighbours, and compare with the truth."""
-    rows = [_scored(extractor, pair, max_keypoints) for pair in pairs]
+    """Match each pair by mutual nearest neighbours, and compare with the truth.
+
+    Args:
+        extractor: of the second photos, and of the first ones unless they have their own.
+        pairs: of photos.
+        of_first: of the first photos, as when a map has other weights than its queries.
+        max_keypoints: per photo.
+    """
+    rows = [_scored((of_first or extractor, extractor), pair, max_keypoints) for pair in pairs]
     means = np.mean(rows, axis=0).tolist()
     count = len(THRESHOLDS_PX)
     return Score(tuple(means[:count]), *means[count:])
 
 
-def _scored(extractor: LocalFeatureExtractor, pair: Pair, max_keypoints: int) -> list[float]:
+def _scored(
+    extractors: tuple[LocalFeatureExtractor, LocalFeatureExtractor], pair: Pair, max_keypoints: int
+) -> list[float]:
     first, second = (
         extractor.extract(rgb, max_keypoints=max_keypoints, extraction=Extraction.ACCURATE)
-        for rgb in (pair.first, pair.second)
+        for extractor, rgb in zip(extractors, (pair.first, pair.second), strict=True)
     )
     if not len(first) or not len(second):
         return [0.0] * len(THRESHOLDS_PX) + [0.0, (len(first) + len(second)) / 2, 0.0]

