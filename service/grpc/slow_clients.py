@@ -71,7 +71,7 @@ class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
                 except (TimedOut, InvalidInput) as error:  # before the method's own envelope
                     await self._envelope.refuse(name, error, context)
 
-        return handler_like(handler, serve, _readable_or_not(handler.request_deserializer))
+        return handler_like(handler, serve, readable_or_not(handler.request_deserializer))
 
 
 class _Waiting:
@@ -110,7 +110,8 @@ class _Unreadable(NamedTuple):
     error: VislocError
 
 
-def _readable_or_not(parse: Callable[[bytes], Any] | None) -> Callable[[bytes], Any]:
+def readable_or_not(parse: Callable[[bytes], Any] | None) -> Callable[[bytes], Any]:
+    """Return a parser that gives a stand-in for what ``parse`` refuses or should not see."""
     # Generated code gives the parser of a message's class.
     kind = getattr(parse, "__self__", None)
 
