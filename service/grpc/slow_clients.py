@@ -46,7 +46,7 @@ class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         max_waiting: int,
     ) -> None:
         self._envelope = envelope
-        self._waiting = _Waiting(max_waiting)
+        self._waiting = Waiting(max_waiting)
         self._connections = connections
         self._patience_s = grace_s + max_message_bytes / SLOWEST_BYTES_PER_S
         self._silence_s = grace_s
@@ -74,7 +74,7 @@ class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         return handler_like(handler, serve, readable_or_not(handler.request_deserializer))
 
 
-class _Waiting:
+class Waiting:
     """The calls that wait for a message, at most ``most``: for more, the longest is given up.
 
     A message may take minutes, if it is as large as any may be. Without this, calls whose messages
@@ -141,7 +141,7 @@ def _malformed(got: str) -> VislocError:
 
 
 async def _timely(
-    messages: AsyncIterator[Any], patience_s: float, waiting: _Waiting
+    messages: AsyncIterator[Any], patience_s: float, waiting: Waiting
 ) -> AsyncGenerator[Any]:
     while True:
         try:
