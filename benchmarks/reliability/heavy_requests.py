@@ -214,15 +214,15 @@ def many_value_messages() -> Mapping[str, _Send]:
     tiles = {"maps": [f"tile{n}" for n in range(10**6)]}
     priors = json.dumps({"map": "room", "image": "", "priors": tiles}).encode()
     readings: dict[str, object] = {"sensorReadings": {"cameraReadings": [{} for _ in range(10**6)]}}
-    text = b"A" * (27 * 2**20)
+    text = b"A" * (26 * 2**20)
     long = b'{"map":"room","image":"' + text + b'"}'
     instant = b'{"timestamp":0,"images":[{"image":"' + text + b'"},{"image":"' + text + b'"}]}'
     quotes = b'{"map":"' + b'\\"' * (13 * 2**20) + b'"}'
     empty_images = pb2.LocalizeRigRequest()
     empty_images.images.add()
     return {
-        "a photo of 28 MB in base64": _by_http("/localize", long),
-        "a sequence of 57 MB of base64": _by_http(
+        "a photo of 27 MB of base64": _by_http("/localize", long),
+        "a sequence of 55 MB of base64": _by_http(
             "/localize/sequence", b'{"map":"room","instants":[' + instant + b"]}"
         ),
         "a text of 14 million quotes": _by_http("/localize", quotes),

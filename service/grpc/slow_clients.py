@@ -46,7 +46,7 @@ class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         max_waiting: int,
     ) -> None:
         self._envelope = envelope
-        self._waiting = _Waiting(max_waiting)
+        self._waiting = Waiting(max_waiting)
         self._connections = connections
         self._patience_s = grace_s + max_message_bytes / SLOWEST_BYTES_PER_S
         self._silence_s = grace_s
@@ -71,10 +71,10 @@ class TimelyCalls(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
                 except (TimedOut, InvalidInput) as error:  # before the method's own envelope
                     await self._envelope.refuse(name, error, context)
 
-        return handler_like(handler, serve, _readable_or_not(handler.request_deserializer))
+        return handler_like(handler, serve, readable_or_not(handler.request_deserializer))
 
 
-class _Waiting:
+class Waiting:
     """The calls that wait for a message, at most ``most``: for more, the longest is given up.
 
     A message may take minutes, if it is as large as any may be. Without this, calls whose messages
@@ -110,7 +110,8 @@ class _Unreadable(NamedTuple):
     error: VislocError
 
 
-def _readable_or_not(parse: Callable[[bytes], Any] | None) -> Callable[[bytes], Any]:
+def readable_or_not(parse: Callable[[bytes], Any] | None) -> Callable[[bytes], Any]:
+    """Return a parser that gives a stand-in for what ``parse`` refuses or should not see."""
     # Generated code gives the parser of a message's class.
     kind = getattr(parse, "__self__", None)
 
@@ -140,7 +141,7 @@ def _malformed(got: str) -> VislocError:
 
 
 async def _timely(
-    messages: AsyncIterator[Any], patience_s: float, waiting: _Waiting
+    messages: AsyncIterator[Any], patience_s: float, waiting: Waiting
 ) -> AsyncGenerator[Any]:
     while True:
         try:

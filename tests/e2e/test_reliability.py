@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from benchmarks.reliability.checks import Check
+from benchmarks.reliability.connections import connections
 from benchmarks.reliability.heavy_requests import heavy_photos
-from benchmarks.reliability.idle_connections import idle_connections
 from benchmarks.reliability.kills import kill_service, kill_workers
 from benchmarks.reliability.maps import SampleMaps, make_maps
 from benchmarks.reliability.refusals import refusals
-from benchmarks.reliability.slow_clients import slow_clients
+from benchmarks.reliability.siege import siege
 from benchmarks.reliability.uploads import full_disk, truncated_upload
 
 pytestmark = pytest.mark.slow
@@ -49,13 +49,16 @@ def test_a_killed_service_comes_back_with_all_that_was_published(
     assert broken(asyncio.run(kill_service(maps, tmp_path, kills=2))) == []
 
 
-def test_slow_clients_do_not_slow_down_others(maps: SampleMaps, tmp_path: Path) -> None:
-    checks = asyncio.run(slow_clients(maps, tmp_path, connections=200, seconds=6, rounds=1))
+@pytest.mark.parametrize("tls", [False, True])
+def test_connections_that_are_idle_slow_or_flooding_shut_nobody_out(
+    maps: SampleMaps, tmp_path: Path, tls: bool
+) -> None:
+    checks = asyncio.run(connections(maps, tmp_path, 1200, 4, limits=[1024], tls=[tls]))
     assert broken(checks) == []
 
 
-def test_idle_connections_shut_nobody_out(maps: SampleMaps, tmp_path: Path) -> None:
-    assert broken(asyncio.run(idle_connections(maps.folder, tmp_path, connections=1500))) == []
+def test_a_siege_costs_no_answer_and_no_publication(maps: SampleMaps, tmp_path: Path) -> None:
+    assert broken(asyncio.run(siege(maps, tmp_path, seconds=60))) == []
 
 
 def test_photos_that_take_long_keep_no_worker(maps: SampleMaps, tmp_path: Path) -> None:

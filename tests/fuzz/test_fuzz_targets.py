@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.fuzz import costs
 from tests.fuzz.child import TARGETS, make_target
 from tests.fuzz.edits import Edit, EditedFolder, decode, encode
 from tests.fuzz.target import MAX_MEMORY_BYTES, MemoryExceeded, Watch, refusal
@@ -93,3 +94,28 @@ def test_edits_come_back_from_their_bytes_and_a_folder_comes_back_from_its_edits
     folder.restore()
     assert {name: (tmp_path / "room" / name).read_bytes() for name in folder.names} == folder.good
     assert not (tmp_path / "room" / "sub" / "b").is_symlink()
+
+
+def _quadratic(data: bytes) -> None:
+    sum(data.count(b"a") for each in data if each == ord("a"))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
+def test_the_search_for_costs_finds_what_costs_more_and_measures_it_large() -> None:
+    start = costs.Input(b"", b"b", b"")
+    parser = costs.Parser("here", 20_000, _quadratic, (start,), (b"a",))
+    (slow, size), _ = costs.search(parser, 1.0, seed=1)
+    assert size <= parser.max_bytes
+    assert slow.seconds > 2 * costs.cost_of(_quadratic, start.of(20_000)).seconds
+    _, (large, size) = costs.search(
+        costs.Parser("here", 2**22, lambda data: data * 20, (start,)), 0.1, seed=1
+    )
+    assert large.memory > 10 * size
+
+
+@pytest.mark.parametrize("name", [name for name in costs.parsers() if "photo:" not in name])
+def test_what_reads_strangers_bytes_takes_the_inputs_to_begin_with(name: str) -> None:
+    parser = costs.parsers()[name]()
+    for given in parser.starts:
+        cost = costs.cost_of(parser.read, given.of(2**14))
+        assert cost.seconds < 60

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
-from fastapi import FastAPI
+from fastapi import FastAPI, Request, Response
+from fastapi.responses import JSONResponse
 from pydantic.json_schema import models_json_schema
 
 from service.http.openapi import example
@@ -63,7 +65,23 @@ def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 
 class App(FastAPI):
-    """FastAPI with the schemas of bodies that it does not parse itself."""
+    """FastAPI with the schemas of bodies that it does not parse itself.
+
+    /openapi.json, which needs no key, is written once: FastAPI writes it for each request, which
+    keeps the event loop for milliseconds.
+    """
+
+    def setup(self) -> None:
+        """Add the route of the schema, which is complete when it is first asked for."""
+
+        async def answer(_: Request) -> Response:
+            return Response(self._written(), media_type="application/json")
+
+        self.add_route("/openapi.json", answer, include_in_schema=False)
+
+    @cache  # noqa: B019  there is one app as long as the process lives
+    def _written(self) -> bytes:
+        return bytes(JSONResponse(self.openapi()).body)
 
     def openapi(self) -> dict[str, Any]:
         """Return /openapi.json."""
