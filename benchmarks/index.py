@@ -147,7 +147,8 @@ def stored(work: Path, name: str) -> GlobalRows:
 def opened(work: Path, name: str) -> GlobalRows:
     """Open the rows of one descriptor with their inverted file."""
     rows = stored(work, name)
-    centers, sizes = (np.load(work / f"{name}.{part}.npy") for part in ("centers", "sizes"))
+    centers = np.load(work / f"{name}.centers.npy", mmap_mode="r")
+    sizes = np.load(work / f"{name}.sizes.npy")
     inverted = InvertedFile(centers, sizes, work / f"{name}.lists")
     return GlobalRows(rows.values, rows.scales, inverted)
 

@@ -18,8 +18,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from visloc.retrieval.rows import dot_products
-
 _ITERATIONS = 10
 _SAMPLES_PER_LIST = 50
 # Of a centre's length, also where all of its rows went elsewhere.
@@ -30,6 +28,9 @@ _WORD_BITS = 64
 ID_BYTES, FACTOR_BYTES = 8, 8
 # Bits in which a query is rounded for the comparison with codes.
 _QUERY_BITS = 6
+# Numbers converted to float32 at once: 1 MiB stays in the cache of a core, and is too small for
+# BLAS to wake other threads, which costs more than the product.
+_BLOCK_NUMBERS = 2**18
 
 
 class Rows(Protocol):
@@ -159,6 +160,28 @@ def largest(values: NDArray[np.floating], count: int) -> NDArray[np.int64]:
     return np.argpartition(-values, count)[:count]
 
 
+def dot_products(
+    matrix: NDArray[np.int8] | NDArray[np.float32],
+    vector: NDArray[np.float32],
+    rows: NDArray[np.int64] | None = None,
+) -> NDArray[np.float32]:
+    """Return the products (m,) of some rows (m,) of a matrix (n, D), or all, with a vector (D,).
+
+    8-bit rows are converted block by block, which is faster than reading 32-bit rows from memory.
+    The matrix may be mapped from a file.
+    """
+    num = len(matrix) if rows is None else len(rows)
+    found = np.empty(num, np.float32)
+    block_rows = max(1, _BLOCK_NUMBERS // matrix.shape[1])
+    block = np.empty((min(num, block_rows), matrix.shape[1]), np.float32)
+    for start in range(0, num, block_rows):
+        some = slice(start, min(start + block_rows, num))
+        wide = block[: some.stop - some.start]
+        wide[...] = matrix[some if rows is None else rows[some]]
+        np.matmul(wide, vector, out=found[some])
+    return found
+
+
 def width_of(dim: int) -> int:
     """Dimensions of centres and codes of rows of ``dim`` dimensions; those added are zero."""
     return -(-dim // _WORD_BITS) * _WORD_BITS
@@ -241,7 +264,9 @@ def _widened(rows: NDArray[np.float32], width: int) -> NDArray[np.float32]:
 
 
 def _lengths(centers: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.asarray(np.maximum(np.linalg.norm(centers, axis=1), _LEAST_ALIKE))
+    # Without squares of all in memory.
+    squared = np.einsum("ij,ij->i", centers, centers)
+    return np.asarray(np.maximum(np.sqrt(squared), _LEAST_ALIKE))
 
 
 def _coarse(centers: NDArray[np.float32]) -> Any:
