@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc.geometry import Camera, Pose
 
 # Raised when the code of the stage changes what comes out.
-_REVISION = 11
+_REVISION = 12
 _LARGEST = 127  # of descriptors in 8 bits
 
 
@@ -145,7 +146,8 @@ def _to_item(model: SparseModel) -> Item:
         "doubt_sensors": np.array(list(model.doubts), dtype=np.str_),
         "doubt_reasons": np.array([doubt.reason for doubt in model.doubts.values()], dtype=np.str_),
         "doubt_px": np.array([doubt.focal_length_px for doubt in model.doubts.values()]),
-        "apart": np.array(model.apart, dtype=np.int64),
+        "apart": np.array([row for piece in model.apart for row in piece], dtype=np.int64),
+        "apart_bounds": np.cumsum([0, *map(len, model.apart)]),
         "undone": np.array(model.undone),
         **{f"observed_{name}": array for name, array in asdict(model.observations).items()},
     }
@@ -173,6 +175,9 @@ def _from_item(item: Item, photos: Sequence[MappingPhoto]) -> SparseModel:
         item["angles_deg"],
         bool(item["on_rigs"]),
         {sensor: Doubt(reason, focal) for sensor, reason, focal in doubts},
-        tuple(item["apart"].tolist()),
+        tuple(
+            tuple(item["apart"][start:end].tolist())
+            for start, end in pairwise(item["apart_bounds"].tolist())
+        ),
         int(item["undone"]),
     )

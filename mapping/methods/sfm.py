@@ -171,7 +171,7 @@ def _notes_on_absent(photos: Sequence[MappingPhoto], model: SparseModel) -> list
         return notes
     notes.append(f"{len(absent)} of {len(photos)} photos found no place: {some(absent)}")
     if model.apart:
-        pieces = ", ".join(map(str, model.apart))
+        pieces = ", ".join(str(len(piece)) for piece in model.apart)
         notes.append(
             f"the photos fell apart into {len(model.apart) + 1} pieces that nothing links for "
             f"sure: the map is of the largest, without others of {pieces} photos. Photos of the "
