@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +25,7 @@ _ROUNDS = 3
 
 
 def extend(
-    photos: list[SfmPhoto], model: SparseModel, late: Late, config: MapperConfig, work: Path
+    photos: Sequence[SfmPhoto], model: SparseModel, late: Late, config: MapperConfig, work: Path
 ) -> SparseModel:
     """Return a model with the photos that found a place late, and landmarks of their matches.
 

@@ -20,6 +20,7 @@ from mapping.methods.contradictions import ModelPhoto, share_shown
 from mapping.methods.look_alikes import ranks_in_time
 from mapping.methods.matching import Matches, fits_poses
 from mapping.methods.sparse_model import MapperConfig, SfmPhoto, SparseModel
+from mapping.progress import ItemProgress
 from mapping.stages.landmarks import View
 from visloc.geometry import Camera, Pose
 from visloc.pose.colmap import normalized_rays, project
@@ -71,6 +72,7 @@ def place_latecomers(
     matches: Sequence[Matches],
     model: SparseModel,
     config: MapperConfig,
+    progress: ItemProgress,
 ) -> Late:
     """Place photos that have none in a model by what it shows of them, one after another.
 
@@ -81,13 +83,16 @@ def place_latecomers(
         describe: returns the descriptors (k, D) of a photo's keypoints, all with one scale.
         matches: verified, between all photos, believed or not.
         model: without rigs.
+        progress: called with the number of photos placed, and of all that had no place.
     """
     growing = _Growing(photos, describe, matches, model, config)
     waiting = {row for row, view in enumerate(model.views) if view is None}
     changed = set(waiting)
     proposed: dict[int, list[_Proposed]] = {}
-    placed = []
+    placed: list[int] = []
+    total = len(waiting)
     while changed:
+        progress(len(placed), total)
         proposed |= {row: growing.propose(row) for row in sorted(changed)}
         changed = set()
         best = [(row, each) for row in sorted(waiting) for each in proposed[row]]

@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.methods.colmap_scene import Rigs
+from mapping.methods.extending import extend
 from mapping.methods.intrinsics import Doubt
+from mapping.methods.latecomers import place_latecomers
 from mapping.methods.matching import Matches, camera_values, pose_values
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
@@ -27,6 +29,8 @@ from visloc.geometry import Camera, Pose
 
 # Raised when the code of the stage changes what comes out.
 _REVISION = 12
+_LATE_REVISION = 1
+_LATE = "late photos"
 _LARGEST = 127  # of descriptors in 8 bits
 
 
@@ -51,6 +55,33 @@ def make_model(
     key = _model_key(matches_key, photos, rigs, settings)
     stage = MAPPING if settings.estimate_poses else TRIANGULATION
     context.workers.run_one(task.make, key, stage, context.progress)
+    return _from_item(context.work.read(key), photos)
+
+
+def with_latecomers(
+    context: BuildContext,
+    photos: Sequence[MappingPhoto],
+    model: SparseModel,
+    matches: Sequence[Matches],
+    matches_key: str,
+    settings: SfmSettings,
+) -> SparseModel:
+    """Place photos that a model without rigs left out, where they show what it has there.
+
+    Args:
+        matches: verified, of pairs with at least these photos.
+        matches_key: stands for them in the key of the result.
+    """
+    task = _LateTask(context.work, tuple(photos), context.features, model, matches, settings)
+    poses = [None if view is None else pose_values(view.cam_from_world) for view in model.views]
+    key = key_of(
+        "late_photos",
+        _LATE_REVISION,
+        matches=matches_key,
+        poses=poses,
+        model=_model_key("", photos, {}, settings),
+    )
+    context.workers.run_one(task.make, key, _LATE, context.progress)
     return _from_item(context.work.read(key), photos)
 
 
@@ -83,20 +114,57 @@ class _ModelTask:
         self.work.get(key, compute)
 
     def _describe(self, row: int) -> NDArray[np.int8]:
-        descriptors = self.features.read(self.photos[row]).descriptors
-        # One scale for all: they are unit rows.
-        return np.rint(_LARGEST * descriptors).astype(np.int8)
+        return _described(self.features, self.photos[row])
 
     def _given(self, photo: MappingPhoto) -> SfmPhoto:
-        return SfmPhoto(
-            name=photo.name,
-            sensor=photo.record.sensor_id,
-            timestamp=photo.record.timestamp,
-            camera=photo.camera,
-            camera_known=photo.camera_known,
-            cam_from_world=None if self.settings.estimate_poses else photo.pose,
-            keypoints=self.features.read(photo).keypoints,
-        )
+        pose = None if self.settings.estimate_poses else photo.pose
+        return _given(self.features, photo, pose)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _LateTask:
+    """A worker's part, for the photos that a model left out."""
+
+    work: WorkFolder
+    photos: tuple[MappingPhoto, ...]
+    features: LocalFeaturesSource
+    model: SparseModel
+    matches: Sequence[Matches]
+    settings: SfmSettings
+
+    def make(self, key: str, progress: Progress) -> None:
+        def compute() -> Item:
+            given = [_given(self.features, photo, None) for photo in self.photos]
+            config, told = MAPPER_CONFIGS[self.settings.mapper], partial(progress, _LATE)
+            late = place_latecomers(given, self._describe, self.matches, self.model, config, told)
+            if not late.rows:
+                return _to_item(self.model)
+            return _to_item(extend(given, self.model, late, config, self.work.scratch))
+
+        if not self.work.has(key):
+            self.work.get(key, compute)
+        absent = self.model.views.count(None)
+        progress(_LATE, absent, absent)
+
+    def _describe(self, row: int) -> NDArray[np.int8]:
+        return _described(self.features, self.photos[row])
+
+
+def _described(features: LocalFeaturesSource, photo: MappingPhoto) -> NDArray[np.int8]:
+    # One scale for all: they are unit rows.
+    return np.rint(_LARGEST * features.read(photo).descriptors).astype(np.int8)
+
+
+def _given(features: LocalFeaturesSource, photo: MappingPhoto, pose: Pose | None) -> SfmPhoto:
+    return SfmPhoto(
+        name=photo.name,
+        sensor=photo.record.sensor_id,
+        timestamp=photo.record.timestamp,
+        camera=photo.camera,
+        camera_known=photo.camera_known,
+        cam_from_world=pose,
+        keypoints=features.read(photo).keypoints,
+    )
 
 
 def _model_key(
