@@ -30,8 +30,8 @@ from visloc.pose.views import MatchedView
 # Matches with photos at most so many steps away in time are tried alone first: what repeats itself
 # within a place matches photos of another part of it.
 _NEAR_STEPS = 6
-# Photos whose right pose the model knows show 0.5 to 0.9 of what they should; in a wrong pose, and
-# photos of another floor, 0.12 at most. Measured: docs/decisions/0037-places-that-contradict.md.
+# In right poses, photos show 0.54 to 0.93 of what they should; in another part of the place, and on
+# another floor, 0.12 at most. Measured: docs/decisions/0037-places-that-contradict.md.
 _LEAST_SHOWN = 0.5
 # Fewer landmarks tell nothing.
 _LEAST_EXPECTED = 20
