@@ -35,6 +35,8 @@ _NEAR_STEPS = 6
 _LEAST_SHOWN = 0.5
 # Fewer landmarks tell nothing.
 _LEAST_EXPECTED = 20
+# Inliers of a pose that is worth a look. As many as the mapper asks for must be inliers or shown.
+_LEAST_PROPOSING = 20
 # Pairs that were not believed make landmarks where so many of their matches fit the poses.
 _LEAST_FITTING = 0.5
 
@@ -145,7 +147,7 @@ class _Growing:
         return set(self._pairs[row])
 
     def propose(self, row: int) -> list[_Proposed]:
-        """Return the poses that enough landmarks propose: of photos near in time, and of all."""
+        """Return the poses that landmarks propose: of photos near in time, and of all."""
         camera = self._cameras.get(self._photos[row].sensor)
         if camera is None:
             return []
@@ -168,7 +170,7 @@ class _Growing:
             landmarks = self._landmarks[other][theirs]
             found.append(np.column_stack([own, landmarks])[landmarks >= 0])
         both = np.unique(np.concatenate(found).astype(np.int64), axis=0)
-        if len(both) < self._config.abs_pose_min_num_inliers:
+        if len(both) < _LEAST_PROPOSING:
             return None
         pixels = self._photos[row].keypoints[both[:, 0]].astype(np.float64)
         seen = MatchedView(camera, Pose.identity(), pixels, self._points[both[:, 1]])
@@ -177,7 +179,7 @@ class _Growing:
         )
         if (
             pose is None
-            or pose.num_inliers < self._config.abs_pose_min_num_inliers
+            or pose.num_inliers < _LEAST_PROPOSING
             or pose.num_inliers < self._config.abs_pose_min_inlier_ratio * len(both)
         ):
             return None
@@ -194,7 +196,11 @@ class _Growing:
         ]
         own = ModelPhoto(view, self._photos[row].keypoints, self._look(row), landmarks, keypoints)
         shown, expected = share_shown([*others, own], self._points, len(others))
-        return expected >= _LEAST_EXPECTED and shown >= _LEAST_SHOWN * expected
+        return (
+            expected >= _LEAST_EXPECTED
+            and shown >= _LEAST_SHOWN * expected
+            and max(shown, len(landmarks)) >= self._config.abs_pose_min_num_inliers
+        )
 
     def _model_photo(self, row: int, view: View, rows: NDArray[np.int64]) -> ModelPhoto:
         landmarks = self._landmarks[row][rows]
