@@ -2,26 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import PIL.Image  # noqa: F401  before pycolmap, see visloc.pose.colmap
 import pycolmap
+from numpy.typing import NDArray
 
 from mapping.methods.adjustment import adjust_some
 from mapping.methods.colmap_scene import ColmapScene, colmap_database
-from mapping.methods.latecomers import Late
+from mapping.methods.latecomers import Late, place_latecomers
 from mapping.methods.matching import Matches
 from mapping.methods.points import cache_options
 from mapping.methods.sparse_model import MapperConfig, SfmPhoto, SparseModel, without_bad_points
 from mapping.methods.triangulation import pipeline_options
+from mapping.progress import ItemProgress
 from mapping.stages.landmarks import Observations
 from visloc.pose.colmap import pose_from_colmap
 
 # Adjusted poses let more matches fit, and these move the poses a little.
 _ROUNDS = 3
+
+
+def with_late_photos(
+    photos: Sequence[SfmPhoto],
+    describe: Callable[[int], NDArray[np.int8]],
+    matches: Sequence[Matches],
+    model: SparseModel,
+    config: MapperConfig,
+    work: Path,
+    progress: ItemProgress,
+) -> SparseModel:
+    """Return a model with the photos that find a place in it late (``place_latecomers``)."""
+    late = place_latecomers(photos, describe, matches, model, config, progress)
+    return extend(photos, model, late, config, work) if late.rows else model
 
 
 def extend(

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapping.methods.colmap_scene import Rigs
-from mapping.methods.extending import extend
+from mapping.methods.extending import with_late_photos
 from mapping.methods.intrinsics import Doubt
-from mapping.methods.latecomers import place_latecomers
 from mapping.methods.matching import Matches, camera_values, pose_values
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
@@ -136,10 +135,8 @@ class _LateTask:
         def compute() -> Item:
             given = [_given(self.features, photo, None) for photo in self.photos]
             config, told = MAPPER_CONFIGS[self.settings.mapper], partial(progress, _LATE)
-            late = place_latecomers(given, self._describe, self.matches, self.model, config, told)
-            if not late.rows:
-                return _to_item(self.model)
-            return _to_item(extend(given, self.model, late, config, self.work.scratch))
+            inputs = given, self._describe, self.matches, self.model, config
+            return _to_item(with_late_photos(*inputs, self.work.scratch, told))
 
         if not self.work.has(key):
             self.work.get(key, compute)
