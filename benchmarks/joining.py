@@ -38,6 +38,7 @@ from mapping.cluster.workers import one_thread_here
 from mapping.frames.anchor import align_poses
 from mapping.importers.dataset import write_imported
 from mapping.importers.images import read as read_photos
+from mapping.methods.extending import with_late_photos
 from mapping.methods.matching import Matches, Verification, match_pairs
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import SfmSettings
@@ -167,18 +168,19 @@ def _model_of(scene: Matched, rows: list[int]) -> dict[int, Pose]:
         if pair.first in number and pair.second in number
     ]
     some = [scene.photos[row] for row in rows]
+
+    def describe(row: int) -> NDArray[np.int8]:
+        return scene.looks[rows[row]]
+
     with tempfile.TemporaryDirectory() as folder:
         try:
             model = reconstruct_places(
-                some,
-                lambda row: scene.looks[rows[row]],
-                {},
-                among,
-                CONFIG,
-                (),
-                Path(folder),
-                lambda *_: None,
+                some, describe, {}, among, CONFIG, (), Path(folder), lambda *_: None
             )
+            if not model.undone:
+                model = with_late_photos(
+                    some, describe, among, model, CONFIG, Path(folder), lambda *_: None
+                )
         except InvalidInput as error:
             typer.echo(f"{len(rows)} photos are in no model: {error.code}")
             return {}

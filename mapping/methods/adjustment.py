@@ -110,6 +110,19 @@ def adjusted_robustly(
     return _with_principal_points(adjusted, camera_ids)
 
 
+def adjust_some(model: pycolmap.Reconstruction, image_ids: Collection[int]) -> None:
+    """Adjust the poses of some images and the points that they see, robustly; all else stays."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in image_ids:
+        config.add_image(image_id)
+        config.set_constant_cam_intrinsics(model.image(image_id).camera_id)
+        for seen in model.image(image_id).get_observation_points2D():
+            if not config.has_variable_point(seen.point3D_id):
+                config.add_variable_point(seen.point3D_id)
+    with quiet():
+        _solve(model, _robust_options(poses=True, intrinsics=False), config)
+
+
 def _with_principal_points(
     model: pycolmap.Reconstruction, camera_ids: Collection[int]
 ) -> pycolmap.Reconstruction:
@@ -184,6 +197,14 @@ def _adjust(
         config.set_constant_cam_intrinsics(camera_id)
     if poses:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    _solve(model, options, config)
+
+
+def _solve(
+    model: pycolmap.Reconstruction,
+    options: pycolmap.BundleAdjustmentOptions,
+    config: pycolmap.BundleAdjustmentConfig,
+) -> None:
     # pycolmap.bundle_adjustment prints to stderr regardless of options.
     adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
     interruptible(lambda token: adjuster.solve())  # noqa: ARG005  it cannot be cancelled

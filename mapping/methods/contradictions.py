@@ -116,7 +116,9 @@ def find_places(photos: Sequence[ModelPhoto], points: NDArray[np.float64]) -> Pl
         expected.append(landmarks)
         shown.append(landmarks[model.shown(row, landmarks)])
     pairs, correlations, counts = _correlations(
-        _table(expected, len(points)), _table(shown, len(points)), model.near
+        _table(expected, len(points)),
+        _table(shown, len(points)),
+        [model.near(row) for row in range(len(photos))],
     )
     weights = (correlations + _SLACK) * np.minimum(counts, _FULL_WEIGHT) / _FULL_WEIGHT
     groups = _contracted(len(photos), pairs, weights)
@@ -125,6 +127,22 @@ def find_places(photos: Sequence[ModelPhoto], points: NDArray[np.float64]) -> Pl
         _contradicting(groups, pairs, correlations, counts),
         frozenset(map(tuple, pairs[correlations >= _AGREE].tolist())),
     )
+
+
+def share_shown(
+    photos: Sequence[ModelPhoto], points: NDArray[np.float64], row: int
+) -> tuple[int, int]:
+    """Return how many landmarks one photo of a model shows, of how many that it should show.
+
+    It should show what photos near it observe, as in ``find_places``.
+
+    Args:
+        photos: of one model.
+        points: (P, 3) its points.
+    """
+    model = _Model(photos, points)
+    expected = model.expected(row)
+    return int(model.shown(row, expected).sum()), len(expected)
 
 
 class _Model:
@@ -144,25 +162,31 @@ class _Model:
         self._landmarks = [p.landmarks[which] for p, which in zip(photos, chosen, strict=True)]
         self._rows = [p.rows[which] for p, which in zip(photos, chosen, strict=True)]
         self._centers = np.array([p.view.cam_from_world.center for p in photos]).reshape(-1, 3)
-        rotations = np.array([p.view.cam_from_world.rotation for p in photos]).reshape(-1, 3, 3)
+        self._rotations = np.array([p.view.cam_from_world.rotation for p in photos]).reshape(
+            -1, 3, 3
+        )
         self._depths = [p.view.cam_from_world.apply(points[p.landmarks])[:, 2] for p in photos]
-        self.near: list[NDArray[np.int64]] = []
-        for row, (photo, depths) in enumerate(zip(photos, self._depths, strict=True)):
-            reach = max(float(np.median(depths)) if len(depths) else 0.0, _TINY)
-            apart = viewpoints_apart(rotations, self._centers, photo.view.cam_from_world, reach)
-            apart[row] = np.inf
-            nearest = np.argsort(apart, kind="stable")[:_MOST_NEAR]
-            self.near.append(nearest[apart[nearest] <= _NEAR])
+
+    def near(self, row: int) -> NDArray[np.int64]:
+        """Return the photos near one, the nearest first."""
+        photo, depths = self._photos[row], self._depths[row]
+        reach = max(float(np.median(depths)) if len(depths) else 0.0, _TINY)
+        pose = photo.view.cam_from_world
+        apart = viewpoints_apart(self._rotations, self._centers, pose, reach)
+        apart[row] = np.inf
+        nearest = np.argsort(apart, kind="stable")[:_MOST_NEAR]
+        return np.asarray(nearest[apart[nearest] <= _NEAR])
 
     def expected(self, row: int) -> NDArray[np.int64]:
         """Return the landmarks that photos near one observe and that it should show, in order."""
         photo, own = self._photos[row], self._depths[row]
         camera, pose = photo.view.camera, photo.view.cam_from_world
-        near = [self._landmarks[other] for other in self.near[row].tolist()]
+        photos = self.near(row)
+        near = [self._landmarks[other] for other in photos.tolist()]
         if not near or not len(own):
             return np.empty(0, np.int64)
         landmarks = np.concatenate(near)
-        observers = np.repeat(self._centers[self.near[row]], [len(each) for each in near], axis=0)
+        observers = np.repeat(self._centers[photos], [len(each) for each in near], axis=0)
         alike = _look_alike(self._points[landmarks], observers, pose.center)
         landmarks = np.unique(landmarks[alike])
         in_cam = pose.apply(self._points[landmarks])
@@ -203,7 +227,7 @@ class _Model:
         """Return the descriptors of landmarks in the nearest photos that observe them."""
         descriptors = np.zeros((len(landmarks), self._photos[row].descriptors.shape[1]), np.int8)
         self._place[landmarks] = np.arange(len(landmarks))
-        for other in self.near[row][::-1].tolist():  # the nearest comes last, and stays
+        for other in self.near(row)[::-1].tolist():  # the nearest comes last, and stays
             places = self._place[self._landmarks[other]]
             wanted = places >= 0
             rows = self._rows[other][wanted]

@@ -52,7 +52,7 @@ def without_look_alikes(photos: Sequence[SfmPhoto], matches: Sequence[Matches]) 
         matches: verified.
     """
     confirmed = _Confirmed(photos, matches)
-    order = _ranks(photos)
+    order = ranks_in_time(photos)
     believed = [
         _share_found(photos, confirmed, pair)
         >= (_LEAST_NEAR if _are_near(photos, order, pair) else _LEAST_FAR)
@@ -171,7 +171,7 @@ def _with_one(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.column_stack([pixels, np.ones(len(pixels))])
 
 
-def _ranks(photos: Sequence[SfmPhoto]) -> list[int]:
+def ranks_in_time(photos: Sequence[SfmPhoto]) -> list[int]:
     """Return the place of each photo in its sensor's order of time."""
     ranks = [0] * len(photos)
     taken: dict[str, int] = defaultdict(int)

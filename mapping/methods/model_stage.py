@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapping.methods.colmap_scene import Rigs
+from mapping.methods.extending import with_late_photos
 from mapping.methods.intrinsics import Doubt
 from mapping.methods.matching import Matches, camera_values, pose_values
 from mapping.methods.sfm_settings import SfmSettings
@@ -25,7 +27,9 @@ from mapping.stages.work_folder import Item, WorkFolder, key_of
 from visloc.geometry import Camera, Pose
 
 # Raised when the code of the stage changes what comes out.
-_REVISION = 11
+_REVISION = 12
+_LATE_REVISION = 1
+_LATE = "late photos"
 _LARGEST = 127  # of descriptors in 8 bits
 
 
@@ -50,6 +54,33 @@ def make_model(
     key = _model_key(matches_key, photos, rigs, settings)
     stage = MAPPING if settings.estimate_poses else TRIANGULATION
     context.workers.run_one(task.make, key, stage, context.progress)
+    return _from_item(context.work.read(key), photos)
+
+
+def with_latecomers(
+    context: BuildContext,
+    photos: Sequence[MappingPhoto],
+    model: SparseModel,
+    matches: Sequence[Matches],
+    matches_key: str,
+    settings: SfmSettings,
+) -> SparseModel:
+    """Place photos that a model without rigs left out, where they show what it has there.
+
+    Args:
+        matches: verified, of pairs with at least these photos.
+        matches_key: stands for them in the key of the result.
+    """
+    task = _LateTask(context.work, tuple(photos), context.features, model, matches, settings)
+    poses = [None if view is None else pose_values(view.cam_from_world) for view in model.views]
+    key = key_of(
+        "late_photos",
+        _LATE_REVISION,
+        matches=matches_key,
+        poses=poses,
+        model=_model_key("", photos, {}, settings),
+    )
+    context.workers.run_one(task.make, key, _LATE, context.progress)
     return _from_item(context.work.read(key), photos)
 
 
@@ -82,20 +113,55 @@ class _ModelTask:
         self.work.get(key, compute)
 
     def _describe(self, row: int) -> NDArray[np.int8]:
-        descriptors = self.features.read(self.photos[row]).descriptors
-        # One scale for all: they are unit rows.
-        return np.rint(_LARGEST * descriptors).astype(np.int8)
+        return _described(self.features, self.photos[row])
 
     def _given(self, photo: MappingPhoto) -> SfmPhoto:
-        return SfmPhoto(
-            name=photo.name,
-            sensor=photo.record.sensor_id,
-            timestamp=photo.record.timestamp,
-            camera=photo.camera,
-            camera_known=photo.camera_known,
-            cam_from_world=None if self.settings.estimate_poses else photo.pose,
-            keypoints=self.features.read(photo).keypoints,
-        )
+        pose = None if self.settings.estimate_poses else photo.pose
+        return _given(self.features, photo, pose)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _LateTask:
+    """A worker's part, for the photos that a model left out."""
+
+    work: WorkFolder
+    photos: tuple[MappingPhoto, ...]
+    features: LocalFeaturesSource
+    model: SparseModel
+    matches: Sequence[Matches]
+    settings: SfmSettings
+
+    def make(self, key: str, progress: Progress) -> None:
+        def compute() -> Item:
+            given = [_given(self.features, photo, None) for photo in self.photos]
+            config, told = MAPPER_CONFIGS[self.settings.mapper], partial(progress, _LATE)
+            inputs = given, self._describe, self.matches, self.model, config
+            return _to_item(with_late_photos(*inputs, self.work.scratch, told))
+
+        if not self.work.has(key):
+            self.work.get(key, compute)
+        absent = self.model.views.count(None)
+        progress(_LATE, absent, absent)
+
+    def _describe(self, row: int) -> NDArray[np.int8]:
+        return _described(self.features, self.photos[row])
+
+
+def _described(features: LocalFeaturesSource, photo: MappingPhoto) -> NDArray[np.int8]:
+    # One scale for all: they are unit rows.
+    return np.rint(_LARGEST * features.read(photo).descriptors).astype(np.int8)
+
+
+def _given(features: LocalFeaturesSource, photo: MappingPhoto, pose: Pose | None) -> SfmPhoto:
+    return SfmPhoto(
+        name=photo.name,
+        sensor=photo.record.sensor_id,
+        timestamp=photo.record.timestamp,
+        camera=photo.camera,
+        camera_known=photo.camera_known,
+        cam_from_world=pose,
+        keypoints=features.read(photo).keypoints,
+    )
 
 
 def _model_key(
@@ -145,7 +211,8 @@ def _to_item(model: SparseModel) -> Item:
         "doubt_sensors": np.array(list(model.doubts), dtype=np.str_),
         "doubt_reasons": np.array([doubt.reason for doubt in model.doubts.values()], dtype=np.str_),
         "doubt_px": np.array([doubt.focal_length_px for doubt in model.doubts.values()]),
-        "apart": np.array(model.apart, dtype=np.int64),
+        "apart": np.array([row for piece in model.apart for row in piece], dtype=np.int64),
+        "apart_bounds": np.cumsum([0, *map(len, model.apart)]),
         "undone": np.array(model.undone),
         **{f"observed_{name}": array for name, array in asdict(model.observations).items()},
     }
@@ -173,6 +240,9 @@ def _from_item(item: Item, photos: Sequence[MappingPhoto]) -> SparseModel:
         item["angles_deg"],
         bool(item["on_rigs"]),
         {sensor: Doubt(reason, focal) for sensor, reason, focal in doubts},
-        tuple(item["apart"].tolist()),
+        tuple(
+            tuple(item["apart"][start:end].tolist())
+            for start, end in pairwise(item["apart_bounds"].tolist())
+        ),
         int(item["undone"]),
     )

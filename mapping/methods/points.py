@@ -37,7 +37,7 @@ def triangulate_points(
     total = len(images) * (1 + rounds)
     progress(0, total)
     with pycolmap.Database.open(path) as database:
-        cache = pycolmap.DatabaseCache.create(database, _cache_options(options))
+        cache = pycolmap.DatabaseCache.create(database, cache_options(options))
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(model)
     for done, image_id in enumerate(images, 1):
@@ -61,7 +61,8 @@ def triangulate_points(
     progress(total, total)
 
 
-def _cache_options(options: pycolmap.IncrementalPipelineOptions) -> pycolmap.DatabaseCacheOptions:
+def cache_options(options: pycolmap.IncrementalPipelineOptions) -> pycolmap.DatabaseCacheOptions:
+    """Return what to read of a database: all photos, and the pairs with enough matches."""
     cache = pycolmap.DatabaseCacheOptions()
     cache.min_num_matches = options.min_num_matches
     cache.load_all_images = True

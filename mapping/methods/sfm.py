@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import JsonValue
 
 from mapping.frames.anchor import align_positions, known_positions
 from mapping.frames.anchor_error import place_error
+from mapping.methods.colmap_scene import Rigs
 from mapping.methods.intrinsics import (
     CAMERAS,
     CameraOrigin,
@@ -22,8 +24,8 @@ from mapping.methods.intrinsics import (
     notes_on,
     origin_of,
 )
-from mapping.methods.matching import Verification, match_pairs
-from mapping.methods.model_stage import make_model
+from mapping.methods.matching import Matches, Verification, match_pairs
+from mapping.methods.model_stage import make_model, with_latecomers
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SparseModel
@@ -36,6 +38,8 @@ from visloc.errors import InvalidInput
 from visloc.geometry import Pose, Similarity
 from visloc.kapture import Dataset
 
+# When more of the photos have no place, what is missing may be most of the place.
+_MANY_ABSENT = 0.4
 UNPLACED = "nothing says where the photos were taken: the frame and unit are arbitrary"
 """The note on a map that has no place in the world."""
 
@@ -69,15 +73,12 @@ def landmarks_from_matches(
         min_matches=config.min_num_matches,
         poses_known=not settings.estimate_poses,
     )
-    matches, matches_key = match_pairs(context, photos, pairs.rows, verification)
+    matched = match_pairs(context, photos, pairs.rows, verification)
     rigs = known_rigs(dataset, {photo.record.sensor_id for photo in photos})
-    model = make_model(context, photos, rigs, matches, matches_key, settings)
-    if (found := with_found_cameras(photos, model)) is not None:
-        matches, matches_key = match_pairs(context, found, pairs.rows, verification)
-        begun = [replace(p, camera=new.camera) for p, new in zip(photos, found, strict=True)]
-        with suppress(InvalidInput):  # a second look that finds nothing takes nothing away
-            again = make_model(context, begun, rigs, matches, matches_key, settings)
-            model = min(again, model, key=lambda each: each.views.count(None))
+    model = make_model(context, photos, rigs, *matched, settings)
+    if settings.estimate_poses:
+        look = _Look(context, photos, rigs, pairs.rows, verification, settings)
+        model = look.again(model, matched)
     names = names_by_sensor((photo.record.sensor_id, photo.name) for photo in photos)
     origins = {
         sensor: origin_of(dataset.sensors[sensor], model.doubts.get(sensor)) for sensor in names
@@ -89,6 +90,58 @@ def landmarks_from_matches(
         pairs=(scene, pairs),
     )
     return replace(made, notes=(*notes, *made.notes))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Look:
+    """A second look at photos that found no place while poses were estimated."""
+
+    context: BuildContext
+    photos: Sequence[MappingPhoto]
+    rigs: Rigs
+    pairs: NDArray[np.int64]
+    verification: Verification
+    settings: SfmSettings
+
+    def again(self, model: SparseModel, matched: tuple[list[Matches], str]) -> SparseModel:
+        """Return a model with more of the photos, with the cameras that the first one found.
+
+        When many found no place, all are mapped anew. Else they are placed in the model as it is.
+        """
+        found = with_found_cameras(self.photos, model)
+        absent = np.array([view is None for view in model.views])
+        if found is not None and (model.on_rigs or absent.mean() > _MANY_ABSENT):
+            matched = match_pairs(self.context, found, self.pairs, self.verification)
+            model = self._anew(model, found, matched)
+        elif found is not None:
+            pairs = self.pairs[_with_their_groups(self.pairs, absent)]
+            matched = match_pairs(self.context, found, pairs, self.verification)
+        if None not in model.views or model.undone or model.on_rigs:
+            return model
+        photos = self.photos if found is None else found
+        return with_latecomers(self.context, photos, model, *matched, self.settings)
+
+    def _anew(
+        self,
+        model: SparseModel,
+        found: Sequence[MappingPhoto],
+        matched: tuple[list[Matches], str],
+    ) -> SparseModel:
+        """Map again, and return the model with more photos."""
+        begun = [replace(p, camera=new.camera) for p, new in zip(self.photos, found, strict=True)]
+        with suppress(InvalidInput):  # a second look that finds nothing takes nothing away
+            again = make_model(self.context, begun, self.rigs, *matched, self.settings)
+            model = min(again, model, key=lambda each: each.views.count(None))
+        return model
+
+
+def _with_their_groups(pairs: NDArray[np.int64], absent: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Tell which pairs to verify again: those of photos that are absent.
+
+    With all others of their first photos, as they are matched and kept together.
+    """
+    firsts = pairs[absent[pairs].any(axis=1), 0]
+    return np.isin(pairs[:, 0], firsts)
 
 
 def with_found_cameras(
@@ -171,7 +224,7 @@ def _notes_on_absent(photos: Sequence[MappingPhoto], model: SparseModel) -> list
         return notes
     notes.append(f"{len(absent)} of {len(photos)} photos found no place: {some(absent)}")
     if model.apart:
-        pieces = ", ".join(map(str, model.apart))
+        pieces = ", ".join(str(len(piece)) for piece in model.apart)
         notes.append(
             f"the photos fell apart into {len(model.apart) + 1} pieces that nothing links for "
             f"sure: the map is of the largest, without others of {pieces} photos. Photos of the "

@@ -65,7 +65,7 @@ def triangulate(
         InvalidInput: ``sfm.no_matches``, ``sfm.no_points``.
     """
     with colmap_database(photos, rigs, matches, work) as (path, scene):
-        options = _pipeline_options(config)
+        options = pipeline_options(config)
 
         def solve(held: Collection[str]) -> pycolmap.Reconstruction:
             model = scene.with_poses(photos)
@@ -105,10 +105,10 @@ def reconstruct(
         known = {photo.sensor for photo in photos if photo.camera_known}
         constant = set() if "intrinsics" in refine else known
         placed = _Placed(len(photos), partial(progress, MAPPING))
-        apart: list[int] = []
+        apart: list[tuple[int, ...]] = []
 
         def options_with(doubts: Mapping[str, Doubt]) -> pycolmap.IncrementalPipelineOptions:
-            options = _pipeline_options(config)
+            options = pipeline_options(config)
             options.constant_cameras = {
                 scene.camera_ids[sensor] for sensor in constant | (doubts.keys() & known)
             }
@@ -121,7 +121,7 @@ def reconstruct(
             models = _map_incrementally(path, options_with(doubts), placed)
             if models:
                 largest = max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()))
-                apart[:] = _photos_apart(models.values(), largest)
+                apart[:] = _photos_apart(models.values(), largest, scene)
                 return largest
             raise _no_model(photos, matches, doubts, left_out)
 
@@ -232,17 +232,20 @@ def _with_all_points(
 
 
 def _photos_apart(
-    models: Iterable[pycolmap.Reconstruction], largest: pycolmap.Reconstruction
-) -> list[int]:
-    """Return how many photos each of the other models adds, in descending order."""
+    models: Iterable[pycolmap.Reconstruction],
+    largest: pycolmap.Reconstruction,
+    scene: ColmapScene,
+) -> list[tuple[int, ...]]:
+    """Return the rows of the photos that each of the other models adds, the most first."""
+    rows = {image.image_id: row for row, image in enumerate(scene.images)}
     known = set(largest.reg_image_ids())
-    counts = []
+    pieces = []
     for model in sorted(models, key=lambda m: -m.num_reg_images()):
         new = set(model.reg_image_ids()) - known
         known |= new
         if len(new) >= _MIN_PIECE:
-            counts.append(len(new))
-    return sorted(counts, reverse=True)
+            pieces.append(tuple(sorted(rows[image_id] for image_id in new)))
+    return sorted(pieces, key=lambda piece: -len(piece))
 
 
 @dataclass(slots=True)
@@ -372,7 +375,8 @@ def _judge(
     }
 
 
-def _pipeline_options(config: MapperConfig) -> pycolmap.IncrementalPipelineOptions:
+def pipeline_options(config: MapperConfig) -> pycolmap.IncrementalPipelineOptions:
+    """Return pycolmap's options for a mapper run: equal inputs give equal bits."""
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
     options.num_threads = 1  # sums of several threads differ in the last bits

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from mapping.methods.intrinsics import Doubt
-from mapping.methods.sfm import with_found_cameras
+from mapping.methods.sfm import _with_their_groups, with_found_cameras
 from mapping.methods.sparse_model import SparseModel
 from mapping.stages.landmarks import Observations, View
 from mapping.stages.photos import MappingPhoto
@@ -51,3 +51,9 @@ def test_a_camera_in_doubt_stays_unknown() -> None:
     photos = [photo_of(0, "film"), photo_of(1, "film")]
     doubts = {"film": Doubt("undetermined", 500.0)}
     assert with_found_cameras(photos, model_of(FOUND, None, doubts=doubts)) is None
+
+
+def test_pairs_are_verified_again_with_all_that_were_matched_together() -> None:
+    pairs = np.array([[0, 1], [0, 3], [1, 2], [2, 3], [2, 4]])
+    absent = np.array([False, False, False, True, False])
+    assert pairs[_with_their_groups(pairs, absent)].tolist() == [[0, 1], [0, 3], [2, 3], [2, 4]]
