@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mapping.methods.colmap_scene import Rigs
 from mapping.methods.intrinsics import Doubt
+from mapping.methods.look_alikes import without_look_alikes
 from mapping.methods.matching import Matches, camera_values, pose_values
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SfmPhoto, SparseModel
@@ -53,6 +54,17 @@ def make_model(
     return _from_item(context.work.read(key), photos)
 
 
+def believed_pairs(
+    context: BuildContext, photos: Sequence[MappingPhoto], matches: Sequence[Matches]
+) -> list[Matches]:
+    """Return the pairs of photos without poses that seem to show one place.
+
+    Among some of the photos, fewer matches would be missed: all photos tell more.
+    """
+    given = [_given(context.features, photo, posed=False) for photo in photos]
+    return without_look_alikes(given, matches)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _ModelTask:
     """A worker's part, for the whole map."""
@@ -66,7 +78,8 @@ class _ModelTask:
 
     def make(self, key: str, progress: Progress) -> None:
         def compute() -> Item:
-            given = [self._given(photo) for photo in self.photos]
+            posed = not self.settings.estimate_poses
+            given = [_given(self.features, photo, posed=posed) for photo in self.photos]
             config, refine = MAPPER_CONFIGS[self.settings.mapper], self.settings.refine
             inputs = self.rigs, self.matches, config, refine, self.work.scratch
             if self.settings.estimate_poses:
@@ -86,16 +99,17 @@ class _ModelTask:
         # One scale for all: they are unit rows.
         return np.rint(_LARGEST * descriptors).astype(np.int8)
 
-    def _given(self, photo: MappingPhoto) -> SfmPhoto:
-        return SfmPhoto(
-            name=photo.name,
-            sensor=photo.record.sensor_id,
-            timestamp=photo.record.timestamp,
-            camera=photo.camera,
-            camera_known=photo.camera_known,
-            cam_from_world=None if self.settings.estimate_poses else photo.pose,
-            keypoints=self.features.read(photo).keypoints,
-        )
+
+def _given(features: LocalFeaturesSource, photo: MappingPhoto, *, posed: bool) -> SfmPhoto:
+    return SfmPhoto(
+        name=photo.name,
+        sensor=photo.record.sensor_id,
+        timestamp=photo.record.timestamp,
+        camera=photo.camera,
+        camera_known=photo.camera_known,
+        cam_from_world=photo.pose if posed else None,
+        keypoints=features.read(photo).keypoints,
+    )
 
 
 def _model_key(
@@ -145,7 +159,6 @@ def _to_item(model: SparseModel) -> Item:
         "doubt_sensors": np.array(list(model.doubts), dtype=np.str_),
         "doubt_reasons": np.array([doubt.reason for doubt in model.doubts.values()], dtype=np.str_),
         "doubt_px": np.array([doubt.focal_length_px for doubt in model.doubts.values()]),
-        "apart": np.array(model.apart, dtype=np.int64),
         "undone": np.array(model.undone),
         **{f"observed_{name}": array for name, array in asdict(model.observations).items()},
     }
@@ -173,6 +186,5 @@ def _from_item(item: Item, photos: Sequence[MappingPhoto]) -> SparseModel:
         item["angles_deg"],
         bool(item["on_rigs"]),
         {sensor: Doubt(reason, focal) for sensor, reason, focal in doubts},
-        tuple(item["apart"].tolist()),
         int(item["undone"]),
     )

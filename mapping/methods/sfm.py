@@ -9,12 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from pydantic import JsonValue
 
 from mapping.frames.anchor import align_positions, known_positions
 from mapping.frames.anchor_error import place_error
+from mapping.methods.colmap_scene import Rigs
 from mapping.methods.intrinsics import (
     CAMERAS,
     CameraOrigin,
@@ -22,8 +24,9 @@ from mapping.methods.intrinsics import (
     notes_on,
     origin_of,
 )
-from mapping.methods.matching import Verification, match_pairs
-from mapping.methods.model_stage import make_model
+from mapping.methods.matching import Matches, Verification, match_pairs
+from mapping.methods.model_stage import believed_pairs, make_model
+from mapping.methods.pieces import MIN_PHOTOS, models_beside
 from mapping.methods.scenes import find_pairs, make_scene
 from mapping.methods.sfm_settings import SfmSettings
 from mapping.methods.sparse_model import MAPPER_CONFIGS, SparseModel
@@ -31,6 +34,7 @@ from mapping.progress import one_step
 from mapping.stages.context import BuildContext
 from mapping.stages.landmarks import MadeLandmarks, View, assemble_landmarks
 from mapping.stages.photos import MappingPhoto, some
+from mapping.stages.work_folder import key_of
 from visloc.archive import Anchor, GlobalFeatures
 from visloc.errors import InvalidInput
 from visloc.geometry import Pose, Similarity
@@ -48,13 +52,17 @@ def landmarks_from_matches(
     settings: SfmSettings,
     *,
     metric: bool,
-) -> MadeLandmarks:
+) -> tuple[MadeLandmarks, ...]:
     """Pair, match and verify the photos, and make landmarks of the matches.
 
     Args:
         photos: with poses, unless the settings estimate them.
         global_features: for the pairing retrieval.
         metric: whether a unit of the dataset's poses is a metre.
+
+    Returns:
+        The landmarks of each piece that photos fall apart into while their poses are estimated, the
+        largest first; one piece of photos with poses.
 
     Raises:
         InvalidInput: ``pairs.*``, ``sfm.*``.
@@ -72,23 +80,40 @@ def landmarks_from_matches(
     matches, matches_key = match_pairs(context, photos, pairs.rows, verification)
     rigs = known_rigs(dataset, {photo.record.sensor_id for photo in photos})
     model = make_model(context, photos, rigs, matches, matches_key, settings)
+    given = photos
     if (found := with_found_cameras(photos, model)) is not None:
-        matches, matches_key = match_pairs(context, found, pairs.rows, verification)
+        again, again_key = match_pairs(context, found, pairs.rows, verification)
         begun = [replace(p, camera=new.camera) for p, new in zip(photos, found, strict=True)]
         with suppress(InvalidInput):  # a second look that finds nothing takes nothing away
-            again = make_model(context, begun, rigs, matches, matches_key, settings)
-            model = min(again, model, key=lambda each: each.views.count(None))
-    names = names_by_sensor((photo.record.sensor_id, photo.name) for photo in photos)
-    origins = {
-        sensor: origin_of(dataset.sensors[sensor], model.doubts.get(sensor)) for sensor in names
-    }
-    notes = [*_notes_on_absent(photos, model), *notes_on(origins, names)]
-    made = replace(
-        _placed_landmarks(dataset, photos, model, settings, metric=metric),
-        settings={**settings.record(), **_origins_record(origins, settings)},
-        pairs=(scene, pairs),
+            second = make_model(context, begun, rigs, again, again_key, settings)
+            if second.views.count(None) <= model.views.count(None):
+                model, matches, matches_key, given = second, again, again_key, begun
+    models = [model]
+    if settings.estimate_poses and model.views.count(None) >= MIN_PHOTOS:
+        make = partial(_model_of_some, context, given, rigs, matches_key, settings)
+        models += models_beside(model, believed_pairs(context, given, matches), make)
+    absent = _notes_on_absent(photos, models)
+    return tuple(
+        replace(
+            _placed_landmarks(dataset, photos, one, settings, metric=metric, notes=absent),
+            pairs=(scene, pairs),
+        )
+        for one in models
     )
-    return replace(made, notes=(*notes, *made.notes))
+
+
+def _model_of_some(
+    context: BuildContext,
+    photos: Sequence[MappingPhoto],
+    rigs: Rigs,
+    matches_key: str,
+    settings: SfmSettings,
+    rows: Sequence[int],
+    matches: Sequence[Matches],
+) -> SparseModel:
+    """Make a model of some of the photos, with the matches between them."""
+    key = key_of("matches_of_some", 1, matches=matches_key, photos=list(rows))
+    return make_model(context, [photos[row] for row in rows], rigs, matches, key, settings)
 
 
 def with_found_cameras(
@@ -127,16 +152,30 @@ def _placed_landmarks(
     settings: SfmSettings,
     *,
     metric: bool,
+    notes: tuple[str, ...],
 ) -> MadeLandmarks:
-    """Put a model where the photos were taken, and make landmarks of its points."""
+    """Put a model where the photos were taken, and make landmarks of its points.
+
+    ``notes`` come before those on the model's cameras and place.
+    """
+    used = {p.record.sensor_id for p, view in zip(photos, model.views, strict=True) if view}
+    names = names_by_sensor(
+        (photo.record.sensor_id, photo.name)
+        for photo in photos
+        if photo.record.sensor_id in used | model.doubts.keys()
+    )
+    origins = {
+        sensor: origin_of(dataset.sensors[sensor], model.doubts.get(sensor)) for sensor in names
+    }
+    notes = (*notes, *notes_on(origins, names))
     placed = np.array([row for row, view in enumerate(model.views) if view is not None])
     views = [view for view in model.views if view is not None]
     points = model.points
-    notes: tuple[str, ...] = ()
     rig_scale: float | None = 1.0
     anchor = Anchor(kind="dataset", images=len(photos))
     if settings.estimate_poses:
-        similarity, anchor, notes = _anchored(dataset, photos, model)
+        similarity, anchor, on_anchor = _anchored(dataset, photos, model)
+        notes = (*notes, *on_anchor)
         views = [View(v.camera, similarity.move(v.cam_from_world)) for v in views]
         points = similarity.apply(points)
         # Without rigs in it, the reconstruction had a unit of its own.
@@ -151,7 +190,7 @@ def _placed_landmarks(
         views=tuple(views),
         landmarks=landmarks,
         rows=tuple(rows),
-        settings={},
+        settings={**settings.record(), **_origins_record(origins, settings)},
         metric=metric,
         anchor=anchor,
         rig_scale=rig_scale,
@@ -159,25 +198,21 @@ def _placed_landmarks(
     )
 
 
-def _notes_on_absent(photos: Sequence[MappingPhoto], model: SparseModel) -> list[str]:
+def _notes_on_absent(
+    photos: Sequence[MappingPhoto], models: Sequence[SparseModel]
+) -> tuple[str, ...]:
+    """Return notes on pairs that were not used, and photos that are in no model."""
     notes = []
-    if model.undone:
+    if undone := sum(model.undone for model in models):
         notes.append(
-            f"{model.undone} pairs of photos were not used: they joined places that look alike, "
+            f"{undone} pairs of photos were not used: they joined places that look alike, "
             "and photos in the joined model missed what others beside them saw"
         )
-    absent = [photo.name for photo, v in zip(photos, model.views, strict=True) if v is None]
-    if not absent:
-        return notes
-    notes.append(f"{len(absent)} of {len(photos)} photos found no place: {some(absent)}")
-    if model.apart:
-        pieces = ", ".join(map(str, model.apart))
-        notes.append(
-            f"the photos fell apart into {len(model.apart) + 1} pieces that nothing links for "
-            f"sure: the map is of the largest, without others of {pieces} photos. Photos of the "
-            "way between them would link them"
-        )
-    return notes
+    views = zip(*(model.views for model in models), strict=True)
+    absent = [p.name for p, seen in zip(photos, views, strict=True) if not any(seen)]
+    if absent:
+        notes.append(f"{len(absent)} of {len(photos)} photos found no place: {some(absent)}")
+    return tuple(notes)
 
 
 def _origins_record(
