@@ -203,10 +203,8 @@ class _Job:
         shutil.rmtree(incoming, ignore_errors=True)  # of a build that was killed here
         try:
             written = self._written(incoming, photos, global_features, pieces, notes)
-            with one_step(context.progress, "archive"):
-                folder = publish_pieces(self.store, written, accept=settings.accept)
-            wrote(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
-            return folder
+            with one_step(context.progress, "publication"):
+                return publish_pieces(self.store, written, accept=settings.accept)
         finally:
             shutil.rmtree(incoming, ignore_errors=True)
 
@@ -303,4 +301,5 @@ class _Job:
             if made.imported is not None:
                 made.imported.write(folder)
             version = write_content(folder, content, map_id, left_out, self.examine)
+            wrote(sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()))
         return WrittenMap(folder, map_id, version, len(placed))
