@@ -127,11 +127,10 @@ def print_map(opened: Map) -> None:
 
 def print_pieces(store: MapStore, largest: Map) -> None:
     """Print the maps that the same build made of photos that nothing links to the largest map."""
-    in_use = {map_id: store.current_version(map_id) for map_id in store.ids()}
     for ref in pieces_of(largest):
         print_map(store.open(ref))
         map_id, _, version = ref.partition("@")
-        if in_use.get(map_id) != version:
+        if map_id not in store.ids() or store.current_version(map_id) != version:
             say(f"not in use: {ref}; put it into use with: mapping use {ref}")
 
 
